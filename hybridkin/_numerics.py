@@ -1,0 +1,375 @@
+"""Numerical ground floor: entire functions, Jacobians of modules, shape checks (torch only)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+_HORNER_DEGREE = 12
+_C3 = tuple((-1.0) ** j / math.factorial(2 * j + 3) for j in range(_HORNER_DEGREE + 1))
+_C4 = tuple((-1.0) ** j / math.factorial(2 * j + 4) for j in range(_HORNER_DEGREE + 1))
+
+
+class Stumpff(NamedTuple):
+    """Entire functions of s = theta^2, with theta the bend angle of an arc.
+
+    c = cos(theta), f = sin(theta)/theta, g = (1 - cos(theta))/theta^2,
+    c3 = (theta - sin(theta))/theta^3, c4 = (cos(theta) - 1 + theta^2/2)/theta^4.
+    With respect to s: 2 f' = c3 - g, 2 g' = 2 c4 - c3, 2 c' = -f.
+    """
+
+    c: Tensor
+    f: Tensor
+    g: Tensor
+    c3: Tensor
+    c4: Tensor
+
+
+def stumpff(s: Tensor) -> Stumpff:
+    """Return the Stumpff functions of s = theta^2, smooth through theta = 0.
+
+    The power series is summed for the half angle and doubled once, which holds full precision
+    up to theta = 2 pi without a branch, a square root or a division.
+
+    Parameters
+    ----------
+    s : Tensor
+        Squared bend angles [rad^2], any shape.
+
+    Returns
+    -------
+    Stumpff
+        Five tensors of the shape of `s`.
+    """
+    quarter = 0.25 * s
+    c3 = torch.full_like(quarter, _C3[-1])
+    c4 = torch.full_like(quarter, _C4[-1])
+    for a3, a4 in zip(_C3[-2::-1], _C4[-2::-1], strict=True):
+        c3 = c3 * quarter + a3
+        c4 = c4 * quarter + a4
+    f = 1.0 - quarter * c3
+    g = 0.5 - quarter * c4
+    c3, c4 = 0.25 * (c3 + f * g), 0.125 * c3 * (1.0 + f)
+    f = 1.0 - s * c3
+    g = 0.5 - s * c4
+    return Stumpff(1.0 - s * g, f, g, c3, c4)
+
+
+def jacobian(module: nn.Module, q: Tensor) -> Tensor:
+    """Return dx/dq of any module that maps every row of q by itself to a row of x.
+
+    Uses the module's own closed-form ``jacobian`` where it has one, else one backward pass per
+    output coordinate.
+
+    Parameters
+    ----------
+    module : nn.Module or callable
+        Maps ``(..., n)`` to ``(..., m)``, row by row.
+    q : Tensor of shape (..., n)
+        Actuator vectors.
+
+    Returns
+    -------
+    Tensor of shape (..., m, n)
+        Jacobian at every row.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import jacobian
+    >>> jacobian(lambda q: q**2, torch.tensor([1.0, 3.0]))
+    tensor([[2., 0.],
+            [0., 6.]])
+    """
+    closed_form = getattr(module, "jacobian", None)
+    if closed_form is not None:
+        return closed_form(q)
+    return forward_and_reverse_jacobian(module, q)[1]
+
+
+def forward_and_reverse_jacobian(module: nn.Module, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x and dx/dq by one backward pass per output coordinate; see `jacobian`."""
+    keep_graph = q.requires_grad and torch.is_grad_enabled()
+    with torch.enable_grad():
+        leaf = q if keep_graph else q.detach().requires_grad_(True)
+        x = module(leaf)
+        rows = [
+            torch.autograd.grad(
+                x[..., i].sum(), leaf, create_graph=keep_graph, retain_graph=True, allow_unused=True
+            )[0]
+            for i in range(x.shape[-1])
+        ]
+    rows = [torch.zeros_like(leaf) if row is None else row for row in rows]
+    J = torch.stack(rows, dim=-2)
+    return (x, J) if keep_graph else (x.detach(), J.detach())
+
+
+class PortableModule(nn.Module):
+    """A module of buffers whose pickle and joblib hash are the same in every process.
+
+    Buffers are stored as plain arrays and come back on their device, or on the CPU where that
+    device does not exist.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        state["_buffers"] = {
+            name: None if value is None else (value.detach().cpu().numpy(), str(value.device))
+            for name, value in self._buffers.items()
+        }
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        buffers: dict[str, Tensor | None] = {}
+        for name, stored in state["_buffers"].items():
+            buffers[name] = None
+            if stored is not None:
+                array, device = stored
+                at_home = device == "cpu" or torch.cuda.is_available()
+                buffers[name] = torch.tensor(array, device=device if at_home else "cpu")
+        super().__setstate__({**state, "_buffers": buffers})
+
+
+def check_vectors(value: Tensor, size: int, name: str, why: str) -> Tensor:
+    """Return `value` when it is a floating tensor of shape (..., size), else raise."""
+    if not isinstance(value, Tensor):
+        raise TypeError(
+            f"`{name}` must be a torch tensor of shape (..., {size}), got "
+            f"{type(value).__name__}; wrap it in torch.as_tensor(...)."
+        )
+    if not value.is_floating_point():
+        raise TypeError(
+            f"`{name}` must be a floating tensor, got {value.dtype}; convert it with `.double()`."
+        )
+    if value.ndim == 0 or value.shape[-1] != size:
+        raise ValueError(
+            f"`{name}` must have shape (..., {size}), got {tuple(value.shape)}; {why}."
+        )
+    return value
+
+
+class RowGram(NamedTuple):
+    """G = J J^T of a Jacobian with three rows, its LDL^T factors and its singular values.
+
+    The six entries of G are kept apart, so that a batch costs a few elementwise operations
+    instead of a LAPACK call per matrix.
+    """
+
+    entries: tuple[Tensor, ...]  # g11, g21, g31, g22, g32, g33
+    sigma_min: Tensor
+    sigma_max: Tensor
+
+
+def row_gram(J: Tensor) -> RowGram:
+    """Return G = J J^T with the smallest and largest singular value of J, in closed form.
+
+    The singular values are good to sqrt(eps) of the largest, because G holds their squares.
+
+    Parameters
+    ----------
+    J : Tensor of shape (..., 3, n)
+        Jacobians.
+
+    Returns
+    -------
+    RowGram
+        Entries and singular values, each of shape (...,).
+    """
+    G = J @ J.mT
+    g11, g21, g31 = G[..., 0, 0], G[..., 1, 0], G[..., 2, 0]
+    g22, g32, g33 = G[..., 1, 1], G[..., 2, 1], G[..., 2, 2]
+    mean = (g11 + g22 + g33) / 3.0
+    a, b, c = g11 - mean, g22 - mean, g33 - mean
+    off = g21 * g21 + g31 * g31 + g32 * g32
+    radius = ((a * a + b * b + c * c + 2.0 * off) / 6.0).sqrt()
+    det = a * (b * c - g32 * g32) - g21 * (g21 * c - g32 * g31) + g31 * (g21 * g32 - b * g31)
+    ratio = 0.5 * det / radius.pow(3).clamp_min(torch.finfo(J.dtype).tiny)
+    angle = torch.acos(ratio.clamp(-1.0, 1.0)) / 3.0
+    low = mean + 2.0 * radius * torch.cos(angle + 2.0 * math.pi / 3.0)
+    high = mean + 2.0 * radius * torch.cos(angle)
+    return RowGram(
+        (g11, g21, g31, g22, g32, g33), low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt()
+    )
+
+
+def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> Tensor:
+    """Return mu with (J J^T + lambda^2 1) mu = v, so that J^T mu is the damped inverse step.
+
+    A row of J that depends on the rows before it, to rounding, gets mu = 0: without damping the
+    result still inverts the rest.
+
+    Parameters
+    ----------
+    gram : RowGram
+        From `row_gram`, batch shape (...,).
+    v : Tensor of shape (..., 3)
+        Right-hand sides.
+    damping_sq : Tensor of shape (...,) or float, default=0.0
+        lambda^2, in the unit of J J^T.
+
+    Returns
+    -------
+    Tensor of shape (..., 3)
+        Multipliers mu.
+    """
+    return _solve_3x3(gram.entries, v, damping_sq)
+
+
+def null_projection(J: Tensor, gram: RowGram, step: Tensor) -> Tensor:
+    """Return (1 - J+ J) step, the part of a step that does not move the tip.
+
+    The projector is undamped: a damped one would leak lambda^2 / (sigma^2 + lambda^2) of the step
+    into the task. Applied twice, which takes the rounding of an ill-conditioned J out again.
+
+    Parameters
+    ----------
+    J : Tensor of shape (..., 3, n)
+        Jacobians.
+    gram : RowGram
+        Their `row_gram`.
+    step : Tensor of shape (..., n)
+        Steps.
+
+    Returns
+    -------
+    Tensor of shape (..., n)
+        Projected steps.
+    """
+    for _ in range(2):
+        mu = _solve_3x3(gram.entries, apply_rows(J, step), 0.0)
+        step = step - apply_columns(J, mu)
+    return step
+
+
+def apply_rows(J: Tensor, step: Tensor) -> Tensor:
+    """Return J step, shape (..., 3), for steps of shape (..., n)."""
+    return (J @ step[..., None])[..., 0]
+
+
+def apply_columns(J: Tensor, mu: Tensor) -> Tensor:
+    """Return J^T mu, shape (..., n), for mu of shape (..., 3)."""
+    return (mu[..., None, :] @ J)[..., 0, :]
+
+
+def box_limited_step(
+    J: Tensor,
+    v: Tensor,
+    z: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    damping_sq: Tensor,
+    mu: Tensor | None = None,
+    *,
+    max_iter: int = 60,
+) -> tuple[Tensor, Tensor]:
+    """Return the exact minimiser of |dq - z|^2 + |J dq - v|^2 / lambda^2 in the box.
+
+    The minimiser is dq(mu) = clip(z + J^T mu, lower, upper) with mu in R^3 the root of
+    F(mu) = J dq(mu) + lambda^2 mu - v. F is the gradient of a strongly convex, piecewise
+    quadratic function, so that Newton's method on its active pieces, with an exact line search
+    along the few breakpoints, ends after finitely many steps at the optimum.
+
+    Parameters
+    ----------
+    J : Tensor of shape (N, 3, n)
+        Jacobians.
+    v : Tensor of shape (N, 3)
+        Wanted task steps J dq.
+    z : Tensor of shape (N, n)
+        Preferred steps; the optimum is the one nearest to them.
+    lower, upper : Tensor of shape (N, n)
+        Bounds of the step, lower <= upper.
+    damping_sq : Tensor of shape (N,)
+        lambda^2 > 0, in the unit of J J^T; not below 1e-6 of its largest eigenvalue in float64.
+    mu : Tensor of shape (N, 3), optional
+        Start of the iteration. Default: zero.
+    max_iter : int, default=60
+        Cap on Newton steps; a handful is usual.
+
+    Returns
+    -------
+    dq : Tensor of shape (N, n)
+        The optimal steps, inside the box.
+    mu : Tensor of shape (N, 3)
+        Their multipliers, (v - J dq) / lambda^2.
+
+    References
+    ----------
+    Hiriart-Urruty, Strodiot & Nguyen, Appl. Math. Optim. 11 (1984); Qi & Sun, Math. Program. 58
+    (1993), for semismooth Newton methods.
+    """
+    mu = torch.zeros_like(v) if mu is None else mu.clone()
+    rows = torch.arange(len(J), device=J.device)
+    noise = 16.0 * torch.finfo(J.dtype).eps
+    m = mu
+    for _ in range(max_iter):
+        if rows.numel() == 0:
+            break
+        y = z + apply_columns(J, m)
+        free = (y > lower) & (y < upper)
+        dq = torch.clamp(y, lower, upper)
+        reach, pull = apply_rows(J, dq), damping_sq[:, None] * m
+        residual = reach + pull - v
+        scale = (J.abs() @ dq.abs()[..., None])[..., 0] + pull.abs() + v.abs()
+        newton = -damped_solve(row_gram(J * free[:, None]), residual, damping_sq)
+        slope = apply_columns(J, newton)
+        full = y + slope
+        gradient = residual + apply_rows(J, torch.clamp(full, lower, upper) - dq)
+        gradient = gradient + damping_sq[:, None] * newton
+        overshoot = (newton * gradient).sum(-1) > 0.0
+        same = (((full > lower) & (full < upper)) == free).all(-1)
+        length = _exact_line_search(J, y, slope, newton, residual, lower, upper, damping_sq)
+        length = torch.where(overshoot & ~same, length, torch.ones_like(length))
+        m = m + length[:, None] * newton
+        mu[rows] = m
+        # With the same coordinates free the Newton step has solved its piece, hence the problem.
+        going = ~same & ((residual.abs() > noise * scale).any(-1))
+        if not going.all():
+            rows, m = rows[going], m[going]
+            J, v, z, damping_sq = J[going], v[going], z[going], damping_sq[going]
+            lower, upper = lower[going], upper[going]
+    return mu
+
+
+def _exact_line_search(
+    J: Tensor,
+    y: Tensor,
+    slope: Tensor,
+    direction: Tensor,
+    residual: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    damping_sq: Tensor,
+) -> Tensor:
+    """Return the step length in (0, 1] at which the dual's slope along a direction vanishes."""
+    raise NotImplementedError
+
+
+def _solve_3x3(
+    entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float
+) -> Tensor:
+    """Solve a symmetric semidefinite 3 x 3 system plus damping by LDL^T without pivoting."""
+    g11, g21, g31, g22, g32, g33 = entries
+    v1, v2, v3 = v.unbind(-1)
+    floor = 8.0 * torch.finfo(v.dtype).eps * (g11 + g22 + g33 + damping_sq)
+    i1 = _reciprocal(g11 + damping_sq, floor)
+    l21, l31 = g21 * i1, g31 * i1
+    i2 = _reciprocal(g22 + damping_sq - l21 * g21, floor)
+    t = g32 - l31 * g21
+    l32 = t * i2
+    i3 = _reciprocal(g33 + damping_sq - l31 * g31 - l32 * t, floor)
+    v2 = v2 - l21 * v1
+    v3 = v3 - l31 * v1 - l32 * v2
+    x3 = v3 * i3
+    x2 = v2 * i2 - l32 * x3
+    x1 = v1 * i1 - l21 * x2 - l31 * x3
+    return torch.stack([x1, x2, x3], dim=-1)
+
+
+def _reciprocal(pivot: Tensor, floor: Tensor) -> Tensor:
+    """Return 1 / pivot, and 0 for a pivot that is only rounding."""
+    keep = pivot > floor
+    return torch.where(keep, 1.0 / torch.where(keep, pivot, torch.ones_like(pivot)), 0.0)
