@@ -58,7 +58,7 @@ def stumpff(s: Tensor) -> Stumpff:
     return Stumpff(1.0 - s * g, f, g, c3, c4)
 
 
-def jacobian(module: nn.Module, q: Tensor) -> Tensor:
+def jacobian(module: Any, q: Tensor) -> Tensor:
     """Return dx/dq of any module that maps every row of q by itself to a row of x.
 
     Uses the module's own closed-form ``jacobian`` where it has one, else one backward pass per
@@ -84,13 +84,19 @@ def jacobian(module: nn.Module, q: Tensor) -> Tensor:
     tensor([[2., 0.],
             [0., 6.]])
     """
-    closed_form = getattr(module, "jacobian", None)
-    if closed_form is not None:
-        return closed_form(q)
-    return forward_and_reverse_jacobian(module, q)[1]
+    return forward_and_jacobian(module, q)[1]
 
 
-def forward_and_reverse_jacobian(module: nn.Module, q: Tensor) -> tuple[Tensor, Tensor]:
+def forward_and_jacobian(module: Any, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x and dx/dq, in closed form where the module offers it; see `jacobian`."""
+    if hasattr(module, "forward_and_jacobian"):
+        return module.forward_and_jacobian(q)
+    if hasattr(module, "jacobian"):
+        return module(q), module.jacobian(q)
+    return forward_and_reverse_jacobian(module, q)
+
+
+def forward_and_reverse_jacobian(module: Any, q: Tensor) -> tuple[Tensor, Tensor]:
     """Return x and dx/dq by one backward pass per output coordinate; see `jacobian`."""
     keep_graph = q.requires_grad and torch.is_grad_enabled()
     with torch.enable_grad():
@@ -151,6 +157,9 @@ def check_vectors(value: Tensor, size: int, name: str, why: str) -> Tensor:
     return value
 
 
+_PROXIMAL_ROUNDS = 2
+
+
 class RowGram(NamedTuple):
     """G = J J^T of a Jacobian with three rows, its LDL^T factors and its singular values.
 
@@ -178,9 +187,7 @@ def row_gram(J: Tensor) -> RowGram:
     RowGram
         Entries and singular values, each of shape (...,).
     """
-    G = J @ J.mT
-    g11, g21, g31 = G[..., 0, 0], G[..., 1, 0], G[..., 2, 0]
-    g22, g32, g33 = G[..., 1, 1], G[..., 2, 1], G[..., 2, 2]
+    entries = g11, g21, g31, g22, g32, g33 = _gram_entries(J)
     mean = (g11 + g22 + g33) / 3.0
     a, b, c = g11 - mean, g22 - mean, g33 - mean
     off = g21 * g21 + g31 * g31 + g32 * g32
@@ -190,9 +197,7 @@ def row_gram(J: Tensor) -> RowGram:
     angle = torch.acos(ratio.clamp(-1.0, 1.0)) / 3.0
     low = mean + 2.0 * radius * torch.cos(angle + 2.0 * math.pi / 3.0)
     high = mean + 2.0 * radius * torch.cos(angle)
-    return RowGram(
-        (g11, g21, g31, g22, g32, g33), low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt()
-    )
+    return RowGram(entries, low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt())
 
 
 def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> Tensor:
@@ -301,56 +306,157 @@ def box_limited_step(
     Hiriart-Urruty, Strodiot & Nguyen, Appl. Math. Optim. 11 (1984); Qi & Sun, Math. Program. 58
     (1993), for semismooth Newton methods.
     """
-    mu = torch.zeros_like(v) if mu is None else mu.clone()
+    mu = torch.zeros_like(v) if mu is None else mu
+    best = mu.clone()
+    J_all, z_all, lower_all, upper_all = J, z, lower, upper
     rows = torch.arange(len(J), device=J.device)
-    noise = 16.0 * torch.finfo(J.dtype).eps
-    m = mu
+    noise = 4.0 * torch.finfo(J.dtype).eps
+    settled = torch.zeros(len(J), dtype=torch.bool, device=J.device)
     for _ in range(max_iter):
+        y = z + apply_columns(J, mu)
+        dq = torch.clamp(y, lower, upper)
+        pull = damping_sq[:, None] * mu
+        residual = apply_rows(J, dq) + pull - v
+        scale = apply_rows(J.abs(), dq.abs()) + pull.abs() + v.abs()
+        best[rows] = mu
+        going = ~settled & (residual.abs() > noise * scale).any(-1)
+        if not going.all():
+            keep = going.nonzero()[:, 0]
+            rows, mu, J, v, z, damping_sq = (a[keep] for a in (rows, mu, J, v, z, damping_sq))
+            lower, upper, y, residual = (a[keep] for a in (lower, upper, y, residual))
         if rows.numel() == 0:
             break
-        y = z + apply_columns(J, m)
         free = (y > lower) & (y < upper)
-        dq = torch.clamp(y, lower, upper)
-        reach, pull = apply_rows(J, dq), damping_sq[:, None] * m
-        residual = reach + pull - v
-        scale = (J.abs() @ dq.abs()[..., None])[..., 0] + pull.abs() + v.abs()
-        newton = -damped_solve(row_gram(J * free[:, None]), residual, damping_sq)
+        newton = -_solve_3x3(_gram_entries(J * free[:, None]), residual, damping_sq)
         slope = apply_columns(J, newton)
         full = y + slope
-        gradient = residual + apply_rows(J, torch.clamp(full, lower, upper) - dq)
-        gradient = gradient + damping_sq[:, None] * newton
-        overshoot = (newton * gradient).sum(-1) > 0.0
-        same = (((full > lower) & (full < upper)) == free).all(-1)
-        length = _exact_line_search(J, y, slope, newton, residual, lower, upper, damping_sq)
-        length = torch.where(overshoot & ~same, length, torch.ones_like(length))
-        m = m + length[:, None] * newton
-        mu[rows] = m
-        # With the same coordinates free the Newton step has solved its piece, hence the problem.
-        going = ~same & ((residual.abs() > noise * scale).any(-1))
-        if not going.all():
-            rows, m = rows[going], m[going]
-            J, v, z, damping_sq = J[going], v[going], z[going], damping_sq[going]
-            lower, upper = lower[going], upper[going]
-    return mu
+        # A full step that stays on its linear piece has solved it, and with it the problem.
+        same = ((full > lower) == (y > lower)) & ((full < upper) == (y < upper))
+        settled = (same | (lower == upper)).all(-1)
+        start = (newton * residual).sum(-1)
+        curvature = damping_sq * newton.square().sum(-1)
+        end = start + curvature + (slope * _moved(y, full, lower, upper)).sum(-1)
+        length = torch.ones_like(end)
+        far = ((end > 0.0) & ~settled).nonzero()[:, 0]
+        if far.numel() > 0:
+            length[far] = _exact_line_search(
+                *(a[far] for a in (y, slope, start, curvature, lower, upper))
+            )
+        mu = mu + length[:, None] * newton
+    best[rows] = mu
+    dq = torch.clamp(z_all + apply_columns(J_all, best), lower_all, upper_all)
+    return dq, best
+
+
+def adaptive_damping(gram: RowGram, healthy: float = 0.02) -> Tensor:
+    """Return lambda^2, zero for a healthy J and growing smoothly from there.
+
+    lambda = healthy sigma_max (1 - (sigma_min / (healthy sigma_max))^2) below
+    sigma_min = healthy sigma_max: free of units, and once differentiable as a square.
+
+    Parameters
+    ----------
+    gram : RowGram
+        From `row_gram`.
+    healthy : float, default=0.02
+        Ratio sigma_min / sigma_max from which on no damping is needed.
+
+    Returns
+    -------
+    Tensor of shape (...,)
+        lambda^2, in the unit of J J^T.
+
+    References
+    ----------
+    Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
+    """
+    threshold = healthy * gram.sigma_max
+    ratio = gram.sigma_min / torch.where(threshold > 0.0, threshold, torch.ones_like(threshold))
+    return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
+
+
+def strict_box_step(
+    J: Tensor, v: Tensor, z: Tensor, lower: Tensor, upper: Tensor, damping_sq: Tensor
+) -> Tensor:
+    """Return the box-limited step whose task part does not depend on the preferred step z.
+
+    Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
+    would trade v against z; therefore the damped task is solved in the box for z = 0 first, and
+    z chooses among the steps that move the tip as that one does.
+
+    Parameters
+    ----------
+    J, v, z, lower, upper : Tensor
+        As for `box_limited_step`.
+    damping_sq : Tensor of shape (N,)
+        lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with
+        that much, and its task error is taken out by proximal rounds on the multipliers.
+
+    Returns
+    -------
+    Tensor of shape (N, n)
+        Steps inside the box.
+    """
+    sigma_sq = row_gram(J).sigma_max.square()
+    # Without any Jacobian the floor only has to be positive.
+    floor = torch.where(sigma_sq > 0.0, _box_floor(J.dtype) * sigma_sq, torch.ones_like(sigma_sq))
+    damped = (damping_sq > 0.0) & (z != 0.0).any(-1)
+    if damped.any():
+        rows = damped.nonzero()[:, 0]
+        task = (J[rows], v[rows], torch.zeros_like(z[rows]), lower[rows], upper[rows])
+        dq = strict_box_step(*task, damping_sq[rows])
+        v = v.index_put((rows,), apply_rows(task[0], dq))
+        damping_sq = torch.where(damped, torch.zeros_like(damping_sq), damping_sq)
+    used = torch.maximum(damping_sq, floor)
+    dq, mu = box_limited_step(J, v, z, lower, upper, used)
+    weak = (damping_sq < floor).nonzero()[:, 0]
+    if weak.numel() > 0:
+        used, mu, excess = used[weak], mu[weak], (used - damping_sq)[weak]
+        task = (J[weak], v[weak], z[weak], lower[weak], upper[weak])
+        for _ in range(_PROXIMAL_ROUNDS):
+            centred = task[1] + excess[:, None] * mu
+            dq_weak, mu = box_limited_step(task[0], centred, *task[2:], used, mu)
+        dq = dq.index_put((weak,), dq_weak)
+    return dq
+
+
+def _box_floor(dtype: torch.dtype) -> float:
+    return max(1e-6, math.sqrt(torch.finfo(dtype).eps))
+
+
+def _moved(y: Tensor, to: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    return torch.clamp(to, lower, upper) - torch.clamp(y, lower, upper)
 
 
 def _exact_line_search(
-    J: Tensor,
-    y: Tensor,
-    slope: Tensor,
-    direction: Tensor,
-    residual: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    damping_sq: Tensor,
+    y: Tensor, slope: Tensor, start: Tensor, curvature: Tensor, lower: Tensor, upper: Tensor
 ) -> Tensor:
-    """Return the step length in (0, 1] at which the dual's slope along a direction vanishes."""
-    raise NotImplementedError
+    """Return t in (0, 1) where start + t curvature + slope . (clip(y + t slope) - clip(y)) = 0.
+
+    The left side grows with t, is linear between the points where a coordinate meets a bound,
+    negative at 0 and positive at 1.
+    """
+    t = torch.cat([(lower - y) / slope, (upper - y) / slope], dim=-1)
+    t = torch.nan_to_num(t, nan=1.0).clamp(0.0, 1.0)
+    ends = torch.stack([torch.zeros_like(start), torch.ones_like(start)], dim=-1)
+    t = torch.cat([t, ends], dim=-1).sort(-1).values
+    y, slope, lower, upper = (a[:, None] for a in (y, slope, lower, upper))
+    moved = _moved(y, y + t[..., None] * slope, lower, upper)
+    value = start[:, None] + t * curvature[:, None] + (slope * moved).sum(-1)
+    right = (value > 0.0).to(torch.uint8).argmax(-1, keepdim=True).clamp_min(1)
+    t0, t1 = t.gather(-1, right - 1)[:, 0], t.gather(-1, right)[:, 0]
+    f0, f1 = value.gather(-1, right - 1)[:, 0], value.gather(-1, right)[:, 0]
+    part = f0 / (f0 - f1)
+    return t0 + (t1 - t0) * torch.nan_to_num(part, nan=1.0).clamp(0.0, 1.0)
 
 
-def _solve_3x3(
-    entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float
-) -> Tensor:
+def _gram_entries(J: Tensor) -> tuple[Tensor, ...]:
+    G = J @ J.mT
+    pairs = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
+    return tuple(G[..., i, j] for i, j in pairs)
+
+
+def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float) -> Tensor:
     """Solve a symmetric semidefinite 3 x 3 system plus damping by LDL^T without pivoting."""
     g11, g21, g31, g22, g32, g33 = entries
     v1, v2, v3 = v.unbind(-1)

@@ -94,7 +94,7 @@ class ConstantCurvatureChain(PortableModule):
             raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
         radii = _vector(radii, "radii", dtype, positive=True)
         n_segments = radii.numel()
-        counts = _actuator_counts(n_actuators, n_segments, angles)
+        counts = _actuator_counts(n_actuators, n_segments)
         if lengths is not None:
             lengths = _vector(lengths, "lengths", dtype, size=n_segments, positive=True)
         if np.ndim(offsets) == 0:
@@ -103,17 +103,28 @@ class ConstantCurvatureChain(PortableModule):
         self.actuators_per_segment = counts
         self.n_actuators = sum(counts)
         self.routing = routing
+        angles = _flat_angles(angles, counts, dtype)
+        if torch.linalg.cond(reading_matrix(radii, angles, counts, routing, lengths is None)) > 1e6:
+            raise ValueError(
+                "`angles` must tell the bending of every segment apart, got "
+                f"{[row.tolist() for row in angles.split(counts)]}; give each segment at least 3 "
+                "actuators at different angles [rad]."
+            )
         self._set_geometry(
             radii=radii,
-            angles=_flat_angles(angles, counts, dtype),
+            angles=angles,
             lengths=lengths,
             offsets=_vector(offsets, "offsets", dtype, size=n_segments),
             base=_pose(base, "base", dtype),
         )
-        self._check_rank()
         _warn_millimetres("radii", radii, 1.0)
         if lengths is not None:
             _warn_millimetres("lengths", lengths, 10.0)
+
+    @property
+    def default_parameters(self) -> tuple[str, ...]:
+        """The geometry that a calibration fits by default."""
+        return ("radii", "base") if self.lengths is None else ("radii", "lengths", "base")
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name: radii, angles, lengths (tendons only), offsets, base."""
@@ -340,17 +351,6 @@ class ConstantCurvatureChain(PortableModule):
         self.register_buffer("arc_matrix", matrix)
         self.register_buffer("arc_offset", offset)
 
-    def _check_rank(self) -> None:
-        readings = reading_matrix(
-            self.radii, self.angles, self.actuators_per_segment, self.routing, self.lengths is None
-        )
-        if torch.linalg.cond(readings) > 1e6:
-            raise ValueError(
-                "`angles` must tell the bending of every segment apart, got "
-                f"{[row.tolist() for row in self.angles.split(self.actuators_per_segment)]}; give "
-                "each segment at least 3 actuators at different angles [rad]."
-            )
-
     def _why_shape(self) -> str:
         per_segment = " + ".join(str(n) for n in self.actuators_per_segment)
         if len(set(self.actuators_per_segment)) == 1:
@@ -395,12 +395,9 @@ def _tensor(value: Any, name: str, dtype: torch.dtype) -> Tensor:
     return tensor
 
 
-def _actuator_counts(n_actuators: Any, n_segments: int, angles: Any) -> tuple[int, ...]:
+def _actuator_counts(n_actuators: Any, n_segments: int) -> tuple[int, ...]:
     if np.ndim(n_actuators) == 0:
         counts = (int(n_actuators),) * n_segments
-        if angles is not None and all(np.ndim(row) == 1 for row in angles):
-            given = tuple(len(row) for row in angles)
-            counts = given if int(n_actuators) == 3 else counts
     else:
         counts = tuple(int(n) for n in n_actuators)
     if len(counts) != n_segments:

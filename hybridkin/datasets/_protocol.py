@@ -1,0 +1,140 @@
+"""The sampling protocol and the split of the paper."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def paper_protocol(
+    random_state: int | np.random.Generator | None = None,
+    *,
+    n_segment: int = 500,
+    n_random: int = 500,
+    low: float = 0.19,
+    high: float = 0.31,
+    hold: float = 0.20,
+    jitter: float = 0.005,
+) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    """Return the commanded lengths of the paper's sampling protocol and the part of each row.
+
+    First each segment in turn moves alone, its three lengths uniform in the working range while
+    the other segments stay short; then all nine lengths are uniform in the range.
+
+    Parameters
+    ----------
+    random_state : int, Generator or None, default=None
+        Source of the draws.
+    n_segment : int, default=500
+        Rows per segment that moves alone.
+    n_random : int, default=500
+        Rows in which all lengths are random.
+    low, high : float, default=0.19 and 0.31
+        Working range of the lengths [m].
+    hold : float, default=0.20
+        Length at which the segments at rest are held [m].
+    jitter : float, default=0.005
+        Held lengths are uniform within ``hold`` -+ ``jitter`` [m].
+
+    Returns
+    -------
+    q_target : ndarray of shape (3 * n_segment + n_random, 9)
+        Commanded chamber lengths [m].
+    part : ndarray of shape (3 * n_segment + n_random,)
+        0, 1 or 2: the segment that moves alone; 3: all of them.
+
+    References
+    ----------
+    Reinhart and Steil (2016), section 3.3.
+
+    Examples
+    --------
+    >>> from hybridkin.datasets import paper_protocol
+    >>> q_target, part = paper_protocol(random_state=0)
+    >>> q_target.shape, (part == 3).sum().item()
+    ((2000, 9), 500)
+    """
+    if not (np.isfinite([low, high, hold, jitter]).all() and low < high and jitter >= 0):
+        raise ValueError(
+            f"`low` < `high` and `jitter` >= 0 are needed, got low={low}, high={high}, "
+            f"jitter={jitter}."
+        )
+    for name, value in (("n_segment", n_segment), ("n_random", n_random)):
+        if not (isinstance(value, (int, np.integer)) and value >= 0):
+            raise ValueError(f"`{name}` must be an integer >= 0, got {value!r}.")
+    rng = np.random.default_rng(random_state)
+    part = np.repeat(np.arange(4, dtype=np.int8), [n_segment] * 3 + [n_random])
+    return draw(rng, part, low, high, hold, jitter), part
+
+
+def draw(
+    rng: np.random.Generator,
+    part: NDArray[np.int8],
+    low: float,
+    high: float,
+    hold: float,
+    jitter: float,
+) -> NDArray[np.float64]:
+    """Return commanded lengths (n_samples, 9) for rows of the given parts; see paper_protocol."""
+    moving = (part[:, None] == 3) | (part[:, None] == np.arange(9) // 3)
+    unit = rng.random((len(part), 9))
+    return np.where(moving, low + (high - low) * unit, hold + jitter * (2 * unit - 1))
+
+
+def default_range() -> dict[str, float]:
+    """Return the range of lengths that `paper_protocol` has by default."""
+    arguments = inspect.signature(paper_protocol).parameters
+    return {name: arguments[name].default for name in ("low", "high", "hold", "jitter")}
+
+
+def paper_split(
+    data: Any,
+    random_state: int | np.random.Generator | None = None,
+    *,
+    n_test: int = 100,
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the paper's split: test rows among the fully random ones, all others for training.
+
+    Parameters
+    ----------
+    data : Bunch or array-like of shape (n_samples,)
+        Data with ``part``, or that array itself.
+    random_state : int, Generator or None, default=None
+        Which of the fully random rows are kept for the test.
+    n_test : int, default=100
+        Rows of the test set.
+
+    Returns
+    -------
+    train_idx : ndarray of shape (n_samples - n_test,)
+        Training rows: every row of a segment moving alone and the other fully random ones.
+    test_idx : ndarray of shape (n_test,)
+        Test rows.
+
+    References
+    ----------
+    Reinhart and Steil (2016), section 3.3.
+
+    Examples
+    --------
+    >>> from hybridkin.datasets import load_trunk, paper_split
+    >>> train_idx, test_idx = paper_split(load_trunk(), random_state=0)
+    >>> len(train_idx), len(test_idx)
+    (1900, 100)
+    """
+    part = getattr(data, "part", data)
+    if part is None:
+        raise ValueError("`data` has no parts: it was not drawn by the paper's protocol.")
+    part = np.asarray(part)
+    random_rows = np.flatnonzero(part == 3)
+    if not 0 < n_test <= len(random_rows):
+        raise ValueError(
+            f"`n_test` must be 1 to {len(random_rows)}, the fully random rows of `data`, "
+            f"got {n_test}."
+        )
+    rng = np.random.default_rng(random_state)
+    test_idx = np.sort(rng.permutation(random_rows)[:n_test])
+    return np.setdiff1d(np.arange(len(part)), test_idx), test_idx

@@ -1,0 +1,350 @@
+"""Data of the simulated trunk, by default under the paper's sampling protocol."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import os
+import warnings
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import as_file, files
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import ArrayLike
+from sklearn.utils import Bunch
+from tqdm import tqdm
+
+from hybridkin.datasets._protocol import default_range, draw, paper_protocol
+from hybridkin.simulation import NotSettledError, TrunkPlant
+
+PAPER = (
+    "R. F. Reinhart and J. J. Steil, Hybrid Mechanical and Data-driven Modeling Improves Inverse "
+    "Kinematic Control of a Soft Robot, Procedia Technology 26, 12-19, 2016."
+)
+OWN = -1  # part of a row whose command was given
+PARTS = ("segment 0", "segment 1", "segment 2", "all segments")
+CHUNK = 25  # rows a process does at a time, and at most loses when it is interrupted
+MAX_REDRAWS = 20
+# Random streams apart from the protocol's own: measurement noise (row), redraws (row, attempt).
+NOISE, REDRAW = 1, 2
+TODO, DONE, FAILED = 0, 1, 2
+
+DESCR = """\
+Simulated three-segment pneumatic trunk
+---------------------------------------
+
+Chamber lengths and tip positions of `hybridkin.simulation.TrunkPlant`, a MuJoCo model in the
+manner of Festo's Bionic Handling Assistant, sampled by the protocol of Reinhart and Steil (2016).
+Everything here is simulated; nothing was measured on a robot.
+
+q : (n_samples, 9), measured chamber lengths [m], three per segment from base to tip
+x : (n_samples, 3), measured tip position in the motion-capture frame [m]
+q_target : (n_samples, 9), commanded chamber lengths [m]
+part : (n_samples,), 0, 1, 2 where that segment alone moves, 3 where all lengths are random
+row : (n_samples,), row of the sampling protocol
+failed : rows that did not settle, as (row, q_target, message)
+parameters : seed, noise, sampling and plant parameters
+
+The shipped set (`load_trunk`) has 3 x 500 + 500 rows, cable noise of 1 mm and motion-capture
+noise of 0.5 mm, and is what ``make_trunk(random_state=0)`` makes.
+"""
+
+
+def make_trunk(
+    q_target: ArrayLike | None = None,
+    *,
+    n_segment: int = 500,
+    n_random: int = 500,
+    random_state: int | None = None,
+    cable_noise: float = 1e-3,
+    mocap_noise: float = 5e-4,
+    n_jobs: int | None = None,
+    progress: bool | Callable[[int, int], object] = False,
+    checkpoint: str | os.PathLike[str] | None = None,
+    return_X_y: bool = False,
+    **plant_parameters: Any,
+) -> Any:
+    """Return simulated data of a pneumatic trunk, by default under the paper's protocol.
+
+    The result depends on the seed and the parameters alone, not on `n_jobs` nor on interruptions.
+    A row of the protocol that does not settle is drawn again, so that every part keeps its size;
+    rows of a given `q_target` that do not settle are left out. Both are reported in ``failed``
+    and by a warning.
+
+    Parameters
+    ----------
+    q_target : array-like of shape (n_samples, 9) or None, default=None
+        Commanded chamber lengths [m]; None draws them by `paper_protocol`.
+    n_segment, n_random : int, default=500
+        Size of the protocol's parts, when `q_target` is None.
+    random_state : int or None, default=None
+        Seed of sampling and noise; None takes a fresh one, kept in ``parameters``.
+    cable_noise : float, default=1e-3
+        Standard deviation of the measured lengths [m].
+    mocap_noise : float, default=5e-4
+        Standard deviation of each coordinate of the measured tip position [m].
+    n_jobs : int or None, default=None
+        Processes, as in joblib.
+    progress : bool or callable, default=False
+        True shows a bar; a callable is handed the rows done and the rows in all.
+    checkpoint : path-like or None, default=None
+        An .npz file kept up to date while rows are made. If it exists and was made with the same
+        seed and parameters, only the missing rows are made.
+    return_X_y : bool, default=False
+        If True, return ``(q, x)`` only.
+    **plant_parameters
+        Handed to `hybridkin.simulation.TrunkPlant`.
+
+    Returns
+    -------
+    data : :class:`~sklearn.utils.Bunch`
+        ``q`` (n_samples, 9) and ``x`` (n_samples, 3) [m], ``q_target``, ``part``, ``row``,
+        ``groups`` (None), ``failed``, ``parameters``, ``units``, ``source``, ``citation``,
+        ``DESCR``. ``part`` is None for a given `q_target`.
+
+    Raises
+    ------
+    ValueError
+        If `q_target` or a parameter is invalid, or the checkpoint is of another run.
+    ImportError
+        If MuJoCo is not installed.
+
+    Warns
+    -----
+    UserWarning
+        If rows did not settle.
+
+    Examples
+    --------
+    >>> from hybridkin.datasets import make_trunk
+    >>> data = make_trunk(n_segment=1, n_random=2, random_state=0)
+    >>> data.q.shape, data.x.shape, data.part.tolist()
+    ((5, 9), (5, 3), [0, 1, 2, 3, 3])
+    """
+    seed = _seed(random_state, checkpoint)
+    plant = _plant_parameters(plant_parameters, cable_noise, mocap_noise)
+    parameters = {"random_state": seed, "plant": plant, "mujoco": _mujoco_version()}
+    if q_target is None:
+        targets, part = paper_protocol(seed, n_segment=n_segment, n_random=n_random)
+        parameters["protocol"] = {
+            "n_segment": int(n_segment),
+            "n_random": int(n_random),
+            **default_range(),
+        }
+    else:
+        targets = np.array(q_target, dtype=float)
+        if targets.ndim != 2 or targets.shape[1] != 9:
+            raise ValueError(f"`q_target` must have shape (n_samples, 9), got {targets.shape}.")
+        low, high = TrunkPlant.admissible
+        bad = np.flatnonzero(~((targets >= low) & (targets <= high)).all(axis=1))
+        if len(bad):
+            raise ValueError(
+                f"`q_target` must be chamber lengths of {low} to {high} m, {len(bad)} rows are "
+                f"not, the first row {bad[0]}: {targets[bad[0]]}; clip them or convert to metres."
+            )
+        parameters["q_target"] = hashlib.sha256(targets.tobytes()).hexdigest()
+        part = np.full(len(targets), OWN, np.int8)
+    n = len(targets)
+    state: dict[str, Any] = {
+        "parameters": json.dumps(parameters, sort_keys=True),
+        "q": np.full((n, 9), np.nan),
+        "x": np.full((n, 3), np.nan),
+        "q_target": targets,
+        "part": part,
+        "status": np.full(n, TODO, np.int8),
+        "failed": [],
+    }
+    if checkpoint is not None and os.path.exists(checkpoint):
+        state = _resume(checkpoint, state)
+    elif checkpoint is not None:
+        _write(checkpoint, state)
+    todo = np.flatnonzero(state["status"] == TODO)
+    report, close = _progress(progress, n)
+    report(n - len(todo), n)
+    chunks = [todo[i : i + CHUNK] for i in range(0, len(todo), CHUNK)]
+    results: Any = Parallel(n_jobs=n_jobs, return_as="generator")(
+        delayed(_measure)(c, targets[c], part[c], seed, plant) for c in chunks
+    )
+    try:
+        for rows, result in zip(chunks, results, strict=True):
+            for key in ("q", "x", "q_target", "status"):
+                state[key][rows] = result[key]
+            state["failed"] += result["failed"]
+            if checkpoint is not None:
+                _write(checkpoint, state)
+            report(int((state["status"] != TODO).sum()), n)
+    finally:
+        results.close()
+        close()
+    if state["failed"]:
+        row, _, message = state["failed"][0]
+        fate = "drawn again" if q_target is None else "left out"
+        warnings.warn(
+            f"{len(state['failed'])} configurations did not settle and were {fate}; the first, in "
+            f"row {row}: {message}",
+            stacklevel=2,
+        )
+    return _bunch(state, return_X_y)
+
+
+def load_trunk(*, return_X_y: bool = False) -> Any:
+    """Return the shipped simulated data of a pneumatic trunk: 2000 rows of the paper's protocol.
+
+    Made by ``make_trunk(random_state=0)``: simulated, with 1 mm cable noise and 0.5 mm
+    motion-capture noise. Loading needs no MuJoCo.
+
+    Parameters
+    ----------
+    return_X_y : bool, default=False
+        If True, return ``(q, x)`` only.
+
+    Returns
+    -------
+    data : :class:`~sklearn.utils.Bunch`
+        As `make_trunk` returns it.
+
+    Examples
+    --------
+    >>> from hybridkin.datasets import load_trunk
+    >>> data = load_trunk()
+    >>> data.q.shape, data.x.shape
+    ((2000, 9), (2000, 3))
+    """
+    with as_file(files("hybridkin.datasets") / "data" / "trunk.npz") as path:
+        return _bunch(_read(path), return_X_y)
+
+
+def _measure(rows, targets, part, seed, plant_parameters):
+    """Settle a chunk of rows; the noise of a row is seeded by (seed, row) whoever makes it."""
+    plant, failed, targets = TrunkPlant(**plant_parameters), [], targets.copy()
+    q, x = np.full((len(rows), 9), np.nan), np.full((len(rows), 3), np.nan)
+    status = np.full(len(rows), FAILED, np.int8)
+    for i, row in enumerate(rows.tolist()):
+        for attempt in range(1 if part[i] == OWN else 1 + MAX_REDRAWS):
+            if attempt:
+                rng = np.random.default_rng([seed, REDRAW, row, attempt])
+                targets[i] = draw(rng, part[i : i + 1], **default_range())[0]
+            try:
+                q[i], pose = plant.settle(targets[i], random_state=[seed, NOISE, row])
+            except NotSettledError as error:
+                failed.append([row, targets[i].tolist(), str(error)])
+                continue
+            x[i], status[i] = pose[:3, 3], DONE
+            break
+        else:
+            if part[i] != OWN:
+                raise NotSettledError(
+                    f"Row {row}: none of {1 + MAX_REDRAWS} draws of part {PARTS[part[i]]!r} "
+                    f"settled; the last: {failed[-1][2]}"
+                )
+    return {"q": q, "x": x, "q_target": targets, "status": status, "failed": failed}
+
+
+def _seed(random_state, checkpoint):
+    if random_state is None:
+        if checkpoint is not None and os.path.exists(checkpoint):
+            raise ValueError(
+                "`random_state` must be an integer to resume from `checkpoint`, got None."
+            )
+        return int(np.random.default_rng().integers(2**31))
+    if not isinstance(random_state, (int, np.integer)) or random_state < 0:
+        raise ValueError(f"`random_state` must be an integer >= 0 or None, got {random_state!r}.")
+    return int(random_state)
+
+
+def _plant_parameters(given, cable_noise, mocap_noise):
+    """All arguments of the plant, as plain numbers and lists."""
+    defaults = {k: v.default for k, v in inspect.signature(TrunkPlant).parameters.items()}
+    for name in ("random_state", "warm_start"):  # rows are independent, each with a seed of its own
+        del defaults[name]
+    unknown = sorted(set(given) - set(defaults))
+    if unknown:
+        raise ValueError(
+            f"`plant_parameters` must be among {sorted(defaults)}, got {', '.join(unknown)}."
+        )
+    merged = {**defaults, **given, "cable_noise": cable_noise, "mocap_noise": mocap_noise}
+    TrunkPlant(**merged)  # complains here, not in a process
+    return {name: np.asarray(value).tolist() for name, value in merged.items()}
+
+
+def _mujoco_version():
+    try:
+        return version("mujoco")
+    except PackageNotFoundError:
+        return None
+
+
+def _progress(progress, total):
+    """Functions to report the rows done so far, and to close the report."""
+    if callable(progress):
+        return progress, lambda: None
+    bar = tqdm(total=total, disable=not progress, unit="row")
+
+    def report(done, _total):
+        bar.update(done - bar.n)
+
+    return report, bar.close
+
+
+def _write(path, state):
+    """Write the file whole or not at all."""
+    path = os.fspath(path)
+    part = f"{path}.part"
+    with open(part, "wb") as file:
+        np.savez_compressed(file, **{**state, "failed": json.dumps(state["failed"])})
+    os.replace(part, path)
+
+
+def _read(path):
+    with open(path, "rb") as stream, np.load(stream) as file:
+        state = {key: file[key] for key in file.files}
+    state["parameters"] = str(state["parameters"])
+    state["failed"] = json.loads(str(state["failed"]))
+    return state
+
+
+def _resume(path, fresh):
+    try:
+        state = _read(path)
+        old, new = json.loads(state["parameters"]), json.loads(fresh["parameters"])
+    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
+        raise ValueError(
+            f"`checkpoint` must be a file written by make_trunk, got {os.fspath(path)!r} "
+            f"({error}); delete it or name another."
+        ) from error
+    differ = [key for key in sorted(set(old) | set(new)) if old.get(key) != new.get(key)]
+    if "plant" in differ:
+        differ.remove("plant")
+        differ += [key for key in new["plant"] if old["plant"].get(key) != new["plant"][key]]
+    if differ:
+        raise ValueError(
+            f"`checkpoint` {os.fspath(path)!r} was made with another {', '.join(differ)}; "
+            "ask for the same run, delete the file or name another."
+        )
+    return state
+
+
+def _bunch(state, return_X_y):
+    rows = np.flatnonzero(state["status"] == DONE)
+    q, x, part = state["q"][rows], state["x"][rows], state["part"][rows]
+    if return_X_y:
+        return q, x
+    return Bunch(
+        q=q,
+        x=x,
+        groups=None,
+        q_target=state["q_target"][rows],
+        part=None if (part == OWN).any() else part,
+        row=rows,
+        failed=[(row, np.array(target), message) for row, target, message in state["failed"]],
+        parameters=json.loads(state["parameters"]),
+        units={"q": "m", "x": "m"},
+        source="simulated by hybridkin.simulation.TrunkPlant",
+        citation=PAPER,
+        DESCR=DESCR,
+    )

@@ -1,0 +1,646 @@
+"""Extreme learning machine: a random hidden layer with a ridge readout."""
+
+import warnings
+from numbers import Integral, Real
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import linalg
+from scipy.linalg.blas import dsyrk  # pyright: ignore
+from scipy.linalg.lapack import dpocon, dpotrf, dtrtri  # pyright: ignore
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
+from sklearn.utils import check_random_state, gen_batches
+from sklearn.utils._param_validation import Interval, StrOptions
+from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+from torch import nn
+
+__all__ = ["ELM", "ELMRegressor"]
+
+_DTYPES = (np.float64, np.float32)
+_BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
+
+# name -> sigma(a), and sigma'(a) from a and s = sigma(a)
+_ACTIVATIONS = {
+    "logistic": (torch.sigmoid, lambda a, s: torch.addcmul(s, s, s, value=-1)),
+    "tanh": (torch.tanh, lambda a, s: 1 - s * s),
+    "sin": (torch.sin, lambda a, s: torch.cos(a)),
+}
+
+_LAYER = ("input_weights", "input_bias", "input_center", "input_scale")
+_READOUT = ("output_weights", "intercept")
+_READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
+
+
+class ELM(nn.Module):
+    """A fitted network ``eps = phi(q) @ output_weights + intercept`` as a torch module.
+
+    ``phi(q) = sigma(W u + b)`` with the scaled input ``u = (q - input_center) / input_scale``,
+    followed by `u` itself where there is a direct link. Buffers only; batch dimensions lead; twice
+    differentiable; it computes in the dtype and on the device of `q`.
+
+    Parameters
+    ----------
+    arrays : mapping of str to array
+        What the state dict holds, so ``ELM(elm.state_dict(), elm.activation)`` is a copy:
+
+        - input_weights (n_hidden, n_inputs), input_bias (n_hidden,): the hidden layer W, b;
+        - input_center, input_scale (n_inputs,): affine map of the inputs [unit of q];
+        - output_weights (n_features, n_outputs), intercept (n_outputs,): the readout [unit of
+          eps], where `n_features` is `n_hidden`, plus `n_inputs` with a direct link;
+        - leverage_center (n_features,), leverage_factor (n_features, n_features), leverage_offset
+          (): ``leverage = |(phi - leverage_center) @ leverage_factor|^2 + leverage_offset``.
+    activation : {"logistic", "tanh", "sin"}, default="logistic"
+        The function sigma.
+    """
+
+    input_weights: torch.Tensor
+    input_bias: torch.Tensor
+    input_center: torch.Tensor
+    input_scale: torch.Tensor
+    output_weights: torch.Tensor
+    intercept: torch.Tensor
+    leverage_center: torch.Tensor
+    leverage_factor: torch.Tensor
+    leverage_offset: torch.Tensor
+    tangent: torch.Tensor
+
+    def __init__(self, arrays, activation="logistic"):
+        super().__init__()
+        self.activation = activation
+        for name in _LAYER + _READOUT:
+            dtype = None if isinstance(arrays[name], torch.Tensor) else torch.float64
+            self.register_buffer(name, torch.as_tensor(arrays[name], dtype=dtype).detach().clone())
+        self.register_buffer("tangent", None, persistent=False)
+        _refresh_tangent(self)
+        self.register_load_state_dict_post_hook(_refresh_tangent)
+
+    def extra_repr(self):
+        """Return the layer sizes and the activation, for printing."""
+        (n_hidden, n_inputs), n_outputs = self.input_weights.shape, len(self.intercept)
+        return f"{n_inputs} -> {n_hidden} {self.activation} -> {n_outputs}"
+
+    def _hidden(self, q, out=None):
+        n_inputs = len(self.input_center)
+        if q.ndim == 0 or q.shape[-1] != n_inputs or not q.is_floating_point():
+            raise ValueError(
+                f"`q` must be a floating-point tensor of shape (..., {n_inputs}), got {q.dtype} of "
+                f"shape {tuple(q.shape)}; this ELM was fitted on {n_inputs} inputs."
+            )
+        # Folding the scaling into W and b would cancel digits where the range is narrow.
+        u = (q - self.input_center.to(q)) / self.input_scale.to(q)
+        W, b = self.input_weights.to(q), self.input_bias.to(q)
+        a = nn.functional.linear(u, W, b) if out is None else torch.addmm(b, u, W.T, out=out)
+        return u, a, _ACTIVATIONS[self.activation][0](a, out=out)
+
+    def _write_features(self, q, out):
+        # In place: a large temporary per block would fragment the heap by hundreds of megabytes.
+        n_hidden = len(self.input_weights)
+        u, _, _ = self._hidden(q, out[:, :n_hidden])
+        if len(self.output_weights) > n_hidden:
+            out[:, n_hidden:] = u
+
+    def _features(self, u, s):
+        return torch.cat((s, u), -1) if len(self.output_weights) > s.shape[-1] else s
+
+    def _readout(self, u, s):
+        weights, intercept = self.output_weights.to(s), self.intercept.to(s)
+        return nn.functional.linear(self._features(u, s), weights.T, intercept)
+
+    def _slope(self, a, s):
+        slope = _ACTIVATIONS[self.activation][1](a, s)
+        J = (slope @ self.tangent.to(s)).unflatten(-1, (len(self.intercept), -1))
+        if len(self.output_weights) > s.shape[-1]:
+            J = J + (self.output_weights[s.shape[-1] :].T / self.input_scale).to(s)
+        return J
+
+    def features(self, q):
+        """Return the features `phi`, shape (..., n_features), of `q`, shape (..., n_inputs)."""
+        u, _, s = self._hidden(q)
+        return self._features(u, s)
+
+    def forward(self, q):
+        """Return the output `eps`, shape (..., n_outputs), at `q`, shape (..., n_inputs)."""
+        u, _, s = self._hidden(q)
+        return self._readout(u, s)
+
+    def jacobian(self, q):
+        """Return ``J[..., i, j] = d eps_i / d q_j``, shape (..., n_outputs, n_inputs)."""
+        _, a, s = self._hidden(q)
+        return self._slope(a, s)
+
+    def forward_and_jacobian(self, q):
+        """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
+        u, a, s = self._hidden(q)
+        return self._readout(u, s), self._slope(a, s)
+
+    def leverage(self, q):
+        """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
+        r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
+        return (r * r).sum(-1) + self.leverage_offset.to(q)
+
+
+def _refresh_tangent(elm, incompatible_keys=None):
+    # J = sigma' @ T with T = w_out (x) w_in
+    w_in = elm.input_weights / elm.input_scale
+    w_out = elm.output_weights[: len(w_in)]
+    elm.tangent = (w_out[:, :, None] * w_in[:, None, :]).flatten(1)
+
+
+class _Statistics(NamedTuple):
+    """Total weight, mean, and scatter about the mean, of the rows [features, targets]."""
+
+    n: float
+    mean: np.ndarray
+    scatter: np.ndarray
+
+
+def _scaling(X, sample_weight, input_scaling):
+    """Return center and scale (d,) that map the columns of `X` to about [-1, 1]."""
+    n_inputs, eps = X.shape[1], np.finfo(X.dtype).eps
+    if input_scaling is None:
+        return np.zeros(n_inputs), np.ones(n_inputs)
+    if isinstance(input_scaling, str):
+        bounds = np.array([X.min(axis=0), X.max(axis=0)], dtype=np.float64)
+    else:
+        bounds = np.asarray(input_scaling, dtype=np.float64)
+    shaped = bounds.shape == (2, n_inputs) and np.isfinite(bounds).all()
+    if not shaped or (bounds[0] > bounds[1]).any():
+        raise ValueError(
+            f"`input_scaling` given as bounds must be a finite array [low, high] of shape "
+            f"(2, {n_inputs}) with low <= high, got {bounds.tolist()} of shape {bounds.shape}; "
+            f'give the limits of each column of `X`, or use "minmax".'
+        )
+    low, high = bounds / 2  # halved first: the widest range must not overflow
+    center, scale = low + high, high - low
+    # A column that is constant up to rounding has no range to divide by.
+    constant = scale <= 4 * eps * np.abs(center)
+    scale = np.where(constant, 1.0, scale)
+    if isinstance(input_scaling, str) and input_scaling == "standard":
+        u = (X - center) / scale
+        mean = np.average(u, axis=0, weights=sample_weight)
+        std = np.sqrt(np.average((u - mean) ** 2, axis=0, weights=sample_weight))
+        center, scale = center + mean * scale, scale * np.where(constant, 1.0, std)
+    return center, scale
+
+
+def _accumulate(stats, elm, X, y, sample_weight, block_size):
+    """Return `stats` with the rows of `X`, `y` added, block by block.
+
+    A block is centred about its own mean. The step from the old mean to the block's enters as one
+    more row, so that all of it is one symmetric product per block, and exact.
+    """
+    n_features, device = len(elm.output_weights), elm.input_center.device
+    n, mean = stats.n, torch.tensor(stats.mean, device=device)
+    scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is kept up
+    buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
+    for rows in gen_batches(len(X), block_size):
+        q = torch.tensor(X[rows], dtype=torch.float64, device=device)
+        z = buffer[: len(q) + 1]
+        block = z[:-1]
+        elm._write_features(q, block[:, :n_features])
+        block[:, n_features:] = torch.tensor(y[rows], device=device)
+        if sample_weight is None:
+            n_block, mean_block = float(len(block)), block.mean(0)
+            block -= mean_block
+        else:
+            w = torch.tensor(sample_weight[rows], device=device)
+            n_block = w.sum().item()
+            mean_block = w @ block / n_block
+            block -= mean_block
+            block *= w.sqrt()[:, None]
+        step = mean_block - mean
+        torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
+        n += n_block
+        mean += step * (n_block / n)
+        if z.device.type == "cpu":  # half the work of a general product
+            c = dsyrk(1.0, z.T.numpy(), beta=1.0, c=scatter.numpy(), overwrite_c=True, lower=True)
+            scatter = torch.from_numpy(c)
+        else:
+            scatter.addmm_(z.T, z)
+    lower = np.tril(scatter.cpu().numpy())
+    return _Statistics(n, mean.cpu().numpy(), lower + np.tril(lower, -1).T)
+
+
+def _merge(a, b):
+    """Return the statistics of the rows of both (parallel variance formula)."""
+    n, step = a.n + b.n, b.mean - a.mean
+    scatter = a.scatter + b.scatter + np.outer(step, step) * (a.n / n * b.n)
+    return _Statistics(n, a.mean + step * (b.n / n), scatter)
+
+
+def _ridge(G, C, alpha):
+    """Return W = (G + alpha 1)^-1 C, R with R R' = (G + alpha 1)^-1, tr(R' G R), and the solver.
+
+    Where G + alpha 1 is singular, W is the solution of minimum norm, and R takes the eigenvalues
+    that rounding has swallowed at their rounding error: large, as there are no data.
+    """
+    A = G + alpha * np.eye(len(G))
+    eps = len(G) * np.finfo(np.float64).eps
+    # Unit diagonal: features of different units are not what makes a system singular.
+    root = np.sqrt(A.diagonal())[:, None]
+    root[root == 0] = 1.0
+    scaled = A / root / root.T
+    L, info = dpotrf(scaled, lower=True)
+    if info == 0 and dpocon(L, np.abs(scaled).sum(0).max(), uplo="L")[0] > eps:
+        W = linalg.cho_solve((L, True), C / root) / root
+        R = dtrtri(L, lower=True)[0].T / root
+        return W, R, len(G) - alpha * np.sum(R * R), "cholesky"
+    eigenvalues, V = linalg.eigh(G)
+    shifted = eigenvalues + alpha
+    cutoff = max(eps * shifted[-1], np.finfo(np.float64).tiny)
+    kept = shifted > cutoff
+    W = V[:, kept] @ ((V[:, kept].T @ C) / shifted[kept, None])
+    R = V / np.sqrt(np.maximum(shifted, cutoff))
+    return W, R, np.sum(eigenvalues[kept] / shifted[kept]), "eigh"
+
+
+def _fit_readout(stats, n_features, alpha, fit_intercept):
+    """Return the arrays of the readout (eq. 3), the noise variance (m,) and the solver."""
+    n, mean, scatter = stats
+    if not fit_intercept:
+        # Both terms are positive: going back from the mean to the origin cancels nothing.
+        scatter = scatter + n * np.outer(mean, mean)
+        mean = np.zeros_like(mean)
+    G, C = scatter[:n_features, :n_features], scatter[:n_features, n_features:]
+    W, R, dof, solver = _ridge(G, C, alpha)
+    # This form of the residual is stationary in W: rounding in W enters squared.
+    rss = scatter.diagonal()[n_features:] - np.sum(W * (2 * C - G @ W), axis=0)
+    dof_left = n - dof - fit_intercept
+    resolved = dof_left > np.sqrt(np.finfo(np.float64).eps) * n
+    noise = np.maximum(rss, 0.0) / dof_left if resolved else np.full_like(rss, np.nan)
+    mu, offset = mean[:n_features], np.float64(1 / n if fit_intercept else 0)
+    arrays = (W, mean[n_features:] - mu @ W, mu, R, offset)
+    return dict(zip(_READOUT, arrays, strict=True)), noise, solver
+
+
+def _device(name):
+    try:
+        device = torch.device("cpu" if name is None else name)
+        torch.zeros(1, dtype=torch.float64, device=device).item()
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
+        raise RuntimeError(
+            f"`device` must name a device on which torch computes in float64 here, got "
+            f"{str(name)!r}; use device=None for the CPU."
+        ) from error
+    return device
+
+
+class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Extreme learning machine: a fixed random hidden layer, a readout by ridge regression.
+
+    ``f(x) = W_out sigma(W u + b)`` with `u` the inputs mapped to [-1, 1], W and b drawn once, and
+    ``W_out = (H' H + alpha 1)^-1 H' T`` (eq. 3 of [1]_). The defaults are those of [1]_.
+
+    The state is the mean and the scatter about it of features and targets, in float64 whatever the
+    data: rows can be added (`partial_fit`), two models can be added (`merge`), exactly.
+
+    Parameters
+    ----------
+    n_hidden : int, default=100
+        Number of hidden neurons H.
+    alpha : float, default=0.1
+        Weight of the penalty on the readout (lambda of [1]_). With 0 a singular system is solved
+        by the readout of minimum norm.
+    activation : {"logistic", "tanh", "sin"}, default="logistic"
+        Activation function sigma.
+    input_scaling : {"minmax", "standard"}, None or array of shape (2, n_inputs), default="minmax"
+        Affine map of the inputs: the training range to [-1, 1], the training mean and standard
+        deviation to 0 and 1, none, or the given bounds [low, high] [unit of X] to [-1, 1]. The
+        first call of `partial_fit` fixes it, so give bounds for a stream, or to merge.
+    weight_scale : float, default=1.0
+        W and b are uniform in [-weight_scale, weight_scale].
+    fit_intercept : bool, default=False
+        Whether to fit an output bias, which is not penalised.
+    direct_link : bool, default=False
+        Whether the scaled inputs are features too, after the hidden neurons.
+    block_size : int, default=None
+        Rows computed at a time; None means about 4 MB of features.
+    device : str or torch.device, default=None
+        Where to compute; None means the CPU. A model unpickled where it is missing uses the CPU.
+    random_state : int, RandomState instance or None, default=None
+        Draws W and b. Models to be merged need the same int.
+
+    Attributes
+    ----------
+    input_weights_, input_bias_ : ndarray of shape (n_hidden, n_inputs) and (n_hidden,)
+        Hidden layer W and b.
+    input_center_, input_scale_ : ndarray of shape (n_inputs,)
+        ``u = (x - input_center_) / input_scale_`` [unit of X].
+    output_weights_, intercept_ : ndarray of shape (n_features, n_outputs) and (n_outputs,)
+        Readout [unit of y]; `n_features` is `n_hidden`, plus `n_inputs` with a direct link.
+    leverage_center_, leverage_factor_, leverage_offset_ : ndarray
+        See :class:`ELM`.
+    noise_variance_ : ndarray of shape (n_outputs,)
+        Residual sum of squares over ``n - tr(G (G + alpha 1)^-1) - fit_intercept`` [unit of y^2]; G
+        the features' Gram matrix, n the sum of the sample weights. NaN if that leaves nothing.
+    n_samples_seen_ : float
+        Sum of the sample weights so far.
+    solver_ : {"cholesky", "eigh"}
+        What solved for the readout: "eigh" if the system was singular.
+    module_ : ELM
+        The fitted network as a torch module q -> eps.
+    n_features_in_ : int
+        Number of inputs.
+    feature_names_in_ : ndarray of shape (n_inputs,)
+        Names of the columns, if `X` had any.
+
+    References
+    ----------
+    .. [1] Reinhart, R. F., & Steil, J. J. (2016). Hybrid mechanical and data-driven modeling
+       improves inverse kinematic control of a soft robot. Procedia Technology, 26.
+    .. [2] Huang, G.-B., Zhu, Q.-Y., & Siew, C.-K. (2006). Extreme learning machine: theory and
+       applications. Neurocomputing, 70, 489-501.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin.elm import ELMRegressor
+    >>> q = np.random.default_rng(0).uniform(0.1, 0.3, (500, 3))
+    >>> error = 0.01 * np.sin(20 * q[:, :2])
+    >>> elm = ELMRegressor(alpha=1e-6, random_state=0).fit(q, error)
+    >>> round(elm.score(q, error), 2)
+    1.0
+    >>> elm.jacobian(q).shape
+    (500, 2, 3)
+    """
+
+    output_weights_: np.ndarray
+
+    _parameter_constraints = {  # noqa: RUF012
+        "n_hidden": [Interval(Integral, 1, None, closed="left")],
+        "alpha": [Interval(Real, 0, None, closed="left")],
+        "activation": [StrOptions(set(_ACTIVATIONS))],
+        "input_scaling": [StrOptions({"minmax", "standard"}), None, "array-like"],
+        "weight_scale": [Interval(Real, 0, None, closed="neither")],
+        "fit_intercept": ["boolean"],
+        "direct_link": ["boolean"],
+        "block_size": [Interval(Integral, 1, None, closed="left"), None],
+        "device": [str, torch.device, None],
+        "random_state": ["random_state"],
+    }
+
+    def __init__(
+        self,
+        n_hidden=100,
+        alpha=0.1,
+        *,
+        activation="logistic",
+        input_scaling="minmax",
+        weight_scale=1.0,
+        fit_intercept=False,
+        direct_link=False,
+        block_size=None,
+        device=None,
+        random_state=None,
+    ):
+        self.n_hidden = n_hidden
+        self.alpha = alpha
+        self.activation = activation
+        self.input_scaling = input_scaling
+        self.weight_scale = weight_scale
+        self.fit_intercept = fit_intercept
+        self.direct_link = direct_link
+        self.block_size = block_size
+        self.device = device
+        self.random_state = random_state
+
+    @_fit_context(prefer_skip_nested_validation=True)
+    def fit(self, X, y, sample_weight=None):
+        """Draw the hidden layer and fit the readout, forgetting earlier rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Targets.
+        sample_weight : array-like of shape (n_samples,), default=None
+            How often each row counts; a row of weight 0 is absent, from the range of `X` too.
+
+        Returns
+        -------
+        self : ELMRegressor
+            The fitted estimator.
+        """
+        return self._learn(X, y, sample_weight, first=True)
+
+    @_fit_context(prefer_skip_nested_validation=True)
+    def partial_fit(self, X, y, sample_weight=None):
+        """Add rows to those already seen; the result is that of one `fit` to all of them.
+
+        The first call draws the hidden layer and fixes the input scaling, for good.
+
+        Parameters
+        ----------
+        X, y, sample_weight : array-like
+            The new rows, as for `fit`.
+
+        Returns
+        -------
+        self : ELMRegressor
+            The fitted estimator.
+        """
+        return self._learn(X, y, sample_weight, first=not hasattr(self, "module_"))
+
+    def merge(self, other):
+        """Add the rows that `other` has seen; the result is that of one `fit` to all of them.
+
+        Parameters
+        ----------
+        other : ELMRegressor
+            A model with the same hidden layer and input scaling; it is left as it is.
+
+        Returns
+        -------
+        self : ELMRegressor
+            The fitted estimator.
+        """
+        if not isinstance(other, ELMRegressor):
+            raise TypeError(f"`other` must be a fitted ELMRegressor, got {type(other).__name__}.")
+        check_is_fitted(self, "module_")
+        check_is_fitted(other, "module_")
+        for name in (*(f"{name}_" for name in _LAYER), "_activation", "feature_names_in_"):
+            if not np.array_equal(getattr(self, name, ()), getattr(other, name, ())):
+                raise ValueError(
+                    f"`other` must have this model's hidden layer, input scaling and columns, but "
+                    f"its {name.strip('_')} differs; give both models the same int as "
+                    f"`random_state`, the same parameters, and bounds as `input_scaling`."
+                )
+        if self.output_weights_.shape != other.output_weights_.shape:
+            raise ValueError(
+                f"`other` must have output_weights_ of shape {self.output_weights_.shape}, got "
+                f"{other.output_weights_.shape}; fit both models with the same `direct_link` and "
+                f"the same columns of `y`."
+            )
+        stats = _merge(self._stats, other._stats)
+        return self._solve(stats, len(self.output_weights_), _device(self.device))
+
+    def predict(self, X, return_std=False):
+        """Return the prediction at `X`, in the dtype of `X`.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+        return_std : bool, default=False
+            Whether to return the standard deviation of a new measurement as well.
+
+        Returns
+        -------
+        y : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Predictions, one-dimensional if the targets were.
+        std : ndarray of the shape of y
+            Only if `return_std`: ``sqrt(noise_variance_ * (1 + leverage(X)))``, the posterior
+            predictive of the Bayesian ridge with prior ``N(0, noise_variance_ / alpha)``.
+        """
+        if not return_std:
+            return self._map(X, lambda elm, q: (elm(q),))[0]
+        y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)))
+        noise = self.noise_variance_ if y.ndim == 2 else self.noise_variance_[0]
+        std = np.sqrt(np.multiply.outer(1 + leverage, noise))
+        return y, std.astype(y.dtype)
+
+    def jacobian(self, X):
+        """Return the derivative of the prediction by the inputs, in closed form.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        J : ndarray of shape (n_samples, n_inputs) or (n_samples, n_outputs, n_inputs)
+            Jacobians [unit of y per unit of X]; gradients if the targets were one-dimensional.
+        """
+        return self._map(X, lambda elm, q: (elm.jacobian(q),))[0]
+
+    def predict_and_jacobian(self, X):
+        """Return ``predict(X), jacobian(X)`` for the price of one hidden layer.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        y, J : ndarray
+            As from `predict` and `jacobian`.
+        """
+        return self._map(X, lambda elm, q: elm.forward_and_jacobian(q))
+
+    def leverage(self, X):
+        """Return ``phi' (G + alpha 1)^-1 phi``, at most 1 on the training rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        leverage : ndarray of shape (n_samples,)
+            Influence that a row of weight 1 would have had on its own prediction [-]. With an
+            intercept the features are centred, and 1 / n is added.
+        """
+        return self._map(X, lambda elm, q: (elm.leverage(q),))[0]
+
+    def _learn(self, X, y, sample_weight, first):
+        checks = {"dtype": _DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
+        X, y = map(np.asarray, validate_data(self, X, y, reset=first, **checks))
+        device = _device(self.device)
+        if sample_weight is not None:
+            sample_weight = _check_sample_weight(
+                sample_weight, X, dtype=np.float64, ensure_non_negative=True
+            )
+            present = sample_weight > 0
+            if not present.all():
+                X, y, sample_weight = X[present], y[present], sample_weight[present]
+        y_ndim, y = y.ndim, y.reshape(len(y), -1).astype(np.float64, copy=False)
+        if first:
+            rng, shape = check_random_state(self.random_state), (self.n_hidden, X.shape[1])
+            W = rng.uniform(-self.weight_scale, self.weight_scale, shape)
+            b = rng.uniform(-self.weight_scale, self.weight_scale, self.n_hidden)
+            layer = (W, b, *_scaling(X, sample_weight, self.input_scaling))
+            activation = self.activation
+            n_features = self.n_hidden + self.direct_link * X.shape[1]
+            n_columns = n_features + y.shape[1]
+            stats = _Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
+        else:
+            layer = [getattr(self, f"{name}_") for name in _LAYER]
+            activation, stats = self._activation, self._stats
+            n_features, n_columns = len(self.output_weights_), len(stats.mean)
+            if n_features + y.shape[1] != n_columns:
+                raise ValueError(
+                    f"`y` must have {n_columns - n_features} columns as in earlier calls, got "
+                    f"{y.shape[1]}; call `fit` to start afresh."
+                )
+            y_ndim = self._y_ndim
+        layer = dict(zip(_LAYER, layer, strict=True))
+        # A readout with no outputs: the features come from the one kernel there is.
+        shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
+        blank = {name: np.zeros(shape) for name, shape in zip(_READOUT, shapes, strict=True)}
+        elm = ELM({**layer, **blank}, activation).to(device)
+        block_size = self.block_size or max(1, _BLOCK_ELEMENTS // n_columns)
+        with torch.no_grad():
+            stats = _accumulate(stats, elm, X, y, sample_weight, block_size)
+        if not np.isfinite(stats.scatter[:, :n_features]).all():
+            raise ValueError(
+                "`X` and `y` must give finite sums of products of features and targets in float64, "
+                "got an overflow; change their unit, or scale the inputs by `input_scaling`."
+            )
+        self._activation, self._y_ndim = activation, y_ndim
+        for name, array in layer.items():
+            setattr(self, f"{name}_", array)
+        return self._solve(stats, n_features, device)
+
+    def _solve(self, stats, n_features, device):
+        readout, self.noise_variance_, self.solver_ = _fit_readout(
+            stats, n_features, self.alpha, self.fit_intercept
+        )
+        if self.solver_ == "eigh":
+            warnings.warn(
+                f"The system of {n_features} features is singular at alpha={self.alpha:g}; solved "
+                f"by its eigenvectors. Raise `alpha` or lower `n_hidden`.",
+                linalg.LinAlgWarning,
+                stacklevel=2,
+            )
+        self._stats, self.n_samples_seen_ = stats, stats.n
+        for name, array in readout.items():
+            setattr(self, f"{name}_", array)
+        self._build(device)
+        return self
+
+    def _build(self, device):
+        arrays = {name: getattr(self, f"{name}_") for name in _LAYER + _READOUT}
+        self.module_ = ELM(arrays, self._activation).to(device)
+
+    def _map(self, X, function):
+        """Return the arrays that `function(module, q)` gives, computed block by block."""
+        check_is_fitted(self, "module_")
+        X = np.asarray(validate_data(self, X, reset=False, dtype=_DTYPES, order="C"))
+        elm, outputs = self.module_, ()
+        width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
+        with torch.no_grad():
+            for rows in gen_batches(len(X), self.block_size or max(1, _BLOCK_ELEMENTS // width)):
+                q = torch.tensor(X[rows], dtype=torch.float64, device=elm.input_center.device)
+                parts = function(elm, q)
+                outputs = outputs or [np.empty((len(X), *p.shape[1:]), X.dtype) for p in parts]
+                for array, part in zip(outputs, parts, strict=True):
+                    array[rows] = part.cpu().numpy()
+        return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
+
+    def __getstate__(self):
+        # Arrays only: the same bytes whatever the device, and readable where it is missing.
+        return {name: value for name, value in super().__getstate__().items() if name != "module_"}
+
+    def __setstate__(self, state):
+        super().__setstate__(state)
+        if hasattr(self, "_stats"):
+            try:
+                device = _device(self.device)
+            except RuntimeError:
+                device = torch.device("cpu")
+            self._build(device)

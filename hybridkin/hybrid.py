@@ -1,0 +1,398 @@
+"""A mechanical model plus a learned model of its error, trusted only where it was learned."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
+from sklearn.linear_model import LinearRegression, Ridge
+from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from hybridkin._numerics import PortableModule, forward_and_jacobian, forward_and_reverse_jacobian
+from hybridkin.calibration import CalibrationResult, calibrate
+from hybridkin.elm import ELMRegressor
+from hybridkin.guards import GUARDS, Guard, fit_guard
+
+__all__ = ["HybridForwardModel"]
+
+_BLOCK = 65536
+
+
+class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Forward kinematics f_hyb(q) = f_mech(q) + eps(q), with eps learned on the model's errors.
+
+    A scikit-learn regressor from actuator vectors to tip positions. The fitted `module_` is a
+    torch module with a closed-form Jacobian, ready for `InverseKinematics`.
+
+    Parameters
+    ----------
+    mechanical_model : nn.Module, optional
+        Maps q (..., n) to x (..., m), a `ConstantCurvatureChain` for example. It is copied, never
+        changed. None: there is no mechanical part, the data alone decide (f^dat of the paper).
+    error_model : estimator, "drop" or None, default=None
+        None is ``ELMRegressor()``, "drop" the mechanical model alone, else any scikit-learn
+        regressor with as many outputs as x has.
+    coupling : {"parallel"}, default="parallel"
+        The error is added at the tip, eq. (2).
+    calibrate : sequence of str or "default", default=()
+        Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
+        in every fold of a cross-validation. "default": the chain's own list.
+    guard : {"leverage", "box", None}, default="leverage"
+        Where eps is trusted. "leverage": where the inputs are as close to the training rows, in
+        the error model's features, as these are to each other; "box": within the training range;
+        None: everywhere. Beyond, eps fades out and f_mech remains.
+    random_state : int, RandomState or None, default=None
+        Seed of the default error model; one that is given brings its own.
+
+    Attributes
+    ----------
+    module_ : nn.Module
+        q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``.
+    mechanical_model_ : nn.Module or None
+        The mechanical part, calibrated when asked.
+    error_model_ : estimator or None
+        The fitted error model.
+    calibration_ : CalibrationResult or None
+        What the calibration found.
+    n_features_in_ : int
+        Number of actuators n.
+    feature_names_in_ : ndarray of shape (n,)
+        Column names, when fitted on a data frame.
+
+    References
+    ----------
+    Reinhart & Steil (2016), section 3, eqs. (2) and (3).
+
+    Examples
+    --------
+    >>> from hybridkin import HybridForwardModel, datasets, robots
+    >>> data = datasets.load_trunk()
+    >>> model = HybridForwardModel(robots.bionic_handling_assistant(), calibrate="default")
+    >>> model.fit(data.q, data.x).predict(data.q[:2]).shape
+    (2, 3)
+    """
+
+    def __init__(
+        self,
+        mechanical_model: nn.Module | None = None,
+        error_model: Any = None,
+        *,
+        coupling: str = "parallel",
+        calibrate: Sequence[str] | str = (),
+        guard: str | None = "leverage",
+        random_state: int | np.random.RandomState | None = None,
+    ) -> None:
+        self.mechanical_model = mechanical_model
+        self.error_model = error_model
+        self.coupling = coupling
+        self.calibrate = calibrate
+        self.guard = guard
+        self.random_state = random_state
+
+    def set_params(self, **params: Any) -> HybridForwardModel:
+        """Set parameters; ``error_model__*`` reach the default ELM as well."""
+        nested = any(name.startswith("error_model__") for name in params)
+        if nested and self.error_model is None and params.get("error_model") is None:
+            self.error_model = ELMRegressor()
+        return super().set_params(**params)
+
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> HybridForwardModel:
+        """Calibrate the mechanical model when asked, and learn its error.
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n)
+            Actuator vectors q [m].
+        y : array-like of shape (N, m) or (N,)
+            Measured tip positions x [m].
+        sample_weight : array-like of shape (N,), optional
+            How many times each row counts.
+        groups : array-like of shape (N,), optional
+            Motion of every row; adds ``calibration_.cv_rmse`` on motions held out.
+
+        Returns
+        -------
+        HybridForwardModel
+            This estimator, fitted.
+
+        Raises
+        ------
+        ValueError
+            For parameters out of their set, shapes that do not fit the mechanical model, and
+            data that are not finite.
+        """
+        self._check_settings()
+        X, y = validate_data(self, X, y, multi_output=True, dtype=[np.float64, np.float32])
+        y = np.asarray(y, dtype=np.float64)
+        weights = None
+        if sample_weight is not None:
+            weights = _check_sample_weight(
+                sample_weight, X, dtype=np.float64, ensure_non_negative=True
+            )
+        q = torch.from_numpy(X.astype(np.float64))
+        mechanical = copy.deepcopy(self.mechanical_model)
+        if hasattr(mechanical, "check_actuators"):
+            mechanical.check_actuators(q, "X")
+        self.calibration_: CalibrationResult | None = None
+        names = self.calibrate
+        if isinstance(names, str) and names == "default":
+            names = getattr(mechanical, "default_parameters", ())
+        if mechanical is not None and len(names):
+            self.calibration_ = calibrate(
+                mechanical, q, torch.from_numpy(y), names, groups=groups, sample_weight=weights
+            )
+            mechanical = self.calibration_.chain
+        error = y - _mechanical_tips(mechanical, q, y)
+        self.mechanical_model_ = mechanical
+        self.error_model_ = None
+        error_module = guard = None
+        if not (isinstance(self.error_model, str) and self.error_model == "drop"):
+            if self.error_model is None:
+                regressor = ELMRegressor(random_state=self.random_state)
+            else:
+                regressor = clone(self.error_model)
+            given = {} if weights is None else {"sample_weight": weights}
+            self.error_model_ = regressor.fit(X, error, **given)
+            error_module = _error_module(regressor, q)
+            kept = q if weights is None else q[torch.from_numpy(weights > 0)]
+            guard = fit_guard(self.guard, error_module, kept)
+        if mechanical is None:
+            guard = None  # there is nothing to fall back on
+        self.module_ = HybridModule(mechanical, error_module, guard)
+        self._single_output = y.ndim == 1
+        return self
+
+    def predict(self, X: ArrayLike) -> NDArray:
+        """Return tip positions f_mech(q) + w(q) eps(q), shape (N, m) or (N,) as in `fit` [m]."""
+        return self._by_blocks(lambda module, q: (module(q),), X)[0]
+
+    def predict_mechanical(self, X: ArrayLike) -> NDArray:
+        """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
+        return self._by_blocks(lambda module, q: (module.mechanical_part(q),), X)[0]
+
+    def predict_error(self, X: ArrayLike) -> NDArray:
+        """Return the learned part w(q) eps(q), shaped like `predict` [m]."""
+        return self._by_blocks(lambda module, q: (module.error_part(q),), X)[0]
+
+    def jacobian(self, X: ArrayLike) -> NDArray:
+        """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n)."""
+        return self._by_blocks(lambda module, q: (module.jacobian(q),), X)[0]
+
+    def predict_and_jacobian(self, X: ArrayLike) -> tuple[NDArray, NDArray]:
+        """Return `predict(X)` and `jacobian(X)` in one pass."""
+        x, J = self._by_blocks(lambda module, q: module.forward_and_jacobian(q), X)
+        return x, J
+
+    def in_domain(self, X: ArrayLike) -> NDArray[np.bool_]:
+        """Return whether eps is fully trusted at each row, shape (N,)."""
+        return self._by_blocks(lambda module, q: (module.in_domain(q),), X)[0]
+
+    def _by_blocks(
+        self, function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]], X: ArrayLike
+    ) -> list[NDArray]:
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
+        blocks = []
+        with torch.no_grad():
+            for start in range(0, len(X), _BLOCK):
+                q = torch.from_numpy(X[start : start + _BLOCK].astype(np.float64))
+                blocks.append(function(self.module_, q))
+        results = []
+        for parts in zip(*blocks, strict=True):
+            array = torch.cat(parts).numpy()
+            if array.dtype != bool:
+                array = array.astype(X.dtype, copy=False)
+            results.append(array[:, 0] if self._single_output and array.ndim > 1 else array)
+        return results
+
+    def _check_settings(self) -> None:
+        if self.coupling != "parallel":
+            raise ValueError(f"`coupling` must be 'parallel', got {self.coupling!r}.")
+        if self.guard not in GUARDS:
+            raise ValueError(f"`guard` must be one of {GUARDS}, got {self.guard!r}.")
+        if isinstance(self.error_model, str) and self.error_model != "drop":
+            raise ValueError(
+                f"`error_model` must be an estimator, None or 'drop', got {self.error_model!r}."
+            )
+        if self.mechanical_model is None:
+            if self.error_model == "drop":
+                raise ValueError(
+                    "`error_model` must not be 'drop' without a `mechanical_model`: nothing would "
+                    "be left to predict with."
+                )
+        elif not isinstance(self.mechanical_model, nn.Module):
+            raise TypeError(
+                "`mechanical_model` must be a torch module q -> x or None, got "
+                f"{type(self.mechanical_model).__name__}; wrap a function in an nn.Module."
+            )
+
+
+class HybridModule(nn.Module):
+    """The sum f_mech(q) + w(q) eps(q) as a torch module q (..., n) -> x (..., m).
+
+    Parameters
+    ----------
+    mechanical, error : nn.Module or None
+        The parts; at least one of them.
+    guard : nn.Module or None
+        The weight w(q) in [0, 1], shape (..., 1). None: one everywhere.
+    """
+
+    def __init__(
+        self, mechanical: nn.Module | None, error: nn.Module | None, guard: Guard | None = None
+    ) -> None:
+        super().__init__()
+        self.mechanical = mechanical
+        self.error = error
+        self.guard = guard
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return x of shape (..., m) [m]."""
+        if self.mechanical is None:
+            return self.error_part(q)
+        if self.error is None:
+            return self.mechanical(q)
+        return self.mechanical(q) + self.error_part(q)
+
+    def mechanical_part(self, q: Tensor) -> Tensor:
+        """Return f_mech(q), zero without a mechanical model, shape (..., m) [m]."""
+        return self.mechanical(q) if self.mechanical is not None else 0.0 * self.error_part(q)
+
+    def error_part(self, q: Tensor) -> Tensor:
+        """Return w(q) eps(q), zero without an error model, shape (..., m) [m]."""
+        if self.error is None:
+            return 0.0 * self.mechanical_part(q)
+        error = self.error(q)
+        return error if self.guard is None else self.guard(q) * error
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return dx/dq of the sum, shape (..., m, n)."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., m) and dx/dq (..., m, n), closed form where the parts offer it."""
+        if self.error is None:
+            return forward_and_jacobian(self.mechanical, q)
+        x, J = forward_and_jacobian(self.error, q)
+        if self.guard is not None:
+            weight, slope = forward_and_reverse_jacobian(self.guard, q)
+            x, J = weight * x, weight[..., None] * J + x[..., None] * slope
+        if self.mechanical is not None:
+            x_mech, J_mech = forward_and_jacobian(self.mechanical, q)
+            x, J = x_mech + x, J_mech + J
+        return x, J
+
+    def in_domain(self, q: Tensor) -> Tensor:
+        """Return whether the error model is fully trusted, shape (...), bool."""
+        if self.guard is None:
+            return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
+        return self.guard.strangeness(q) <= 1.0
+
+
+class AffineModule(PortableModule):
+    """A fitted linear regressor as a torch module."""
+
+    def __init__(self, coef: NDArray, intercept: NDArray) -> None:
+        super().__init__()
+        coef = torch.as_tensor(np.atleast_2d(coef), dtype=torch.float64)
+        bias = torch.as_tensor(intercept, dtype=torch.float64).expand(len(coef))
+        self.register_buffer("coef", coef.clone())
+        self.register_buffer("bias", bias.clone())
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return coef q + bias, shape (..., m)."""
+        return q @ self.coef.to(q).mT + self.bias.to(q)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return the constant matrix for every row, shape (..., m, n)."""
+        coef = self.coef.to(q)
+        return coef.expand(*q.shape[:-1], *coef.shape)
+
+
+class RegressorModule(nn.Module):
+    """Any fitted scikit-learn regressor as a torch module, its Jacobian by central differences.
+
+    The step is the cube root of machine precision times the training range of each input, which
+    leaves a relative error near 1e-10 for smooth regressors. Trees are piecewise constant: their
+    Jacobian is zero almost everywhere.
+    """
+
+    def __init__(self, regressor: Any, q: Tensor) -> None:
+        super().__init__()
+        self.regressor = regressor
+        width = (q.amax(0) - q.amin(0)).numpy()
+        self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(width > 0, width, 1.0)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the regressor's prediction, shape (..., m)."""
+        return _Differenced.apply(q, self)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return dx/dq, shape (..., m, n)."""
+        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
+        columns = []
+        for j, step in enumerate(self._step):
+            move = np.zeros(rows.shape[1])
+            move[j] = step
+            columns.append((self._predict(rows + move) - self._predict(rows - move)) / (2 * step))
+        J = torch.from_numpy(np.stack(columns, axis=-1)).to(q)
+        return J.reshape(*q.shape[:-1], *J.shape[1:])
+
+    def evaluate(self, q: Tensor) -> Tensor:
+        """Return the prediction outside any graph, shape (..., m)."""
+        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
+        x = torch.from_numpy(self._predict(rows)).to(q)
+        return x.reshape(*q.shape[:-1], x.shape[-1])
+
+    def _predict(self, rows: NDArray) -> NDArray:
+        return np.asarray(self.regressor.predict(rows), dtype=np.float64).reshape(len(rows), -1)
+
+
+class _Differenced(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, module: RegressorModule) -> Tensor:
+        ctx.save_for_backward(q)
+        ctx.module = module
+        return module.evaluate(q)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (q,) = ctx.saved_tensors
+        return (grad[..., None, :] @ ctx.module.jacobian(q))[..., 0, :], None
+
+
+def _error_module(regressor: Any, q: Tensor) -> nn.Module:
+    module = getattr(regressor, "module_", None)
+    if isinstance(module, nn.Module):
+        return module
+    if isinstance(regressor, (LinearRegression, Ridge)):
+        return AffineModule(regressor.coef_, regressor.intercept_)
+    return RegressorModule(regressor, q)
+
+
+def _mechanical_tips(mechanical: nn.Module | None, q: Tensor, y: NDArray) -> NDArray | float:
+    if mechanical is None:
+        return 0.0
+    with torch.no_grad():
+        tips = mechanical(q).numpy()
+    wanted = y.shape if y.ndim == 2 else (len(y), 1)
+    if tips.shape != wanted:
+        raise ValueError(
+            f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
+            f"shape {y.shape}."
+        )
+    return tips.reshape(y.shape)

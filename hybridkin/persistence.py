@@ -1,0 +1,295 @@
+"""Models on disk: one safetensors file of arrays with a JSON header, and no pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+from sklearn.linear_model import LinearRegression
+from torch import nn
+
+from hybridkin.chain import ConstantCurvatureChain
+from hybridkin.elm import ELMRegressor, _Statistics
+from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
+from hybridkin.hybrid import AffineModule, HybridForwardModel, HybridModule
+
+__all__ = ["load_model", "save_model"]
+
+_FORMAT = "hybridkin-model"
+_VERSION = 1
+_ELM_ARRAYS = (
+    *("input_weights_", "input_bias_", "input_center_", "input_scale_"),
+    *("output_weights_", "intercept_", "noise_variance_"),
+    *("leverage_center_", "leverage_factor_", "leverage_offset_"),
+)
+_ELM_SETTINGS = ("solver_", "n_samples_seen_", "n_features_in_", "_activation", "_y_ndim")
+
+Arrays = dict[str, NDArray]
+
+
+def save_model(model: Any, path: str | Path) -> None:
+    """Write a chain or a fitted hybrid model to one file.
+
+    Parameters
+    ----------
+    model : ConstantCurvatureChain or fitted HybridForwardModel
+        The hybrid's mechanical model must be a ConstantCurvatureChain or None, its error model an
+        ELMRegressor, a LinearRegression, or "drop".
+    path : str or Path
+        File to write, usually ``*.safetensors``. It is replaced only once all is written.
+
+    Raises
+    ------
+    TypeError
+        For other models: their parts could only be stored as code.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> from hybridkin import load_model, robots, save_model
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "trunk.safetensors"
+    >>> save_model(robots.bionic_handling_assistant(), path)
+    >>> load_model(path)
+    ConstantCurvatureChain(3 extensible segments, 9 actuators, segment)
+    """
+    arrays: Arrays = {}
+    if isinstance(model, ConstantCurvatureChain):
+        header = _store_chain(model, arrays, "")
+    elif isinstance(model, HybridForwardModel):
+        header = _store_hybrid(model, arrays)
+    else:
+        raise TypeError(
+            "`model` must be a ConstantCurvatureChain or a fitted HybridForwardModel, got "
+            f"{type(model).__name__}."
+        )
+    header = {"format": _FORMAT, "version": _VERSION, **header}
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"`path` must lie in a folder that exists, got {path}.")
+    handle, staging = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
+    os.close(handle)
+    try:
+        whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        save_file(whole, staging, metadata={"hybridkin": json.dumps(header)})
+        os.replace(staging, path)
+    finally:
+        Path(staging).unlink(missing_ok=True)
+
+
+def load_model(path: str | Path) -> Any:
+    """Return the model that `save_model` wrote; nothing in the file is ever run as code.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to read.
+
+    Returns
+    -------
+    ConstantCurvatureChain or HybridForwardModel
+        On the CPU, ready to predict.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not such a model, is damaged, or comes from a later version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"`path` must name a saved model, got {path}: no such file.")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {})["hybridkin"])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is not a model saved by hybridkin ({error}).") from error
+    if header.get("format") != _FORMAT or not isinstance(header.get("version"), int):
+        raise ValueError(f"{path} is not a model saved by hybridkin: its header is another one.")
+    if header["version"] > _VERSION:
+        raise ValueError(
+            f"{path} has format version {header['version']}, this hybridkin reads up to "
+            f"{_VERSION}; install a newer one."
+        )
+    try:
+        if header["kind"] == "chain":
+            return _restored_chain(header, arrays, "")
+        if header["kind"] == "hybrid":
+            return _restored_hybrid(header, arrays)
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}.") from error
+    raise ValueError(f"{path} holds a model of unknown kind {header['kind']!r}.")
+
+
+def _store_chain(chain: ConstantCurvatureChain, arrays: Arrays, prefix: str) -> dict[str, Any]:
+    for name, value in chain.geometry().items():
+        arrays[prefix + name] = value.detach().cpu().numpy()
+    return {
+        "kind": "chain",
+        "actuators_per_segment": list(chain.actuators_per_segment),
+        "routing": chain.routing,
+    }
+
+
+def _restored_chain(header: dict[str, Any], arrays: Arrays, prefix: str) -> ConstantCurvatureChain:
+    counts = [int(n) for n in header["actuators_per_segment"]]
+    angles = arrays[prefix + "angles"]
+    return ConstantCurvatureChain(
+        arrays[prefix + "radii"],
+        n_actuators=counts,
+        angles=np.split(angles, np.cumsum(counts)[:-1]),
+        lengths=arrays.get(prefix + "lengths"),
+        routing=header["routing"],
+        offsets=arrays[prefix + "offsets"],
+        base=arrays[prefix + "base"],
+        dtype=torch.from_numpy(angles).dtype,
+    )
+
+
+def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
+    if not hasattr(model, "module_"):
+        raise TypeError("`model` must be fitted before it is saved; call `fit` first.")
+    header: dict[str, Any] = {
+        "kind": "hybrid",
+        "coupling": model.coupling,
+        "calibrate": model.calibrate if isinstance(model.calibrate, str) else [*model.calibrate],
+        "guard": model.guard,
+        "n_features_in": model.n_features_in_,
+        "feature_names_in": [str(name) for name in getattr(model, "feature_names_in_", [])],
+        "single_output": model._single_output,
+        "mechanical": None,
+        "nominal": None,
+    }
+    for key, part in (("mechanical", model.mechanical_model_), ("nominal", model.mechanical_model)):
+        if part is not None:
+            if not isinstance(part, ConstantCurvatureChain):
+                raise TypeError(
+                    "`model` must have a ConstantCurvatureChain or None as `mechanical_model` to "
+                    f"be saved, got {type(part).__name__}."
+                )
+            header[key] = _store_chain(part, arrays, f"{key}.")
+    header["error"] = _store_error(model.error_model_, arrays)
+    header["fitted_guard"] = _store_guard(model.module_.guard, arrays)
+    return header
+
+
+def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardModel:
+    mechanical, nominal = (
+        None if header[key] is None else _restored_chain(header[key], arrays, f"{key}.")
+        for key in ("mechanical", "nominal")
+    )
+    error, error_module = _restored_error(header["error"], arrays)
+    names = header["calibrate"]
+    model = HybridForwardModel(
+        nominal,
+        "drop" if error is None else error,
+        coupling=header["coupling"],
+        calibrate=names if isinstance(names, str) else tuple(names),
+        guard=header["guard"],
+    )
+    model.mechanical_model_, model.error_model_ = mechanical, error
+    model.calibration_ = None
+    model.n_features_in_ = int(header["n_features_in"])
+    if header["feature_names_in"]:
+        model.feature_names_in_ = np.array(header["feature_names_in"], dtype=object)
+    model._single_output = bool(header["single_output"])
+    guard = _restored_guard(header["fitted_guard"], arrays, error_module)
+    model.module_ = HybridModule(mechanical, error_module, guard)
+    with torch.no_grad():  # a file whose arrays do not fit together fails here, not in use
+        model.module_.forward_and_jacobian(torch.ones(1, model.n_features_in_, dtype=torch.float64))
+    return model
+
+
+def _store_error(regressor: Any, arrays: Arrays) -> dict[str, Any] | None:
+    if regressor is None:
+        return None
+    if isinstance(regressor, ELMRegressor):
+        for name in _ELM_ARRAYS:
+            arrays[f"error.{name}"] = np.asarray(getattr(regressor, name))
+        arrays["error.mean"], arrays["error.scatter"] = (
+            regressor._stats.mean,
+            regressor._stats.scatter,
+        )
+        params = regressor.get_params()
+        params["device"] = None
+        if not isinstance(params["random_state"], (int, np.integer)):
+            params["random_state"] = None
+        return {
+            "kind": "elm",
+            "params": {name: _plain(value) for name, value in params.items()},
+            "settings": {name: _plain(getattr(regressor, name)) for name in _ELM_SETTINGS},
+        }
+    if isinstance(regressor, LinearRegression):
+        arrays["error.coef"] = np.asarray(regressor.coef_)
+        arrays["error.intercept"] = np.asarray(regressor.intercept_)
+        return {"kind": "linear", "n_features_in": regressor.n_features_in_}
+    raise TypeError(
+        "`model` must have an ELMRegressor, a LinearRegression or 'drop' as `error_model` to be "
+        f"saved, got {type(regressor).__name__}, which could only be stored as code."
+    )
+
+
+def _restored_error(header: Any, arrays: Arrays) -> tuple[Any, nn.Module | None]:
+    if header is None:
+        return None, None
+    if header["kind"] == "elm":
+        elm = ELMRegressor(**header["params"])
+        settings = {name: header["settings"][name] for name in _ELM_SETTINGS}
+        stored = {name: arrays[f"error.{name}"] for name in _ELM_ARRAYS}
+        mean, scatter = arrays["error.mean"], arrays["error.scatter"]
+        statistics = _Statistics(float(settings["n_samples_seen_"]), mean, scatter)
+        elm.__setstate__({**elm.get_params(), **stored, **settings, "_stats": statistics})
+        return elm, elm.module_
+    if header["kind"] == "linear":
+        linear = LinearRegression()
+        linear.coef_, linear.intercept_ = arrays["error.coef"], arrays["error.intercept"]
+        linear.n_features_in_ = int(header["n_features_in"])
+        return linear, AffineModule(linear.coef_, linear.intercept_)
+    raise ValueError(f"unknown error model {header['kind']!r}")
+
+
+def _store_guard(guard: Guard | None, arrays: Arrays) -> str | None:
+    if guard is None:
+        return None
+    if isinstance(guard, BoxGuard):
+        names, kind, module = ("low", "high"), "box", guard
+    else:
+        assert isinstance(guard, LeverageGuard)
+        arrays["guard.limit"] = guard.limit.cpu().numpy()
+        if not isinstance(guard.readout, QuadraticReadout):
+            return "leverage of the error model"
+        names, kind, module = ("center", "half_width", "factor"), "leverage", guard.readout
+    for name in names:
+        arrays[f"guard.{name}"] = getattr(module, name).cpu().numpy()
+    return kind
+
+
+def _restored_guard(kind: Any, arrays: Arrays, error_module: nn.Module | None) -> Guard | None:
+    tensors = {
+        name.removeprefix("guard."): torch.from_numpy(array)
+        for name, array in arrays.items()
+        if name.startswith("guard.")
+    }
+    if kind is None:
+        return None
+    if kind == "box":
+        return BoxGuard(tensors["low"], tensors["high"])
+    if kind == "leverage":
+        limit = tensors.pop("limit")
+        return LeverageGuard(QuadraticReadout(**tensors), limit)
+    if kind == "leverage of the error model" and error_module is not None:
+        return LeverageGuard(error_module, tensors["limit"])
+    raise ValueError(f"unknown guard {kind!r}")
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

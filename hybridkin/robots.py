@@ -1,0 +1,283 @@
+"""Robots by name, and robot descriptions read from TOML files."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridkin.chain import ConstantCurvatureChain
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = [
+    "BHA_LENGTH_LIMITS",
+    "BHA_WORKING_BOX",
+    "LogFormat",
+    "RobotDescription",
+    "bionic_handling_assistant",
+    "from_toml",
+    "read_description",
+]
+
+BHA_LENGTH_LIMITS = (0.10, 0.40)
+"""Shortest and longest chamber of the Bionic Handling Assistant [m]."""
+
+BHA_WORKING_BOX = (0.19, 0.31)
+"""Chamber lengths it works in: 0.25 m, give or take 0.06 m."""
+
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+
+
+def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
+    """Return the nominal chain of Festo's Bionic Handling Assistant.
+
+    Three segments of three chambers at 0, 120 and 240 degrees; q holds the nine chamber lengths,
+    segment by segment from the base.
+
+    Parameters
+    ----------
+    tool : float, default=0.0
+        Rigid length beyond the last segment [m].
+
+    Returns
+    -------
+    ConstantCurvatureChain
+        With the published radii 0.100, 0.093 and 0.079 m.
+
+    References
+    ----------
+    Reinhart & Steil (2016), section 2; Rolf & Steil (2012), Constant curvature continuum
+    kinematics as fast approximate model for the Bionic Handling Assistant, IROS.
+
+    Examples
+    --------
+    >>> from hybridkin import robots
+    >>> robots.bionic_handling_assistant().n_actuators
+    9
+    """
+    return ConstantCurvatureChain([0.100, 0.093, 0.079], offsets=[0.0, 0.0, tool])
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """How a robot's log is written: columns, units and sign.
+
+    Attributes
+    ----------
+    q, x : tuple of str
+        Columns of the actuator vector and of the tip position, in the chain's order.
+    q_unit, x_unit : {"m", "cm", "mm"}
+        Units of these columns.
+    q_sign : int
+        -1 where the log counts a pulled (shortened) tendon as positive.
+    group_suffix : str
+        Rows whose motion ends in this belong to the motion named without it.
+    """
+
+    q: tuple[str, ...]
+    x: tuple[str, ...]
+    q_unit: str = "m"
+    x_unit: str = "m"
+    q_sign: int = 1
+    group_suffix: str = ""
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """A robot as its TOML file describes it.
+
+    Attributes
+    ----------
+    name : str
+        What to call it.
+    chain : ConstantCurvatureChain
+        Its nominal kinematics.
+    calibrate : tuple of str
+        Geometry that should be fitted to data.
+    log : LogFormat or None
+        How its logs are written.
+    """
+
+    name: str
+    chain: ConstantCurvatureChain
+    calibrate: tuple[str, ...]
+    log: LogFormat | None
+
+
+def from_toml(path: str | Path) -> ConstantCurvatureChain:
+    """Return the chain that a TOML file describes; see `read_description` for the format."""
+    return read_description(path).chain
+
+
+def read_description(path: str | Path) -> RobotDescription:
+    """Return the robot that a TOML file describes.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file like this one::
+
+            name = "my trunk"
+            model = "constant-curvature"    # the default
+            routing = "base"                # or "segment", the default
+            calibrate = ["radii", "base"]   # optional
+
+            [[segment]]                     # base to tip
+            radius = 0.0045                 # of the actuator circle [m]
+            length = 0.060                  # [m]; leave out for extensible segments
+            actuators = 3                   # the default
+            angle_deg = 0.0                 # of the first actuator; or angles_deg = [0, 120, 240]
+            clockwise = false               # which way the others follow
+            offset = 0.0                    # rigid length after the segment [m]
+            repeat = 2                      # as many segments like this one
+
+            [base]                          # optional
+            position = [0.0, 0.0, 0.0]      # [m]
+            rotation_vector_deg = [0.0, 0.0, 0.0]
+
+            [log]                           # how its logs are written, optional
+            q = ["servo_1", "servo_2", "servo_3"]
+            x = ["tip_x", "tip_y", "tip_z"]
+            q_unit = "mm"
+            x_unit = "mm"
+            q_sign = -1                     # -1: the log counts a pulled tendon as positive
+            group_suffix = "_hold"          # rows of motion "a_hold" belong to motion "a"
+
+    Returns
+    -------
+    RobotDescription
+        The nominal chain and what else the file says.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not TOML, lacks a key, or has one that is not known; the message names it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"`path` must name a robot description, got {path}: no such file.")
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not a TOML file: {error}.") from error
+    try:
+        return _description(content, path.stem)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
+    top = {"name", "model", "routing", "calibrate", "segment", "base", "log"}
+    _known(content, top, "the file")
+    model = content.get("model", "constant-curvature")
+    if model != "constant-curvature":
+        raise ValueError(f"`model` must be 'constant-curvature', got {model!r}.")
+    segments = []
+    tables = content.get("segment", [])
+    if not isinstance(tables, list) or not tables:
+        raise ValueError("`segment` is missing; describe each segment in a [[segment]] table.")
+    for i, table in enumerate(tables):
+        segments += _segments(table, f"[[segment]] {i + 1}")
+    lengths = [segment["length"] for segment in segments]
+    if any(length is None for length in lengths) and any(length is not None for length in lengths):
+        raise ValueError(
+            "`length` must stand in every [[segment]] (tendons) or in none (chambers)."
+        )
+    chain = ConstantCurvatureChain(
+        [segment["radius"] for segment in segments],
+        n_actuators=[len(segment["angles"]) for segment in segments],
+        angles=[segment["angles"] for segment in segments],
+        lengths=None if lengths[0] is None else lengths,
+        routing=content.get("routing", "segment"),
+        offsets=[segment["offset"] for segment in segments],
+        base=_base(content.get("base", {})),
+    )
+    calibrate = content.get("calibrate", chain.default_parameters)
+    if not isinstance(calibrate, (list, tuple)):
+        raise ValueError(f"`calibrate` must be a list of names, got {calibrate!r}.")
+    log = _log_format(content["log"], chain.n_actuators) if "log" in content else None
+    return RobotDescription(str(content.get("name", stem)), chain, tuple(calibrate), log)
+
+
+def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
+    keys = {"radius", "length", "actuators", "angle_deg", "angles_deg", "clockwise", "offset"}
+    _known(table, keys | {"repeat"}, where)
+    if "radius" not in table:
+        raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
+    if "angles_deg" in table:
+        for other in ("angle_deg", "actuators", "clockwise"):
+            if other in table:
+                raise ValueError(f"`{other}` cannot stand beside `angles_deg` in {where}.")
+        angles = np.radians(np.asarray(table["angles_deg"], dtype=float))
+    else:
+        n = _number(table, "actuators", where, 3)
+        step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
+        angles = math.radians(_number(table, "angle_deg", where, 0.0)) + step * np.arange(n)
+    segment = {
+        "radius": _number(table, "radius", where),
+        "length": _number(table, "length", where) if "length" in table else None,
+        "offset": _number(table, "offset", where, 0.0),
+        "angles": angles,
+    }
+    return [segment] * int(_number(table, "repeat", where, 1))
+
+
+def _base(table: Mapping[str, Any]) -> np.ndarray:
+    _known(table, {"position", "rotation_vector_deg"}, "[base]")
+    parts = {}
+    for key in ("position", "rotation_vector_deg"):
+        parts[key] = np.asarray(table.get(key, [0.0, 0.0, 0.0]), dtype=float)
+        if parts[key].shape != (3,):
+            raise ValueError(f"`{key}` in [base] must hold 3 numbers, got {table[key]!r}.")
+    pose = np.eye(4)
+    pose[:3, 3] = parts["position"]
+    pose[:3, :3] = Rotation.from_rotvec(parts["rotation_vector_deg"], degrees=True).as_matrix()
+    return pose
+
+
+def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
+    _known(table, {"q", "x", "q_unit", "x_unit", "q_sign", "group_suffix"}, "[log]")
+    columns = {}
+    for key, size in (("q", n_actuators), ("x", 3)):
+        value = table.get(key, [])
+        if not isinstance(value, list) or len(value) != size:
+            raise ValueError(f"`{key}` in [log] must name {size} columns, got {value!r}.")
+        columns[key] = tuple(str(name) for name in value)
+    for key in ("q_unit", "x_unit"):
+        if table.get(key, "m") not in _UNITS:
+            raise ValueError(f"`{key}` in [log] must be one of {[*_UNITS]}, got {table[key]!r}.")
+    if table.get("q_sign", 1) not in (1, -1):
+        raise ValueError(f"`q_sign` in [log] must be 1 or -1, got {table['q_sign']!r}.")
+    if not isinstance(table.get("group_suffix", ""), str):
+        raise ValueError(f"`group_suffix` in [log] must be text, got {table['group_suffix']!r}.")
+    options = ("q_unit", "x_unit", "q_sign", "group_suffix")
+    extra = {key: table[key] for key in options if key in table}
+    return LogFormat(**columns, **extra)
+
+
+def _number(table: Mapping[str, Any], key: str, where: str, default: float | None = None) -> Any:
+    value = table.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"`{key}` in {where} must be a number, got {value!r}.")
+    return value
+
+
+def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
+    for key in table:
+        if key not in keys:
+            close = difflib.get_close_matches(key, keys, n=1)
+            hint = f"did you mean `{close[0]}`?" if close else f"known: {sorted(keys)}."
+            raise ValueError(f"`{key}` in {where} is not known; {hint}")

@@ -1,0 +1,392 @@
+import copy
+import math
+import pickle
+
+import joblib
+import mpmath
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, jacobian
+from hybridkin._numerics import forward_and_reverse_jacobian, stumpff
+
+RADII = [0.100, 0.093, 0.079]
+THREE = 2 * math.pi / 3 * torch.arange(3, dtype=torch.float64)
+STRAIGHT = torch.full((9,), 0.25, dtype=torch.float64)
+
+
+def bha(**options):
+    return ConstantCurvatureChain(RADII, **options)
+
+
+def tendons(routing="base", **options):
+    options = {"offsets": [0.002, 0.003, 0.01], **options}
+    return ConstantCurvatureChain(
+        [0.0045, 0.005, 0.004], lengths=[0.06, 0.0625, 0.064], routing=routing, **options
+    )
+
+
+def random_q(rng, n=20, size=9, center=0.25, width=0.06):
+    return center + width * (2 * torch.rand(n, size, generator=rng, dtype=torch.float64) - 1)
+
+
+def rotation_z(angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def pose(rotation, position):
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = rotation, torch.as_tensor(position, dtype=torch.float64)
+    return matrix
+
+
+CHAINS = {
+    "chambers": (bha(offsets=[0.01, 0.0, 0.05]), 0.25, 0.06),
+    "tendons, own segment": (tendons("segment"), 0.0, 0.005),
+    "tendons, through": (tendons("base"), 0.0, 0.005),
+    "mixed": (
+        ConstantCurvatureChain(
+            [0.1, 0.08],
+            n_actuators=[4, 3],
+            routing="base",
+            base=pose(rotation_z(0.7), [0.1, 0.2, 0.3]),
+        ),
+        0.25,
+        0.06,
+    ),
+}
+each_chain = pytest.mark.parametrize(("chain", "center", "width"), CHAINS.values(), ids=CHAINS)
+
+
+@pytest.mark.parametrize("theta", [0.0, 1e-12, 1e-4, 0.5, 1.0, 2.0, math.pi, 4.0, 2 * math.pi])
+def test_stumpff_functions_against_mpmath(theta):
+    s = torch.tensor(theta**2, dtype=torch.float64)
+    with mpmath.workdps(60):
+        exact = mpmath.mpf(s.item())
+
+        def series(k):
+            return mpmath.nsum(lambda j: (-exact) ** int(j) / mpmath.factorial(2 * j + k), [0, 60])
+
+        expected = [float(series(k)) for k in (0, 1, 2, 3, 4)]
+    assert_close(
+        torch.stack(list(stumpff(s))),
+        torch.tensor(expected, dtype=torch.float64),
+        rtol=4e-15,
+        atol=3e-15,
+    )
+
+
+def test_quarter_circle():
+    radius, arc = 0.1, math.pi / 2
+    chain = ConstantCurvatureChain([radius])
+    length = 0.4
+    q = length - radius * arc * THREE.cos()
+    expected = torch.tensor([length / arc, 0.0, length / arc], dtype=torch.float64)
+    assert_close(chain(q), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_half_turn_of_a_tendon_robot():
+    chain = ConstantCurvatureChain([0.01], lengths=[0.2], offsets=[0.05])
+    q = -0.01 * math.pi * THREE.cos()
+    expected = torch.tensor([0.4 / math.pi, 0.0, -0.05], dtype=torch.float64)
+    assert_close(chain(q), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_three_chambers_match_the_textbook_bending(rng):
+    q = random_q(rng)
+    length, bending = bha().arcs(q)
+    l1, l2, l3 = q.unflatten(1, (3, 3)).unbind(-1)
+    radii = torch.tensor(RADII, dtype=torch.float64)
+    expected = torch.stack([l2 + l3 - 2 * l1, math.sqrt(3) * (l3 - l2)], -1) / (3 * radii[:, None])
+    assert_close(length, q.unflatten(1, (3, 3)).mean(-1), rtol=1e-14, atol=0)
+    assert_close(bending, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_through_going_tendons_read_the_sum_of_bendings(rng):
+    chain = tendons("base", offsets=0.0)
+    bending = torch.randn(3, 2, generator=rng, dtype=torch.float64)
+    angles = chain.angles.unflatten(0, (3, 3))
+    toward = torch.stack([angles.cos(), angles.sin()], -1)
+    q = -(chain.radii[:, None] * (toward * bending.cumsum(0)[:, None]).sum(-1)).flatten()
+    assert_close(chain.arcs(q)[1], bending, rtol=1e-12, atol=1e-12)
+
+
+def test_shorter_chamber_is_on_the_side_the_tip_goes_to():
+    q = STRAIGHT.clone()
+    q[0] -= 0.02
+    assert bha()(q)[0] > 0.01
+
+
+def test_singular_values_of_three_equal_straight_segments():
+    J = ConstantCurvatureChain([0.03] * 3).jacobian(torch.full((9,), 0.1, dtype=torch.float64))
+    expected = torch.tensor([8.050764858994132, 8.050764858994132, 1.0], dtype=torch.float64)
+    assert_close(torch.linalg.svdvals(J), expected, rtol=1e-14, atol=0)
+
+
+@each_chain
+def test_gradcheck_at_straight_and_beside_it(chain, center, width, rng):
+    size = chain.n_actuators
+    for spread in (0.0, 1e-9, width):
+        q = random_q(rng, 2, size, center, spread).requires_grad_()
+        assert torch.autograd.gradcheck(chain, q)
+        assert torch.autograd.gradgradcheck(chain, q)
+
+
+@each_chain
+def test_closed_form_jacobian_is_that_of_autograd(chain, center, width, rng):
+    for spread in (0.0, 1e-9, width):
+        q = random_q(rng, 10, chain.n_actuators, center, spread)
+        x, J = chain.forward_and_jacobian(q)
+        x_reverse, J_reverse = forward_and_reverse_jacobian(chain.forward, q)
+        assert_close(x, x_reverse, rtol=1e-15, atol=1e-15)
+        assert_close(J, J_reverse, rtol=1e-13, atol=1e-13 * float(J.abs().max()))
+
+
+@each_chain
+def test_jacobian_against_central_differences(chain, center, width, rng):
+    q = torch.cat(
+        [
+            random_q(rng, 5, chain.n_actuators, center, width),
+            torch.full((1, chain.n_actuators), center, dtype=torch.float64),
+        ]
+    )
+    J = chain.jacobian(q)
+    step = 1e-3 * float(chain.radii.mean())
+    # Richardson's rule on two central differences: the error is of fourth order in the step.
+    columns = []
+    for j in range(chain.n_actuators):
+        move = torch.zeros_like(q[0])
+        move[j] = step
+        near = (chain(q + move) - chain(q - move)) / (2 * step)
+        far = (chain(q + 2 * move) - chain(q - 2 * move)) / (4 * step)
+        columns.append((4 * near - far) / 3)
+    assert (torch.stack(columns, -1) - J).abs().max() / J.abs().max() < 1e-8
+
+
+@each_chain
+def test_pose_jacobian_turns_the_tip_frame(chain, center, width, rng):
+    q = random_q(rng, 5, chain.n_actuators, center, width)
+    step = 1e-6 * width
+    J = chain.pose_jacobian(q)
+    assert_close(J[:, :3], chain.jacobian(q), rtol=1e-13, atol=1e-13)
+    frame = chain.poses(q)[:, -1, :3, :3]
+    for j in range(chain.n_actuators):
+        move = torch.zeros_like(q[0])
+        move[j] = step
+        ahead, behind = (chain.poses(q + m)[:, -1, :3, :3] for m in (move, -move))
+        spin = (ahead - behind) / (2 * step) @ frame.mT
+        angular = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], -1)
+        scale = J[:, 3:].abs().max()
+        assert_close(angular / scale, J[:, 3:, j] / scale, rtol=0, atol=1e-7)
+
+
+@each_chain
+def test_poses_backbone_and_tip_agree(chain, center, width, rng):
+    q = random_q(rng, 4, chain.n_actuators, center, width)
+    poses, points = chain.poses(q), chain.backbone(q, n_points=7)
+    assert points.shape == (4, chain.n_segments * 7 + 1, 3)
+    assert_close(poses[:, -1, :3, 3], chain(q), rtol=1e-13, atol=1e-14)
+    assert_close(points[:, -1], chain(q), rtol=1e-13, atol=1e-14)
+    assert_close(points[:, ::7], poses[..., :3, 3], rtol=1e-13, atol=1e-14)
+    rotations = poses[..., :3, :3]
+    eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
+    assert_close(rotations.mT @ rotations, eye, rtol=0, atol=1e-14)
+
+
+def test_backbone_has_the_segments_length(rng):
+    q = random_q(rng, 3)
+    points = bha().backbone(q, n_points=400)
+    length = points.diff(dim=1).norm(dim=-1).sum(-1)
+    assert_close(length, q.mean(-1) * 3, rtol=1e-5, atol=0)
+
+
+def test_splitting_a_segment_changes_nothing(rng):
+    q = random_q(rng, 5, 3)
+    whole = ConstantCurvatureChain([0.1])
+    halves = ConstantCurvatureChain([0.1, 0.1])
+    assert_close(halves(torch.cat([q, q], 1) / 2), whole(q), rtol=1e-13, atol=1e-14)
+
+
+def test_permuting_actuators_with_their_angles_changes_nothing(rng):
+    q = random_q(rng, 5)
+    order = [2, 0, 1]
+    angles = [2 * math.pi / 3 * i for i in order]
+    permuted = bha(angles=angles)
+    assert_close(
+        permuted(q.unflatten(1, (3, 3))[..., order].flatten(1)), bha()(q), rtol=1e-13, atol=1e-14
+    )
+
+
+def test_turning_the_actuators_turns_the_tip(rng):
+    q = random_q(rng, 5)
+    turned = bha(angles=[0.4 + 2 * math.pi / 3 * i for i in range(3)])
+    assert_close(turned(q), bha()(q) @ rotation_z(0.4).mT, rtol=1e-13, atol=1e-14)
+
+
+def test_base_moves_everything(rng):
+    q = random_q(rng, 5)
+    base = pose(rotation_z(1.0), [1.0, -2.0, 0.5])
+    moved = bha(base=base)
+    expected = bha()(q) @ base[:3, :3].mT + base[:3, 3]
+    assert_close(moved(q), expected, rtol=1e-14, atol=1e-14)
+    assert_close(moved.jacobian(q), base[:3, :3] @ bha().jacobian(q), rtol=1e-14, atol=1e-14)
+    assert_close(moved.poses(q), base @ bha().poses(q), rtol=1e-14, atol=1e-14)
+
+
+def test_change_of_units(rng):
+    q = random_q(rng, 5)
+    with pytest.warns(UserWarning, match="millimetres"):
+        in_mm = ConstantCurvatureChain([100.0, 93.0, 79.0])
+    assert_close(in_mm(1000 * q), 1000 * bha()(q), rtol=1e-13, atol=1e-11)
+
+
+def test_float32_keeps_its_dtype_and_accuracy(rng):
+    q = random_q(rng, 100)
+    x, J = bha().forward_and_jacobian(q.float())
+    assert x.dtype == J.dtype == torch.float32
+    reference, J_reference = bha().forward_and_jacobian(q.float().double())
+    assert_close(x.double(), reference, rtol=0, atol=1e-6)
+    assert_close(J.double(), J_reference, rtol=0, atol=1e-5)
+
+
+def test_no_nan_near_straight():
+    spread = 10.0 ** torch.arange(-16, -1, dtype=torch.float64)
+    q = 0.25 + spread[:, None] * torch.tensor([0.0, 1.0, -0.5] * 3, dtype=torch.float64)
+    for dtype in (torch.float64, torch.float32):
+        x, J = bha().forward_and_jacobian(q.to(dtype))
+        assert torch.isfinite(x).all()
+        assert torch.isfinite(J).all()
+
+
+def test_common_length_change_moves_the_tip():
+    straight, longer = bha()(STRAIGHT), bha()(STRAIGHT + 0.01)
+    expected = torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
+    assert_close(longer - straight, expected, rtol=1e-12, atol=1e-15)
+
+
+@settings(max_examples=30, deadline=None)
+@given(lead=st.lists(st.integers(0, 3), max_size=3), single=st.booleans())
+def test_any_batch_shape(lead, single):
+    q = torch.full((*lead, 9), 0.25, dtype=torch.float32 if single else torch.float64)
+    chain = bha()
+    assert chain(q).shape == (*lead, 3)
+    assert chain.jacobian(q).shape == (*lead, 3, 9)
+    assert chain.pose_jacobian(q).shape == (*lead, 6, 9)
+    assert chain.poses(q).shape == (*lead, 4, 4, 4)
+    assert chain.backbone(q, 5).shape == (*lead, 16, 3)
+    length, bending = chain.arcs(q)
+    assert length.shape == (*lead, 3)
+    assert bending.shape == (*lead, 3, 2)
+
+
+def test_batch_equals_loop_and_nan_stays_in_its_row(rng):
+    q = random_q(rng, 6)
+    chain = bha()
+    assert_close(chain(q), torch.stack([chain(row) for row in q]), rtol=0, atol=1e-15)
+    spoilt = q.clone()
+    spoilt[2, 4] = torch.nan
+    x = chain(spoilt)
+    kept = [0, 1, 3, 4, 5]
+    assert torch.isnan(x[2]).all()
+    assert_close(x[kept], chain(q)[kept], rtol=0, atol=1e-15)
+
+
+def test_functional_transforms(rng):
+    q = random_q(rng, 4)
+    chain = bha()
+    J = torch.func.vmap(torch.func.jacrev(chain))(q)
+    assert_close(J, chain.jacobian(q), rtol=1e-13, atol=1e-13)
+    hessian = torch.func.vmap(torch.func.hessian(chain))(STRAIGHT[None])
+    assert torch.isfinite(hessian).all()
+    state = {"base": pose(torch.eye(3), [0.0, 0.0, 1.0])}
+    lifted = torch.func.functional_call(chain, state, (q,))
+    assert_close(lifted[:, 2], chain(q)[:, 2] + 1.0, rtol=1e-14, atol=0)
+
+
+def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
+    q = random_q(rng, 4)
+    chain = bha()
+    before = chain.radii.clone()
+
+    def tip(radii):
+        return chain.with_geometry(radii=radii)(q)
+
+    radii = chain.radii.clone().requires_grad_()
+    assert torch.autograd.gradcheck(tip, radii)
+    assert_close(chain.radii, before, rtol=0, atol=0)
+    with pytest.raises(ValueError, match="lengths"):
+        chain.with_geometry(lengths=radii)
+
+
+@each_chain
+def test_pickle_copy_and_hash(chain, center, width, rng):
+    q = random_q(rng, 3, chain.n_actuators, center, width)
+    for twin in (pickle.loads(pickle.dumps(chain)), copy.deepcopy(chain)):
+        assert_close(twin(q), chain(q), rtol=0, atol=0)
+        assert joblib.hash(twin) == joblib.hash(chain)
+    assert_close(chain.float()(q).double(), chain(q).double(), rtol=0, atol=0)
+    chain.double()
+
+
+def test_transform3d_both_ways(rng):
+    transforms = pytest.importorskip("pytorch_kinematics").transforms
+    base = transforms.Transform3d(matrix=pose(rotation_z(0.3), [0.1, 0.0, 0.2])[None])
+    chain = bha(base=base)
+    q = random_q(rng, 3)
+    assert_close(chain.tip_transform(q).get_matrix()[:, :3, 3], chain(q), rtol=1e-13, atol=1e-14)
+
+
+def test_reverse_mode_jacobian_of_any_module(rng):
+    q = random_q(rng, 3)
+    assert_close(
+        jacobian(lambda q: q.sin() @ torch.ones(9, 2, dtype=q.dtype), q),
+        q.cos()[:, None].expand(3, 2, 9),
+        rtol=1e-14,
+        atol=0,
+    )
+    assert_close(jacobian(bha(), q), bha().jacobian(q), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ConstantCurvatureChain([0.1, -0.1]), "`radii` must be positive"),
+        (lambda: ConstantCurvatureChain([[0.1]]), r"`radii` must have shape \(S,\)"),
+        (lambda: ConstantCurvatureChain([0.1, float("nan")]), "`radii` must be finite"),
+        (lambda: ConstantCurvatureChain(["a"]), "`radii` must be numeric"),
+        (lambda: bha(n_actuators=2), "at least 3 on every segment"),
+        (lambda: bha(n_actuators=[3, 3]), "`n_actuators` must be one number or 3 numbers"),
+        (lambda: bha(angles=[0.0, 0.0, 0.0]), "`angles` must tell the bending"),
+        (lambda: bha(angles=[[0.0, 2.0, 4.0]] * 2), "`angles` must hold"),
+        (lambda: bha(lengths=[0.1, 0.1]), r"`lengths` must have shape \(3,\)"),
+        (lambda: bha(lengths=[0.1, 0.1, 0.0]), "`lengths` must be positive"),
+        (lambda: bha(routing="through"), "`routing` must be one of"),
+        (lambda: bha(offsets=[0.0]), r"`offsets` must have shape \(3,\)"),
+        (lambda: bha(base=np.eye(3)), r"`base` must be one pose of shape \(4, 4\)"),
+        (lambda: bha(base=2 * np.eye(4)), "`base` must hold a rotation"),
+        (lambda: bha()(torch.zeros(4, 6, dtype=torch.float64)), r"`q` must have shape \(..., 9\)"),
+        (lambda: bha().backbone(STRAIGHT, 0), "`n_points` must be at least 1"),
+        (lambda: bha().check_actuators(STRAIGHT - 0.25), "positive actuator lengths"),
+        (lambda: bha().check_actuators(STRAIGHT * torch.nan), "must be finite"),
+    ],
+)
+def test_bad_input_says_what_is_needed(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_wrong_types_say_what_to_do():
+    with pytest.raises(TypeError, match="torch tensor"):
+        bha()(np.zeros(9))
+    with pytest.raises(TypeError, match="floating"):
+        bha()(torch.zeros(9, dtype=torch.int64))
+
+
+def test_lengths_in_millimetres_are_noticed():
+    with pytest.warns(UserWarning, match="millimetres"):
+        bha().check_actuators(1000 * STRAIGHT)

@@ -1,0 +1,111 @@
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, robots
+
+TENDONS = """
+name = "three by three"
+routing = "base"
+calibrate = ["radii", "base"]
+[[segment]]
+radius = 0.0045
+length = 0.06
+angle_deg = 30
+repeat = 2
+[[segment]]
+radius = 0.004
+length = 0.05
+actuators = 4
+clockwise = true
+offset = 0.01
+[base]
+position = [0, 0, 1]
+rotation_vector_deg = [180, 0, 0]
+[log]
+q = ["a", "b", "c", "d", "e", "f", "g", "h", "i", "j"]
+x = ["x", "y", "z"]
+q_unit = "mm"
+q_sign = -1
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text):
+        path = tmp_path / "robot.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_bionic_handling_assistant():
+    chain = robots.bionic_handling_assistant(tool=0.1)
+    assert_close(chain.radii, torch.tensor([0.100, 0.093, 0.079], dtype=torch.float64))
+    straight = torch.full((9,), 0.25, dtype=torch.float64)
+    assert_close(chain(straight), torch.tensor([0.0, 0.0, 0.85], dtype=torch.float64))
+
+
+def test_description_is_the_chain_it_describes(write):
+    robot = robots.read_description(write(TENDONS))
+    turn = math.radians(30)
+    base = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    base[2, 3] = 1.0
+    expected = ConstantCurvatureChain(
+        [0.0045, 0.0045, 0.004],
+        n_actuators=[3, 3, 4],
+        angles=[[turn + 2 * math.pi / 3 * i for i in range(3)]] * 2
+        + [[-math.pi / 2 * i for i in range(4)]],
+        lengths=[0.06, 0.06, 0.05],
+        routing="base",
+        offsets=[0.0, 0.0, 0.01],
+        base=base,
+    )
+    q = 1e-3 * torch.arange(10, dtype=torch.float64)
+    assert_close(robot.chain(q), expected(q), rtol=1e-13, atol=1e-15)
+    assert_close(robots.from_toml(write(TENDONS))(q), expected(q), rtol=1e-13, atol=1e-15)
+    assert robot.name == "three by three"
+    assert robot.calibrate == ("radii", "base")
+    assert robot.log == robots.LogFormat(tuple("abcdefghij"), ("x", "y", "z"), "mm", "m", -1)
+
+
+def test_defaults_are_chambers_named_after_the_file(write):
+    robot = robots.read_description(write("[[segment]]\nradius = 0.1\n"))
+    assert robot.name == "robot"
+    assert robot.chain.lengths is None
+    assert robot.log is None
+    assert robot.calibrate == ("radii", "base")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("segment = 3", "`segment` is missing"),
+        ("name = ", "is not a TOML file"),
+        ("[[segment]]\nlength = 1.0", "`radius` is missing in .*segment.* 1"),
+        ("[[segment]]\nradius = 0.1\nlenght = 0.2", "`lenght` in .* did you mean `length`"),
+        ("[[segment]]\nradius = '0.1'", "`radius` in .* must be a number"),
+        ("[[segment]]\nradius = -0.1", "`radii` must be positive"),
+        ("[[segment]]\nradius = 0.1\nactuators = 2", "at least 3"),
+        ("[[segment]]\nradius = 0.1\nlength = 1\n[[segment]]\nradius = 0.1", "in every"),
+        ("model = 'rigid'\n[[segment]]\nradius = 0.1", "`model` must be"),
+        ("calibrate = 'radii'\n[[segment]]\nradius = 0.1", "`calibrate` must be a list"),
+        ("[[segment]]\nradius = 0.1\n[base]\nposition = [1]", "`position` in .base. must hold 3"),
+        ("[[segment]]\nradius = 0.1\n[log]\nq = ['a']", "`q` in .log. must name 3 columns"),
+        (
+            "[[segment]]\nradius = 0.1\n[log]\nq = ['a','b','c']\nx = ['x','y','z']\nq_unit = 'in'",
+            "`q_unit` in .log. must be one of",
+        ),
+    ],
+)
+def test_bad_descriptions_name_the_key(write, text, message):
+    with pytest.raises(ValueError, match=message):
+        robots.read_description(write(text))
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        robots.from_toml(tmp_path / "none.toml")

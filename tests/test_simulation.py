@@ -1,0 +1,309 @@
+import importlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from hybridkin import ConstantCurvatureChain
+from hybridkin.simulation import NotSettledError, TrunkPlant
+from hybridkin.simulation._mjcf import RADII, TIME_STEP
+from hybridkin.simulation.trunk import SERVO_GAINS, _Budget
+
+mujoco = pytest.importorskip("mujoco", reason="the simulated trunk needs hybridkin[sim]")
+
+IDEAL = {"gravity": 0.0, "base_error": np.zeros(6)}
+TURN = Rotation.from_euler("z", 120, degrees=True)
+
+
+def segment_lengths(lengths, segment):
+    """The three lengths of one segment, the others at rest."""
+    q = np.full((3, 3), 0.25)
+    q[segment] = lengths
+    return q.ravel()
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return TrunkPlant()
+
+
+@pytest.fixture(scope="module")
+def ideal():
+    return TrunkPlant(**IDEAL)
+
+
+@pytest.fixture(scope="module")
+def working():
+    """Typical and extreme configurations."""
+    rng = np.random.default_rng(0)
+    return np.concatenate(
+        [
+            rng.uniform(0.19, 0.31, (4, 9)),
+            rng.choice([0.19, 0.31], (4, 9)),
+            rng.uniform(0.1, 0.4, (4, 9)),
+        ]
+    )
+
+
+# closed form
+
+
+@pytest.mark.parametrize("length", [0.19, 0.25, 0.31])
+def test_equal_lengths_without_gravity_give_a_straight_trunk(ideal, length):
+    q, pose = ideal.settle(np.full(9, length))
+    expected = np.eye(4)
+    expected[2, 3] = 3 * length
+    assert_allclose(q, length, atol=1e-8)
+    assert_allclose(pose, expected, atol=1e-8)
+
+
+def test_quarter_circle_without_gravity(ideal):
+    theta, length, r = np.pi / 2, 0.25, RADII[2]
+    lengths = length - r * theta * np.cos([0, 2 * np.pi / 3, 4 * np.pi / 3])
+    _, pose = ideal.settle(segment_lengths(lengths, 2))
+    arc = 2 * length / np.pi
+    assert_allclose(pose[:3, 3], [arc, 0, 0.5 + arc], atol=3e-3)
+    # The tangent turns towards +x, where the chamber is shortest.
+    assert_allclose(pose[:3, 2], [1, 0, 0], atol=1e-2)
+
+
+def test_without_gravity_the_trunk_is_a_constant_curvature_chain(ideal, working):
+    chain = ConstantCurvatureChain(RADII)
+    for q_target in working[:8]:
+        q, pose = ideal.settle(q_target)
+        assert_allclose(pose[:3, 3], chain(torch.as_tensor(q)).numpy(), atol=2e-3)
+
+
+def test_gravity_breaks_constant_curvature(plant):
+    chain = ConstantCurvatureChain(RADII)
+    q, pose = plant.settle(np.full(9, 0.25))
+    assert np.linalg.norm(pose[:3, 3] - chain(torch.as_tensor(q)).numpy()) > 0.01
+
+
+# invariance and sign
+
+
+@pytest.mark.parametrize("segment", [0, 1, 2])
+@pytest.mark.parametrize("actuator", [0, 1, 2])
+def test_shortening_a_chamber_bends_towards_it(ideal, segment, actuator):
+    lengths = np.full(3, 0.27)
+    lengths[actuator] = 0.21
+    tip = ideal(segment_lengths(lengths, segment))
+    angle = 2 * np.pi * actuator / 3
+    assert tip[:2] @ [np.cos(angle), np.sin(angle)] > 0.02
+    assert abs(tip[:2] @ [-np.sin(angle), np.cos(angle)]) < 1e-3
+
+
+@pytest.mark.parametrize("gravity", [0.0, 9.81])
+def test_hanging_trunk_turns_with_its_chambers(gravity, working):
+    hanging = TrunkPlant(tilt=0.0, gravity=gravity, base_error=np.zeros(6))
+    for q_target in working[[0, 5]]:
+        turned = np.roll(q_target.reshape(3, 3), 1, axis=1).ravel()
+        assert_allclose(hanging(turned), TURN.apply(hanging(q_target)), atol=2e-3)
+
+
+def test_gravity_pulls_a_tilted_trunk_towards_positive_x():
+    tilted = TrunkPlant(base_error=np.zeros(6))
+    x, y, z = tilted(np.full(9, 0.25))
+    assert x > 0.01
+    assert abs(y) < 1e-6
+    assert 0.7 < z < 0.76
+
+
+def test_base_error_moves_the_measured_pose(working):
+    error = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
+    moved, plain = TrunkPlant(base_error=error), TrunkPlant(base_error=np.zeros(6))
+    (q_m, pose_m), (q_p, pose_p) = moved.settle(working[0]), plain.settle(working[0])
+    R = Rotation.from_rotvec(error[3:])
+    assert_allclose(q_m, q_p)
+    assert_allclose(pose_m[:3, 3], R.apply(pose_p[:3, 3]) + error[:3], atol=1e-12)
+    assert_allclose(pose_m[:3, :3], R.as_matrix() @ pose_p[:3, :3], atol=1e-12)
+
+
+# the map q -> x
+
+
+def test_lengths_reach_the_command_and_the_pose_is_rigid(plant, working):
+    for q_target in working:
+        q, pose = plant.settle(q_target)
+        assert_allclose(q, q_target, atol=1e-5)
+        assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+        assert_allclose(pose[3], [0, 0, 0, 1])
+
+
+def test_start_shape_does_not_matter(plant, working):
+    warm = TrunkPlant(warm_start=True)
+    tips = np.array([plant(q_target) for q_target in working])
+    warm_tips = np.array([warm(q_target) for q_target in working])
+    assert_allclose(warm_tips, tips, atol=1e-7)
+
+
+def test_tip_is_a_smooth_function_of_the_command(plant, working):
+    direction = np.random.default_rng(1).standard_normal(9)
+    direction /= np.linalg.norm(direction)
+    for q_target in working[:8]:
+        centre = np.clip(q_target, 0.192, 0.308)
+        behind, here, ahead = (plant(centre + s * 1e-3 * direction) for s in (-1, 0, 1))
+        assert np.linalg.norm(ahead - behind) / 2e-3 < 8  # gain
+        assert np.linalg.norm(ahead - 2 * here + behind) / 1e-6 < 100  # curvature [1/m]
+
+
+def test_running_the_servos_from_straight_ends_in_the_same_shape(plant, working):
+    target, model = working[0], plant._model
+    data, integral = mujoco.MjData(model), np.zeros(9)
+    mujoco.mj_forward(model, data)
+    for _ in range(int(12 / TIME_STEP)):
+        gap = target - data.ten_length
+        integral += TIME_STEP * gap
+        data.ctrl[:] = SERVO_GAINS[0] * gap + SERVO_GAINS[1] * integral
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    R, p = plant._T_mocap_base[:3, :3], plant._T_mocap_base[:3, 3]
+    assert_allclose(R @ data.site("tip").xpos + p, plant(target), atol=1e-5)
+
+
+def test_weak_chambers_saturate_and_the_measured_lengths_say_so(working):
+    weak = TrunkPlant(max_force=20.0)
+    q, _ = weak.settle(working[4])
+    short = np.abs(q - working[4]) > 1e-5
+    assert short.any()
+    assert not short.all()
+    # A saturated chamber stays between where it would be at rest and where it was sent.
+    assert ((q - working[4])[short] * (0.25 - working[4])[short] > 0).all()
+
+
+# noise and determinism
+
+
+def test_same_seed_same_measurements_and_reset_starts_over(working):
+    noise = {"cable_noise": 1e-3, "mocap_noise": 5e-4, "random_state": 3}
+    a, b = TrunkPlant(**noise), TrunkPlant(**noise)
+    first, second = a(working[0]), a(working[0])
+    assert_allclose(b(working[0]), first, rtol=0, atol=1e-12)
+    assert np.abs(second - first).max() > 1e-6
+    a.reset()
+    assert_allclose(a(working[0]), first, rtol=0, atol=1e-12)
+
+
+def test_noise_has_the_stated_standard_deviation(monkeypatch, working):
+    noisy = TrunkPlant(cable_noise=2e-3, mocap_noise=1e-3, random_state=0)
+    clean_q, clean_pose = TrunkPlant().settle(working[0])
+    # The shape is the same each time: settle once, measure often.
+    state = noisy._equilibrium(noisy._rest, working[0], _Budget(200))
+    held_result = noisy._hold(state[0], working[0], state[1])
+    monkeypatch.setattr(noisy, "_equilibrium", lambda *_: state)
+    monkeypatch.setattr(noisy, "_check_stable", lambda *_: None)
+    monkeypatch.setattr(noisy, "_hold", lambda *_: held_result)
+    q, pose = map(np.array, zip(*(noisy.settle(working[0]) for _ in range(2000)), strict=True))
+    assert_allclose((q - clean_q).std(axis=0), 2e-3, rtol=0.1)
+    assert_allclose((pose - clean_pose)[:, :3, 3].std(axis=0), 1e-3, rtol=0.1)
+    assert_allclose((q - clean_q).mean(axis=0), 0, atol=2e-4)
+    assert_allclose(pose[:, :3, :3], np.broadcast_to(clean_pose[:3, :3], (2000, 3, 3)), atol=1e-9)
+
+
+def test_noise_of_one_measurement_can_be_seeded(working):
+    noisy = TrunkPlant(cable_noise=1e-3, mocap_noise=5e-4, random_state=0)
+    first = noisy.settle(working[0], random_state=[7, 1])
+    noisy(working[1])
+    for a, b in zip(first, noisy.settle(working[0], random_state=[7, 1]), strict=True):
+        assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+# not settled
+
+
+def test_too_few_iterations_are_not_settled(working):
+    with pytest.raises(NotSettledError, match=r"max_iter=2 Newton"):
+        TrunkPlant(max_iter=2).settle(working[0])
+
+
+def test_a_trunk_too_soft_for_its_weight_is_not_settled():
+    upright = TrunkPlant(tilt=np.pi, bending_stiffness=0.05, torsional_stiffness=0.05)
+    with pytest.raises(NotSettledError, match="Not settled"):
+        upright.settle(np.full(9, 0.31))
+
+
+def test_an_unstable_equilibrium_is_not_settled():
+    # Straight up is an equilibrium by symmetry, but this trunk would fall over.
+    upright = TrunkPlant(tilt=np.pi, torsional_stiffness=50.0, bending_stiffness=0.02)
+    with pytest.raises(NotSettledError, match=r"lowest stiffness is -\d"):
+        upright.settle(np.full(9, 0.25))
+
+
+@pytest.mark.parametrize(
+    ("limit", "message"),
+    [("MAX_SPEED", "tip speed"), ("MAX_DRIFT", "tip drift"), ("MAX_LENGTH_ERROR", "length error")],
+)
+def test_a_trunk_that_moves_is_not_settled(plant, working, monkeypatch, limit, message):
+    module = importlib.import_module("hybridkin.simulation.trunk")
+    for name in ("MAX_SPEED", "MAX_DRIFT", "MAX_LENGTH_ERROR"):
+        monkeypatch.setattr(module, name, np.inf if name != limit else getattr(module, name))
+    state, held = plant._equilibrium(plant._rest, working[0], _Budget(200))
+    plant._hold(state, working[0], held)  # at rest all is well
+    state = state.copy()
+    state[0] += 1e-2
+    with pytest.raises(NotSettledError, match=message):
+        plant._hold(state, working[0], held)
+
+
+def test_a_failure_leaves_the_plant_usable(working):
+    warm = TrunkPlant(warm_start=True)
+    expected = warm(working[0])
+    warm._max_iter = 1
+    with pytest.raises(NotSettledError):
+        warm(working[5])
+    warm._max_iter = 200
+    assert_allclose(warm(working[0]), expected, atol=1e-7)
+
+
+# bad input
+
+
+@pytest.mark.parametrize(
+    ("q_target", "message"),
+    [
+        (np.full(8, 0.25), r"`q_target` must have shape \(9,\), got \(8,\)"),
+        (np.full((2, 9), 0.25), r"got \(2, 9\)"),
+        (np.full(9, np.nan), r"0.1 to 0.4 m, got \[nan"),
+        (np.full(9, 250.0), "convert it to metres"),
+        (segment_lengths([0.25, 0.25, 0.05], 1), r"got \[0.05\] for chambers \[5\]"),
+    ],
+)
+def test_bad_commands_raise(plant, q_target, message):
+    with pytest.raises(ValueError, match=message):
+        plant.settle(q_target)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mass", 0.0),
+        ("bending_stiffness", -1.0),
+        ("max_force", np.nan),
+        ("cable_noise", -1e-3),
+        ("tilt", np.inf),
+        ("gravity", "9.81"),
+        ("base_error", [0.0, 0.0, 0.0]),
+    ],
+)
+def test_bad_parameters_raise(name, value):
+    with pytest.raises(ValueError, match=f"`{name}` must be"):
+        TrunkPlant(**{name: value})
+
+
+def test_missing_mujoco_names_the_extra(monkeypatch):
+    def refuse(name, *args):
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr("hybridkin.simulation.trunk.import_module", refuse)
+    with pytest.raises(ImportError, match=r"pip install hybridkin\[sim\]"):
+        TrunkPlant()
+
+
+def test_importing_the_room_does_not_import_mujoco():
+    code = "import sys, hybridkin.simulation, hybridkin.datasets; sys.exit('mujoco' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
