@@ -400,24 +400,44 @@ def strict_box_step(
     sigma_sq = row_gram(J).sigma_max.square()
     # Without any Jacobian the floor only has to be positive.
     floor = torch.where(sigma_sq > 0.0, _box_floor(J.dtype) * sigma_sq, torch.ones_like(sigma_sq))
-    damped = (damping_sq > 0.0) & (z != 0.0).any(-1)
-    if damped.any():
-        rows = damped.nonzero()[:, 0]
+    centre = torch.zeros_like(v)
+    rows = ((damping_sq > 0.0) & (z != 0.0).any(-1)).nonzero()[:, 0]
+    if rows.numel() > 0:
         task = (J[rows], v[rows], torch.zeros_like(z[rows]), lower[rows], upper[rows])
-        dq = strict_box_step(*task, damping_sq[rows])
+        dq, mu = _proximal_box_step(*task, damping_sq[rows], floor[rows], centre[rows])
         v = v.index_put((rows,), apply_rows(task[0], dq))
-        damping_sq = torch.where(damped, torch.zeros_like(damping_sq), damping_sq)
+        # These multipliers hold what the limits hold already, also where v is out of reach.
+        centre = centre.index_put((rows,), mu)
+        damping_sq = damping_sq.index_put((rows,), torch.zeros_like(damping_sq[rows]))
+    return _proximal_box_step(J, v, z, lower, upper, damping_sq, floor, centre)[0]
+
+
+def _proximal_box_step(
+    J: Tensor,
+    v: Tensor,
+    z: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    damping_sq: Tensor,
+    floor: Tensor,
+    centre: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return `box_limited_step` for any lambda^2 >= 0, what it lacks to the floor made up for.
+
+    Every round solves J dq + used mu = v + (used - lambda^2) mu_last, whose fixed point has
+    J dq + lambda^2 mu = v.
+    """
     used = torch.maximum(damping_sq, floor)
-    dq, mu = box_limited_step(J, v, z, lower, upper, used)
-    weak = (damping_sq < floor).nonzero()[:, 0]
+    excess = (used - damping_sq)[:, None]
+    dq, mu = box_limited_step(J, v + excess * centre, z, lower, upper, used, centre)
+    weak = (excess[:, 0] > 0.0).nonzero()[:, 0]
     if weak.numel() > 0:
-        used, mu, excess = used[weak], mu[weak], (used - damping_sq)[weak]
-        task = (J[weak], v[weak], z[weak], lower[weak], upper[weak])
+        J, v, z, lower, upper = (a[weak] for a in (J, v, z, lower, upper))
+        last, excess, used = mu[weak], excess[weak], used[weak]
         for _ in range(_PROXIMAL_ROUNDS):
-            centred = task[1] + excess[:, None] * mu
-            dq_weak, mu = box_limited_step(task[0], centred, *task[2:], used, mu)
-        dq = dq.index_put((weak,), dq_weak)
-    return dq
+            again, last = box_limited_step(J, v + excess * last, z, lower, upper, used, last)
+        dq, mu = dq.index_put((weak,), again), mu.index_put((weak,), last)
+    return dq, mu
 
 
 def _box_floor(dtype: torch.dtype) -> float:

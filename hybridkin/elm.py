@@ -15,6 +15,8 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import nn
 
+from hybridkin._numerics import PortableModule
+
 __all__ = ["ELM", "ELMRegressor"]
 
 _DTYPES = (np.float64, np.float32)
@@ -32,7 +34,7 @@ _READOUT = ("output_weights", "intercept")
 _READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
 
 
-class ELM(nn.Module):
+class ELM(PortableModule):
     """A fitted network ``eps = phi(q) @ output_weights + intercept`` as a torch module.
 
     ``phi(q) = sigma(W u + b)`` with the scaled input ``u = (q - input_center) / input_scale``,

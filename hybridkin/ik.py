@@ -452,7 +452,8 @@ class InverseKinematics:
         error, gram = (target - x).norm(dim=-1), row_gram(J)
         singular = gram.sigma_min < _HEALTHY * gram.sigma_max
         status = self._statuses(found.q, error, tol, found.held, singular)
-        status[found.stationary & (error > tol)] = IKStatus.UNREACHABLE
+        nearest = found.stationary & (error > tol) & torch.isfinite(error)
+        status[nearest] = IKStatus.UNREACHABLE
         results = (found.q, x, error, status, found.n_iter, gram.sigma_min)
         return IKSolution(*_give_back((*results, self._margin(found.q)), lead, as_numpy))
 

@@ -271,13 +271,13 @@ class TrackingDisplay:
         scale = _UNITS[unit]
         for (name, x), color, style in self._styled():
             mean = scale * np.nanmean(_distance(x, self.target))
-            label = f"{name}: {mean:.2f} {unit}"
+            label = f"{name}: mean error {mean:.2f} {unit}"
             ax.plot(scale * x[:, i], scale * x[:, j], style, color=color, label=label)
         target = scale * self.target
         ax.plot(target[:, i], target[:, j], color="black", linewidth=1.0, label="target")
         ax.set(xlabel=f"{plane[0]} [{unit}]", ylabel=f"{plane[1]} [{unit}]")
         ax.set_aspect("equal", adjustable="datalim")
-        ax.legend(frameon=False, fontsize="small", title="mean error")
+        ax.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16))
         self.ax_ = ax
         return self
 
@@ -289,8 +289,9 @@ class TrackingDisplay:
         for (_, x), color, style in self._styled():
             ax.plot(steps, scale * x, style, color=color, linewidth=1.2)
         ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
-        for letter, value in zip("xyz", scale * self.target[-1], strict=True):
-            ax.annotate(f" {letter}", (steps[-1], value), va="center")
+        for letter, values in zip("xyz", scale * self.target.T, strict=True):
+            top = int(values.argmax())
+            ax.annotate(letter, (steps[top], values[top]), (0, 3), textcoords="offset points")
         ax.set(xlabel="time step" if self.t is None else "time [s]", ylabel=f"tip [{unit}]")
         self.ax_ = ax
         return self

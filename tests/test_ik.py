@@ -268,7 +268,7 @@ def test_start_outside_the_limits_walks_back_at_full_speed():
     path = torch.stack(path)
     back = torch.tensor([0.4075, 0.4025], dtype=torch.float64)
     assert_close(path[:2, 0], back, rtol=0.0, atol=1e-15)
-    assert_close(path[0, 4], torch.tensor(0.099).double(), rtol=0.0, atol=1e-15)
+    assert_close(path[0, 4], torch.tensor(0.099, dtype=torch.float64), rtol=0.0, atol=1e-15)
     assert (path[2:, 0] <= 0.4).all()
     assert (path[1:, 4] >= 0.1).all()
 
@@ -390,8 +390,10 @@ def test_batch_equals_loop_and_any_split(rng):
     whole = ik.solve(target, restarts=2, random_state=0)
     single = [ik.solve(row, restarts=2, random_state=0) for row in target]
     halves = [ik.solve(part, restarts=2, random_state=0) for part in (target[:33], target[33:])]
-    assert_close(whole.q, torch.stack([s.q for s in single]), rtol=0.0, atol=1e-12)
-    assert_close(whole.q, torch.cat([s.q for s in halves]), rtol=0.0, atol=1e-12)
+    for other in (torch.stack([s.q for s in single]), torch.cat([s.q for s in halves])):
+        assert_close(whole.q[:60], other[:60], rtol=0.0, atol=1e-12)
+        # On the way to a nearest point rounding is not contracted as it is by Gauss-Newton.
+        assert_close(whole.q[60:], other[60:], rtol=0.0, atol=1e-8)
     assert whole.status.tolist() == [int(s.status) for s in single]
     q = uniform(rng, 0.1, 0.4, 4, 20, 9)
     steps = ik.step(q, target.reshape(4, 20, 3))
@@ -420,7 +422,7 @@ def test_a_nan_target_marks_only_its_row(rng):
     q = uniform(rng, 0.2, 0.3, 4, 9)
     q[3, 3] = torch.nan
     step = bha().step(q, spoilt)
-    assert (step.dq[1:] == 0.0).all()
+    assert (step.dq[1:] == 0.0).all()  # hold still
     assert step.dq[0].norm() > 0.0
     assert torch.isnan(step.error[[1, 3]]).all()
 
@@ -494,8 +496,8 @@ def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
     assert_close(torch.from_numpy(blind.x), CHAIN(torch.from_numpy(blind.q)))
     np.testing.assert_allclose(blind.error, np.linalg.norm(blind.x_measured - path, axis=1))
     np.testing.assert_allclose(blind.q, ik.track(path).q, atol=1e-14)
-    assert seeing.mean_error <= seeing.p95_error <= seeing.max_error
-    assert seeing.max_error == seeing.error.max()
+    assert (seeing.mean_error, seeing.max_error) == (seeing.error.mean(), seeing.error.max())
+    assert 0.94 < (seeing.error <= seeing.p95_error).mean() < 0.96
     assert seeing.largest_step == np.abs(np.diff(seeing.q, axis=0)).max()
 
 
@@ -509,11 +511,12 @@ def test_a_failing_plant_loses_only_its_own_point():
         return CHAIN(torch.from_numpy(q)).numpy()
 
     seen = []
-    with pytest.warns(UserWarning, match="point 3.*no reading"):
+    with pytest.warns(UserWarning, match=r"point 3.*no reading"):
         track = bha(dt=0.02).track(
             closed_path(50)[:10],
             plant=plant,
             feedback="measured",
+            tol=0.01,
             progress=lambda i, n: seen.append((i, n)),
         )
     assert np.isnan(track.x_measured).any(axis=1).tolist() == [i == 3 for i in range(10)]
@@ -528,7 +531,7 @@ def test_a_failing_plant_loses_only_its_own_point():
 def test_track_takes_a_trajectory_uneven_times_and_gaps_in_the_path():
     ik = bha()
     path = figure_eight([0.0, 0.0, 0.75], (0.3, 0.15), duration=2.0, dt=0.02)
-    track = ik.track(path)
+    track = ik.track(path, tol=1e-3)
     np.testing.assert_array_equal(track.t, path.t)
     assert (track.status == IKStatus.CONVERGED).all()
     assert track.x_measured is None

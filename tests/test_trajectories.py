@@ -99,7 +99,7 @@ def test_trajectory_is_checked_frozen_and_its_own():
         Trajectory(t[:2], np.zeros((3, 3)))
     with pytest.raises(ValueError, match="first: row 1"):
         Trajectory(t, [[0, 0, 0], [0, np.nan, 0], [0, 0, 0]])
-    with pytest.raises(ValueError, match="must increase.*row 2"):
+    with pytest.raises(ValueError, match=r"must increase.*row 2"):
         Trajectory([0.0, 1.0, 1.0], np.zeros((3, 3)))
 
 

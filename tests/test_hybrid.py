@@ -1,0 +1,250 @@
+import copy
+import pickle
+import warnings
+
+import joblib
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
+from sklearn.ensemble import RandomForestRegressor
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import LinearRegression
+from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, PolynomialFeatures
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    ELMRegressor,
+    HybridForwardModel,
+    jacobian,
+    robots,
+)
+
+
+class SmallSum(torch.nn.Module):
+    """A mechanical model of any number of actuators and one output."""
+
+    def forward(self, q):
+        return 0.01 * q.sum(-1, keepdim=True)
+
+
+def expected_failures(estimator):
+    if estimator.mechanical_model is None:
+        return {}
+    failures = {"check_regressor_multioutput": "this mechanical model has one output"}
+    if isinstance(estimator.error_model, str):
+        failures["check_regressors_train"] = "a mechanical model alone learns nothing"
+    return failures
+
+
+@parametrize_with_checks(
+    [
+        HybridForwardModel(),
+        HybridForwardModel(error_model=LinearRegression()),
+        HybridForwardModel(SmallSum()),
+        HybridForwardModel(SmallSum(), KernelRidge(), guard="box"),
+        HybridForwardModel(SmallSum(), "drop"),
+    ],
+    expected_failed_checks=expected_failures,
+)
+def test_scikit_learn_contract(estimator, check):
+    check(estimator)
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Tips of a chain plus a smooth error, in 12 motions."""
+    rng = np.random.default_rng(0)
+    q = 0.25 + 0.06 * rng.uniform(-1, 1, (360, 9))
+    x = robots.bionic_handling_assistant()(torch.from_numpy(q)).numpy()
+    x += 0.02 * np.sin(20 * q[:, :3]) + 0.05 * (q[:, 3:6] - 0.25) + [0.01, 0.0, -0.02]
+    x += 0.0005 * rng.standard_normal(x.shape)
+    return q, x, np.repeat(np.arange(12), 30)
+
+
+def bha():
+    return robots.bionic_handling_assistant()
+
+
+def error_of(model, q, x):
+    return np.linalg.norm(model.predict(q) - x, axis=1).mean()
+
+
+def quadratic():
+    return make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression())
+
+
+def test_the_sum_of_the_paper(log):
+    q, x, _ = log
+    elm = ELMRegressor(random_state=0)
+    model = HybridForwardModel(bha(), elm, guard=None).fit(q, x)
+    tips = bha()(torch.from_numpy(q)).numpy()
+    expected = tips + elm.fit(q, x - tips).predict(q)
+    assert_allclose(model.predict(q), expected, rtol=0, atol=1e-12)
+    assert_allclose(model.predict_mechanical(q), tips, rtol=0, atol=1e-15)
+    assert_allclose(
+        model.predict_mechanical(q) + model.predict_error(q), model.predict(q), atol=1e-14
+    )
+
+
+def test_learning_the_error_helps_on_other_motions(log):
+    q, x, groups = log
+    train = groups < 9
+    mechanical = HybridForwardModel(bha(), "drop").fit(q[train], x[train])
+    hybrid = HybridForwardModel(bha(), random_state=0).fit(q[train], x[train])
+    data_driven = HybridForwardModel(random_state=0).fit(q[train], x[train])
+    errors = [error_of(m, q[~train], x[~train]) for m in (hybrid, mechanical, data_driven)]
+    assert errors[0] < 0.5 * min(errors[1:])
+
+
+@pytest.mark.parametrize("guard", ["leverage", "box", None])
+@pytest.mark.parametrize(
+    "error_model",
+    [
+        None,
+        "drop",
+        LinearRegression(),
+        quadratic(),
+        KernelRidge(kernel="rbf", gamma=10.0, alpha=1e-3),
+        GaussianProcessRegressor(alpha=1e-4),
+    ],
+    ids=["elm", "drop", "linear", "quadratic", "kernel ridge", "gaussian process"],
+)
+def test_jacobian_is_that_of_the_whole_sum(log, error_model, guard):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), error_model, guard=guard, random_state=0).fit(q, x)
+    # inside the domain, at its edge, and far outside, where the guard is at work
+    points = 0.25 + np.outer([0.5, 1.05, 1.6, 3.0], q[0] - 0.25)
+    prediction, J = model.predict_and_jacobian(points)
+    assert_array_equal(prediction, model.predict(points))
+    assert_array_equal(J, model.jacobian(points))
+    step = 1e-5
+    moves = step * np.eye(9)
+    columns = [(model.predict(points + m) - model.predict(points - m)) / (2 * step) for m in moves]
+    assert_allclose(np.stack(columns, -1), J, rtol=0, atol=1e-6 * np.abs(J).max())
+    reverse = jacobian(lambda q: model.module_(q), torch.from_numpy(points)).numpy()
+    assert_allclose(reverse, J, rtol=0, atol=1e-7 * np.abs(J).max())
+
+
+def test_guard_leaves_the_training_rows_and_falls_back_to_mechanics(log):
+    q, x, _ = log
+    far = 0.25 + 40.0 * (q - 0.25)
+    for guard in ("leverage", "box"):
+        model = HybridForwardModel(bha(), LinearRegression(), guard=guard).fit(q, x)
+        free = HybridForwardModel(bha(), LinearRegression(), guard=None).fit(q, x)
+        assert model.in_domain(q).all()
+        assert_allclose(model.predict(q), free.predict(q), rtol=0, atol=1e-15)
+        assert not model.in_domain(far).any()
+        assert np.abs(model.predict_error(far)).max() < 0.01 * np.abs(free.predict_error(far)).max()
+        assert free.in_domain(far).all()
+
+
+def test_guard_is_smooth(log):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), random_state=0).fit(q, x)
+    line = 0.25 + torch.linspace(0.9, 3.0, 9, dtype=torch.float64)[:, None] * (
+        torch.from_numpy(q[:1]) - 0.25
+    )
+    assert torch.autograd.gradcheck(model.module_, line.requires_grad_())
+    assert torch.autograd.gradgradcheck(model.module_, line[::4].detach().requires_grad_())
+
+
+def test_calibration_happens_inside_fit(log):
+    q, x, groups = log
+    nominal = ConstantCurvatureChain([0.12, 0.12, 0.12])
+    truth = bha()(torch.from_numpy(q)).numpy()
+    model = HybridForwardModel(nominal, "drop", calibrate="default").fit(q, truth)
+    assert_allclose(model.mechanical_model_.radii, bha().radii, rtol=0, atol=1e-9)
+    assert_allclose(nominal.radii, [0.12] * 3)
+    assert model.calibration_.cv_rmse is None
+    model = HybridForwardModel(nominal, "drop", calibrate=("radii",)).fit(q, x, groups=groups)
+    assert model.calibration_.cv_rmse > model.calibration_.rmse
+
+
+def test_cross_validation_and_search_by_groups(log):
+    q, x, groups = log
+    model = HybridForwardModel(bha(), ELMRegressor(random_state=0))
+    scores = cross_val_score(model, q, x, cv=GroupKFold(5), groups=groups)
+    assert scores.shape == (5,)
+    assert scores.min() > 0.99
+    search = GridSearchCV(
+        model,
+        {"error_model__alpha": [1e-4, 1e-1, 1e3], "guard": ["leverage", None]},
+        cv=GroupKFold(3),
+        n_jobs=2,
+    ).fit(q, x, groups=groups)
+    assert search.best_params_["error_model__alpha"] < 1e3
+    default = GridSearchCV(HybridForwardModel(bha()), {"error_model__alpha": [1e-2, 1e3]})
+    assert default.fit(q, x).best_params_ == {"error_model__alpha": 1e-2}
+
+
+def test_pipeline_in_other_units(log):
+    q, x, _ = log
+    metres = FunctionTransformer(lambda q: q / 1000.0)
+    pipeline = Pipeline([("metres", metres), ("model", HybridForwardModel(bha(), random_state=0))])
+    expected = HybridForwardModel(bha(), random_state=0).fit(q, x).predict(q)
+    assert_allclose(pipeline.fit(1000 * q, x).predict(1000 * q), expected, rtol=0, atol=1e-9)
+
+
+def test_clone_pickle_and_hash(log):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), ELMRegressor(random_state=0)).fit(q, x)
+    fresh = clone(model)
+    assert not hasattr(fresh, "module_")
+    assert joblib.hash(fresh) == joblib.hash(clone(model))
+    for twin in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        assert_array_equal(twin.predict(q), model.predict(q))
+        assert joblib.hash(twin) == joblib.hash(model)
+
+
+def test_float32_in_float32_out(log):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), random_state=0).fit(q.astype(np.float32), x)
+    prediction, J = model.predict_and_jacobian(q.astype(np.float32))
+    assert prediction.dtype == J.dtype == np.float32
+    reference = HybridForwardModel(bha(), random_state=0).fit(q, x).predict(q)
+    assert_allclose(prediction, reference, rtol=0, atol=1e-5)
+
+
+def test_a_tree_has_no_slope_but_predicts(log):
+    q, x, _ = log
+    forest = RandomForestRegressor(10, random_state=0)
+    model = HybridForwardModel(bha(), forest, guard=None).fit(q, x)
+    assert_allclose(model.jacobian(q[:5]), bha().jacobian(torch.from_numpy(q[:5])), atol=1e-12)
+    assert error_of(model, q, x) < error_of(HybridForwardModel(bha(), "drop").fit(q, x), q, x)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: HybridForwardModel(bha(), coupling="serial"), "`coupling` must be 'parallel'"),
+        (lambda: HybridForwardModel(bha(), guard="ball"), "`guard` must be one of"),
+        (lambda: HybridForwardModel(bha(), "auto"), "`error_model` must be an estimator"),
+        (lambda: HybridForwardModel(None, "drop"), "nothing would be left"),
+        (lambda: HybridForwardModel(bha(), calibrate=("radius",)), "`parameters` must name"),
+    ],
+)
+def test_bad_settings(log, make, message):
+    with pytest.raises(ValueError, match=message):
+        make().fit(*log[:2])
+
+
+def test_bad_data(log):
+    q, x, _ = log
+    with pytest.raises(TypeError, match="must be a torch module"):
+        HybridForwardModel(lambda q: q).fit(q, x)
+    with pytest.raises(ValueError, match=r"`X` must have shape \(..., 9\)"):
+        HybridForwardModel(bha()).fit(q[:, :6], x)
+    with pytest.raises(ValueError, match="`y` must have 3 columns"):
+        HybridForwardModel(bha()).fit(q, x[:, :2])
+    with pytest.raises(ValueError, match="positive actuator lengths"):
+        HybridForwardModel(bha()).fit(q - 0.25, x)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        HybridForwardModel(bha()).fit(1000 * q, x)
+    assert any("millimetres" in str(w.message) for w in caught)
