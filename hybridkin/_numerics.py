@@ -433,7 +433,7 @@ def _proximal_box_step(
     weak = (excess[:, 0] > 0.0).nonzero()[:, 0]
     if weak.numel() > 0:
         J, v, z, lower, upper = (a[weak] for a in (J, v, z, lower, upper))
-        last, excess, used = mu[weak], excess[weak], used[weak]
+        again, last, excess, used = dq[weak], mu[weak], excess[weak], used[weak]
         for _ in range(_PROXIMAL_ROUNDS):
             again, last = box_limited_step(J, v + excess * last, z, lower, upper, used, last)
         dq, mu = dq.index_put((weak,), again), mu.index_put((weak,), last)

@@ -20,6 +20,9 @@ _RELATIVE = ("radii", "lengths")
 _PARAMETERS = ("radii", "angles", "lengths", "offsets", "tool", "base")
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 _MAX_ROUNDS = 12
+_KNOWN = (
+    0.1  # k parameters that share one unknown direction narrow to 1 / sqrt(k) by the prior alone
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,7 +45,7 @@ class CalibrationResult:
     names : tuple of P str
         Free parameters, as "radii[0]" or "base[rot x]".
     identifiable : dict of str to bool array
-        False where the data narrow the prior by less than half: that value is an assumption.
+        False where the data narrow the prior less than tenfold: that value is an assumption.
     rmse : float
         Root mean square tip distance on the given data [m].
     cv_rmse : float or None
@@ -180,6 +183,16 @@ class _Rows(NamedTuple):
     def rmse(self, residual: np.ndarray) -> float:
         return float(np.sqrt((residual**2).sum() / float(self.weight.sum())))
 
+    def noise(self, residual: np.ndarray, robust: bool) -> float:
+        """Return the standard deviation of one coordinate, from the median where robust."""
+        weight = np.repeat(self.weight.numpy(), 3)
+        if not robust:
+            return float(np.sqrt((residual**2).sum() / weight.sum()))
+        size = np.abs(residual) / np.sqrt(weight)
+        order = np.argsort(size)
+        middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+        return 1.4826 * float(size[order][middle])
+
 
 @dataclass(frozen=True)
 class _Problem:
@@ -257,9 +270,9 @@ def _solve(problem: _Problem, rows: _Rows, theta: np.ndarray, loss: str) -> _Fit
     def jacobian(theta: np.ndarray) -> np.ndarray:
         return derivative(torch.as_tensor(theta).to(rows.q)).detach().numpy()
 
-    floor = 1e-14 * float(_reach(problem.chain))
+    floor = 1e-12 * float(_reach(problem.chain))
     robust = loss != "linear"
-    sigma = _noise(residual(theta), robust, floor)
+    sigma = max(rows.noise(residual(theta), robust), floor)
     converged = False
     for _ in range(_MAX_ROUNDS):
 
@@ -281,15 +294,21 @@ def _solve(problem: _Problem, rows: _Rows, theta: np.ndarray, loss: str) -> _Fit
             max_nfev=100,
         )
         theta, converged = solution.x, solution.status > 0
-        previous, sigma = sigma, _noise(residual(theta), robust, floor)
+        previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:
             break
     J = jacobian(theta)
     errors = residual(theta)
     freedom = max(3.0 * float(rows.weight.sum()) - theta.size, 1.0)
     variance = max(sigma**2 if robust else errors @ errors / freedom, floor**2)
-    information = J.T @ J / variance + np.diag(problem.prior_std**-2.0)
-    covariance = np.linalg.pinv(information, hermitian=True)
+    scale = np.minimum(problem.prior_std, 1e6)  # a prior of infinite width is none
+    # By singular values in units of the prior: squares would lose what the data leave open.
+    _, told, directions = np.linalg.svd(
+        J * (scale / np.sqrt(variance)), full_matrices=len(J) < theta.size
+    )
+    told = np.pad(told, (0, theta.size - told.size))
+    factor = scale[:, None] * directions.T / np.sqrt(told**2 + 1.0)
+    covariance = factor @ factor.T
     return _Fit(problem, theta, covariance, rows.rmse(errors), bool(converged))
 
 
@@ -299,7 +318,7 @@ def _result(fit: _Fit, cv_rmse: float | None, torch_given: bool) -> CalibrationR
         chain = problem.moved(torch.as_tensor(fit.theta).to(problem.chain.geometry()["base"]))
     std = np.sqrt(np.diag(fit.covariance))
     safe = np.where(std > 0, std, 1.0)
-    known = std < 0.5 * problem.prior_std
+    known = std < _KNOWN * problem.prior_std
     geometry = {name: value.detach() for name, value in chain.geometry().items()}
     geometry["tool"] = geometry["offsets"][-1]
     reach = float(_reach(problem.chain))
@@ -389,12 +408,6 @@ def _size(chain: Any, name: str) -> int:
     if name == "base":
         return 6
     return 1 if name == "tool" else len(chain.actuators_per_segment)
-
-
-def _noise(residual: np.ndarray, robust: bool, floor: float) -> float:
-    if robust:
-        return max(1.4826 * float(np.median(np.abs(residual))), floor)
-    return max(float(np.sqrt(np.mean(residual**2))), floor)
 
 
 def _theta_bounds(

@@ -244,7 +244,8 @@ class InverseKinematics:
     and two proximal rounds take the remaining task error (a relative 1e-6, squared and cubed)
     out again where v can be reached; (b) near a singularity, where lambda is larger, the
     damped task is solved in the box without posture first, and the posture then only chooses
-    among the steps that move the tip the same way. A start outside the limits walks back at
+    among the steps that move the tip the same way (to 1e-8 of the step; where v is also out of
+    reach, up to 1e-3 was seen). A start outside the limits walks back at
     `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q.
 
     References
@@ -299,8 +300,9 @@ class InverseKinematics:
             )
             if value is not None and value.ndim == 1
         }
-        if hasattr(self._module, "n_actuators"):
-            sizes["model"] = int(self._module.n_actuators)
+        n_actuators: Any = getattr(self._module, "n_actuators", None)
+        if n_actuators is not None:
+            sizes["model"] = int(n_actuators)
         if len(set(sizes.values())) > 1:
             raise ValueError(
                 f"limits and posture must agree in the number of actuators, got {sizes}; give "
@@ -556,7 +558,10 @@ class InverseKinematics:
         bounds = self._step_bounds(q, self.dq_max.to(q) * period)
         J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
         move = self._resolve(J, v, posture, *bounds)
-        return move._replace(sigma_min=torch.where(fine[:, 0], move.sigma_min, math.nan))
+        return move._replace(
+            dq=torch.where(torch.isnan(q), 0.0, move.dq),
+            sigma_min=torch.where(fine[:, 0], move.sigma_min, math.nan),
+        )
 
     def _resolve(
         self,
@@ -712,8 +717,8 @@ class InverseKinematics:
             rows, live = rows[going], [a[going] for a in (new, x_new, J_new, aim, gap_new)]
             if rows.numel() == 0:
                 break
-        start = (a[all_rows] for a in (found.q, found.x, found.J, target))
-        _, *ended, error_new = self._try_step(*start, None)
+        q, x, J, aim = (a[all_rows] for a in (found.q, found.x, found.J, target))
+        _, *ended, error_new = self._try_step(q, x, J, aim, None)
         better = error_new < found.error[all_rows]
         found.put(all_rows[better], *(a[better] for a in (*ended, error_new)))
 
