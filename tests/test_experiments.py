@@ -108,17 +108,17 @@ def test_without_a_column_of_motions_the_log_is_cut_into_stretches(log, tmp_path
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"log": "none.csv"}, "no such file"),
+        ({"log": "none.csv"}, "there is none at"),
         ({"robot": "none.toml"}, "no such file"),
         ({"groups": "motions"}, "motion"),
         ({"exclude": "*"}, "at least 2 motions"),
         ({"text": "l1,l2\n1,2\n"}, "l3"),
-        ({"text": "l1,l2,l3,l4,l5,l6,x,y,z,motion\n"}, "no data"),
+        ({"text": "l1,l2,l3,l4,l5,l6,x,y,z,motion\n"}, "a header but no rows"),
         ({"text": "l1,l2,l3,l4,l5,l6,x,y,z,motion\n1,2,3,4,5,6,7,8,nan,1\n"}, "NaN"),
         ({"text": "l1,l2,l3,l4,l5,l6,x,y,z,motion\n1,2,3,4,5,6,7,8,a,1\n"}, "'a'"),
         (
             {
-                "text": "l1,l2,l3,l4,l5,l6,x,y,z,motion\n-1,2,3,4,5,6,7,8,9,1\n" * 1
+                "text": "l1,l2,l3,l4,l5,l6,x,y,z,motion\n-1,2,3,4,5,6,7,8,9,1\n"
                 + "1,2,3,4,5,6,7,8,9,2\n"
             },
             "positive actuator lengths",

@@ -386,25 +386,33 @@ def test_max_iter_is_honest(rng):
     assert (solution.error <= start).all()
 
 
-def test_batch_equals_loop_and_any_split(rng):
-    spread = [(0.2, 0.3), (0.1, 0.4)]
-    target = torch.cat([CHAIN(uniform(rng, *ends, 30, 9)) for ends in spread] + [randn(rng, 20, 3)])
-    ik = bha()
+def solve_whole_and_in_parts(ik, target):
     whole = ik.solve(target, restarts=2, random_state=0)
     single = [ik.solve(row, restarts=2, random_state=0) for row in target]
-    halves = [ik.solve(part, restarts=2, random_state=0) for part in (target[:33], target[33:])]
-    for other in (torch.stack([s.q for s in single]), torch.cat([s.q for s in halves])):
-        assert_close(whole.q[:30], other[:30], rtol=0.0, atol=1e-12)
-        # At limits, rounding grows by the 1e6 of the box-limited step's smallest damping.
-        assert_close(whole.q[30:60], other[30:60], rtol=0.0, atol=1e-9)
-        # On the way to a nearest point it is not contracted as it is by Gauss-Newton.
-        assert_close(whole.q[60:], other[60:], rtol=0.0, atol=1e-8)
+    cut = len(target) // 3
+    parts = [ik.solve(part, restarts=2, random_state=0) for part in target.split([cut, 2 * cut])]
+    return whole, single, [torch.stack([s.q for s in single]), torch.cat([s.q for s in parts])]
+
+
+def test_batch_equals_loop_and_any_split(rng):
+    target = CHAIN(uniform(rng, 0.2, 0.3, 30, 9))
+    whole, _, others = solve_whole_and_in_parts(bha(q_min=-0.5, q_max=1.0), target)
+    for other in others:
+        assert_close(whole.q, other, rtol=0.0, atol=1e-12)
+    target = torch.cat([CHAIN(uniform(rng, 0.1, 0.4, 30, 9)), randn(rng, 30, 3)])
+    ik = bha()
+    whole, single, others = solve_whole_and_in_parts(ik, target)
+    for other in others:
+        # At limits, rounding grows by the 1e6 of the box-limited step's smallest damping, and
+        # on the way to a nearest point it is not contracted as it is by Gauss-Newton.
+        assert_close(whole.q, other, rtol=0.0, atol=1e-8)
     assert whole.status.tolist() == [int(s.status) for s in single]
-    q = uniform(rng, 0.1, 0.4, 4, 20, 9)
-    steps = ik.step(q, target.reshape(4, 20, 3))
-    rows = [ik.step(*row).dq for row in zip(q.reshape(80, 9), target, strict=True)]
-    assert steps.dq.shape == (4, 20, 9)
-    assert_close(steps.dq.reshape(80, 9), torch.stack(rows), rtol=0.0, atol=1e-12)
+    q = uniform(rng, 0.2, 0.3, 4, 15, 9)
+    target = CHAIN(q) + 0.01 * randn(rng, 4, 15, 3)
+    steps = ik.step(q, target)
+    rows = [ik.step(*row).dq for row in zip(q.reshape(60, 9), target.reshape(60, 3), strict=True)]
+    assert steps.dq.shape == (4, 15, 9)
+    assert_close(steps.dq.reshape(60, 9), torch.stack(rows), rtol=0.0, atol=1e-12)
 
 
 def test_empty_batches():
@@ -547,7 +555,7 @@ def test_track_takes_a_trajectory_uneven_times_and_gaps_in_the_path():
     spoilt[40:45] = np.nan
     track = ik.track(spoilt, path.t)
     assert (track.status == IKStatus.INVALID_INPUT).nonzero()[0].tolist() == [40, 41, 42, 43, 44]
-    assert track.error[46:].max() < 1e-3
+    assert track.error[47:].max() < 1e-3  # one jump to the path, one step to settle
 
 
 def test_a_path_out_of_reach_is_followed_at_the_limits():
