@@ -79,6 +79,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     (2, 3)
     """
 
+    n_features_in_: int
+    feature_names_in_: NDArray
+
     def __init__(
         self,
         mechanical_model: nn.Module | None = None,
@@ -105,8 +108,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def fit(
         self,
-        X: ArrayLike,
-        y: ArrayLike,
+        X: Any,
+        y: Any,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
     ) -> HybridForwardModel:
@@ -135,7 +138,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             data that are not finite.
         """
         self._check_settings()
-        X, y = validate_data(self, X, y, multi_output=True, dtype=[np.float64, np.float32])
+        X, y = validate_data(self, X, y=y, multi_output=True, dtype=[np.float64, np.float32])
         y = np.asarray(y, dtype=np.float64)
         weights = None
         if sample_weight is not None:
@@ -143,7 +146,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 sample_weight, X, dtype=np.float64, ensure_non_negative=True
             )
         q = torch.from_numpy(X.astype(np.float64))
-        mechanical = copy.deepcopy(self.mechanical_model)
+        mechanical: Any = copy.deepcopy(self.mechanical_model)
         if hasattr(mechanical, "check_actuators"):
             mechanical.check_actuators(q, "X")
         self.calibration_: CalibrationResult | None = None
@@ -160,6 +163,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.error_model_ = None
         error_module = guard = None
         if not (isinstance(self.error_model, str) and self.error_model == "drop"):
+            regressor: Any
             if self.error_model is None:
                 regressor = ELMRegressor(random_state=self.random_state)
             else:
@@ -175,33 +179,33 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._single_output = y.ndim == 1
         return self
 
-    def predict(self, X: ArrayLike) -> NDArray:
+    def predict(self, X: Any) -> NDArray:
         """Return tip positions f_mech(q) + w(q) eps(q), shape (N, m) or (N,) as in `fit` [m]."""
         return self._by_blocks(lambda module, q: (module(q),), X)[0]
 
-    def predict_mechanical(self, X: ArrayLike) -> NDArray:
+    def predict_mechanical(self, X: Any) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
         return self._by_blocks(lambda module, q: (module.mechanical_part(q),), X)[0]
 
-    def predict_error(self, X: ArrayLike) -> NDArray:
+    def predict_error(self, X: Any) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m]."""
         return self._by_blocks(lambda module, q: (module.error_part(q),), X)[0]
 
-    def jacobian(self, X: ArrayLike) -> NDArray:
+    def jacobian(self, X: Any) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n)."""
         return self._by_blocks(lambda module, q: (module.jacobian(q),), X)[0]
 
-    def predict_and_jacobian(self, X: ArrayLike) -> tuple[NDArray, NDArray]:
+    def predict_and_jacobian(self, X: Any) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
         x, J = self._by_blocks(lambda module, q: module.forward_and_jacobian(q), X)
         return x, J
 
-    def in_domain(self, X: ArrayLike) -> NDArray[np.bool_]:
+    def in_domain(self, X: Any) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
         return self._by_blocks(lambda module, q: (module.in_domain(q),), X)[0]
 
     def _by_blocks(
-        self, function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]], X: ArrayLike
+        self, function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]], X: Any
     ) -> list[NDArray]:
         check_is_fitted(self)
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
@@ -305,12 +309,15 @@ class HybridModule(nn.Module):
 class AffineModule(PortableModule):
     """A fitted linear regressor as a torch module."""
 
-    def __init__(self, coef: NDArray, intercept: NDArray) -> None:
+    coef: Tensor
+    bias: Tensor
+
+    def __init__(self, coef: ArrayLike, intercept: ArrayLike) -> None:
         super().__init__()
-        coef = torch.as_tensor(np.atleast_2d(coef), dtype=torch.float64)
-        bias = torch.as_tensor(intercept, dtype=torch.float64).expand(len(coef))
-        self.register_buffer("coef", coef.clone())
-        self.register_buffer("bias", bias.clone())
+        matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64)
+        bias = torch.tensor(np.asarray(intercept), dtype=torch.float64)
+        self.register_buffer("coef", matrix)
+        self.register_buffer("bias", bias.expand(len(matrix)).clone())
 
     def forward(self, q: Tensor) -> Tensor:
         """Return coef q + bias, shape (..., m)."""
@@ -370,7 +377,7 @@ class _Differenced(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore
         (q,) = ctx.saved_tensors
         return (grad[..., None, :] @ ctx.module.jacobian(q))[..., 0, :], None
 

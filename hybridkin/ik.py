@@ -419,7 +419,7 @@ class InverseKinematics:
             Iterations per start.
         restarts : int, default=0
             Further starts for rows that failed: `q_pref` first where `q0` was given, then drawn
-        in the limits, the same for every row.
+            in the limits, the same for every row.
         random_state : int, Generator or None, default=None
             Seed of the restarts.
 

@@ -231,7 +231,7 @@ def _store_error(regressor: Any, arrays: Arrays) -> dict[str, Any] | None:
     if isinstance(regressor, LinearRegression):
         arrays["error.coef"] = np.asarray(regressor.coef_)
         arrays["error.intercept"] = np.asarray(regressor.intercept_)
-        return {"kind": "linear", "n_features_in": regressor.n_features_in_}
+        return {"kind": "linear"}
     raise TypeError(
         "`model` must have an ELMRegressor, a LinearRegression or 'drop' as `error_model` to be "
         f"saved, got {type(regressor).__name__}, which could only be stored as code."
@@ -252,7 +252,7 @@ def _restored_error(header: Any, arrays: Arrays) -> tuple[Any, nn.Module | None]
     if header["kind"] == "linear":
         linear = LinearRegression()
         linear.coef_, linear.intercept_ = arrays["error.coef"], arrays["error.intercept"]
-        linear.n_features_in_ = int(header["n_features_in"])
+        linear.n_features_in_ = linear.coef_.shape[-1]  # pyright: ignore[reportAttributeAccessIssue]
         return linear, AffineModule(linear.coef_, linear.intercept_)
     raise ValueError(f"unknown error model {header['kind']!r}")
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
@@ -73,7 +72,7 @@ class ErrorHistogramDisplay:
         x = np.asarray(x)
         return cls({name: _distance(np.asarray(p), x) for name, p in predictions.items()})
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm", bins: int = 40) -> Any:
+    def plot(self, ax: Any = None, *, unit: str = "cm", bins: int = 40) -> Any:
         """Draw the histograms, the mean of each model marked, and return self."""
         ax = _axes(ax)
         scale = _UNITS[unit]
@@ -103,7 +102,7 @@ class ErrorBoxDisplay:
     def __init__(self, errors: Mapping[str, ArrayLike]) -> None:
         self.errors = {name: np.asarray(values, dtype=float) for name, values in errors.items()}
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Any:
+    def plot(self, ax: Any = None, *, unit: str = "cm") -> Any:
         """Draw horizontal boxes with the mean (dot) and the maximum (cross) and return self."""
         ax = _axes(ax)
         scale = _UNITS[unit]
@@ -147,7 +146,7 @@ class BarDisplay:
         self.values = np.asarray(values, dtype=float)
         self.spreads = np.asarray(spreads, dtype=float)
 
-    def plot(self, ax: Axes | None = None, *, label: str = "") -> Any:
+    def plot(self, ax: Any = None, *, label: str = "") -> Any:
         """Draw one row per name, the first on top, and return self."""
         ax = _axes(ax)
         places = np.arange(len(self.names))[::-1]
@@ -264,7 +263,7 @@ class TrackingDisplay:
         self.tracks = {name: np.asarray(x, dtype=float) for name, x in tracks.items()}
         self.t = None if t is None else np.asarray(t, dtype=float)
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm", plane: str = "xy") -> Any:
+    def plot(self, ax: Any = None, *, unit: str = "cm", plane: str = "xy") -> Any:
         """Draw the paths in one plane of the task space and return self."""
         ax = _axes(ax)
         i, j = ("xyz".index(letter) for letter in plane)
@@ -281,7 +280,7 @@ class TrackingDisplay:
         self.ax_ = ax
         return self
 
-    def plot_time(self, ax: Axes | None = None, *, unit: str = "cm") -> Any:
+    def plot_time(self, ax: Any = None, *, unit: str = "cm") -> Any:
         """Draw the three coordinates over time and return self."""
         ax = _axes(ax)
         scale = _UNITS[unit]
@@ -292,6 +291,7 @@ class TrackingDisplay:
         for letter, values in zip("xyz", scale * self.target.T, strict=True):
             top = int(values.argmax())
             ax.annotate(letter, (steps[top], values[top]), (0, 3), textcoords="offset points")
+        ax.margins(y=0.08)
         ax.set(xlabel="time step" if self.t is None else "time [s]", ylabel=f"tip [{unit}]")
         self.ax_ = ax
         return self
@@ -324,7 +324,7 @@ class ActuatorDisplay:
         self.actuators_per_segment = tuple(actuators_per_segment)
         self.t = None if t is None else np.asarray(t, dtype=float)
 
-    def plot(self, axes: Sequence[Axes] | None = None, *, unit: str = "cm") -> Any:
+    def plot(self, axes: Any = None, *, unit: str = "cm") -> Any:
         """Draw one axes per segment, sharing time, and return self."""
         n = len(self.actuators_per_segment)
         if axes is None:

@@ -396,9 +396,13 @@ def solve_whole_and_in_parts(ik, target):
 
 def test_batch_equals_loop_and_any_split(rng):
     target = CHAIN(uniform(rng, 0.2, 0.3, 30, 9))
-    whole, _, others = solve_whole_and_in_parts(bha(q_min=-0.5, q_max=1.0), target)
+    free = bha(q_min=-0.5, q_max=1.0)
+    whole, _, others = solve_whole_and_in_parts(free, target)
     for other in others:
-        assert_close(whole.q, other, rtol=0.0, atol=1e-12)
+        # The tip is pinned to rounding; the posture passes some ten curved steps, each of which
+        # multiplies what the model's own batches differ by.
+        assert_close(whole.x, CHAIN(other), rtol=0.0, atol=1e-12)
+        assert_close(whole.q, other, rtol=0.0, atol=1e-10)
     target = torch.cat([CHAIN(uniform(rng, 0.1, 0.4, 30, 9)), randn(rng, 30, 3)])
     ik = bha()
     whole, single, others = solve_whole_and_in_parts(ik, target)

@@ -110,7 +110,7 @@ def compare_by_group(
     errors: dict[str, NDArray] = {}
     fold_of_row = np.empty(len(q), dtype=int)
     choices = []
-    results = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
+    results: Any = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
     for i, ((_, test), (found, chosen)) in enumerate(zip(folds, results, strict=True)):
         for name, values in found.items():
             errors.setdefault(name, np.empty(len(q)))[test] = values
@@ -356,7 +356,11 @@ def _write_comparison(
     figure, ax = plots.new_figure(7.0, 3.6)
     plots.ErrorBoxDisplay(errors).plot(ax, unit="mm")
     ax.set_xlim(0.0, 1100 * float(np.percentile(errors["mechanical, nominal"], 99)))
-    report.figure("held_out", figure, "Tip error on motions held out; boxes: quartiles, 5, 95 %.")
+    report.figure(
+        "held_out",
+        figure,
+        "Tip error on motions held out: quartiles, 5 and 95 %; larger errors lie beyond the axis.",
+    )
     figure, ax = plots.new_figure(5.5, 3.4)
     shown = ("mechanical, calibrated", "hybrid, ELM")
     plots.ErrorHistogramDisplay({name: errors[name] for name in shown}).plot(ax, unit="mm")
