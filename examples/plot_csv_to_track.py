@@ -19,7 +19,7 @@ for name, predict in (("mechanical", model.predict_mechanical), ("hybrid", model
     print(f"{name:10s}: mean {100 * error.mean():.2f} cm, max {100 * error.max():.1f} cm")
 
 path = trajectories.figure_eight(center=(0.0, 0.0, 0.70), size=(0.50, 0.25), dt=0.05)
-ik = InverseKinematics(model, q_min=0.1, q_max=0.4, q_pref=np.full(9, 0.25), dt=0.05)
+ik = InverseKinematics(model, q_min=0.1, q_max=0.4, q_pref=0.25, dt=0.05)
 track = ik.track(path)  # track.q holds the chamber lengths to send to the robot
 print(track)
 

@@ -6,7 +6,7 @@ from hybridkin.calibration import CalibrationResult, calibrate
 from hybridkin.chain import ConstantCurvatureChain
 from hybridkin.elm import ELMRegressor
 from hybridkin.hybrid import HybridForwardModel
-from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Track
+from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Step, Track
 from hybridkin.persistence import load_model, save_model
 
 __version__ = "0.1.0"
@@ -19,6 +19,7 @@ __all__ = [
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
+    "Step",
     "Track",
     "__version__",
     "calibrate",

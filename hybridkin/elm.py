@@ -13,140 +13,13 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_c
 from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
-from torch import nn
 
-from hybridkin._numerics import PortableModule
+from hybridkin._network import ACTIVATIONS, ELM, LAYER, READOUT
 
 __all__ = ["ELM", "ELMRegressor"]
 
 _DTYPES = (np.float64, np.float32)
 _BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
-
-# name -> sigma(a), and sigma'(a) from a and s = sigma(a)
-_ACTIVATIONS = {
-    "logistic": (torch.sigmoid, lambda a, s: torch.addcmul(s, s, s, value=-1)),
-    "tanh": (torch.tanh, lambda a, s: 1 - s * s),
-    "sin": (torch.sin, lambda a, s: torch.cos(a)),
-}
-
-_LAYER = ("input_weights", "input_bias", "input_center", "input_scale")
-_READOUT = ("output_weights", "intercept")
-_READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
-
-
-class ELM(PortableModule):
-    """A fitted network ``eps = phi(q) @ output_weights + intercept`` as a torch module.
-
-    ``phi(q) = sigma(W u + b)`` with the scaled input ``u = (q - input_center) / input_scale``,
-    followed by `u` itself where there is a direct link. Buffers only; batch dimensions lead; twice
-    differentiable; it computes in the dtype and on the device of `q`.
-
-    Parameters
-    ----------
-    arrays : mapping of str to array
-        What the state dict holds, so ``ELM(elm.state_dict(), elm.activation)`` is a copy:
-
-        - input_weights (n_hidden, n_inputs), input_bias (n_hidden,): the hidden layer W, b;
-        - input_center, input_scale (n_inputs,): affine map of the inputs [unit of q];
-        - output_weights (n_features, n_outputs), intercept (n_outputs,): the readout [unit of
-          eps], where `n_features` is `n_hidden`, plus `n_inputs` with a direct link;
-        - leverage_center (n_features,), leverage_factor (n_features, n_features), leverage_offset
-          (): ``leverage = |(phi - leverage_center) @ leverage_factor|^2 + leverage_offset``.
-    activation : {"logistic", "tanh", "sin"}, default="logistic"
-        The function sigma.
-    """
-
-    input_weights: torch.Tensor
-    input_bias: torch.Tensor
-    input_center: torch.Tensor
-    input_scale: torch.Tensor
-    output_weights: torch.Tensor
-    intercept: torch.Tensor
-    leverage_center: torch.Tensor
-    leverage_factor: torch.Tensor
-    leverage_offset: torch.Tensor
-    tangent: torch.Tensor
-
-    def __init__(self, arrays, activation="logistic"):
-        super().__init__()
-        self.activation = activation
-        for name in _LAYER + _READOUT:
-            dtype = None if isinstance(arrays[name], torch.Tensor) else torch.float64
-            self.register_buffer(name, torch.as_tensor(arrays[name], dtype=dtype).detach().clone())
-        self.register_buffer("tangent", None, persistent=False)
-        _refresh_tangent(self)
-        self.register_load_state_dict_post_hook(_refresh_tangent)
-
-    def extra_repr(self):
-        """Return the layer sizes and the activation, for printing."""
-        (n_hidden, n_inputs), n_outputs = self.input_weights.shape, len(self.intercept)
-        return f"{n_inputs} -> {n_hidden} {self.activation} -> {n_outputs}"
-
-    def _hidden(self, q, out=None):
-        n_inputs = len(self.input_center)
-        if q.ndim == 0 or q.shape[-1] != n_inputs or not q.is_floating_point():
-            raise ValueError(
-                f"`q` must be a floating-point tensor of shape (..., {n_inputs}), got {q.dtype} of "
-                f"shape {tuple(q.shape)}; this ELM was fitted on {n_inputs} inputs."
-            )
-        # Folding the scaling into W and b would cancel digits where the range is narrow.
-        u = (q - self.input_center.to(q)) / self.input_scale.to(q)
-        W, b = self.input_weights.to(q), self.input_bias.to(q)
-        a = nn.functional.linear(u, W, b) if out is None else torch.addmm(b, u, W.T, out=out)
-        return u, a, _ACTIVATIONS[self.activation][0](a, out=out)
-
-    def _write_features(self, q, out):
-        # In place: a large temporary per block would fragment the heap by hundreds of megabytes.
-        n_hidden = len(self.input_weights)
-        u, _, _ = self._hidden(q, out[:, :n_hidden])
-        if len(self.output_weights) > n_hidden:
-            out[:, n_hidden:] = u
-
-    def _features(self, u, s):
-        return torch.cat((s, u), -1) if len(self.output_weights) > s.shape[-1] else s
-
-    def _readout(self, u, s):
-        weights, intercept = self.output_weights.to(s), self.intercept.to(s)
-        return nn.functional.linear(self._features(u, s), weights.T, intercept)
-
-    def _slope(self, a, s):
-        slope = _ACTIVATIONS[self.activation][1](a, s)
-        J = (slope @ self.tangent.to(s)).unflatten(-1, (len(self.intercept), -1))
-        if len(self.output_weights) > s.shape[-1]:
-            J = J + (self.output_weights[s.shape[-1] :].T / self.input_scale).to(s)
-        return J
-
-    def features(self, q):
-        """Return the features `phi`, shape (..., n_features), of `q`, shape (..., n_inputs)."""
-        u, _, s = self._hidden(q)
-        return self._features(u, s)
-
-    def forward(self, q):
-        """Return the output `eps`, shape (..., n_outputs), at `q`, shape (..., n_inputs)."""
-        u, _, s = self._hidden(q)
-        return self._readout(u, s)
-
-    def jacobian(self, q):
-        """Return ``J[..., i, j] = d eps_i / d q_j``, shape (..., n_outputs, n_inputs)."""
-        _, a, s = self._hidden(q)
-        return self._slope(a, s)
-
-    def forward_and_jacobian(self, q):
-        """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
-        u, a, s = self._hidden(q)
-        return self._readout(u, s), self._slope(a, s)
-
-    def leverage(self, q):
-        """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
-        r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
-        return (r * r).sum(-1) + self.leverage_offset.to(q)
-
-
-def _refresh_tangent(elm, incompatible_keys=None):
-    # J = sigma' @ T with T = w_out (x) w_in
-    w_in = elm.input_weights / elm.input_scale
-    w_out = elm.output_weights[: len(w_in)]
-    elm.tangent = (w_out[:, :, None] * w_in[:, None, :]).flatten(1)
 
 
 class _Statistics(NamedTuple):
@@ -273,7 +146,7 @@ def _fit_readout(stats, n_features, alpha, fit_intercept):
     noise = np.maximum(rss, 0.0) / dof_left if resolved else np.full_like(rss, np.nan)
     mu, offset = mean[:n_features], np.float64(1 / n if fit_intercept else 0)
     arrays = (W, mean[n_features:] - mu @ W, mu, R, offset)
-    return dict(zip(_READOUT, arrays, strict=True)), noise, solver
+    return dict(zip(READOUT, arrays, strict=True)), noise, solver
 
 
 def _device(name):
@@ -372,7 +245,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _parameter_constraints = {  # noqa: RUF012
         "n_hidden": [Interval(Integral, 1, None, closed="left")],
         "alpha": [Interval(Real, 0, None, closed="left")],
-        "activation": [StrOptions(set(_ACTIVATIONS))],
+        "activation": [StrOptions(set(ACTIVATIONS))],
         "input_scaling": [StrOptions({"minmax", "standard"}), None, "array-like"],
         "weight_scale": [Interval(Real, 0, None, closed="neither")],
         "fit_intercept": ["boolean"],
@@ -462,7 +335,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise TypeError(f"`other` must be a fitted ELMRegressor, got {type(other).__name__}.")
         check_is_fitted(self, "module_")
         check_is_fitted(other, "module_")
-        for name in (*(f"{name}_" for name in _LAYER), "_activation", "feature_names_in_"):
+        for name in (*(f"{name}_" for name in LAYER), "_activation", "feature_names_in_"):
             if not np.array_equal(getattr(self, name, ()), getattr(other, name, ())):
                 raise ValueError(
                     f"`other` must have this model's hidden layer, input scaling and columns, but "
@@ -571,7 +444,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             n_columns = n_features + y.shape[1]
             stats = _Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
         else:
-            layer = [getattr(self, f"{name}_") for name in _LAYER]
+            layer = [getattr(self, f"{name}_") for name in LAYER]
             activation, stats = self._activation, self._stats
             n_features, n_columns = len(self.output_weights_), len(stats.mean)
             if n_features + y.shape[1] != n_columns:
@@ -580,10 +453,10 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                     f"{y.shape[1]}; call `fit` to start afresh."
                 )
             y_ndim = self._y_ndim
-        layer = dict(zip(_LAYER, layer, strict=True))
+        layer = dict(zip(LAYER, layer, strict=True))
         # A readout with no outputs: the features come from the one kernel there is.
         shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
-        blank = {name: np.zeros(shape) for name, shape in zip(_READOUT, shapes, strict=True)}
+        blank = {name: np.zeros(shape) for name, shape in zip(READOUT, shapes, strict=True)}
         elm = ELM({**layer, **blank}, activation).to(device)
         block_size = self.block_size or max(1, _BLOCK_ELEMENTS // n_columns)
         with torch.no_grad():
@@ -616,7 +489,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self
 
     def _build(self, device):
-        arrays = {name: getattr(self, f"{name}_") for name in _LAYER + _READOUT}
+        arrays = {name: getattr(self, f"{name}_") for name in LAYER + READOUT}
         self.module_ = ELM(arrays, self._activation).to(device)
 
     def _map(self, X, function):

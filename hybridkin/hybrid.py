@@ -263,6 +263,11 @@ class HybridModule(nn.Module):
         self.error = error
         self.guard = guard
 
+    @property
+    def n_actuators(self) -> int | None:
+        """Length of q, where the mechanical model tells it."""
+        return getattr(self.mechanical, "n_actuators", None)
+
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m) [m]."""
         if self.mechanical is None:

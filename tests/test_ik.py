@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain
-from hybridkin._numerics import (
+from hybridkin._solvers import (
     adaptive_damping,
     apply_columns,
     apply_rows,

@@ -51,7 +51,10 @@ failed : rows that did not settle, as (row, q_target, message)
 parameters : seed, noise, sampling and plant parameters
 
 The shipped set (`load_trunk`) has 3 x 500 + 500 rows, cable noise of 1 mm and motion-capture
-noise of 0.5 mm, and is what ``make_trunk(random_state=0)`` makes.
+noise of 0.5 mm, and is what ``make_trunk(random_state=0)`` makes. Row i again:
+
+    plant = TrunkPlant(**data.parameters["plant"])
+    q, pose = plant.settle(data.q_target[i], random_state=[0, 1, data.row[i]])
 """
 
 

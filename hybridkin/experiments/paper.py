@@ -42,7 +42,7 @@ PAPER_TRACKING = {"mechanical, nominal": 4.16, "hybrid on nominal": 1.67}
 PAPER_ELM = {"n_hidden": 100, "alpha": 0.1}
 """The paper's network, section 3.3."""
 
-PREFERRED = (0.25,) * 9
+PREFERRED = 0.25
 """The preferred posture: straight, at medium elongation [m] (section 4)."""
 
 TRACKED = (

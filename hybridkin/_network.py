@@ -1,0 +1,132 @@
+"""A random hidden layer and its readout as a torch module, with closed-form derivatives."""
+
+import torch
+from torch import nn
+
+from hybridkin._numerics import PortableModule
+
+# name -> sigma(a), and sigma'(a) from a and s = sigma(a)
+ACTIVATIONS = {
+    "logistic": (torch.sigmoid, lambda a, s: torch.addcmul(s, s, s, value=-1)),
+    "tanh": (torch.tanh, lambda a, s: 1 - s * s),
+    "sin": (torch.sin, lambda a, s: torch.cos(a)),
+}
+
+LAYER = ("input_weights", "input_bias", "input_center", "input_scale")
+READOUT = ("output_weights", "intercept")
+READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
+
+
+class ELM(PortableModule):
+    """A fitted network ``eps = phi(q) @ output_weights + intercept`` as a torch module.
+
+    ``phi(q) = sigma(W u + b)`` with the scaled input ``u = (q - input_center) / input_scale``,
+    followed by `u` itself where there is a direct link. Buffers only; batch dimensions lead; twice
+    differentiable; it computes in the dtype and on the device of `q`.
+
+    Parameters
+    ----------
+    arrays : mapping of str to array
+        What the state dict holds, so ``ELM(elm.state_dict(), elm.activation)`` is a copy:
+
+        - input_weights (n_hidden, n_inputs), input_bias (n_hidden,): the hidden layer W, b;
+        - input_center, input_scale (n_inputs,): affine map of the inputs [unit of q];
+        - output_weights (n_features, n_outputs), intercept (n_outputs,): the readout [unit of
+          eps], where `n_features` is `n_hidden`, plus `n_inputs` with a direct link;
+        - leverage_center (n_features,), leverage_factor (n_features, n_features), leverage_offset
+          (): ``leverage = |(phi - leverage_center) @ leverage_factor|^2 + leverage_offset``.
+    activation : {"logistic", "tanh", "sin"}, default="logistic"
+        The function sigma.
+    """
+
+    input_weights: torch.Tensor
+    input_bias: torch.Tensor
+    input_center: torch.Tensor
+    input_scale: torch.Tensor
+    output_weights: torch.Tensor
+    intercept: torch.Tensor
+    leverage_center: torch.Tensor
+    leverage_factor: torch.Tensor
+    leverage_offset: torch.Tensor
+    tangent: torch.Tensor
+
+    def __init__(self, arrays, activation="logistic"):
+        super().__init__()
+        self.activation = activation
+        for name in LAYER + READOUT:
+            dtype = None if isinstance(arrays[name], torch.Tensor) else torch.float64
+            self.register_buffer(name, torch.as_tensor(arrays[name], dtype=dtype).detach().clone())
+        self.register_buffer("tangent", None, persistent=False)
+        _refresh_tangent(self)
+        self.register_load_state_dict_post_hook(_refresh_tangent)
+
+    def extra_repr(self):
+        """Return the layer sizes and the activation, for printing."""
+        (n_hidden, n_inputs), n_outputs = self.input_weights.shape, len(self.intercept)
+        return f"{n_inputs} -> {n_hidden} {self.activation} -> {n_outputs}"
+
+    def _hidden(self, q, out=None):
+        n_inputs = len(self.input_center)
+        if q.ndim == 0 or q.shape[-1] != n_inputs or not q.is_floating_point():
+            raise ValueError(
+                f"`q` must be a floating-point tensor of shape (..., {n_inputs}), got {q.dtype} of "
+                f"shape {tuple(q.shape)}; this ELM was fitted on {n_inputs} inputs."
+            )
+        # Folding the scaling into W and b would cancel digits where the range is narrow.
+        u = (q - self.input_center.to(q)) / self.input_scale.to(q)
+        W, b = self.input_weights.to(q), self.input_bias.to(q)
+        a = nn.functional.linear(u, W, b) if out is None else torch.addmm(b, u, W.T, out=out)
+        return u, a, ACTIVATIONS[self.activation][0](a, out=out)
+
+    def _write_features(self, q, out):
+        # In place: a large temporary per block would fragment the heap by hundreds of megabytes.
+        n_hidden = len(self.input_weights)
+        u, _, _ = self._hidden(q, out[:, :n_hidden])
+        if len(self.output_weights) > n_hidden:
+            out[:, n_hidden:] = u
+
+    def _features(self, u, s):
+        return torch.cat((s, u), -1) if len(self.output_weights) > s.shape[-1] else s
+
+    def _readout(self, u, s):
+        weights, intercept = self.output_weights.to(s), self.intercept.to(s)
+        return nn.functional.linear(self._features(u, s), weights.T, intercept)
+
+    def _slope(self, a, s):
+        slope = ACTIVATIONS[self.activation][1](a, s)
+        J = (slope @ self.tangent.to(s)).unflatten(-1, (len(self.intercept), -1))
+        if len(self.output_weights) > s.shape[-1]:
+            J = J + (self.output_weights[s.shape[-1] :].T / self.input_scale).to(s)
+        return J
+
+    def features(self, q):
+        """Return the features `phi`, shape (..., n_features), of `q`, shape (..., n_inputs)."""
+        u, _, s = self._hidden(q)
+        return self._features(u, s)
+
+    def forward(self, q):
+        """Return the output `eps`, shape (..., n_outputs), at `q`, shape (..., n_inputs)."""
+        u, _, s = self._hidden(q)
+        return self._readout(u, s)
+
+    def jacobian(self, q):
+        """Return ``J[..., i, j] = d eps_i / d q_j``, shape (..., n_outputs, n_inputs)."""
+        _, a, s = self._hidden(q)
+        return self._slope(a, s)
+
+    def forward_and_jacobian(self, q):
+        """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
+        u, a, s = self._hidden(q)
+        return self._readout(u, s), self._slope(a, s)
+
+    def leverage(self, q):
+        """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
+        r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
+        return (r * r).sum(-1) + self.leverage_offset.to(q)
+
+
+def _refresh_tangent(elm, incompatible_keys=None):
+    # J = sigma' @ T with T = w_out (x) w_in
+    w_in = elm.input_weights / elm.input_scale
+    w_out = elm.output_weights[: len(w_in)]
+    elm.tangent = (w_out[:, :, None] * w_in[:, None, :]).flatten(1)
