@@ -1,13 +1,17 @@
 """Hybrid mechanical and data-driven kinematics of soft and cable-driven robots."""
 
-from hybridkin import datasets, robots, trajectories
-from hybridkin._numerics import jacobian
-from hybridkin.calibration import CalibrationResult, calibrate
-from hybridkin.chain import ConstantCurvatureChain
-from hybridkin.elm import ELMRegressor
-from hybridkin.hybrid import HybridForwardModel
-from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Step, Track
-from hybridkin.persistence import load_model, save_model
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hybridkin import datasets, experiments, plots, robots, simulation, trajectories
+    from hybridkin._numerics import jacobian
+    from hybridkin.calibration import CalibrationResult, calibrate
+    from hybridkin.chain import ConstantCurvatureChain
+    from hybridkin.elm import ELMRegressor
+    from hybridkin.hybrid import HybridForwardModel
+    from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Step, Track
+    from hybridkin.persistence import load_model, save_model
 
 __version__ = "0.1.0"
 
@@ -24,9 +28,41 @@ __all__ = [
     "__version__",
     "calibrate",
     "datasets",
+    "experiments",
     "jacobian",
     "load_model",
+    "plots",
     "robots",
     "save_model",
+    "simulation",
     "trajectories",
 ]
+
+# Rooms are opened when first used: torch and scikit-learn take seconds to import.
+_ROOM_OF = {
+    "CalibrationResult": "calibration",
+    "ConstantCurvatureChain": "chain",
+    "ELMRegressor": "elm",
+    "HybridForwardModel": "hybrid",
+    "IKSolution": "ik",
+    "IKStatus": "ik",
+    "InverseKinematics": "ik",
+    "Step": "ik",
+    "Track": "ik",
+    "calibrate": "calibration",
+    "jacobian": "_numerics",
+    "load_model": "persistence",
+    "save_model": "persistence",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _ROOM_OF:
+        return getattr(import_module(f"hybridkin.{_ROOM_OF[name]}"), name)
+    if name in __all__:
+        return import_module(f"hybridkin.{name}")
+    raise AttributeError(f"module 'hybridkin' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -81,6 +81,7 @@ def test_only_plots_uses_matplotlib_and_only_the_command_line_prints():
 def test_import_is_light():
     code = (
         "import sys, hybridkin; "
+        "hybridkin.HybridForwardModel, hybridkin.InverseKinematics, hybridkin.datasets.load_trunk; "
         "heavy = {'matplotlib', 'mujoco', 'pytorch_kinematics'} & set(sys.modules); "
         "sys.exit(str(heavy) if heavy else 0)"
     )
