@@ -5,7 +5,7 @@ OUT ?= results
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test check benchmark clean
+.PHONY: paper test check clean
 
 paper: $(VENV)/.installed
 	$(BIN)/python -m hybridkin paper --out $(OUT)
@@ -17,9 +17,6 @@ check: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
-
-benchmark: $(VENV)/.installed
-	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-only -o addopts="-s"
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

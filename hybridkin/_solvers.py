@@ -12,7 +12,7 @@ _PROXIMAL_ROUNDS = 2
 
 
 class RowGram(NamedTuple):
-    """G = J J^T of a Jacobian with three rows, its LDL^T factors and its singular values.
+    """G = J J^T of a Jacobian with three rows, and its singular values.
 
     The six entries of G are kept apart, so that a batch costs a few elementwise operations
     instead of a LAPACK call per matrix.
