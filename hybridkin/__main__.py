@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -86,8 +87,9 @@ class _Bars:
 
     def warn(self, message: Any, *_: Any) -> None:
         text = str(message)
-        if text not in self._seen:
-            self._seen.add(text)
+        kind = re.sub(r"[\d.]+", "", text)
+        if kind not in self._seen:
+            self._seen.add(kind)
             tqdm.write(f"hybridkin: warning: {text}", file=sys.stderr)
 
     def close(self) -> None:

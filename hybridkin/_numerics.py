@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 _HORNER_DEGREE = 12
+_SERIES_END = 50.0  # [rad^2], a little more than a full turn
 _C3 = tuple((-1.0) ** j / math.factorial(2 * j + 3) for j in range(_HORNER_DEGREE + 1))
 _C4 = tuple((-1.0) ** j / math.factorial(2 * j + 4) for j in range(_HORNER_DEGREE + 1))
 
@@ -32,7 +33,8 @@ def stumpff(s: Tensor) -> Stumpff:
     """Return the Stumpff functions of s = theta^2, smooth through theta = 0.
 
     The power series is summed for the half angle and doubled once, which holds full precision
-    up to theta = 2 pi without a branch, a square root or a division.
+    beyond a full turn without a square root or a division near zero; further out, where nothing
+    cancels any more, trigonometry takes over.
 
     Parameters
     ----------
@@ -44,6 +46,17 @@ def stumpff(s: Tensor) -> Stumpff:
     Stumpff
         Five tensors of the shape of `s`.
     """
+    wound = s > _SERIES_END
+    near = _stumpff_by_series(torch.where(wound, 0.0, s))
+    far = torch.where(wound, s, _SERIES_END)
+    theta = far.sqrt()
+    c, f = torch.cos(theta), torch.sin(theta) / theta
+    g = (1.0 - c) / far
+    beyond = Stumpff(c, f, g, (1.0 - f) / far, (0.5 - g) / far)
+    return Stumpff(*(torch.where(wound, b, a) for a, b in zip(near, beyond, strict=True)))
+
+
+def _stumpff_by_series(s: Tensor) -> Stumpff:
     quarter = 0.25 * s
     c3 = torch.full_like(quarter, _C3[-1])
     c4 = torch.full_like(quarter, _C4[-1])

@@ -52,7 +52,18 @@ def new_figure(
     return figure, figure.subplots(rows, columns, **options)
 
 
-class ErrorHistogramDisplay:
+class _ErrorDisplay:
+    def __init__(self, errors: Mapping[str, ArrayLike]) -> None:
+        self.errors = {name: np.asarray(values, dtype=float) for name, values in errors.items()}
+
+    @classmethod
+    def from_predictions(cls, x: ArrayLike, predictions: Mapping[str, ArrayLike]) -> Any:
+        """Return the display for measured tips `x` (N, 3) and predicted ones by model [m]."""
+        x = np.asarray(x)
+        return cls({name: _distance(np.asarray(p), x) for name, p in predictions.items()})
+
+
+class ErrorHistogramDisplay(_ErrorDisplay):
     """Histogram of tip errors, one outline per model (Fig. 2, right, of the paper).
 
     Parameters
@@ -60,17 +71,6 @@ class ErrorHistogramDisplay:
     errors : mapping of str to array-like of shape (N,)
         Tip distances of each model [m].
     """
-
-    def __init__(self, errors: Mapping[str, ArrayLike]) -> None:
-        self.errors = {name: np.asarray(values, dtype=float) for name, values in errors.items()}
-
-    @classmethod
-    def from_predictions(
-        cls, x: ArrayLike, predictions: Mapping[str, ArrayLike]
-    ) -> ErrorHistogramDisplay:
-        """Return the display for measured tips `x` (N, 3) and predicted ones by model [m]."""
-        x = np.asarray(x)
-        return cls({name: _distance(np.asarray(p), x) for name, p in predictions.items()})
 
     def plot(self, ax: Any = None, *, unit: str = "cm", bins: int = 40) -> Any:
         """Draw the histograms, the mean of each model marked, and return self."""
@@ -90,7 +90,7 @@ class ErrorHistogramDisplay:
         return self
 
 
-class ErrorBoxDisplay:
+class ErrorBoxDisplay(_ErrorDisplay):
     """Spread of tip errors side by side: box from quartile to quartile, whiskers to 5 and 95 %.
 
     Parameters
@@ -98,9 +98,6 @@ class ErrorBoxDisplay:
     errors : mapping of str to array-like of shape (N,)
         Tip distances of each model [m].
     """
-
-    def __init__(self, errors: Mapping[str, ArrayLike]) -> None:
-        self.errors = {name: np.asarray(values, dtype=float) for name, values in errors.items()}
 
     def plot(self, ax: Any = None, *, unit: str = "cm") -> Any:
         """Draw horizontal boxes with the mean (dot) and the maximum (cross) and return self."""

@@ -63,22 +63,49 @@ CHAINS = {
 each_chain = pytest.mark.parametrize(("chain", "center", "width"), CHAINS.values(), ids=CHAINS)
 
 
-@pytest.mark.parametrize("theta", [0.0, 1e-12, 1e-4, 0.5, 1.0, 2.0, math.pi, 4.0, 2 * math.pi])
+SWITCH = math.sqrt(50.0)
+BESIDE_SWITCH = [SWITCH * (1 - 1e-12), SWITCH * (1 + 1e-12)]
+
+
+@pytest.mark.parametrize(
+    "theta",
+    [0.0, 1e-12, 1e-4, 0.5, 1.0, 2.0, math.pi, 4.0, 2 * math.pi, *BESIDE_SWITCH, 12.0, 1e3],
+)
 def test_stumpff_functions_against_mpmath(theta):
     s = torch.tensor(theta**2, dtype=torch.float64)
-    with mpmath.workdps(60):
+    with mpmath.workdps(120):
         exact = mpmath.mpf(s.item())
 
-        def series(k):
-            return mpmath.nsum(lambda j: (-exact) ** int(j) / mpmath.factorial(2 * j + k), [0, 60])
-
-        expected = [float(series(k)) for k in (0, 1, 2, 3, 4)]
+        angle = mpmath.sqrt(exact) or mpmath.mpf("1e-30")  # right to 60 digits at zero, too
+        c, f = mpmath.cos(angle), mpmath.sin(angle) / angle
+        g = (1 - c) / angle**2 if exact else mpmath.mpf("0.5")
+        c3 = (1 - f) / angle**2 if exact else mpmath.mpf(1) / 6
+        c4 = (0.5 - g) / angle**2 if exact else mpmath.mpf(1) / 24
+        expected = [float(value) for value in (c, f, g, c3, c4)]
     assert_close(
         torch.stack(list(stumpff(s))),
         torch.tensor(expected, dtype=torch.float64),
         rtol=4e-15,
         atol=3e-15,
     )
+
+
+def test_no_kink_where_trigonometry_takes_over():
+    beside = torch.tensor([50.0, math.nextafter(50.0, 51.0)], dtype=torch.float64).requires_grad_()
+    for value in stumpff(beside):
+        (first,) = torch.autograd.grad(value.sum(), beside, create_graph=True)
+        (second,) = torch.autograd.grad(first.sum(), beside, retain_graph=True)
+        for quantity, tolerance in ((value, 2e-14), (first, 2e-15), (second, 1e-15)):
+            assert abs(quantity[1] - quantity[0]) < tolerance
+
+
+def test_absurd_bends_stay_finite():
+    """Lengths in millimetres taken for metres: hundreds of turns, but no overflow."""
+    q = 1000.0 * (0.25 + 0.06 * torch.linspace(-1, 1, 9, dtype=torch.float64))
+    x, J = bha().forward_and_jacobian(q.requires_grad_())
+    assert x.norm() < 750.0
+    assert torch.isfinite(J).all()
+    assert torch.isfinite(torch.autograd.grad(x.sum(), q)[0]).all()
 
 
 def test_quarter_circle():
