@@ -15,16 +15,11 @@ from hybridkin._numerics import Stumpff, stumpff
 
 def tip(length: Tensor, bending: Tensor, arc: Stumpff, offsets: Tensor) -> Tensor:
     """Return the tip (3, N) in the base frame, carried from the last segment to the first."""
-    bx, by = bending
-    vx = vy = torch.zeros_like(length[0])
-    vz = vx
+    across, ahead = torch.zeros_like(bending[:, 0]), torch.zeros_like(length[0])
     for k in range(len(length) - 1, -1, -1):
-        vz = vz + offsets[k]
-        ahead = length[k] - (bx[k] * vx + by[k] * vy)
-        m = arc.g[k] * ahead + arc.f[k] * vz
-        vx, vy = vx + bx[k] * m, vy + by[k] * m
-        vz = arc.f[k] * ahead + arc.c[k] * vz
-    return torch.stack([vx, vy, vz])
+        b, c, f, g = bending[:, k], arc.c[k], arc.f[k], arc.g[k]
+        across, ahead, _, _ = _carried(across, ahead + offsets[k], length[k], b, c, f, g)
+    return torch.cat([across, ahead[None]])
 
 
 def tip_and_columns(
@@ -35,43 +30,56 @@ def tip_and_columns(
     With `angular`, 3 S columns of angular velocity follow the linear ones.
     """
     arc = stumpff((bending**2).sum(0))
-    bx, by = bending
+    slope_f, slope_g = arc.c3 - arc.g, 2.0 * arc.c4 - arc.c3  # twice the derivatives by s
+    eye = torch.eye(2, dtype=length.dtype, device=length.device)[..., None]
+    across, ahead = torch.zeros_like(bending[:, 0]), torch.zeros_like(length[0])
     zero = torch.zeros_like(length[0])
-    vx = vy = vz = zero
-    linear: list[Tensor] = []
-    turning: list[Tensor] = []
+    linear = turning = None
     for k in range(len(length) - 1, -1, -1):
-        x, y, c, f, g, c3 = bx[k], by[k], arc.c[k], arc.f[k], arc.g[k], arc.c3[k]
-        vz = vz + offsets[k]
-        ahead = length[k] - (x * vx + y * vy)
-        m = g * ahead + f * vz
-        by_s = (2.0 * arc.c4[k] - c3) * ahead + (c3 - g) * vz
-        n = (c3 - g) * ahead - f * vz
-        to_x, to_y = by_s * x - g * vx, by_s * y - g * vy
-        own = [
-            torch.stack([g * x, g * y, f]),
-            torch.stack([m + x * to_x, y * to_x, n * x - f * vx]),
-            torch.stack([x * to_y, m + y * to_y, n * y - f * vy]),
-        ]
-        later = [_turn(column, x, y, c, f, g) for column in linear]
-        linear = own + later
+        b, c, f, g = bending[:, k], arc.c[k], arc.f[k], arc.g[k]
+        before, tail = across, ahead + offsets[k]
+        across, ahead, rest, m = _carried(before, tail, length[k], b, c, f, g)
+        to = torch.addcmul(slope_g[k] * rest, slope_f[k], tail) * b - g * before
+        n = torch.addcmul(slope_f[k] * rest, f, tail, value=-1.0)
+        by_length = torch.cat([g * b, f[None]])[:, None]
+        by_bending = torch.cat(
+            [torch.addcmul(m * eye, b[:, None], to[None]), (n * b - f * before)[None]]
+        )
+        own = torch.cat([by_length, by_bending], dim=1)
+        linear = own if linear is None else torch.cat([own, _turned(linear, b, c, f, g)], dim=1)
         if angular:
+            x, y, c3 = *b, arc.c3[k]
             spin = [
-                torch.stack([zero, zero, zero]),
-                torch.stack([-c3 * x * y, 1.0 - c3 * y * y, -g * y]),
-                torch.stack([c3 * x * x - 1.0, c3 * x * y, g * x]),
+                *(zero, -c3 * x * y, c3 * x * x - 1.0),
+                *(zero, 1.0 - c3 * y * y, c3 * x * y),
+                *(zero, -g * y, g * x),
             ]
-            turning = spin + [_turn(column, x, y, c, f, g) for column in turning]
-        vx, vy = vx + x * m, vy + y * m
-        vz = f * ahead + c * vz
-    return torch.stack([vx, vy, vz]), torch.stack(linear + turning, dim=1)
+            own = torch.stack(spin).unflatten(0, (3, 3))
+            own = own if turning is None else torch.cat([own, _turned(turning, b, c, f, g)], dim=1)
+            turning = own
+    columns = [block for block in (linear, turning) if block is not None]
+    return torch.cat([across, ahead[None]]), torch.cat(columns, dim=1)
 
 
-def _turn(v: Tensor, x: Tensor, y: Tensor, c: Tensor, f: Tensor, g: Tensor) -> Tensor:
-    """Return vectors (3, N) of a segment's end frame in its start frame."""
-    along = x * v[0] + y * v[1]
-    m = f * v[2] - g * along
-    return torch.stack([v[0] + x * m, v[1] + y * m, c * v[2] - f * along])
+def _carried(
+    across: Tensor, tail: Tensor, length: Tensor, b: Tensor, c: Tensor, f: Tensor, g: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return a point of a segment's end frame in its start frame, and (e, m) of the formula.
+
+    The point is (across, tail), (2, N) and (N,); e is the length less the tail along b, m what
+    the point moves across per bending.
+    """
+    rest = length - (b * across).sum(0)
+    m = torch.addcmul(g * rest, f, tail)
+    return torch.addcmul(across, b, m), torch.addcmul(f * rest, c, tail), rest, m
+
+
+def _turned(v: Tensor, b: Tensor, c: Tensor, f: Tensor, g: Tensor) -> Tensor:
+    """Return vectors (3, K, N) of a segment's end frame in its start frame."""
+    along = (b[:, None] * v[:2]).sum(0)
+    m = torch.addcmul(f * v[2], g, along, value=-1.0)
+    across = torch.addcmul(v[:2], b[:, None], m)
+    return torch.cat([across, torch.addcmul(c * v[2], f, along, value=-1.0)[None]])
 
 
 def arc_transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:

@@ -8,10 +8,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-_HORNER_DEGREE = 12
 _SERIES_END = 50.0  # [rad^2], a little more than a full turn
-_C3 = tuple((-1.0) ** j / math.factorial(2 * j + 3) for j in range(_HORNER_DEGREE + 1))
-_C4 = tuple((-1.0) ** j / math.factorial(2 * j + 4) for j in range(_HORNER_DEGREE + 1))
+# Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
+_DEGREE = {torch.float64: 12, torch.float32: 8}
+_SERIES = tuple(
+    ((-1.0) ** j / math.factorial(2 * j + 3), (-1.0) ** j / math.factorial(2 * j + 4))
+    for j in range(max(_DEGREE.values()), -1, -1)
+)
 
 
 class Stumpff(NamedTuple):
@@ -58,14 +61,16 @@ def stumpff(s: Tensor) -> Stumpff:
 
 def _stumpff_by_series(s: Tensor) -> Stumpff:
     quarter = 0.25 * s
-    c3 = torch.full_like(quarter, _C3[-1])
-    c4 = torch.full_like(quarter, _C4[-1])
-    for a3, a4 in zip(_C3[-2::-1], _C4[-2::-1], strict=True):
-        c3 = c3 * quarter + a3
-        c4 = c4 * quarter + a4
+    # c3 and c4 together: one multiply-add per power, however small the batch.
+    powers = s.new_tensor(_SERIES[-1 - _DEGREE.get(s.dtype, 12) :])
+    pair = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
+    both = pair[0].expand(2, *s.shape)
+    for coefficients in pair[1:]:
+        both = torch.addcmul(coefficients, both, quarter)
+    c3, c4 = both.unbind()
     f = 1.0 - quarter * c3
     g = 0.5 - quarter * c4
-    c3, c4 = 0.25 * (c3 + f * g), 0.125 * c3 * (1.0 + f)
+    c3, c4 = 0.25 * torch.addcmul(c3, f, g), 0.125 * torch.addcmul(c3, c3, f)
     f = 1.0 - s * c3
     g = 0.5 - s * c4
     return Stumpff(1.0 - s * g, f, g, c3, c4)
