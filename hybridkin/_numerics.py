@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -155,6 +156,21 @@ class PortableModule(nn.Module):
                 at_home = device == "cpu" or torch.cuda.is_available()
                 buffers[name] = torch.tensor(array, device=device if at_home else "cpu")
         super().__setstate__({**state, "_buffers": buffers})
+
+
+def in_blocks(
+    function: Callable[[Tensor], tuple[Tensor, ...]], q: Tensor, size: int = 4096
+) -> tuple[Tensor, ...]:
+    """Return what a row-by-row function gives for q (..., n), computed in blocks of rows.
+
+    The temporaries of a block stay in the cache: a million rows cost as much each as a thousand.
+    """
+    lead = q.shape[:-1]
+    if lead.numel() <= size:
+        return function(q)
+    parts = [function(rows) for rows in q.reshape(-1, q.shape[-1]).split(size)]
+    whole = (torch.cat(part) for part in zip(*parts, strict=True))
+    return tuple(tensor.reshape(*lead, *tensor.shape[1:]) for tensor in whole)
 
 
 def check_vectors(value: Tensor, size: int, name: str, why: str) -> Tensor:

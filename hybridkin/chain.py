@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._arcs import arc_transforms, reading_matrix, tip, tip_and_columns
-from hybridkin._numerics import PortableModule, check_vectors, stumpff
+from hybridkin._numerics import PortableModule, check_vectors, in_blocks, stumpff
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
@@ -199,11 +199,8 @@ class ConstantCurvatureChain(PortableModule):
         J : Tensor of shape (..., 3, n_actuators)
             Closed-form Jacobian dx/dq [-].
         """
-        length, bending = self._arc_rows(q)
-        tail, columns = tip_and_columns(length, bending, self.offsets.to(q))
-        base = self.base.to(q)
-        x = (base[:3, :3] @ tail + base[:3, 3:]).T
-        return x.reshape(*q.shape[:-1], 3), self._actuator_jacobian(columns, q)
+        x, J = in_blocks(self._forward_and_jacobian, q)
+        return x, J
 
     def pose_jacobian(self, q: Tensor) -> Tensor:
         """Return the tip's linear [-] and angular [rad/m] Jacobian, shape (..., 6, n_actuators).
@@ -363,6 +360,13 @@ class ConstantCurvatureChain(PortableModule):
         rows = q.reshape(-1, self.n_actuators)
         arcs = torch.addmm(self.arc_offset.to(q)[:, None], self.arc_matrix.to(q), rows.T)
         return arcs[: self.n_segments], arcs[self.n_segments :].unflatten(0, (2, self.n_segments))
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        length, bending = self._arc_rows(q)
+        tail, columns = tip_and_columns(length, bending, self.offsets.to(q))
+        base = self.base.to(q)
+        x = (base[:3, :3] @ tail + base[:3, 3:]).T
+        return x.reshape(*q.shape[:-1], 3), self._actuator_jacobian(columns, q)
 
     def _actuator_jacobian(self, columns: Tensor, q: Tensor) -> Tensor:
         """Fold the constant map q -> arcs and the base into columns (3, 3 S, N)."""

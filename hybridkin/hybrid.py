@@ -15,7 +15,12 @@ from sklearn.utils.validation import _check_sample_weight, check_is_fitted, vali
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from hybridkin._numerics import PortableModule, forward_and_jacobian, forward_and_reverse_jacobian
+from hybridkin._numerics import (
+    PortableModule,
+    forward_and_jacobian,
+    forward_and_reverse_jacobian,
+    in_blocks,
+)
 from hybridkin.calibration import CalibrationResult, calibrate
 from hybridkin.elm import ELMRegressor
 from hybridkin.guards import GUARDS, Guard, fit_guard
@@ -293,10 +298,14 @@ class HybridModule(nn.Module):
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (..., m) and dx/dq (..., m, n), closed form where the parts offer it."""
+        x, J = in_blocks(self._forward_and_jacobian, q)
+        return x, J
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         if self.error is None:
             return forward_and_jacobian(self.mechanical, q)
         x, J = forward_and_jacobian(self.error, q)
-        if self.guard is not None:
+        if self.guard is not None and not self.in_domain(q).all():  # else it is exactly one
             weight, slope = forward_and_reverse_jacobian(self.guard, q)
             x, J = weight * x, weight[..., None] * J + x[..., None] * slope
         if self.mechanical is not None:
