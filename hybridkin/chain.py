@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._arcs import arc_transforms, reading_matrix, tip, tip_and_columns
+from hybridkin._geometry import (
+    actuator_counts,
+    flat_angles,
+    pose,
+    vector,
+    warn_millimetres,
+)
 from hybridkin._numerics import PortableModule, check_vectors, in_blocks, stumpff
 
 if TYPE_CHECKING:
@@ -92,18 +97,18 @@ class ConstantCurvatureChain(PortableModule):
         super().__init__()
         if routing not in _ROUTINGS:
             raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
-        radii = _vector(radii, "radii", dtype, positive=True)
+        radii = vector(radii, "radii", dtype, positive=True)
         n_segments = radii.numel()
-        counts = _actuator_counts(n_actuators, n_segments)
+        counts = actuator_counts(n_actuators, n_segments)
         if lengths is not None:
-            lengths = _vector(lengths, "lengths", dtype, size=n_segments, positive=True)
+            lengths = vector(lengths, "lengths", dtype, size=n_segments, positive=True)
         if np.ndim(offsets) == 0:
             offsets = np.full(n_segments, float(offsets))
         self.n_segments = n_segments
         self.actuators_per_segment = counts
         self.n_actuators = sum(counts)
         self.routing = routing
-        angles = _flat_angles(angles, counts, dtype)
+        angles = flat_angles(angles, counts, dtype)
         if torch.linalg.cond(reading_matrix(radii, angles, counts, routing, lengths is None)) > 1e6:
             raise ValueError(
                 "`angles` must tell the bending of every segment apart, got "
@@ -114,12 +119,12 @@ class ConstantCurvatureChain(PortableModule):
             radii=radii,
             angles=angles,
             lengths=lengths,
-            offsets=_vector(offsets, "offsets", dtype, size=n_segments),
-            base=_pose(base, "base", dtype),
+            offsets=vector(offsets, "offsets", dtype, size=n_segments),
+            base=pose(base, "base", dtype),
         )
-        _warn_millimetres("radii", radii, 1.0)
+        warn_millimetres("radii", radii, 1.0)
         if lengths is not None:
-            _warn_millimetres("lengths", lengths, 10.0)
+            warn_millimetres("lengths", lengths, 10.0)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -289,6 +294,47 @@ class ConstantCurvatureChain(PortableModule):
         points = torch.cat([points[..., :-1, :], end], dim=-2)
         return torch.cat([poses[..., 0, None, :3, 3], points.flatten(-3, -2)], dim=-2)
 
+    def consistency(self, q: Tensor) -> Tensor:
+        """Return how far the actuator readings of each segment contradict each other.
+
+        The readings are compared with those that the fitted arcs would give. Three chambers always
+        agree; with more actuators a broken cable or sensor shows, and on tendon chains a common
+        pull of all tendons of a segment, which bends nothing here.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        Tensor of shape (..., S)
+            Root mean square residual of the actuators of each segment [m].
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ConstantCurvatureChain
+        >>> chain = ConstantCurvatureChain([0.01, 0.01], lengths=[0.1, 0.1])
+        >>> chain.consistency(torch.tensor([-0.002, 0.001, 0.001, -0.003, -0.003, -0.003]))
+        tensor([0.0000, 0.0030])
+        """
+        length, bending = self._arc_rows(q)
+        readings = reading_matrix(
+            self.radii,
+            self.angles,
+            self.actuators_per_segment,
+            self.routing,
+            self.lengths is None,
+        ).to(q)
+        turns = (bending * self.radii.to(q)[:, None]).flatten(0, 1)
+        arcs = turns if self.lengths is not None else torch.cat([length, turns])
+        residual = q.reshape(-1, self.n_actuators) - (readings @ arcs).T
+        parts = residual.split(self.actuators_per_segment, dim=-1)
+        norms = [torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5 for part in parts]
+        rms = torch.stack(norms, dim=-1)
+        return rms.reshape(*q.shape[:-1], self.n_segments)
+
     def check_actuators(self, q: Tensor, name: str = "q") -> None:
         """Raise where q cannot be a log of this robot, and warn where it looks like millimetres.
 
@@ -319,7 +365,7 @@ class ConstantCurvatureChain(PortableModule):
                 f"row {row}; for tendon length changes build the chain with `lengths=`."
             )
         reach = 10.0 if self.lengths is None else 10.0 * float(self.lengths.detach().sum())
-        _warn_millimetres(name, rows.abs(), reach)
+        warn_millimetres(name, rows.abs(), reach)
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
@@ -374,88 +420,3 @@ class ConstantCurvatureChain(PortableModule):
         arc_matrix = arc_matrix.transpose(0, 1).flatten(0, 1)
         J = self.base.to(q)[:3, :3] @ (columns.permute(2, 0, 1) @ arc_matrix)
         return J.reshape(*q.shape[:-1], 3, self.n_actuators)
-
-
-def _vector(
-    value: Any, name: str, dtype: torch.dtype, *, size: int | None = None, positive: bool = False
-) -> Tensor:
-    vector = _tensor(value, name, dtype)
-    if vector.ndim != 1 or vector.numel() == 0 or (size is not None and vector.numel() != size):
-        need = "(S,), one value per segment" if size is None else f"({size},), one per segment"
-        raise ValueError(f"`{name}` must have shape {need}, got {tuple(vector.shape)}.")
-    if positive and not (vector > 0).all():
-        raise ValueError(f"`{name}` must be positive [m], got {vector.tolist()}.")
-    return vector
-
-
-def _tensor(value: Any, name: str, dtype: torch.dtype) -> Tensor:
-    try:
-        tensor = torch.as_tensor(np.asarray(value) if not isinstance(value, Tensor) else value)
-        tensor = tensor.to(dtype).clone()
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
-    if not torch.isfinite(tensor).all():
-        raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")
-    return tensor
-
-
-def _actuator_counts(n_actuators: Any, n_segments: int) -> tuple[int, ...]:
-    if np.ndim(n_actuators) == 0:
-        counts = (int(n_actuators),) * n_segments
-    else:
-        counts = tuple(int(n) for n in n_actuators)
-    if len(counts) != n_segments:
-        raise ValueError(
-            f"`n_actuators` must be one number or {n_segments} numbers, one per segment as in "
-            f"`radii`, got {len(counts)}."
-        )
-    if min(counts) < 3:
-        raise ValueError(
-            f"`n_actuators` must be at least 3 on every segment, got {counts}; two actuators do "
-            "not determine which way a segment bends."
-        )
-    return counts
-
-
-def _flat_angles(angles: Any, counts: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    if angles is None:
-        rows = [2.0 * math.pi * np.arange(n) / n for n in counts]
-    elif np.ndim(angles[0]) == 0:
-        rows = [angles] * len(counts)
-    else:
-        rows = list(angles)
-    rows = [_tensor(row, "angles", dtype) for row in rows]
-    if tuple(row.numel() for row in rows) != counts:
-        raise ValueError(
-            f"`angles` must hold {list(counts)} angles for the segments, got "
-            f"{[row.numel() for row in rows]}; give shape (n,), (S, n) or one list per segment."
-        )
-    return torch.cat(rows)
-
-
-def _pose(value: Any, name: str, dtype: torch.dtype) -> Tensor:
-    if value is None:
-        return torch.eye(4, dtype=dtype)
-    if hasattr(value, "get_matrix"):  # a pytorch_kinematics Transform3d
-        value = value.get_matrix().detach()
-        value = value[0] if value.shape[:1] == (1,) else value
-    pose = _tensor(value, name, dtype)
-    if pose.shape != (4, 4):
-        raise ValueError(f"`{name}` must be one pose of shape (4, 4), got {tuple(pose.shape)}.")
-    rotation = pose[:3, :3]
-    eye = torch.eye(3, dtype=dtype, device=pose.device)
-    if (rotation.mT @ rotation - eye).abs().max() > 1e-4 or torch.linalg.det(rotation) < 0:
-        raise ValueError(
-            f"`{name}` must hold a rotation in its upper left 3 x 3 block (orthonormal, "
-            f"right-handed), got {rotation.tolist()}."
-        )
-    return pose
-
-
-def _warn_millimetres(name: str, value: Tensor, limit: float) -> None:
-    if value.numel() and float(value.max()) > limit:
-        warnings.warn(
-            f"`{name}` reaches {float(value.max()):.4g}, which looks like millimetres; hybridkin "
-            "works in metres.",
-            stacklevel=3,
-        )

@@ -143,6 +143,28 @@ def test_through_going_tendons_read_the_sum_of_bendings(rng):
     assert_close(chain.arcs(q)[1], bending, rtol=1e-12, atol=1e-12)
 
 
+def test_consistency_finds_the_broken_reading(rng):
+    chain = ConstantCurvatureChain([0.1, 0.08], n_actuators=[3, 4])
+    bending = 0.3 * torch.randn(2, 2, generator=rng, dtype=torch.float64)
+    toward = torch.stack([chain.angles.cos(), chain.angles.sin()], -1)
+    segment = torch.tensor([0, 0, 0, 1, 1, 1, 1])
+    q = 0.25 - chain.radii[segment] * (toward * bending[segment]).sum(-1)
+    assert_close(chain.consistency(q), torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-15)
+    q[5] += 0.01
+    # Four readings of three unknowns: a quarter of the error, with alternating sign, remains.
+    expected = torch.tensor([0.0, 0.0025], dtype=torch.float64)
+    assert_close(chain.consistency(q), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("routing", ["segment", "base"])
+def test_a_common_pull_of_tendons_is_inconsistent(routing):
+    chain = tendons(routing)
+    q = torch.tensor([0.0] * 3 + [-0.004] * 3 + [0.0] * 3, dtype=torch.float64)
+    expected = torch.tensor([0.0, 0.004, 0.0], dtype=torch.float64)
+    assert_close(chain.consistency(q.expand(2, 9)), expected.expand(2, 3), rtol=1e-9, atol=1e-12)
+    assert_close(chain(q), chain(0.0 * q), rtol=1e-12, atol=1e-15)
+
+
 def test_shorter_chamber_is_on_the_side_the_tip_goes_to():
     q = STRAIGHT.clone()
     q[0] -= 0.02

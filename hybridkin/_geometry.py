@@ -1,0 +1,101 @@
+"""Geometry as a user writes it: turned into tensors, checked, with messages that help."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def vector(
+    value: Any, name: str, dtype: torch.dtype, *, size: int | None = None, positive: bool = False
+) -> Tensor:
+    """Return one number per segment as a tensor (S,), checked."""
+    vector = _tensor(value, name, dtype)
+    if vector.ndim != 1 or vector.numel() == 0 or (size is not None and vector.numel() != size):
+        need = "(S,), one value per segment" if size is None else f"({size},), one per segment"
+        raise ValueError(f"`{name}` must have shape {need}, got {tuple(vector.shape)}.")
+    if positive and not (vector > 0).all():
+        raise ValueError(f"`{name}` must be positive [m], got {vector.tolist()}.")
+    return vector
+
+
+def _tensor(value: Any, name: str, dtype: torch.dtype) -> Tensor:
+    try:
+        tensor = torch.as_tensor(np.asarray(value) if not isinstance(value, Tensor) else value)
+        tensor = tensor.to(dtype).clone()
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
+    if not torch.isfinite(tensor).all():
+        raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")
+    return tensor
+
+
+def actuator_counts(n_actuators: Any, n_segments: int) -> tuple[int, ...]:
+    """Return the number of actuators of every segment."""
+    if np.ndim(n_actuators) == 0:
+        counts = (int(n_actuators),) * n_segments
+    else:
+        counts = tuple(int(n) for n in n_actuators)
+    if len(counts) != n_segments:
+        raise ValueError(
+            f"`n_actuators` must be one number or {n_segments} numbers, one per segment as in "
+            f"`radii`, got {len(counts)}."
+        )
+    if min(counts) < 3:
+        raise ValueError(
+            f"`n_actuators` must be at least 3 on every segment, got {counts}; two actuators do "
+            "not determine which way a segment bends."
+        )
+    return counts
+
+
+def flat_angles(angles: Any, counts: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """Return the angles of all actuators, segment by segment, shape (n,)."""
+    if angles is None:
+        rows = [2.0 * math.pi * np.arange(n) / n for n in counts]
+    elif np.ndim(angles[0]) == 0:
+        rows = [angles] * len(counts)
+    else:
+        rows = list(angles)
+    rows = [_tensor(row, "angles", dtype) for row in rows]
+    if tuple(row.numel() for row in rows) != counts:
+        raise ValueError(
+            f"`angles` must hold {list(counts)} angles for the segments, got "
+            f"{[row.numel() for row in rows]}; give shape (n,), (S, n) or one list per segment."
+        )
+    return torch.cat(rows)
+
+
+def pose(value: Any, name: str, dtype: torch.dtype) -> Tensor:
+    """Return a pose given as a matrix, a Transform3d or None, shape (4, 4)."""
+    if value is None:
+        return torch.eye(4, dtype=dtype)
+    if hasattr(value, "get_matrix"):  # a pytorch_kinematics Transform3d
+        value = value.get_matrix().detach()
+        value = value[0] if value.shape[:1] == (1,) else value
+    matrix = _tensor(value, name, dtype)
+    if matrix.shape != (4, 4):
+        raise ValueError(f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}.")
+    rotation = matrix[:3, :3]
+    eye = torch.eye(3, dtype=dtype, device=matrix.device)
+    if (rotation.mT @ rotation - eye).abs().max() > 1e-4 or torch.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"`{name}` must hold a rotation in its upper left 3 x 3 block (orthonormal, "
+            f"right-handed), got {rotation.tolist()}."
+        )
+    return matrix
+
+
+def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
+    """Warn where values are too large to be metres."""
+    if value.numel() and float(value.max()) > limit:
+        warnings.warn(
+            f"`{name}` reaches {float(value.max()):.4g}, which looks like millimetres; hybridkin "
+            "works in metres.",
+            stacklevel=3,
+        )
