@@ -20,6 +20,7 @@ _RELATIVE = ("radii", "lengths")
 _PARAMETERS = ("radii", "angles", "lengths", "offsets", "tool", "base")
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 _MAX_ROUNDS = 12
+_WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
 _KNOWN = (
     0.1  # k parameters that share one unknown direction narrow to 1 / sqrt(k) by the prior alone
 )
@@ -251,7 +252,7 @@ def _fit(
         low.append(lo)
         high.append(hi)
         std = prior.get(name, 0.5) if isinstance(prior, Mapping) else prior
-        stds.append(np.full(size, float(std)))
+        stds.append(np.full(size, min(float(std), _WIDEST)))
     problem = _Problem(
         chain, names, np.concatenate(stds), np.concatenate(low), np.concatenate(high)
     )
@@ -301,13 +302,12 @@ def _solve(problem: _Problem, rows: _Rows, theta: np.ndarray, loss: str) -> _Fit
     errors = residual(theta)
     freedom = max(3.0 * float(rows.weight.sum()) - theta.size, 1.0)
     variance = max(sigma**2 if robust else errors @ errors / freedom, floor**2)
-    scale = np.minimum(problem.prior_std, 1e6)  # a prior of infinite width is none
     # By singular values in units of the prior: squares would lose what the data leave open.
     _, told, directions = np.linalg.svd(
-        J * (scale / np.sqrt(variance)), full_matrices=len(J) < theta.size
+        J * (problem.prior_std / np.sqrt(variance)), full_matrices=len(J) < theta.size
     )
     told = np.pad(told, (0, theta.size - told.size))
-    factor = scale[:, None] * directions.T / np.sqrt(told**2 + 1.0)
+    factor = problem.prior_std[:, None] * directions.T / np.sqrt(told**2 + 1.0)
     covariance = factor @ factor.T
     return _Fit(problem, theta, covariance, rows.rmse(errors), bool(converged))
 

@@ -36,7 +36,7 @@ BHA_LENGTH_LIMITS = (0.10, 0.40)
 BHA_WORKING_BOX = (0.19, 0.31)
 """Chamber lengths it works in: 0.25 m, give or take 0.06 m."""
 
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_UNITS = ("m", "cm", "mm")
 
 
 def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:

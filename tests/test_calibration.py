@@ -86,6 +86,17 @@ def test_prior_keeps_what_the_data_do_not_tell(rng):
     assert "not all identified" in repr(result)
 
 
+def test_without_a_prior_what_the_data_do_not_tell_is_still_told_apart(rng):
+    q = chambers(rng, 60)
+    q[:, 6:] = 0.25
+    x = ConstantCurvatureChain(RADII)(q)
+    x = x + 0.001 * torch.randn(60, 3, generator=rng, dtype=torch.float64)
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    result = calibrate(nominal, q, x, ("radii",), prior=float("inf"))
+    assert result.identifiable["radii"].tolist() == [True, True, False]
+    assert (result.chain.radii[:2] - torch.tensor(RADII[:2])).abs().max() < 0.005
+
+
 def test_robust_loss_forgets_outliers(rng):
     q = chambers(rng)
     truth = ConstantCurvatureChain(RADII)

@@ -25,13 +25,13 @@ from hybridkin.experiments._report import (
     quadratic,
     quiet,
 )
+from hybridkin.guards import GUARDS
 from hybridkin.hybrid import HybridForwardModel
 from hybridkin.persistence import save_model
 
 ALPHAS = tuple(10.0**k for k in range(-5, 4))
 """Ridge weights to choose from."""
 
-GUARDS = ("leverage", "box", None)
 _N_HIDDEN = 100
 _INNER_FOLDS = 4
 _BLOCKS = 10
