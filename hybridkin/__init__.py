@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hybridkin.hybrid import HybridForwardModel
     from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Step, Track
     from hybridkin.persistence import load_model, save_model
+    from hybridkin.rigid import RigidChain
 
 __version__ = "0.1.0"
 
@@ -23,6 +24,7 @@ __all__ = [
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
+    "RigidChain",
     "Step",
     "Track",
     "__version__",
@@ -47,6 +49,7 @@ _ROOM_OF = {
     "IKSolution": "ik",
     "IKStatus": "ik",
     "InverseKinematics": "ik",
+    "RigidChain": "rigid",
     "Step": "ik",
     "Track": "ik",
     "calibrate": "calibration",

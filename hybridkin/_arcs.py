@@ -1,85 +1,157 @@
-"""Kernels of constant curvature: lengths from arcs, tips and derivatives from arcs (torch only).
+"""Kernels of constant curvature: lengths from arcs, tips and derivatives from arcs.
 
-Batches come last here: lengths (S, N), bending vectors (2, S, N), vectors (3, N).
+Batches come last here: lengths (S, N), bending vectors (2, S, N), vectors (3, N). The formulas are
+written once, by components, for tensors and for plain numbers: `fma(a, b, c)` is a + b c and
+`fms(a, b, c)` is a - b c.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._numerics import Stumpff, stumpff
+from hybridkin._numerics import Stumpff, stumpff, stumpff_of_number
+
+Vector = tuple[Any, ...]  # x, y, z
+
+
+class _Arithmetic(NamedTuple):
+    fma: Callable[[Any, Any, Any], Any]
+    fms: Callable[[Any, Any, Any], Any]
+
+
+_TENSORS = _Arithmetic(torch.addcmul, partial(torch.addcmul, value=-1.0))
+_NUMBERS = _Arithmetic(lambda a, b, c: a + b * c, lambda a, b, c: a - b * c)
+
+
+class _Carried(NamedTuple):
+    """A point in the start frame of a segment, and what its derivatives need."""
+
+    point: Vector  # in the start frame
+    tail: Vector  # in the end frame, the rigid offset included
+    rest: Any  # length less the tail along the bending
+    across: Any  # how far the point moves across, per bending
+
+
+def _carried(
+    by: _Arithmetic, point: Vector, length: Any, b: Any, arc: Any, offset: Any
+) -> _Carried:
+    """Return a point of the frame after a segment's rigid offset in the segment's start frame."""
+    x, y, z = point
+    c, f, g, _, _ = arc
+    z = z + offset
+    rest = by.fms(by.fms(length, b[0], x), b[1], y)
+    m = by.fma(g * rest, f, z)
+    start = by.fma(x, b[0], m), by.fma(y, b[1], m), by.fma(f * rest, c, z)
+    return _Carried(start, (x, y, z), rest, m)
+
+
+def _columns(by: _Arithmetic, at: _Carried, b: Any, arc: Any) -> tuple[Vector, ...]:
+    """Return the derivatives of a carried point by (l, bx, by) of the segment."""
+    (bx, by_), (x, y, z), m = b, at.tail, at.across
+    _, f, g, c3, c4 = arc
+    slope_f, slope_g = c3 - g, 2.0 * c4 - c3  # twice the derivatives by s
+    to = by.fma(slope_g * at.rest, slope_f, z)
+    n = by.fms(slope_f * at.rest, f, z)
+    to_x, to_y = by.fms(to * bx, g, x), by.fms(to * by_, g, y)
+    return (
+        (g * bx, g * by_, f),
+        (by.fma(m, bx, to_x), by_ * to_x, by.fms(n * bx, f, x)),
+        (bx * to_y, by.fma(m, by_, to_y), by.fms(n * by_, f, y)),
+    )
+
+
+def _turned(by: _Arithmetic, v: Any, b: Any, arc: Any) -> Vector:
+    """Return vectors of a segment's end frame in its start frame."""
+    c, f, g, _, _ = arc
+    along = by.fma(b[0] * v[0], b[1], v[1])
+    m = by.fms(f * v[2], g, along)
+    return by.fma(v[0], b[0], m), by.fma(v[1], b[1], m), by.fms(c * v[2], f, along)
 
 
 def tip(length: Tensor, bending: Tensor, arc: Stumpff, offsets: Tensor) -> Tensor:
     """Return the tip (3, N) in the base frame, carried from the last segment to the first."""
-    across, ahead = torch.zeros_like(bending[:, 0]), torch.zeros_like(length[0])
-    for k in range(len(length) - 1, -1, -1):
-        b, c, f, g = bending[:, k], arc.c[k], arc.f[k], arc.g[k]
-        across, ahead, _, _ = _carried(across, ahead + offsets[k], length[k], b, c, f, g)
-    return torch.cat([across, ahead[None]])
+    return torch.stack(_all_carried(length, bending, arc, offsets)[0].point)
 
 
 def tip_and_columns(
     length: Tensor, bending: Tensor, offsets: Tensor, *, angular: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Return the tip (3, N) and its derivatives by (l, bx, by) of each segment, (3, 3 S, N).
+    """Return the tip (3, N) and its derivatives by the arcs of the segments, (3, 3 S, N).
 
-    With `angular`, 3 S columns of angular velocity follow the linear ones.
+    Columns are the lengths of all segments, then the x-, then the y-bendings. With `angular`,
+    3 S columns of angular velocity follow the linear ones.
     """
     arc = stumpff((bending**2).sum(0))
-    slope_f, slope_g = arc.c3 - arc.g, 2.0 * arc.c4 - arc.c3  # twice the derivatives by s
-    eye = torch.eye(2, dtype=length.dtype, device=length.device)[..., None]
-    across, ahead = torch.zeros_like(bending[:, 0]), torch.zeros_like(length[0])
+    carried = _all_carried(length, bending, arc, offsets)
+    tails = tuple(torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
+    rest, across = (torch.stack([at[i] for at in carried]) for i in (2, 3))
+    # The segments' own columns all at once, then turned by every segment before them.
+    own = _columns(_TENSORS, _Carried(carried[0].point, tails, rest, across), bending, arc)
+    kinds = [torch.stack([*itertools.chain(*own)])]
+    if angular:
+        kinds.append(torch.stack(_spins(bending, arc)))
+    columns = torch.cat([kind.unflatten(0, (3, 3)) for kind in kinds]).transpose(0, 1)
+    turned = columns[:, :, -1:]
+    bends, arcs = _by_segment(bending), _by_segment(arc)
+    for k in range(len(length) - 2, -1, -1):
+        ahead = torch.stack(_turned(_TENSORS, turned.unbind(), bends[k], arcs[k]))
+        turned = torch.cat([columns[:, :, k : k + 1], ahead], dim=2)
+    return torch.stack(carried[0].point), turned.flatten(1, 2)
+
+
+def _all_carried(length: Tensor, bending: Tensor, arc: Stumpff, offsets: Tensor) -> list[_Carried]:
+    """Return the tip in the start frame of every segment."""
     zero = torch.zeros_like(length[0])
-    linear = turning = None
-    for k in range(len(length) - 1, -1, -1):
-        b, c, f, g = bending[:, k], arc.c[k], arc.f[k], arc.g[k]
-        before, tail = across, ahead + offsets[k]
-        across, ahead, rest, m = _carried(before, tail, length[k], b, c, f, g)
-        to = torch.addcmul(slope_g[k] * rest, slope_f[k], tail) * b - g * before
-        n = torch.addcmul(slope_f[k] * rest, f, tail, value=-1.0)
-        by_length = torch.cat([g * b, f[None]])[:, None]
-        by_bending = torch.cat(
-            [torch.addcmul(m * eye, b[:, None], to[None]), (n * b - f * before)[None]]
-        )
-        own = torch.cat([by_length, by_bending], dim=1)
-        linear = own if linear is None else torch.cat([own, _turned(linear, b, c, f, g)], dim=1)
-        if angular:
-            x, y, c3 = *b, arc.c3[k]
-            spin = [
-                *(zero, -c3 * x * y, c3 * x * x - 1.0),
-                *(zero, 1.0 - c3 * y * y, c3 * x * y),
-                *(zero, -g * y, g * x),
-            ]
-            own = torch.stack(spin).unflatten(0, (3, 3))
-            own = own if turning is None else torch.cat([own, _turned(turning, b, c, f, g)], dim=1)
-            turning = own
-    columns = [block for block in (linear, turning) if block is not None]
-    return torch.cat([across, ahead[None]]), torch.cat(columns, dim=1)
+    point, carried = (zero, zero, zero), []
+    parts = zip(length, _by_segment(bending), _by_segment(arc), offsets, strict=True)
+    for of_length, b, of_arc, offset in [*parts][::-1]:
+        carried.append(_carried(_TENSORS, point, of_length, b, of_arc, offset))
+        point = carried[-1].point
+    return carried[::-1]
 
 
-def _carried(
-    across: Tensor, tail: Tensor, length: Tensor, b: Tensor, c: Tensor, f: Tensor, g: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return a point of a segment's end frame in its start frame, and (e, m) of the formula.
+def _by_segment(parts: Iterable[Tensor]) -> list[tuple[Tensor, ...]]:
+    """Return for every segment its row of each part (S, N)."""
+    return [*zip(*(part.unbind() for part in parts), strict=True)]
 
-    The point is (across, tail), (2, N) and (N,); e is the length less the tail along b, m what
-    the point moves across per bending.
+
+def _spins(bending: Tensor, arc: Stumpff) -> list[Tensor]:
+    """Return the nine entries of the angular velocity by (l, bx, by), each (S, N)."""
+    (x, y), zero = bending, torch.zeros_like(bending[0])
+    c3, g = arc.c3, arc.g
+    by_x = -c3 * x * y, 1.0 - c3 * y * y, -g * y
+    by_y = c3 * x * x - 1.0, c3 * x * y, g * x
+    return [zero, zero, zero, *by_x, *by_y]
+
+
+def tip_and_columns_of_numbers(
+    arcs: NDArray, offsets: Sequence[float]
+) -> tuple[Vector, list[list[float]]]:
+    """Return the tip and its derivatives for one configuration, in plain numbers.
+
+    `arcs` holds 3 S numbers: lengths, x- and y-bendings. The columns come as three rows of 3 S
+    numbers in the same order; see `tip_and_columns`.
     """
-    rest = length - (b * across).sum(0)
-    m = torch.addcmul(g * rest, f, tail)
-    return torch.addcmul(across, b, m), torch.addcmul(f * rest, c, tail), rest, m
-
-
-def _turned(v: Tensor, b: Tensor, c: Tensor, f: Tensor, g: Tensor) -> Tensor:
-    """Return vectors (3, K, N) of a segment's end frame in its start frame."""
-    along = (b[:, None] * v[:2]).sum(0)
-    m = torch.addcmul(f * v[2], g, along, value=-1.0)
-    across = torch.addcmul(v[:2], b[:, None], m)
-    return torch.cat([across, torch.addcmul(c * v[2], f, along, value=-1.0)[None]])
+    n = len(offsets)
+    numbers = arcs.tolist()
+    lengths, bendings = numbers[:n], list(zip(numbers[n : 2 * n], numbers[2 * n :], strict=True))
+    point, columns = (0.0, 0.0, 0.0), []
+    for k in range(n - 1, -1, -1):
+        b = bendings[k]
+        arc = stumpff_of_number(b[0] * b[0] + b[1] * b[1])
+        at = _carried(_NUMBERS, point, lengths[k], b, arc, offsets[k])
+        point = at.point
+        columns = [_turned(_NUMBERS, column, b, arc) for column in columns]
+        columns = [*_columns(_NUMBERS, at, b, arc), *columns]
+    ordered = [columns[3 * k + j] for j in range(3) for k in range(n)]
+    return point, [list(row) for row in zip(*ordered, strict=True)]
 
 
 def arc_transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:

@@ -24,6 +24,18 @@ def vector(
     return vector
 
 
+def filled(value: Any, name: str, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    """Return one number for all, or an array of the shape (also a list of lists), as a tensor."""
+    if len(shape) == 1 and isinstance(value, (list, tuple)) and any(np.ndim(v) for v in value):
+        value = [number for part in value for number in np.ravel(part)]
+    tensor = _tensor(value, name, dtype)
+    if tensor.ndim and tensor.shape != shape:
+        raise ValueError(
+            f"`{name}` must have shape {shape}, or be one number, got {tuple(tensor.shape)}."
+        )
+    return tensor.expand(shape).clone()
+
+
 def _tensor(value: Any, name: str, dtype: torch.dtype) -> Tensor:
     try:
         tensor = torch.as_tensor(np.asarray(value) if not isinstance(value, Tensor) else value)

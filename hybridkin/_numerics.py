@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-_SERIES_END = 50.0  # [rad^2], a little more than a full turn
+_SERIES_END = 1.0  # [rad^2]; from here on nothing cancels in the trigonometric forms
 # Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
-_DEGREE = {torch.float64: 12, torch.float32: 8}
+_DEGREE = {torch.float64: 7, torch.float32: 4}
 _SERIES = tuple(
     ((-1.0) ** j / math.factorial(2 * j + 3), (-1.0) ** j / math.factorial(2 * j + 4))
     for j in range(max(_DEGREE.values()), -1, -1)
@@ -26,19 +26,18 @@ class Stumpff(NamedTuple):
     With respect to s: 2 f' = c3 - g, 2 g' = 2 c4 - c3, 2 c' = -f.
     """
 
-    c: Tensor
-    f: Tensor
-    g: Tensor
-    c3: Tensor
-    c4: Tensor
+    c: Any
+    f: Any
+    g: Any
+    c3: Any
+    c4: Any
 
 
 def stumpff(s: Tensor) -> Stumpff:
     """Return the Stumpff functions of s = theta^2, smooth through theta = 0.
 
-    The power series is summed for the half angle and doubled once, which holds full precision
-    beyond a full turn without a square root or a division near zero; further out, where nothing
-    cancels any more, trigonometry takes over.
+    Up to one radian the power series is summed: no square root, no division. Beyond, where
+    nothing cancels any more, trigonometry takes over; both agree to rounding where they meet.
 
     Parameters
     ----------
@@ -50,31 +49,45 @@ def stumpff(s: Tensor) -> Stumpff:
     Stumpff
         Five tensors of the shape of `s`.
     """
-    wound = s > _SERIES_END
-    near = _stumpff_by_series(torch.where(wound, 0.0, s))
-    far = torch.where(wound, s, _SERIES_END)
-    theta = far.sqrt()
-    c, f = torch.cos(theta), torch.sin(theta) / theta
-    g = (1.0 - c) / far
-    beyond = Stumpff(c, f, g, (1.0 - f) / far, (0.5 - g) / far)
-    return Stumpff(*(torch.where(wound, b, a) for a, b in zip(near, beyond, strict=True)))
-
-
-def _stumpff_by_series(s: Tensor) -> Stumpff:
-    quarter = 0.25 * s
     # c3 and c4 together: one multiply-add per power, however small the batch.
-    powers = s.new_tensor(_SERIES[-1 - _DEGREE.get(s.dtype, 12) :])
-    pair = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
-    both = pair[0].expand(2, *s.shape)
-    for coefficients in pair[1:]:
-        both = torch.addcmul(coefficients, both, quarter)
-    c3, c4 = both.unbind()
-    f = 1.0 - quarter * c3
-    g = 0.5 - quarter * c4
-    c3, c4 = 0.25 * torch.addcmul(c3, f, g), 0.125 * torch.addcmul(c3, c3, f)
-    f = 1.0 - s * c3
+    powers = s.new_tensor(_SERIES[-1 - _DEGREE.get(s.dtype, 7) :])
+    powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
+    near = s.clamp(max=_SERIES_END)
+    c3, c4 = _horner(powers, near, torch.addcmul).expand(2, *s.shape).unbind()
+    far = s.clamp(min=_SERIES_END)
+    theta = far.sqrt()
+    c, far_c3, far_c4 = _by_trigonometry(far, theta, torch.cos(theta), torch.sin(theta))
+    bent = s > _SERIES_END
+    c3, c4 = torch.where(bent, far_c3, c3), torch.where(bent, far_c4, c4)
+    f, g = 1.0 - s * c3, 0.5 - s * c4
+    return Stumpff(torch.where(bent, c, 1.0 - s * g), f, g, c3, c4)
+
+
+def stumpff_of_number(s: float) -> Stumpff:
+    """Return the Stumpff functions of one number; see `stumpff`."""
+    if s > _SERIES_END:
+        theta = math.sqrt(s)
+        c, c3, c4 = _by_trigonometry(s, theta, math.cos(theta), math.sin(theta))
+        return Stumpff(c, 1.0 - s * c3, 0.5 - s * c4, c3, c4)
+    c3, c4 = (_horner(powers, s, _multiply_add) for powers in zip(*_SERIES, strict=True))
     g = 0.5 - s * c4
-    return Stumpff(1.0 - s * g, f, g, c3, c4)
+    return Stumpff(1.0 - s * g, 1.0 - s * c3, g, c3, c4)
+
+
+def _horner(powers: Sequence[Any], s: Any, fma: Callable) -> Any:
+    total = powers[0]
+    for coefficient in powers[1:]:
+        total = fma(coefficient, total, s)
+    return total
+
+
+def _multiply_add(a: float, b: float, c: float) -> float:
+    return a + b * c
+
+
+def _by_trigonometry(s: Any, theta: Any, c: Any, sine: Any) -> tuple[Any, Any, Any]:
+    """Return c, c3 and c4 of s = theta^2 that is not small."""
+    return c, (1.0 - sine / theta) / s, (0.5 - (1.0 - c) / s) / s
 
 
 def jacobian(module: Any, q: Tensor) -> Tensor:

@@ -58,7 +58,7 @@ def save_model(model: Any, path: str | Path) -> None:
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "trunk.safetensors"
     >>> save_model(robots.bionic_handling_assistant(), path)
     >>> load_model(path)
-    ConstantCurvatureChain(3 extensible segments, 9 actuators, segment)
+    ConstantCurvatureChain(extensible, 3 segments, 9 actuators, routing 'segment')
     """
     arrays: Arrays = {}
     if isinstance(model, ConstantCurvatureChain):

@@ -1,0 +1,261 @@
+"""What all chains of circular arcs share: tip, poses and derivatives from one arc per segment."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from hybridkin._arcs import arc_transforms, tip, tip_and_columns
+from hybridkin._numerics import PortableModule, check_vectors, in_blocks, stumpff
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Transform3d
+    from typing_extensions import Self
+
+
+class ArcChain(PortableModule):
+    """A chain of circular arcs; its kinds differ in how the actuators shape them.
+
+    A kind sets the attributes below and gives `_arcs_and_slope`.
+    """
+
+    n_segments: int
+    n_actuators: int
+    actuators_per_segment: tuple[int, ...]
+    tip_at: float  # the point that is steered, in segments from the base
+    offsets: Tensor  # (S,)
+    base: Tensor  # (4, 4)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the tip position.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        Tensor of shape (..., 3)
+            Tip position in the measuring frame [m].
+        """
+        length, bending = self._split(self._to_tip(self._arcs(q)))
+        tail = tip(length, bending, stumpff((bending**2).sum(0)), self._tip_offsets().to(q))
+        return self._in_measuring_frame(tail, q)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return the position Jacobian dx/dq, shape (..., 3, n_actuators), in closed form."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip position [m] and its Jacobian in one pass.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        x : Tensor of shape (..., 3)
+            Tip position [m].
+        J : Tensor of shape (..., 3, n_actuators)
+            Closed-form Jacobian dx/dq [-].
+        """
+        x, J = in_blocks(self._forward_and_jacobian, q)
+        return x, J
+
+    def pose_jacobian(self, q: Tensor) -> Tensor:
+        """Return the tip's linear [-] and angular [rad/m] Jacobian, shape (..., 6, n_actuators).
+
+        The angular rows give the angular velocity in the measuring frame.
+        """
+        arcs, slope = self._arcs_and_slope(self._rows(q))
+        length, bending = self._split(self._to_tip(arcs))
+        _, columns = tip_and_columns(length, bending, self._tip_offsets().to(q), angular=True)
+        parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
+        return torch.cat(parts, dim=-2)
+
+    def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the arc of every segment.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        length : Tensor of shape (..., S)
+            Centre-line lengths [m].
+        bending : Tensor of shape (..., S, 2)
+            Bending vectors [rad]: their norm is the bend angle, they point where it bends.
+        """
+        return self._leading(self._arcs(q), q)
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Return the pose of the base and of the end of every segment, its offset included.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        Tensor of shape (..., S + 1, 4, 4)
+            Homogeneous transforms into the measuring frame; the last one is the robot's end.
+        """
+        return self._poses(*self.arcs(q), self.offsets)
+
+    def tip_transform(self, q: Tensor) -> Transform3d:
+        """Return the tip pose as a pytorch_kinematics Transform3d, for q of shape (N, n)."""
+        from pytorch_kinematics import Transform3d  # takes a second and loads pyplot
+
+        arcs = self._leading(self._to_tip(self._arcs(q)), q)
+        return Transform3d(matrix=self._poses(*arcs, self._tip_offsets())[..., -1, :, :])
+
+    def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
+        """Return points along the whole backbone, base to end.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+        n_points : int, default=20
+            Points per segment; the last of each is the segment's end, its offset included.
+
+        Returns
+        -------
+        Tensor of shape (..., S * n_points + 1, 3)
+            Positions in the measuring frame [m].
+        """
+        if n_points < 1:
+            raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
+        length, bending = self.arcs(q)
+        poses = self._poses(length, bending, self.offsets)
+        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
+        f, g = stumpff((t * bending[..., None, :]).square().sum(-1))[1:3]
+        bend = (g[..., None] * t) * bending[..., None, :]
+        arc = (t * length[..., None, None]) * torch.cat([bend, f[..., None]], dim=-1)
+        start, end = poses[..., :-1, :, :], poses[..., 1:, None, :3, 3]
+        points = arc @ start[..., :3, :3].mT + start[..., None, :3, 3]
+        points = torch.cat([points[..., :-1, :], end], dim=-2)
+        return torch.cat([poses[..., 0, None, :3, 3], points.flatten(-3, -2)], dim=-2)
+
+    def with_tip(self, at: float) -> Self:
+        """Return a chain that steers another point of the same robot.
+
+        Parameters
+        ----------
+        at : float
+            Where on the backbone, in segments from the base: 1.5 is the middle of the second
+            segment's arc, 2.0 its end with its rigid offset, S (the default) the robot's end.
+
+        Returns
+        -------
+        ArcChain
+            Its tip, Jacobians and tip transform are those of that point; actuators, arcs, poses and
+            backbone stay those of the whole robot.
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ConstantCurvatureChain
+        >>> chain = ConstantCurvatureChain([0.01, 0.01], lengths=[0.1, 0.1]).with_tip(1.5)
+        >>> chain(torch.zeros(6, dtype=torch.float64))
+        tensor([0.0000, 0.0000, 0.1500], dtype=torch.float64)
+        """
+        if not 0.0 < at <= self.n_segments:
+            raise ValueError(
+                f"`at` must lie in (0, {self.n_segments}], in segments from the base, got {at}."
+            )
+        chain = copy.deepcopy(self)
+        chain.tip_at = float(at)
+        return chain
+
+    def extra_repr(self) -> str:
+        """Return the summary shown by repr()."""
+        where = "" if self.tip_at == self.n_segments else f", tip at {self.tip_at:g}"
+        return f"{self.n_segments} segments, {self.n_actuators} actuators{where}"
+
+    def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return arcs (3 S, N) of rows (N, n) and their derivative, (3 S, n) or (3 S, n, N).
+
+        Arcs are the lengths of all segments, then the x-, then the y-bendings.
+        """
+        raise NotImplementedError
+
+    def _rows(self, q: Tensor) -> Tensor:
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        return q.reshape(-1, self.n_actuators)
+
+    def _why_shape(self) -> str:
+        per_segment = " + ".join(str(n) for n in self.actuators_per_segment)
+        if len(set(self.actuators_per_segment)) == 1:
+            per_segment = f"{self.actuators_per_segment[0]} actuators each"
+        return f"this chain has {self.n_segments} segments of {per_segment}"
+
+    def _arcs(self, q: Tensor) -> Tensor:
+        return self._arcs_and_slope(self._rows(q))[0]
+
+    def _to_tip(self, arcs: Tensor) -> Tensor:
+        """Return the rows (3 m, ...) of arcs (3 S, ...), or of their slope, up to the tip."""
+        if self.tip_at == self.n_segments:
+            return arcs
+        m = math.ceil(self.tip_at)
+        parts = arcs.unflatten(0, (3, self.n_segments))[:, :m]
+        last = parts[:, -1:] * (self.tip_at - m + 1)
+        return torch.cat([parts[:, :-1], last], dim=1).flatten(0, 1)
+
+    def _tip_offsets(self) -> Tensor:
+        if self.tip_at == self.n_segments:
+            return self.offsets
+        m = math.ceil(self.tip_at)
+        last = self.offsets[m - 1 : m] * float(self.tip_at == m)
+        return torch.cat([self.offsets[: m - 1], last])
+
+    @staticmethod
+    def _split(arcs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return lengths (S, N) and bending vectors (2, S, N)."""
+        length, x, y = arcs.unflatten(0, (3, -1))
+        return length, torch.stack([x, y])
+
+    def _leading(self, arcs: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return lengths (..., S) and bending vectors (..., S, 2)."""
+        parts = arcs.unflatten(0, (3, -1)).permute(2, 1, 0)
+        parts = parts.reshape(*q.shape[:-1], *parts.shape[1:])
+        return parts[..., 0], parts[..., 1:]
+
+    def _poses(self, length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
+        steps = arc_transforms(length, bending, offsets.to(length))
+        pose = self.base.to(length).expand(*length.shape[:-1], 4, 4)
+        poses = [pose]
+        for step in steps.unbind(-3):
+            pose = pose @ step
+            poses.append(pose)
+        return torch.stack(poses, dim=-3)
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        arcs, slope = self._arcs_and_slope(self._rows(q))
+        length, bending = self._split(self._to_tip(arcs))
+        tail, columns = tip_and_columns(length, bending, self._tip_offsets().to(q))
+        return self._in_measuring_frame(tail, q), self._by_actuators(columns, slope, q)
+
+    def _in_measuring_frame(self, tail: Tensor, q: Tensor) -> Tensor:
+        base = self.base.to(q)
+        return (base[:3, :3] @ tail + base[:3, 3:]).T.reshape(*q.shape[:-1], 3)
+
+    def _by_actuators(self, columns: Tensor, slope: Tensor, q: Tensor) -> Tensor:
+        """Fold the slope of the arcs and the base into columns (3, 3 m, N)."""
+        columns = (self.base.to(q)[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
+        slope = self._to_tip(slope)
+        if slope.ndim == 2:
+            J = torch.matmul(slope.T, columns)  # (3, n, N)
+        else:
+            J = (columns[:, :, None] * slope).sum(1)
+        return J.flatten(0, 1).T.contiguous().reshape(*q.shape[:-1], 3, self.n_actuators)
