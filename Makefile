@@ -5,13 +5,16 @@ OUT ?= results
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test check clean
+.PHONY: paper test bench check clean
 
 paper: $(VENV)/.installed
 	$(BIN)/python -m hybridkin paper --out $(OUT)
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -q
+
+bench: $(VENV)/.bench
+	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet
 
 check: $(VENV)/.installed
 	$(BIN)/ruff check .
@@ -23,6 +26,10 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet torch==2.13.0
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	touch $@
+
+$(VENV)/.bench: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --editable ".[bench]"
 	touch $@
 
 clean:

@@ -1,0 +1,79 @@
+"""Chains alone: tip and Jacobian in one pass against automatic derivation and another library."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import jacobian
+
+
+def test_against_automatic_derivatives(race, chain, draw, batch, autodiff):
+    q = draw(batch)
+    name, derive = autodiff
+    assert_close(chain.forward_and_jacobian(q)[1], derive(chain, q))
+    race(
+        "chain: tip + J",
+        name,
+        lambda: chain.forward_and_jacobian(q),
+        lambda: derive(chain, q),
+        rows=batch,
+    )
+
+
+def test_cost_per_row_of_a_large_batch(race, chain, draw, timed):
+    large, small = (1_000_000, 10_000) if timed else (64, 8)
+    q = draw(large)
+    few = q[:small].clone()
+    assert_close(chain.forward_and_jacobian(q)[1][:small], chain.forward_and_jacobian(few)[1])
+    race(
+        "chain: tip + J",
+        f"itself, {small:,} rows",
+        lambda: chain.forward_and_jacobian(q),
+        lambda: chain.forward_and_jacobian(few),
+        rows=large,
+        peer_rows=small,
+        at_most=1.3,
+    )
+
+
+def test_one_configuration(race, chain, draw, arm):
+    q = draw(1)[0]
+    x, J = chain.forward_and_jacobian(q)
+    assert_close(J, jacobian(lambda q: chain(q), q))
+    assert_close(x, chain(q))
+    race(
+        "chain: tip + J",
+        "pytorch_kinematics (9 joints): J",
+        lambda: chain.forward_and_jacobian(q),
+        lambda: arm.jacobian(q),
+    )
+
+
+def test_one_configuration_in_plain_numbers(race, chain, draw, arm):
+    if not hasattr(chain, "numpy_function"):
+        pytest.skip("needs ConstantCurvatureChain.numpy_function")
+    q = draw(1)[0]
+    function, array = chain.numpy_function(), q.numpy()
+    for ours, expected in zip(function(array), chain.forward_and_jacobian(q), strict=True):
+        np.testing.assert_allclose(ours, expected.numpy(), rtol=1e-12, atol=1e-14)
+    race(
+        "chain: tip + J, plain numbers",
+        "pytorch_kinematics (9 joints): J",
+        lambda: function(array),
+        lambda: arm.jacobian(q),
+    )
+
+
+def test_rigid_chain(race, urdf, arm, draw, batch):
+    rigid = pytest.importorskip("hybridkin.rigid")
+    ours = rigid.RigidChain.from_urdf(urdf, "link9")
+    q = torch.randn(batch, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert_close(ours.forward_and_jacobian(q)[1], arm.jacobian(q)[:, :3])
+    race(
+        "rigid chain (9 joints): tip + J",
+        "pytorch_kinematics (9 joints): J",
+        lambda: ours.forward_and_jacobian(q),
+        lambda: arm.jacobian(q),
+        rows=batch,
+    )
