@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 class ArcChain(PortableModule):
     """A chain of circular arcs; its kinds differ in how the actuators shape them.
 
-    A kind sets the attributes below and gives `_arcs_and_slope`.
+    A kind sets the attributes below and gives `_arcs_and_slope` and `_arc_tangents`.
     """
 
     n_segments: int
@@ -79,6 +80,48 @@ class ArcChain(PortableModule):
         _, columns = tip_and_columns(length, bending, self._tip_offsets().to(q), angular=True)
         parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
         return torch.cat(parts, dim=-2)
+
+    def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivative of the tip along changes of the geometry, in closed form.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+        tangents : dict of str to Tensor of shape (P, ...)
+            P changes of entries of `geometry()`, stacked; entries left out stay as they are.
+
+        Returns
+        -------
+        Tensor of shape (..., 3, P)
+            How fast the tip moves along every change [m per unit of the change].
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ConstantCurvatureChain
+        >>> chain = ConstantCurvatureChain([0.01], lengths=[0.1])
+        >>> longer = {"lengths": torch.ones(1, 1, dtype=torch.float64)}
+        >>> chain.geometry_jacobian(torch.zeros(3, dtype=torch.float64), longer).flatten()
+        tensor([0., 0., 1.], dtype=torch.float64)
+        """
+        rows = self._rows(q)
+        length, bending = self._split(self._to_tip(self._arcs_and_slope(rows)[0]))
+        offsets, base = self._tip_offsets().to(q), self.base.to(q)
+        tail, columns = tip_and_columns(length, bending, offsets, rigid=True)
+        tangents = {name: value.to(q) for name, value in tangents.items()}
+        moves = self._to_tip(self._arc_tangents(rows, tangents).permute(2, 1, 0)).permute(2, 1, 0)
+        columns = (base[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
+        by_arcs, by_offsets = (
+            columns.permute(2, 0, 1).contiguous().split([3 * len(length), len(length)], dim=2)
+        )
+        J = by_arcs @ moves.mT
+        if "offsets" in tangents:
+            J = J + by_offsets @ self._tip_offsets(tangents["offsets"]).T
+        if "base" in tangents:
+            turned = tail.T @ tangents["base"][:, :3, :3].permute(2, 1, 0).flatten(1)
+            J = J + turned.unflatten(1, J.shape[1:]) + tangents["base"][:, :3, 3].T
+        return J.reshape(*q.shape[:-1], *J.shape[1:])
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arc of every segment.
@@ -190,6 +233,10 @@ class ArcChain(PortableModule):
         """
         raise NotImplementedError
 
+    def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
+        raise NotImplementedError
+
     def _rows(self, q: Tensor) -> Tensor:
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         return q.reshape(-1, self.n_actuators)
@@ -212,12 +259,14 @@ class ArcChain(PortableModule):
         last = parts[:, -1:] * (self.tip_at - m + 1)
         return torch.cat([parts[:, :-1], last], dim=1).flatten(0, 1)
 
-    def _tip_offsets(self) -> Tensor:
+    def _tip_offsets(self, offsets: Tensor | None = None) -> Tensor:
+        """Return the rigid offsets (..., m) up to the tip, by default of the chain itself."""
+        offsets = self.offsets if offsets is None else offsets
         if self.tip_at == self.n_segments:
-            return self.offsets
+            return offsets
         m = math.ceil(self.tip_at)
-        last = self.offsets[m - 1 : m] * float(self.tip_at == m)
-        return torch.cat([self.offsets[: m - 1], last])
+        last = offsets[..., m - 1 : m] * float(self.tip_at == m)
+        return torch.cat([offsets[..., : m - 1], last], dim=-1)
 
     @staticmethod
     def _split(arcs: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,6 @@ written once, by components, for tensors and for plain numbers: `fma(a, b, c)` i
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -81,23 +80,30 @@ def tip(length: Tensor, bending: Tensor, arc: Stumpff, offsets: Tensor) -> Tenso
 
 
 def tip_and_columns(
-    length: Tensor, bending: Tensor, offsets: Tensor, *, angular: bool = False
+    length: Tensor,
+    bending: Tensor,
+    offsets: Tensor,
+    *,
+    angular: bool = False,
+    rigid: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return the tip (3, N) and its derivatives by the arcs of the segments, (3, 3 S, N).
 
     Columns are the lengths of all segments, then the x-, then the y-bendings. With `angular`,
-    3 S columns of angular velocity follow the linear ones.
+    3 S columns of angular velocity follow, with `rigid`, S columns for the offsets.
     """
     arc = stumpff((bending**2).sum(0))
     carried = _all_carried(length, bending, arc, offsets)
     tails = tuple(torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
     rest, across = (torch.stack([at[i] for at in carried]) for i in (2, 3))
     # The segments' own columns all at once, then turned by every segment before them.
-    own = _columns(_TENSORS, _Carried(carried[0].point, tails, rest, across), bending, arc)
-    kinds = [torch.stack([*itertools.chain(*own)])]
+    own: Any = _columns(_TENSORS, _Carried(carried[0].point, tails, rest, across), bending, arc)
+    kinds = [torch.stack(sum(own, ()))]
     if angular:
         kinds.append(torch.stack(_spins(bending, arc)))
-    columns = torch.cat([kind.unflatten(0, (3, 3)) for kind in kinds]).transpose(0, 1)
+    if rigid:
+        kinds.append(torch.stack([*(arc.f * bending), arc.c]))
+    columns = torch.cat([kind.unflatten(0, (-1, 3)) for kind in kinds]).transpose(0, 1)
     turned = columns[:, :, -1:]
     bends, arcs = _by_segment(bending), _by_segment(arc)
     for k in range(len(length) - 2, -1, -1):
@@ -170,22 +176,27 @@ def arc_transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     return torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
 
 
-def reading_matrix(
-    radii: Tensor, angles: Tensor, counts: Sequence[int], routing: str, extensible: bool
-) -> Tensor:
-    """Return the map from arcs to actuator lengths, bendings taken in units of 1 / radius.
+def levers(radii: Tensor, angles: Tensor, counts: Sequence[int]) -> Tensor:
+    """Return where every actuator crosses its segment's cross-section (..., 2, n) [m].
 
-    Rows are actuators; columns are the lengths (extensible chains only), then the x- and the
-    y-bendings of all segments.
+    The inputs may carry leading dimensions alike.
+    """
+    repeats = torch.tensor(counts, device=radii.device)
+    radius = radii.repeat_interleave(repeats, dim=-1, output_size=sum(counts))
+    return torch.stack([radius * angles.cos(), radius * angles.sin()], dim=-2)
+
+
+def reading_matrix(levers: Tensor, counts: Sequence[int], routing: str, extensible: bool) -> Tensor:
+    """Return the linear map from arcs to actuator lengths, (..., n, 3 S) or (..., n, 2 S).
+
+    Columns are the lengths (extensible chains only), then the x- and the y-bendings of all
+    segments.
     """
     n_segments = len(counts)
-    spans = torch.zeros(sum(counts), n_segments, dtype=radii.dtype, device=radii.device)
+    spans = levers.new_zeros(sum(counts), n_segments)
     row = 0
     for k, n in enumerate(counts):
         spans[row : row + n, (0 if routing == "base" else k) : k + 1] = 1.0
         row += n
-    repeats = torch.tensor(counts, device=radii.device)
-    own_radius = radii.repeat_interleave(repeats, output_size=sum(counts))
-    lever = spans * (own_radius[:, None] / radii)
-    columns = [-torch.cos(angles)[:, None] * lever, -torch.sin(angles)[:, None] * lever]
-    return torch.cat([spans, *columns] if extensible else columns, dim=1)
+    x, y = (-levers[..., None] * spans).unbind(-3)
+    return torch.cat([spans.expand_as(x), x, y] if extensible else [x, y], dim=-1)

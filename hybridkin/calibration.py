@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, cast
 
 import numpy as np
 import torch
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
+from scipy.linalg import qr
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
-from hybridkin._numerics import stumpff
+from hybridkin._least_squares import Fit, Rows, solve
+from hybridkin._parameters import ALIASES, POSITIVE, Problem, parameter_names
+from hybridkin._starts import Start, starts
 
 __all__ = ["CalibrationResult", "calibrate"]
 
-_RELATIVE = ("radii", "lengths")
-_PARAMETERS = ("radii", "angles", "lengths", "offsets", "tool", "base")
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
-_MAX_ROUNDS = 12
 _WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
-_KNOWN = (
-    0.1  # k parameters that share one unknown direction narrow to 1 / sqrt(k) by the prior alone
-)
+_KNOWN = 0.1  # k parameters that share one unknown direction narrow to 1 / sqrt(k) by the prior
+_EQUAL = 1.0 - 1e-4  # of starts that explain the tips alike the given one counts
+_BETTER = 0.8  # another handedness than the given one must explain the tips this much better,
+_FAR_BETTER = 0.5  # and this much where the user has not asked for it
+_UNPHYSICAL = 1.75  # positive geometry that moves by this factor is worth a word
+_STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%")}
 
 
 @dataclass(frozen=True, repr=False)
@@ -35,9 +39,9 @@ class CalibrationResult:
     chain
         Copy of the given chain with the calibrated geometry.
     values : dict of str to array
-        The calibrated geometry by parameter name, in the chain's shapes and units: "radii" (S,)
-        [m], "lengths" (S,) [m], "angles" (n,) [rad], "offsets" (S,) [m], "tool" () [m], "base"
-        (4, 4).
+        The calibrated geometry by parameter name, in the chain's shapes and units, as
+        ``chain.geometry()`` has it; "tool" () [m] is the last of the offsets, "turns" (S,) [rad]
+        the angle of the first actuator of each segment.
     std_errors : dict of str to array
         One standard error for each entry of `values`; for "base" shape (6,), three of rotation
         [rad] and three of translation [m], in the measuring frame.
@@ -47,6 +51,11 @@ class CalibrationResult:
         Free parameters, as "radii[0]" or "base[rot x]".
     identifiable : dict of str to bool array
         False where the data narrow the prior less than tenfold: that value is an assumption.
+    singular_values : ndarray of shape (P,)
+        How many times the data narrow the prior, along P directions that they tell apart, largest
+        first. Below 10 the prior decides.
+    unidentified : tuple of str
+        A sentence for each direction that the data leave open, with what to do.
     rmse : float
         Root mean square tip distance on the given data [m].
     cv_rmse : float or None
@@ -58,9 +67,11 @@ class CalibrationResult:
     chain: Any
     values: dict[str, Any]
     std_errors: dict[str, Any]
-    correlations: np.ndarray
+    correlations: NDArray
     names: tuple[str, ...]
-    identifiable: dict[str, np.ndarray]
+    identifiable: dict[str, NDArray]
+    singular_values: NDArray
+    unidentified: tuple[str, ...]
     rmse: float
     cv_rmse: float | None
     converged: bool
@@ -68,11 +79,11 @@ class CalibrationResult:
     def __repr__(self) -> str:
         lines = [f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"]
         for name, value in self.values.items():
-            known = np.asarray(self.identifiable[name]).all()
             lines.append(f"  {name}: {_shown(value)}")
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
-            if not known:
-                lines.append("    not all identified by these data: the prior decides there")
+        if self.unidentified:
+            lines.append("  These data cannot tell, and the prior decides:")
+            lines += [f"    {sentence}" for sentence in self.unidentified]
         return "\n".join(lines)
 
 
@@ -99,27 +110,35 @@ def calibrate(
     Nonlinear least squares on the tip distance with exact derivatives. Radii and lengths are
     fitted by their logarithm and so stay positive. A weak prior keeps every parameter near its
     start where the data say nothing; its weight against the data follows the noise level, which
-    is estimated from the residuals, so exact data override it.
+    is estimated from the residuals, so exact data override it. With a free base or free angles
+    several starts are tried, other turns and mirror images of the actuator rings among them: of a
+    robot wired the other way round the data tell.
 
     Parameters
     ----------
-    chain : ConstantCurvatureChain
-        Start of the search; it is not changed.
+    chain : ConstantCurvatureChain, RigidChain or nn.Module
+        Start of the search; it is not changed. Any module q -> x with `geometry()`,
+        `with_geometry()`, `reach` and `check_actuators()` will do.
     q : array or Tensor of shape (N, n_actuators)
-        Actuator vectors [m].
+        Actuator vectors [m], of revolute joints [rad].
     x : array or Tensor of shape (N, 3)
         Measured tip positions [m].
     parameters : sequence of str, default=("radii", "base")
-        Among "radii", "angles" (one turn of each segment's actuators), "lengths" (tendon chains),
-        "offsets", "tool" (the last offset), "base" (pose).
+        Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
+        chains), "offsets", "rest_bends", "actuator_zeros", "base" (pose); or instead of all angles
+        "turns", of each segment's ring of actuators as a whole, and instead of all offsets "tool",
+        the last one.
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
         All but "linear" bound the influence of outliers.
     bounds : dict of str to (low, high), optional
-        Limits of "radii", "lengths", "offsets", "tool" [m] or of the turn in "angles" [rad].
+        Limits of all entries of a name, in its own unit. Default: a factor of 5 on radii and
+        lengths, half a turn on rest bends, and offsets that are no shorter than minus a tenth of
+        the robot's length.
     prior : float or dict of str to float, default=0.5
         Standard deviation of the weak prior in natural units: a fraction of radii and lengths, of
-        the robot's length for "offsets", "tool" and the base position, radians for angles and the
-        base orientation. ``inf`` turns it off.
+        the mean radius for "actuator_zeros", of the robot's length for "offsets", "tool" and the
+        base position, radians for angles, rest bends and the base orientation. ``inf`` turns it
+        off.
     groups : array-like of shape (N,), optional
         Motion of every row; asks for `cv_rmse` on motions held out.
     sample_weight : array-like of shape (N,), optional
@@ -134,6 +153,12 @@ def calibrate(
     ------
     ValueError
         For unknown parameters, wrong shapes, or data that are not finite.
+
+    Warns
+    -----
+    UserWarning
+        Where a value ran into a bound or left what is physical, and where the mirror image of the
+        given robot explains the data far better: then that is returned.
 
     References
     ----------
@@ -160,299 +185,182 @@ def calibrate(
             raise ValueError(f"`groups` must have shape ({len(q)},), got {groups.shape}.")
     weights = _check_weights(sample_weight, q)
     kept = weights > 0
-    rows = _Rows(q[kept], x[kept], weights[kept])
-    starts = [chain]
-    if "base" in names:
-        starts.append(_aligned(chain, rows))
-    fits = [_fit(start, rows, names, loss, bounds or {}, prior) for start in starts]
-    best = min(fits, key=lambda fit: fit.rmse)
+    rows = Rows(q[kept], x[kept], weights[kept])
+    stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
+    stds = {name: min(float(stds.get(name, 0.5)), _WIDEST) for name in names}
+    with torch.no_grad():
+        candidates = starts(chain, rows, names)
+    fits = []
+    for start in candidates:
+        problem = Problem.of(start.chain, names, bounds or {}, stds)
+        first = _first_theta(problem, start)
+        fits.append(solve(problem, rows, first, loss, roughly=len(candidates) > 1))
+    best = _best(fits, candidates, bool({"angles", "turns"} & {*names}))
+    if len(candidates) > 1:
+        best = solve(best.problem, rows, best.theta, loss)
+    _warn_unphysical(best)
     cv_rmse = None
     if groups is not None:
-        cv_rmse = _cross_validate(best.problem, rows, groups[kept.numpy()], loss)
-    return _result(best, cv_rmse, torch_given)
+        cv_rmse = _cross_validate(best, rows, groups[kept.numpy()], loss)
+    return _result(best, rows, cv_rmse, torch_given)
 
 
-class _Rows(NamedTuple):
-    q: Tensor
-    x: Tensor
-    weight: Tensor
-
-    def residual(self, chain: Any) -> Tensor:
-        """Return the weighted coordinate errors (3 N,), whose squares add up to the loss."""
-        return ((chain(self.q) - self.x) * self.weight.sqrt()[:, None]).reshape(-1)
-
-    def rmse(self, residual: np.ndarray) -> float:
-        return float(np.sqrt((residual**2).sum() / float(self.weight.sum())))
-
-    def noise(self, residual: np.ndarray, robust: bool) -> float:
-        """Return the standard deviation of one coordinate, from the median where robust."""
-        weight = np.repeat(self.weight.numpy(), 3)
-        if not robust:
-            return float(np.sqrt((residual**2).sum() / weight.sum()))
-        size = np.abs(residual) / np.sqrt(weight)
-        order = np.argsort(size)
-        middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
-        return 1.4826 * float(size[order][middle])
+def _first_theta(problem: Problem, start: Start) -> NDArray:
+    theta = [np.zeros(part.size) for part in problem.parameters]
+    for part, own in zip(problem.parameters, theta, strict=True):
+        if part.name == "radii":
+            own += np.log(start.scale)
+    return np.clip(np.concatenate(theta), problem.low, problem.high)
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """The free parameters theta of a chain, all of natural size one, zero at the start."""
-
-    chain: Any
-    names: tuple[str, ...]
-    prior_std: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    def moved(self, theta: Tensor) -> Any:
-        geometry = self.chain.geometry()
-        reach = _reach(self.chain)
-        moved: dict[str, Tensor] = {}
-        parts = theta.split([_size(self.chain, name) for name in self.names])
-        for name, part in zip(self.names, parts, strict=True):
-            if name in _RELATIVE:
-                moved[name] = geometry[name] * torch.exp(part)
-            elif name == "angles":
-                counts = torch.tensor(self.chain.actuators_per_segment, device=part.device)
-                total = sum(self.chain.actuators_per_segment)
-                turn = part.repeat_interleave(counts, output_size=total)
-                moved[name] = geometry[name] + turn
-            elif name == "offsets":
-                moved[name] = geometry[name] + reach * part
-            elif name == "tool":
-                offsets = geometry["offsets"]
-                moved["offsets"] = torch.cat([offsets[:-1], offsets[-1:] + reach * part])
-            else:
-                moved[name] = _moved_base(geometry["base"], part, reach)
-        return self.chain.with_geometry(**moved)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    problem: _Problem
-    theta: np.ndarray
-    covariance: np.ndarray
-    rmse: float
-    converged: bool
-
-
-def _fit(
-    chain: Any,
-    rows: _Rows,
-    names: tuple[str, ...],
-    loss: str,
-    bounds: Mapping[str, tuple[float, float]],
-    prior: float | Mapping[str, float],
-) -> _Fit:
-    low, high, stds = [], [], []
-    for name in names:
-        size = _size(chain, name)
-        lo, hi = _theta_bounds(chain, name, bounds.get(name))
-        low.append(lo)
-        high.append(hi)
-        std = prior.get(name, 0.5) if isinstance(prior, Mapping) else prior
-        stds.append(np.full(size, min(float(std), _WIDEST)))
-    problem = _Problem(
-        chain, names, np.concatenate(stds), np.concatenate(low), np.concatenate(high)
-    )
-    theta = np.clip(np.zeros(problem.prior_std.size), problem.low, problem.high)
-    return _solve(problem, rows, theta, loss)
-
-
-def _solve(problem: _Problem, rows: _Rows, theta: np.ndarray, loss: str) -> _Fit:
-    """Alternate least squares and the noise level that weighs the prior against the data."""
-
-    def residual(theta: np.ndarray) -> np.ndarray:
-        return rows.residual(problem.moved(torch.as_tensor(theta).to(rows.q))).detach().numpy()
-
-    derivative = torch.func.jacfwd(lambda t: rows.residual(problem.moved(t)))
-
-    def jacobian(theta: np.ndarray) -> np.ndarray:
-        return derivative(torch.as_tensor(theta).to(rows.q)).detach().numpy()
-
-    floor = 1e-12 * float(_reach(problem.chain))
-    robust = loss != "linear"
-    sigma = max(rows.noise(residual(theta), robust), floor)
-    converged = False
-    for _ in range(_MAX_ROUNDS):
-
-        def whitened(theta: np.ndarray, sigma: float = sigma) -> np.ndarray:
-            return np.concatenate([residual(theta) / sigma, theta / problem.prior_std])
-
-        def whitened_jacobian(theta: np.ndarray, sigma: float = sigma) -> np.ndarray:
-            return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
-
-        solution = least_squares(
-            whitened,
-            theta,
-            jac=whitened_jacobian,  # pyright: ignore[reportArgumentType]
-            bounds=(problem.low, problem.high),
-            loss=loss,
-            ftol=1e-12,
-            xtol=1e-12,
-            gtol=1e-12,
-            max_nfev=100,
+def _best(fits: list[Fit], candidates: list[Start], free_angles: bool) -> Fit:
+    """Return the best fit: of equals the first, and a mirror image only where clearly better."""
+    best, image = fits[0], None
+    for fit, start in zip(fits[1:], candidates[1:], strict=True):
+        if not any(start.mirrored):
+            best = fit if fit.rmse < _EQUAL * best.rmse else best
+        elif image is None or fit.rmse < image.rmse:
+            image = fit
+    if image is None or image.rmse >= (_BETTER if free_angles else _FAR_BETTER) * best.rmse:
+        return best
+    if not free_angles:
+        warnings.warn(
+            f"the actuators run the other way round than `chain` says: its mirror image leaves "
+            f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
+            "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`.",
+            stacklevel=3,
         )
-        theta, converged = solution.x, solution.status > 0
-        previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
-        if abs(sigma - previous) <= 0.02 * previous:
-            break
-    J = jacobian(theta)
-    errors = residual(theta)
-    freedom = max(3.0 * float(rows.weight.sum()) - theta.size, 1.0)
-    variance = max(sigma**2 if robust else errors @ errors / freedom, floor**2)
+    return image
+
+
+def _warn_unphysical(fit: Fit) -> None:
+    problem, theta = fit.problem, fit.theta
+    words = []
+    for label, at, low, high in zip(problem.labels, theta, problem.low, problem.high, strict=True):
+        if min(at - low, high - at) < 1e-6:
+            side = "lower" if at - low < high - at else "upper"
+            words.append(f"{label} ran into its {side} bound")
+    before = problem.chain.geometry()
+    for part, at in zip(problem.parameters, problem.parts(theta), strict=True):
+        for label, moved in zip(part.labels, at, strict=True):
+            if part.name in POSITIVE and abs(moved) > np.log(_UNPHYSICAL):
+                words.append(f"{label} went to {np.exp(moved):.2g} times its start")
+        if part.entry == "offsets":
+            offsets = fit.chain().geometry()["offsets"]
+            worse = (offsets < -0.02 * part.units[0]) & (offsets < before["offsets"])
+            for k in worse.nonzero().flatten().tolist():
+                words.append(f"offsets[{k}] became {1e3 * float(offsets[k]):.3g} mm")
+    if words:
+        warnings.warn(
+            f"calibration left what is physical: {'; '.join(words)}. Check the units and the "
+            "start, narrow the `prior`, or fit less; the robot may do what this model does not "
+            "know (slack tendons, gravity, twist).",
+            stacklevel=3,
+        )
+
+
+def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> CalibrationResult:
+    problem, chain = fit.problem, fit.chain()
+    prior_std = problem.prior_std
     # By singular values in units of the prior: squares would lose what the data leave open.
-    _, told, directions = np.linalg.svd(
-        J * (problem.prior_std / np.sqrt(variance)), full_matrices=len(J) < theta.size
-    )
-    told = np.pad(told, (0, theta.size - told.size))
-    factor = problem.prior_std[:, None] * directions.T / np.sqrt(told**2 + 1.0)
+    J = fit.jacobian * prior_std
+    _, told, directions = np.linalg.svd(J / fit.noise, full_matrices=len(J) < J.shape[1])
+    told = np.pad(told, (0, len(prior_std) - told.size))
+    factor = prior_std[:, None] * directions.T / np.sqrt(told**2 + 1.0)
     covariance = factor @ factor.T
-    return _Fit(problem, theta, covariance, rows.rmse(errors), bool(converged))
-
-
-def _result(fit: _Fit, cv_rmse: float | None, torch_given: bool) -> CalibrationResult:
-    problem = fit.problem
-    with torch.no_grad():
-        chain = problem.moved(torch.as_tensor(fit.theta).to(problem.chain.geometry()["base"]))
-    std = np.sqrt(np.diag(fit.covariance))
+    std = np.sqrt(np.diag(covariance))
     safe = np.where(std > 0, std, 1.0)
-    known = std < _KNOWN * problem.prior_std
     geometry = {name: value.detach() for name, value in chain.geometry().items()}
-    geometry["tool"] = geometry["offsets"][-1]
-    reach = float(_reach(problem.chain))
-    values, std_errors, identifiable, labels = {}, {}, {}, []
-    start = 0
-    for name in problem.names:
-        size = _size(problem.chain, name)
-        part = slice(start, start + size)
-        start += size
-        error, flag = std[part], known[part]
-        if name in _RELATIVE:
-            error = error * geometry[name].numpy()
-        elif name == "angles":
-            counts = problem.chain.actuators_per_segment
-            error, flag = np.repeat(error, counts), np.repeat(flag, counts)
-        elif name == "base":
-            error = error * np.array([1.0, 1.0, 1.0, reach, reach, reach])
-        else:
-            error = error * reach
-        if name == "tool":
-            error, flag = error[0], flag[0]
-        entries = ("rot x", "rot y", "rot z", "x", "y", "z") if name == "base" else range(size)
-        labels += [f"{name}[{entry}]" for entry in entries]
-        values[name] = geometry[name] if torch_given else geometry[name].numpy()
-        std_errors[name] = torch.as_tensor(error) if torch_given else np.asarray(error)
-        identifiable[name] = np.asarray(flag)
+    values, std_errors, identifiable = {}, {}, {}
+    pieces = (problem.parts(part) for part in (std, std < _KNOWN * prior_std))
+    for part, error, known in zip(problem.parameters, *pieces, strict=True):
+        value = part.value(geometry[part.entry])
+        error = part.std_errors(error, value.numpy())
+        values[part.name] = value if torch_given else value.numpy()
+        std_errors[part.name] = torch.as_tensor(error) if torch_given else np.asarray(error)
+        identifiable[part.name] = np.asarray(part.flags(known))
+    open_ones = directions[told * _KNOWN < 1.0]
     return CalibrationResult(
         chain=chain,
         values=values,
         std_errors=std_errors,
-        correlations=fit.covariance / np.outer(safe, safe),
-        names=tuple(labels),
+        correlations=covariance / np.outer(safe, safe),
+        names=problem.labels,
         identifiable=identifiable,
+        singular_values=told,
+        unidentified=_sentences(fit, open_ones * prior_std, float(rows.weight.sum())),
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
         converged=fit.converged,
     )
 
 
-def _cross_validate(problem: _Problem, rows: _Rows, groups: np.ndarray, loss: str) -> float:
+def _sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
+    """Say which moves of the parameters (K, P) hardly move the tips, each by few of them."""
+    if not len(directions):
+        return ()
+    problem = fit.problem
+    units = np.concatenate([part.units for part in problem.parameters])
+    steps = [_STEPS[kind] for part in problem.parameters for kind in part.kind]
+    sizes = np.array([size for size, _ in steps])
+    # Each direction led by one parameter that the others do not hold: few terms in each.
+    _, order = cast(
+        tuple[NDArray, NDArray], qr(directions / problem.prior_std, mode="r", pivoting=True)
+    )
+    leads = order[: len(directions)]
+    moves = np.linalg.solve(directions[:, leads].T, directions)
+    sentences = []
+    for lead, move in sorted(zip(leads, moves, strict=True), key=lambda pair: pair[0]):
+        shown = move * units / sizes
+        shown, move = shown / shown[lead], move / shown[lead]
+        tips = 1e3 * np.linalg.norm(fit.jacobian @ move) / np.sqrt(n_rows)
+        terms = [i for i in np.argsort(-np.abs(shown)) if abs(shown[i]) > 0.05 and i != lead][:6]
+        words = [f"{problem.labels[i]} {shown[i]:+.3g} {steps[i][1]}" for i in [lead, *terms]]
+        advice = f"leave {problem.labels[lead]} out or measure it"
+        if terms:
+            others = " or ".join(problem.labels[i] for i in [lead, *terms[:1]])
+            advice = f"leave out or measure {others}"
+        move = " with ".join(filter(None, [words[0], ", ".join(words[1:])]))
+        sentences.append(f"{move} moves the tips by {tips:.2g} mm rms: {advice}.")
+    return tuple(sentences)
+
+
+def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     folds = min(5, len(np.unique(groups)))
     if folds < 2:
         raise ValueError("`groups` must name at least 2 motions to hold one out, got 1.")
-    residuals = []
-    start = np.clip(np.zeros(problem.prior_std.size), problem.low, problem.high)
+    squares = 0.0
     for train, test in GroupKFold(folds).split(rows.q, groups=groups):
-        fit = _solve(problem, _Rows(*(part[train] for part in rows)), start, loss)
-        held_out = _Rows(*(part[test] for part in rows))
-        residuals.append(held_out.residual(problem.moved(torch.as_tensor(fit.theta).to(rows.q))))
-    return rows.rmse(torch.cat(residuals).numpy())
-
-
-def _aligned(chain: Any, rows: _Rows) -> Any:
-    """Return the chain at the base pose that matches the two clouds of tips (Kabsch)."""
-    tips, weight = chain(rows.q), rows.weight[:, None] / rows.weight.sum()
-    here, there = (weight * tips).sum(0), (weight * rows.x).sum(0)
-    u, _, vh = torch.linalg.svd((weight * (tips - here)).mT @ (rows.x - there))
-    sign = torch.ones_like(here)
-    sign[2] = torch.sign(torch.linalg.det(u @ vh))
-    rotation = vh.mT @ (sign[:, None] * u.mT)
-    move = torch.eye(4, dtype=here.dtype)
-    move[:3, :3], move[:3, 3] = rotation, there - rotation @ here
-    return chain.with_geometry(base=move @ chain.geometry()["base"])
-
-
-def _moved_base(base: Tensor, part: Tensor, reach: Tensor) -> Tensor:
-    """Return the base turned by the rotation vector part[:3] and moved by reach * part[3:]."""
-    w = part[:3]
-    zero = torch.zeros_like(w[0])
-    cross = torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
-    arc = stumpff((w * w).sum())
-    eye = torch.eye(3, dtype=base.dtype, device=base.device)
-    rotation = (eye + arc.f * cross + arc.g * cross @ cross) @ base[:3, :3]
-    position = base[:3, 3] + reach * part[3:]
-    return torch.cat([torch.cat([rotation, position[:, None]], dim=1), base[3:]], dim=0)
-
-
-def _reach(chain: Any) -> Tensor:
-    """Return the natural unit of length: the backbone's where it is fixed, else 10 radii."""
-    geometry = chain.geometry()
-    if "lengths" in geometry:
-        return geometry["lengths"].sum()
-    return 10.0 * geometry["radii"].mean()
-
-
-def _size(chain: Any, name: str) -> int:
-    if name == "base":
-        return 6
-    return 1 if name == "tool" else len(chain.actuators_per_segment)
-
-
-def _theta_bounds(
-    chain: Any, name: str, bound: tuple[float, float] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    size = _size(chain, name)
-    if bound is None:
-        return np.full(size, -np.inf), np.full(size, np.inf)
-    low, high = bound
-    if not low < high:
-        raise ValueError(f"`bounds` of {name!r} must be (low, high) with low < high, got {bound}.")
-    if name == "angles":
-        return np.full(size, float(low)), np.full(size, float(high))
-    if name in _RELATIVE:
-        start = chain.geometry()[name].numpy()
-        if low < 0:
-            raise ValueError(f"`bounds` of {name!r} must not be negative, got {bound}.")
-        with np.errstate(divide="ignore"):
-            return np.log(low / start), np.log(high / start)
-    start = chain.geometry()["offsets"].numpy()[-size:]
-    reach = float(_reach(chain))
-    return (low - start) / reach, (high - start) / reach
+        fit = solve(best.problem, Rows(*(part[train] for part in rows)), best.theta, loss)
+        held_out = Rows(*(part[test] for part in rows))
+        squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weight.sum())
+    return float(np.sqrt(squares / float(rows.weight.sum())))
 
 
 def _check_parameters(
     chain: Any, parameters: Sequence[str], bounds: Mapping | None, prior: float | Mapping
 ) -> tuple[str, ...]:
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
-    geometry = {*chain.geometry(), "tool"}
-    available = [name for name in _PARAMETERS if name in geometry]
+    available = parameter_names(chain)
     unknown = [name for name in names if name not in available]
     if unknown or not names or len(set(names)) < len(names):
         raise ValueError(
             f"`parameters` must name different ones of {available} for this chain, got {names}."
         )
-    if {"offsets", "tool"} <= set(names):
-        raise ValueError(
-            "`parameters` must not hold both 'offsets' and 'tool': the tool is the "
-            "last offset; leave 'tool' out."
-        )
+    for alias, entry in ALIASES.items():
+        if {alias, entry} <= set(names):
+            raise ValueError(
+                f"`parameters` must not hold both {entry!r} and {alias!r}, which moves a part of "
+                f"them; leave {alias!r} out."
+            )
     for argument, given in (("bounds", bounds), ("prior", prior)):
         if isinstance(given, Mapping) and not set(given) <= set(names):
             raise ValueError(f"`{argument}` must name only {names}, got {sorted(given)}.")
-    if bounds and "base" in bounds:
-        raise ValueError("`bounds` cannot hold 'base'; tighten it by `prior={'base': ...}`.")
+    for name, (low, high) in (bounds or {}).items():
+        if not low < high:
+            raise ValueError(
+                f"`bounds` of {name!r} must be (low, high) with low < high, got {(low, high)}."
+            )
     stds = list(prior.values()) if isinstance(prior, Mapping) else [prior]
     if not all(std > 0 for std in stds):
         raise ValueError(f"`prior` must be positive standard deviations, got {prior}.")
