@@ -95,10 +95,12 @@ def tip_and_columns(
     arc = stumpff((bending**2).sum(0))
     carried = _all_carried(length, bending, arc, offsets)
     tails = tuple(torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
-    rest, across = (torch.stack([at[i] for at in carried]) for i in (2, 3))
+    rest = torch.stack([at.rest for at in carried])
+    across = torch.stack([at.across for at in carried])
     # The segments' own columns all at once, then turned by every segment before them.
-    own: Any = _columns(_TENSORS, _Carried(carried[0].point, tails, rest, across), bending, arc)
-    kinds = [torch.stack(sum(own, ()))]
+    at = _Carried(carried[0].point, tails, rest, across)
+    by_length, by_x, by_y = _columns(_TENSORS, at, bending, arc)
+    kinds = [torch.stack([*by_length, *by_x, *by_y])]
     if angular:
         kinds.append(torch.stack(_spins(bending, arc)))
     if rigid:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,29 @@ def pose(value: Any, name: str, dtype: torch.dtype) -> Tensor:
             f"right-handed), got {rotation.tolist()}."
         )
     return matrix
+
+
+def check_replacements(values: Mapping[str, Tensor], current: Mapping[str, Tensor]) -> None:
+    """Raise where values are not part of the geometry, or have another shape."""
+    for name, value in values.items():
+        if name not in current:
+            raise ValueError(
+                f"`{name}` is not part of this chain's geometry; it has {sorted(current)}."
+            )
+        if value.shape != current[name].shape:
+            raise ValueError(
+                f"`{name}` must have shape {tuple(current[name].shape)}, got {tuple(value.shape)}."
+            )
+
+
+def check_finite_rows(rows: Tensor, name: str) -> None:
+    """Raise where rows (N, n) of a log hold NaN or infinity."""
+    bad = ~torch.isfinite(rows).all(dim=1)
+    if bad.any():
+        raise ValueError(
+            f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of {len(rows)} rows "
+            f"(first: row {int(bad.nonzero()[0])}); drop those rows."
+        )
 
 
 def warn_millimetres(name: str, value: Tensor, limit: float) -> None:

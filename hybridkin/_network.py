@@ -3,7 +3,9 @@
 import torch
 from torch import nn
 
-from hybridkin._numerics import PortableModule
+from hybridkin._numerics import PortableModule, in_blocks
+
+_BLOCK = 2**17  # numbers in the hidden layer of a block of rows: a megabyte, so that it stays near
 
 # name -> sigma(a), and sigma'(a) from a and s = sigma(a)
 ACTIVATIONS = {
@@ -111,11 +113,13 @@ class ELM(PortableModule):
 
     def jacobian(self, q):
         """Return ``J[..., i, j] = d eps_i / d q_j``, shape (..., n_outputs, n_inputs)."""
-        _, a, s = self._hidden(q)
-        return self._slope(a, s)
+        return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q):
         """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
+        return in_blocks(self._forward_and_jacobian, q, max(1, _BLOCK // len(self.input_weights)))
+
+    def _forward_and_jacobian(self, q):
         u, a, s = self._hidden(q)
         return self._readout(u, s), self._slope(a, s)
 

@@ -181,9 +181,17 @@ def in_blocks(
     lead = q.shape[:-1]
     if lead.numel() <= size:
         return function(q)
-    parts = [function(rows) for rows in q.reshape(-1, q.shape[-1]).split(size)]
-    whole = (torch.cat(part) for part in zip(*parts, strict=True))
-    return tuple(tensor.reshape(*lead, *tensor.shape[1:]) for tensor in whole)
+    blocks = q.reshape(-1, q.shape[-1]).split(size)
+    first = function(blocks[0])
+    if any(part.requires_grad for part in first):  # a graph would grow by every write
+        parts = zip(first, *(function(rows) for rows in blocks[1:]), strict=True)
+        whole = [torch.cat(part) for part in parts]
+    else:
+        whole = [part.new_empty(lead.numel(), *part.shape[1:]) for part in first]
+        for k, rows in enumerate(blocks):
+            for result, part in zip(whole, function(rows) if k else first, strict=True):
+                result[k * size : k * size + len(part)].copy_(part)
+    return tuple(result.reshape(*lead, *result.shape[1:]) for result in whole)
 
 
 def check_vectors(value: Tensor, size: int, name: str, why: str) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._arc_chain import ArcChain
-from hybridkin._arcs import reading_matrix, tip_and_columns_of_numbers
+from hybridkin._arcs import levers, reading_matrix, tip_and_columns_of_numbers
 from hybridkin._geometry import (
     actuator_counts,
+    check_finite_rows,
+    check_replacements,
     filled,
     flat_angles,
     pose,
@@ -117,12 +119,14 @@ class ConstantCurvatureChain(ArcChain):
         self.routing = routing
         self.tip_at = float(n_segments)
         angles = flat_angles(angles, counts, dtype)
-        if torch.linalg.cond(reading_matrix(radii, angles, counts, routing, lengths is None)) > 1e6:
-            raise ValueError(
-                "`angles` must tell the bending of every segment apart, got "
-                f"{[row.tolist() for row in angles.split(counts)]}; give each segment at least 3 "
-                "actuators at different angles [rad]."
-            )
+        for row in angles.split(counts):
+            sees = [row.cos(), row.sin(), torch.ones_like(row)]
+            if torch.linalg.cond(torch.stack(sees[: 3 if lengths is None else 2])) > 1e6:
+                raise ValueError(
+                    "`angles` must tell the bending of every segment apart, got "
+                    f"{[row.tolist() for row in angles.split(counts)]}; give each segment at least "
+                    "3 actuators at different angles [rad]."
+                )
         self._set_geometry(
             radii=radii,
             angles=angles,
@@ -140,6 +144,11 @@ class ConstantCurvatureChain(ArcChain):
     def default_parameters(self) -> tuple[str, ...]:
         """The geometry that a calibration fits by default."""
         return ("radii", "base") if self.lengths is None else ("radii", "lengths", "base")
+
+    @property
+    def reach(self) -> Tensor:
+        """The natural size of the robot, shape () [m]: its backbone, or else 10 mean radii."""
+        return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name, as in the constructor; lengths on tendon chains only."""
@@ -160,16 +169,7 @@ class ConstantCurvatureChain(ArcChain):
             A new chain; this one is left as it was.
         """
         current = self.geometry()
-        for name, value in geometry.items():
-            if name not in current:
-                raise ValueError(
-                    f"`{name}` is not part of this chain's geometry; it has {sorted(current)}."
-                )
-            if value.shape != current[name].shape:
-                raise ValueError(
-                    f"`{name}` must have shape {tuple(current[name].shape)}, got "
-                    f"{tuple(value.shape)}."
-                )
+        check_replacements(geometry, current)
         chain = type(self).__new__(type(self))
         nn.Module.__init__(chain)
         for name in _STRUCTURE:
@@ -199,21 +199,13 @@ class ConstantCurvatureChain(ArcChain):
         >>> import torch
         >>> from hybridkin import ConstantCurvatureChain
         >>> chain = ConstantCurvatureChain([0.01, 0.01], lengths=[0.1, 0.1])
-        >>> chain.consistency(torch.tensor([-0.002, 0.001, 0.001, -0.003, -0.003, -0.003]))
-        tensor([0.0000, 0.0030])
+        >>> q = torch.tensor([-0.002, 0.001, 0.001, -0.003, -0.003, -0.003]).double()
+        >>> chain.consistency(q).round(decimals=6)
+        tensor([0.0000, 0.0030], dtype=torch.float64)
         """
         rows = self._rows(q) - self.actuator_zeros.to(q)
-        readings = reading_matrix(
-            self.radii,
-            self.angles,
-            self.actuators_per_segment,
-            self.routing,
-            self.lengths is None,
-        ).to(q)
-        length, bending = self._split(self.arc_matrix.to(q) @ rows.T)
-        turns = (bending * self.radii.to(q)[:, None]).flatten(0, 1)
-        arcs = turns if self.lengths is not None else torch.cat([length, turns])
-        residual = rows - (readings @ arcs).T
+        readings, arc_matrix = self._readings().to(q), self.arc_matrix.to(q)
+        residual = rows - rows @ (readings @ arc_matrix[-readings.shape[1] :]).T
         parts = residual.split(self.actuators_per_segment, dim=-1)
         norms = [torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5 for part in parts]
         rms = torch.stack(norms, dim=-1)
@@ -267,12 +259,7 @@ class ConstantCurvatureChain(ArcChain):
         """
         check_vectors(q, self.n_actuators, name, self._why_shape())
         rows = q.detach().reshape(-1, self.n_actuators)
-        bad = ~torch.isfinite(rows).all(dim=1)
-        if bad.any():
-            raise ValueError(
-                f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of "
-                f"{len(rows)} rows (first: row {int(bad.nonzero()[0])}); drop those rows."
-            )
+        check_finite_rows(rows, name)
         if self.lengths is None and (rows <= 0).any():
             row = int((rows <= 0).any(dim=1).nonzero()[0])
             raise ValueError(
@@ -300,20 +287,15 @@ class ConstantCurvatureChain(ArcChain):
         values = (radii, angles, lengths, offsets, rest_bends, actuator_zeros, base)
         for name, value in zip(_GEOMETRY, values, strict=True):
             self.register_buffer(name, value)
-        readings = reading_matrix(
-            radii, angles, self.actuators_per_segment, self.routing, lengths is None
-        )
-        normal = readings.mT @ readings
-        matrix = torch.linalg.solve(normal, readings.mT)
-        scale = torch.cat([radii, radii])[:, None]
-        if lengths is None:
-            matrix = torch.cat([matrix[: self.n_segments], matrix[self.n_segments :] / scale])
-            straight = torch.zeros_like(radii)
-        else:
-            matrix = torch.cat(
-                [matrix.new_zeros(self.n_segments, self.n_actuators), matrix / scale]
-            )
-            straight = lengths
+        readings = self._readings()
+        # In bendings times radius: one unit for all, or half of the digits would go.
+        units = torch.cat([torch.ones_like(radii), 1.0 / radii, 1.0 / radii])
+        scaled = readings * units[-readings.shape[1] :]
+        inverse = torch.linalg.solve(scaled.mT @ scaled, scaled.mT)
+        # One step of refinement: the normal equations lose some digits.
+        inverse = inverse + (torch.eye(len(inverse)).to(inverse) - inverse @ scaled) @ inverse
+        matrix = nn.functional.pad(inverse, (0, 0, len(units) - len(inverse), 0)) * units[:, None]
+        straight = torch.zeros_like(radii) if lengths is None else lengths
         offset = torch.cat([straight, *rest_bends.T]) - matrix @ actuator_zeros
         self.register_buffer("arc_matrix", matrix)
         self.register_buffer("arc_offset", offset)
@@ -321,3 +303,33 @@ class ConstantCurvatureChain(ArcChain):
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         matrix = self.arc_matrix.to(rows)
         return torch.addmm(self.arc_offset.to(rows)[:, None], matrix, rows.T), matrix
+
+    def _readings(self) -> Tensor:
+        at = levers(self.radii, self.angles, self.actuators_per_segment)
+        return reading_matrix(at, self.actuators_per_segment, self.routing, self.lengths is None)
+
+    def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
+        counts, S = self.actuators_per_segment, self.n_segments
+        change = {name: value.to(rows) for name, value in self.geometry().items()}
+        P = len(next(iter(tangents.values())))
+        change = {
+            name: tangents.get(name, torch.zeros_like(value).expand(P, *value.shape).to(rows))
+            for name, value in self.geometry().items()
+        }
+        at = levers(self.radii, self.angles, counts).to(rows)
+        turned = torch.stack([-at[1], at[0]]) * change["angles"][:, None]
+        moved = turned + levers(change["radii"], self.angles.to(rows), counts)
+        readings = self._readings().to(rows)
+        by_reading = reading_matrix(moved, counts, self.routing, False)
+        by_reading = nn.functional.pad(by_reading, (readings.shape[1] - 2 * S, 0))
+        # The derivative of a least-squares inverse M of B, with M M' = (B' B)^-1.
+        M = self.arc_matrix.to(rows)[-readings.shape[1] :]
+        contradicted = torch.eye(len(readings)).to(rows) - readings @ M
+        by_matrix = M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
+        by_matrix = nn.functional.pad(by_matrix, (0, 0, 3 * S - len(M), 0))
+        straight = change.get("lengths", torch.zeros_like(change["radii"]))
+        rest = torch.cat([straight, *change["rest_bends"].unbind(-1)], dim=-1)
+        shift = rest - change["actuator_zeros"] @ self.arc_matrix.to(rows).T
+        moving = (rows - self.actuator_zeros.to(rows)) @ by_matrix.flatten(0, 1).T
+        return moving.unflatten(1, by_matrix.shape[:2]) + shift

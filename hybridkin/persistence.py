@@ -20,11 +20,27 @@ from hybridkin.chain import ConstantCurvatureChain
 from hybridkin.elm import ELMRegressor, _Statistics
 from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
 from hybridkin.hybrid import AffineModule, HybridForwardModel, HybridModule
+from hybridkin.rigid import RigidChain
 
 __all__ = ["load_model", "save_model"]
 
 _FORMAT = "hybridkin-model"
 _VERSION = 1
+# Every kind of chain: its arrays, and what its header says.
+_CHAINS = {
+    "chain": (
+        ConstantCurvatureChain,
+        ("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),
+        ("actuators_per_segment", "routing", "tip_at"),
+    ),
+    "rigid": (
+        RigidChain,
+        ("origins", "axes", "q_min", "q_max", "tip", "tool", "base"),
+        ("kinds", "names"),
+    ),
+}
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+_OPTIONAL = ("lengths", "rest_bends", "actuator_zeros")
 _ELM_ARRAYS = (
     *("input_weights_", "input_bias_", "input_center_", "input_scale_"),
     *("output_weights_", "intercept_", "noise_variance_"),
@@ -33,6 +49,7 @@ _ELM_ARRAYS = (
 _ELM_SETTINGS = ("solver_", "n_samples_seen_", "n_features_in_", "_activation", "_y_ndim")
 
 Arrays = dict[str, NDArray]
+Chain = ConstantCurvatureChain | RigidChain
 
 
 def save_model(model: Any, path: str | Path) -> None:
@@ -40,8 +57,8 @@ def save_model(model: Any, path: str | Path) -> None:
 
     Parameters
     ----------
-    model : ConstantCurvatureChain or fitted HybridForwardModel
-        The hybrid's mechanical model must be a ConstantCurvatureChain or None, its error model an
+    model : ConstantCurvatureChain, RigidChain or fitted HybridForwardModel
+        The hybrid's mechanical model must be one of these chains or None, its error model an
         ELMRegressor, a LinearRegression, or "drop".
     path : str or Path
         File to write, usually ``*.safetensors``. It is replaced only once all is written.
@@ -61,14 +78,14 @@ def save_model(model: Any, path: str | Path) -> None:
     ConstantCurvatureChain(extensible, 3 segments, 9 actuators, routing 'segment')
     """
     arrays: Arrays = {}
-    if isinstance(model, ConstantCurvatureChain):
+    if isinstance(model, (ConstantCurvatureChain, RigidChain)):
         header = _store_chain(model, arrays, "")
     elif isinstance(model, HybridForwardModel):
         header = _store_hybrid(model, arrays)
     else:
         raise TypeError(
-            "`model` must be a ConstantCurvatureChain or a fitted HybridForwardModel, got "
-            f"{type(model).__name__}."
+            "`model` must be a ConstantCurvatureChain, a RigidChain or a fitted "
+            f"HybridForwardModel, got {type(model).__name__}."
         )
     header = {"format": _FORMAT, "version": _VERSION, **header}
     path = Path(path)
@@ -94,7 +111,7 @@ def load_model(path: str | Path) -> Any:
 
     Returns
     -------
-    ConstantCurvatureChain or HybridForwardModel
+    ConstantCurvatureChain, RigidChain or HybridForwardModel
         On the CPU, ready to predict.
 
     Raises
@@ -111,9 +128,10 @@ def load_model(path: str | Path) -> Any:
         with safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {})["hybridkin"])
             arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
+    except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not a model saved by hybridkin ({error}).") from error
-    if header.get("format") != _FORMAT or not isinstance(header.get("version"), int):
+    known = isinstance(header, dict) and header.get("format") == _FORMAT
+    if not known or not isinstance(header.get("version"), int):
         raise ValueError(f"{path} is not a model saved by hybridkin: its header is another one.")
     if header["version"] > _VERSION:
         raise ValueError(
@@ -121,38 +139,46 @@ def load_model(path: str | Path) -> Any:
             f"{_VERSION}; install a newer one."
         )
     try:
-        if header["kind"] == "chain":
+        if header["kind"] in _CHAINS:
             return _restored_chain(header, arrays, "")
         if header["kind"] == "hybrid":
             return _restored_hybrid(header, arrays)
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError, AttributeError) as error:
+    except (
+        LookupError,
+        AttributeError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+        ArithmeticError,
+    ) as error:
         raise ValueError(f"{path} is damaged: {error!r}.") from error
     raise ValueError(f"{path} holds a model of unknown kind {header['kind']!r}.")
 
 
-def _store_chain(chain: ConstantCurvatureChain, arrays: Arrays, prefix: str) -> dict[str, Any]:
-    for name, value in chain.geometry().items():
-        arrays[prefix + name] = value.detach().cpu().numpy()
-    return {
-        "kind": "chain",
-        "actuators_per_segment": list(chain.actuators_per_segment),
-        "routing": chain.routing,
-    }
+def _store_chain(chain: Chain, arrays: Arrays, prefix: str) -> dict[str, Any]:
+    kind = next(kind for kind, (cls, *_) in _CHAINS.items() if isinstance(chain, cls))
+    _, tensors, settings = _CHAINS[kind]
+    for name in tensors:
+        if getattr(chain, name) is not None:
+            arrays[prefix + name] = getattr(chain, name).detach().cpu().numpy()
+    return {"kind": kind, **{name: getattr(chain, name) for name in settings}}
 
 
-def _restored_chain(header: dict[str, Any], arrays: Arrays, prefix: str) -> ConstantCurvatureChain:
+def _restored_chain(header: dict[str, Any], arrays: Arrays, prefix: str) -> Chain:
+    cls, tensors, _ = _CHAINS[header["kind"]]
+    needed = [name for name in tensors if name not in _OPTIONAL or prefix + name in arrays]
+    stored: dict[str, Any] = {name: arrays[prefix + name] for name in needed}
+    dtype = torch.from_numpy(stored["base"]).dtype
+    if not dtype.is_floating_point:
+        raise ValueError(f"`base` must be floating, got {dtype}")
+    if cls is RigidChain:
+        return RigidChain(**stored, kinds=header["kinds"], names=header["names"], dtype=dtype)
     counts = [int(n) for n in header["actuators_per_segment"]]
-    angles = arrays[prefix + "angles"]
-    return ConstantCurvatureChain(
-        arrays[prefix + "radii"],
-        n_actuators=counts,
-        angles=np.split(angles, np.cumsum(counts)[:-1]),
-        lengths=arrays.get(prefix + "lengths"),
-        routing=header["routing"],
-        offsets=arrays[prefix + "offsets"],
-        base=arrays[prefix + "base"],
-        dtype=torch.from_numpy(angles).dtype,
+    stored["angles"] = np.split(stored["angles"], np.cumsum(counts)[:-1])
+    chain = ConstantCurvatureChain(
+        **stored, n_actuators=counts, routing=header["routing"], dtype=dtype
     )
+    return chain.with_tip(header.get("tip_at", chain.n_segments))
 
 
 def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
@@ -171,10 +197,10 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
     }
     for key, part in (("mechanical", model.mechanical_model_), ("nominal", model.mechanical_model)):
         if part is not None:
-            if not isinstance(part, ConstantCurvatureChain):
+            if not isinstance(part, (ConstantCurvatureChain, RigidChain)):
                 raise TypeError(
-                    "`model` must have a ConstantCurvatureChain or None as `mechanical_model` to "
-                    f"be saved, got {type(part).__name__}."
+                    "`model` must have a ConstantCurvatureChain, a RigidChain or None as "
+                    f"`mechanical_model` to be saved, got {type(part).__name__}."
                 )
             header[key] = _store_chain(part, arrays, f"{key}.")
     header["error"] = _store_error(model.error_model_, arrays)

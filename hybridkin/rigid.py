@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import warnings
 from collections.abc import Iterable, Sequence
-from importlib import import_module
 from os import PathLike
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from hybridkin._geometry import pose, warn_millimetres
+from hybridkin._arm_files import Joint, chain_path, limits_of, mjcf_path, urdf_path
+from hybridkin._geometry import (
+    check_finite_rows,
+    check_replacements,
+    pose,
+    warn_millimetres,
+)
 from hybridkin._numerics import PortableModule, check_vectors, in_blocks
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["RigidChain"]
 
 _KINDS = ("revolute", "prismatic")
-_MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 _MANY_TURNS = 4.0 * math.pi  # [rad]; a joint that winds further is more likely in degrees
 _FEW_ROWS = 64  # up to here the number of calls decides, not the work
 _FAR = 10.0  # [m]; a joint that slides further is more likely in millimetres
@@ -193,7 +193,7 @@ class RigidChain(PortableModule):
             For text that is no URDF, links that are not there or not connected, a path without
             moving joint, and joints that are floating, planar or mimic another one.
         """
-        path = _urdf_path(text_or_path, end_link, root_link)
+        path = urdf_path(text_or_path, end_link, root_link)
         return cls._from_path(path, tool=tool, base=base, dtype=dtype)
 
     @classmethod
@@ -235,7 +235,7 @@ class RigidChain(PortableModule):
             For text that is no MJCF, bodies that are not there or not connected, a path without
             moving joint, and free or ball joints.
         """
-        path = _mjcf_path(text_or_path, end_link, root_link)
+        path = mjcf_path(text_or_path, end_link, root_link)
         return cls._from_path(path, tool=tool, base=base, dtype=dtype)
 
     @classmethod
@@ -267,12 +267,12 @@ class RigidChain(PortableModule):
         ValueError
             For chains that branch or have no moving joint.
         """
-        return cls._from_path(_chain_path(chain), tool=tool, base=base, dtype=dtype)
+        return cls._from_path(chain_path(chain), tool=tool, base=base, dtype=dtype)
 
     @classmethod
-    def _from_path(cls, path: Iterable[_Joint], **options: Any) -> RigidChain:
+    def _from_path(cls, path: Iterable[Joint], **options: Any) -> RigidChain:
         """Return the arm of the moving joints, the fixed ones folded into their poses."""
-        moving: list[_Joint] = []
+        moving: list[Joint] = []
         pending = np.eye(4)
         for joint in path:
             pending = pending @ joint.origin
@@ -281,7 +281,7 @@ class RigidChain(PortableModule):
                 pending = np.eye(4)
         if not moving:
             raise ValueError("the path from the root to `end_link` must have a moving joint.")
-        limits = [_limits(joint) for joint in moving]
+        limits = [limits_of(joint) for joint in moving]
         return cls(
             np.stack([joint.origin for joint in moving]),
             [joint.axis for joint in moving],
@@ -325,17 +325,7 @@ class RigidChain(PortableModule):
         RigidChain
             A new arm; this one is left as it was.
         """
-        current = self.geometry()
-        for name, value in geometry.items():
-            if name not in current:
-                raise ValueError(
-                    f"`{name}` is not part of this chain's geometry; it has {sorted(current)}."
-                )
-            if value.shape != current[name].shape:
-                raise ValueError(
-                    f"`{name}` must have shape {tuple(current[name].shape)}, got "
-                    f"{tuple(value.shape)}."
-                )
+        check_replacements(geometry, self.geometry())
         chain = type(self).__new__(type(self))
         nn.Module.__init__(chain)
         chain.n_actuators, chain.kinds, chain.names = self.n_actuators, self.kinds, self.names
@@ -461,12 +451,7 @@ class RigidChain(PortableModule):
         """
         check_vectors(q, self.n_actuators, name, self._why_shape())
         rows = q.detach().reshape(-1, self.n_actuators)
-        bad = ~torch.isfinite(rows).all(dim=1)
-        if bad.any():
-            raise ValueError(
-                f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of "
-                f"{len(rows)} rows (first: row {int(bad.nonzero()[0])}); drop those rows."
-            )
+        check_finite_rows(rows, name)
         _warn_degrees(name, rows[:, ~self.slides].abs())
         warn_millimetres(name, rows[:, self.slides].abs(), _FAR)
 
@@ -557,22 +542,6 @@ class RigidChain(PortableModule):
         return torch.stack(frames, dim=-3)
 
 
-class _Joint(NamedTuple):
-    """A joint of a robot description, fixed or moving, and its pose in the link before it."""
-
-    origin: NDArray
-    kind: str = "fixed"
-    axis: NDArray | tuple[float, float, float] = (0.0, 0.0, 1.0)
-    name: str = ""
-    limits: Sequence[float] | None = None
-
-
-def _limits(joint: _Joint) -> tuple[float, float]:
-    """Return the limits of a joint, infinite where they are missing or empty."""
-    low, high = (-math.inf, math.inf) if joint.limits is None else joint.limits
-    return (float(low), float(high)) if low < high else (-math.inf, math.inf)
-
-
 def _motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
     """Return B_0, B_1, B_2 of every joint, its origin included, shape (n, 3, 4, 4)."""
     motions = origins.new_zeros(len(axes), 3, 4, 4)
@@ -621,151 +590,3 @@ def _warn_degrees(name: str, turns: Tensor) -> None:
             "degrees; hybridkin works in radians.",
             stacklevel=3,
         )
-
-
-def _source(text_or_path: str | PathLike[str]) -> str | Path:
-    """Return XML text as it is, else the path of an existing file."""
-    if isinstance(text_or_path, str) and text_or_path.lstrip().startswith("<"):
-        return text_or_path.strip()
-    path = Path(text_or_path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"`text_or_path` must be XML text, starting with '<', or an existing file, got {path}."
-        )
-    return path
-
-
-def _one_of(name: str, known: Sequence[str], argument: str) -> str:
-    if name not in known:
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean {close[0]!r}? It has" if close else "it has"
-        raise ValueError(f"`{argument}` {name!r} is not in the robot; {hint} {list(known)}.")
-    return name
-
-
-def _urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[_Joint]:
-    from pytorch_kinematics.urdf import URDF  # takes a second and loads pyplot
-
-    source = _source(text_or_path)
-    text = source.read_bytes() if isinstance(source, Path) else source.encode()
-    try:
-        robot: Any = URDF.from_xml_string(text)
-    except Exception as error:  # the reader has no exception of its own for all its failures
-        raise ValueError(f"`text_or_path` must be a valid URDF: {error}.") from error
-    by_child = {joint.child: joint for joint in robot.joints}
-    known = [link.name for link in robot.links]
-    link = _one_of(end_link, known, "end_link")
-    root = None if root_link is None else _one_of(root_link, known, "root_link")
-    path: list[_Joint] = []
-    while link != root and link in by_child:
-        joint = by_child.pop(link)  # so that a circle ends
-        path.insert(0, _urdf_joint(joint))
-        link = joint.parent
-    if root is not None and link != root:
-        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root!r} does not.")
-    return path
-
-
-def _urdf_joint(joint: Any) -> _Joint:
-    if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
-        raise ValueError(
-            f"joint {joint.name!r} is {joint.type}; only revolute, continuous, prismatic and fixed "
-            "joints are supported on the way to `end_link`; choose a `root_link` after it."
-        )
-    if joint.mimic is not None:
-        raise ValueError(
-            f"joint {joint.name!r} mimics {joint.mimic.joint!r}, which is not supported on the way "
-            "to `end_link`."
-        )
-    origin = np.eye(4)
-    if joint.origin is not None:
-        origin[:3, :3] = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()
-        origin[:3, 3] = joint.origin.xyz or [0, 0, 0]
-    kind = "revolute" if joint.type == "continuous" else joint.type
-    axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # the URDF default
-    limits = None
-    if joint.type != "continuous" and joint.limit is not None:
-        limits = (joint.limit.lower, joint.limit.upper)
-    return _Joint(origin, kind, axis, joint.name, limits)
-
-
-def _mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[_Joint]:
-    try:
-        mujoco: Any = import_module("mujoco")
-    except ImportError as error:
-        raise ImportError(
-            "RigidChain.from_mjcf needs MuJoCo: pip install 'hybridkin[sim]'."
-        ) from error
-    source = _source(text_or_path)
-    try:
-        if isinstance(source, Path):
-            model = mujoco.MjModel.from_xml_path(str(source))
-        else:
-            model = mujoco.MjModel.from_xml_string(source)
-    except ValueError as error:
-        raise ValueError(f"`text_or_path` must be a valid MJCF: {error}.") from error
-    bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
-    sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
-    _one_of(end_link, [*bodies, *sites], "end_link")
-    root = 0 if root_link is None else bodies[_one_of(root_link, list(bodies), "root_link")]
-    path: list[_Joint] = []
-    body = bodies.get(end_link, -1)
-    if body < 0:
-        site = sites[end_link]
-        path.append(_Joint(_mjcf_pose(model.site_pos[site], model.site_quat[site])))
-        body = model.site_bodyid[site]
-    while body not in (root, 0):
-        path = [*_mjcf_joints(model, body), *path]
-        body = model.body_parentid[body]
-    if body != root:
-        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root_link!r} does not.")
-    return path
-
-
-def _mjcf_joints(model: Any, body: int) -> list[_Joint]:
-    """Return the steps of one body: its pose, then every joint about its own anchor."""
-    steps = [_Joint(_mjcf_pose(model.body_pos[body], model.body_quat[body]))]
-    first = model.body_jntadr[body]
-    for j in range(first, first + model.body_jntnum[body]):
-        name, kind = model.joint(j).name, int(model.jnt_type[j])
-        if kind not in _MJCF_KINDS:
-            raise ValueError(
-                f"joint {name!r} of body {model.body(body).name!r} is free or a ball; only hinges "
-                "and slides are supported on the way to `end_link`; choose a `root_link` after it."
-            )
-        axis, anchor, zero = model.jnt_axis[j], model.jnt_pos[j], model.qpos0[model.jnt_qposadr[j]]
-        origin, back = np.eye(4), np.eye(4)
-        origin[:3, 3], back[:3, 3] = anchor, -anchor
-        if _MJCF_KINDS[kind] == "revolute":
-            origin[:3, :3] = Rotation.from_rotvec(-zero * axis).as_matrix()
-        else:
-            origin[:3, 3] -= zero * axis
-        limits = model.jnt_range[j] if model.jnt_limited[j] else None
-        steps += [_Joint(origin, _MJCF_KINDS[kind], axis, name, limits), _Joint(back)]
-    return steps
-
-
-def _mjcf_pose(position: NDArray, quaternion: NDArray) -> NDArray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # w comes first
-    matrix[:3, 3] = position
-    return matrix
-
-
-def _chain_path(chain: Chain) -> list[_Joint]:
-    path: list[_Joint] = []
-    for name in chain.get_frame_names(exclude_fixed=False):
-        frame: Any = chain.find_frame(name)
-        if len(frame.children) > 1:
-            raise ValueError(
-                f"`chain` must be serial, but {name!r} has {len(frame.children)} children; choose "
-                "one end by pytorch_kinematics.SerialChain(chain, end_frame_name)."
-            )
-        origin = np.eye(4)
-        for offset in (frame.link.offset, frame.joint.offset):
-            if offset is not None:
-                origin = origin @ offset.get_matrix()[0].detach().cpu().double().numpy()
-        joint = frame.joint
-        axis = joint.axis.detach().cpu().double().numpy()
-        path.append(_Joint(origin, joint.joint_type, axis, joint.name, joint.limits))
-    return path

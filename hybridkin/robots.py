@@ -140,6 +140,8 @@ def read_description(path: str | Path) -> RobotDescription:
             angle_deg = 0.0                 # of the first actuator; or angles_deg = [0, 120, 240]
             clockwise = false               # which way the others follow
             offset = 0.0                    # rigid length after the segment [m]
+            rest_bend_deg = [0.0, 0.0]      # its pre-curvature: a bending vector
+            zeros = [0.0, 0.0, 0.0]         # what the sensor of each actuator reads too much [m]
             repeat = 2                      # as many segments like this one
 
             [base]                          # optional
@@ -203,6 +205,8 @@ def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
         lengths=None if lengths[0] is None else lengths,
         routing=content.get("routing", "segment"),
         offsets=[segment["offset"] for segment in segments],
+        rest_bends=[segment["rest_bend"] for segment in segments],
+        actuator_zeros=[segment["zeros"] for segment in segments],
         base=_base(content.get("base", {})),
     )
     calibrate = content.get("calibrate", chain.default_parameters)
@@ -214,7 +218,7 @@ def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
 
 def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
     keys = {"radius", "length", "actuators", "angle_deg", "angles_deg", "clockwise", "offset"}
-    _known(table, keys | {"repeat"}, where)
+    _known(table, keys | {"rest_bend_deg", "zeros", "repeat"}, where)
     if "radius" not in table:
         raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
     if "angles_deg" in table:
@@ -231,20 +235,18 @@ def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         "length": _number(table, "length", where) if "length" in table else None,
         "offset": _number(table, "offset", where, 0.0),
         "angles": angles,
+        "rest_bend": np.radians(_numbers(table, "rest_bend_deg", where, 2)),
+        "zeros": _numbers(table, "zeros", where, len(angles)),
     }
     return [segment] * int(_number(table, "repeat", where, 1))
 
 
 def _base(table: Mapping[str, Any]) -> np.ndarray:
     _known(table, {"position", "rotation_vector_deg"}, "[base]")
-    parts = {}
-    for key in ("position", "rotation_vector_deg"):
-        parts[key] = np.asarray(table.get(key, [0.0, 0.0, 0.0]), dtype=float)
-        if parts[key].shape != (3,):
-            raise ValueError(f"`{key}` in [base] must hold 3 numbers, got {table[key]!r}.")
     pose = np.eye(4)
-    pose[:3, 3] = parts["position"]
-    pose[:3, :3] = Rotation.from_rotvec(parts["rotation_vector_deg"], degrees=True).as_matrix()
+    pose[:3, 3] = _numbers(table, "position", "[base]", 3)
+    turn = _numbers(table, "rotation_vector_deg", "[base]", 3)
+    pose[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
     return pose
 
 
@@ -273,6 +275,14 @@ def _number(table: Mapping[str, Any], key: str, where: str, default: float | Non
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"`{key}` in {where} must be a number, got {value!r}.")
     return value
+
+
+def _numbers(table: Mapping[str, Any], key: str, where: str, size: int) -> np.ndarray:
+    value = table.get(key, [0.0] * size)
+    wrong = not isinstance(value, list) or len(value) != size
+    if wrong or not all(type(v) in (int, float) and math.isfinite(v) for v in value):
+        raise ValueError(f"`{key}` in {where} must hold {size} numbers, got {value!r}.")
+    return np.array(value, dtype=float)
 
 
 def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:

@@ -59,17 +59,25 @@ CHAINS = {
         0.25,
         0.06,
     ),
+    "pre-curved": (
+        tendons(
+            rest_bends=[[0.2, -0.1], [0.0, 0.3], [-0.4, 0.0]],
+            actuator_zeros=1e-4 * np.arange(9),
+        ),
+        0.0,
+        0.005,
+    ),
 }
 each_chain = pytest.mark.parametrize(("chain", "center", "width"), CHAINS.values(), ids=CHAINS)
 
 
-SWITCH = math.sqrt(50.0)
-BESIDE_SWITCH = [SWITCH * (1 - 1e-12), SWITCH * (1 + 1e-12)]
+SWITCH = 1.0  # [rad], where trigonometry takes over from the series
+BESIDE_SWITCH = [math.nextafter(SWITCH, 0.0), math.nextafter(SWITCH, 2.0)]
 
 
 @pytest.mark.parametrize(
     "theta",
-    [0.0, 1e-12, 1e-4, 0.5, 1.0, 2.0, math.pi, 4.0, 2 * math.pi, *BESIDE_SWITCH, 12.0, 1e3],
+    [0.0, 1e-12, 1e-4, 0.5, SWITCH, 2.0, math.pi, 4.0, 2 * math.pi, *BESIDE_SWITCH, 12.0, 1e3],
 )
 def test_stumpff_functions_against_mpmath(theta):
     s = torch.tensor(theta**2, dtype=torch.float64)
@@ -91,12 +99,112 @@ def test_stumpff_functions_against_mpmath(theta):
 
 
 def test_no_kink_where_trigonometry_takes_over():
-    beside = torch.tensor([50.0, math.nextafter(50.0, 51.0)], dtype=torch.float64).requires_grad_()
+    steps = [math.nextafter(SWITCH, 0.0), SWITCH, math.nextafter(SWITCH, 2.0)]
+    beside = torch.tensor(steps, dtype=torch.float64).requires_grad_()
     for value in stumpff(beside):
         (first,) = torch.autograd.grad(value.sum(), beside, create_graph=True)
         (second,) = torch.autograd.grad(first.sum(), beside, retain_graph=True)
-        for quantity, tolerance in ((value, 2e-14), (first, 2e-15), (second, 1e-15)):
-            assert abs(quantity[1] - quantity[0]) < tolerance
+        for quantity, tolerance in ((value, 4e-16), (first, 4e-16), (second, 2e-15)):
+            assert quantity.diff().abs().max() < tolerance
+
+
+def textbook(q, radii, lengths, offsets):
+    """Return tip and rotation by Webster & Jones (2010): curvature, direction, Rz Ry Rz."""
+    position, rotation, before = np.zeros(3), np.eye(3), 0
+    for k, radius in enumerate(radii):
+        l1, l2, l3 = q[3 * k : 3 * k + 3]
+        bend = np.array([l2 + l3 - 2 * l1, mpmath.sqrt(3) * (l3 - l2)]) / (3 * radius)
+        length = (l1 + l2 + l3) / 3 if lengths is None else lengths[k]
+        if lengths is not None:  # these tendons have spent what the segments before took
+            bend, before = bend - before, bend
+        theta, phi = mpmath.hypot(*bend), mpmath.atan2(bend[1], bend[0])
+        c, s, cp, sp = mpmath.cos(theta), mpmath.sin(theta), mpmath.cos(phi), mpmath.sin(phi)
+        arc = np.array([0, 0, length])
+        if theta:
+            arc = length / theta * np.array([(1 - c) * cp, (1 - c) * sp, s])
+        z = np.array([[cp, -sp, 0], [sp, cp, 0], [0, 0, 1]])
+        turn = z @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ z.T
+        position = position + rotation @ (arc + offsets[k] * turn[:, 2])
+        rotation = rotation @ turn
+    return position, rotation
+
+
+def textbook_derivatives(q, *geometry):
+    """Return tip, Jacobian, angular Jacobian and second derivatives, by central differences.
+
+    With steps of 1e-20 and 100 digits each is right to 40 digits.
+    """
+    steps, h = np.diag([mpmath.mpf("1e-20")] * len(q)), mpmath.mpf("1e-20")
+    x, R = textbook(q, *geometry)
+    ahead, behind = ([textbook(q + sign * step, *geometry) for step in steps] for sign in (1, -1))
+    J = [(a[0] - b[0]) / (2 * h) for a, b in zip(ahead, behind, strict=True)]
+    spins = [(a[1] - b[1]) @ R.T / (2 * h) for a, b in zip(ahead, behind, strict=True)]
+    angular = [(spin[2, 1], spin[0, 2], spin[1, 0]) for spin in spins]
+    second = np.empty((len(q), len(q), 3), dtype=object)
+    for j, k in zip(*np.tril_indices(len(q)), strict=True):
+        move = steps[j] + steps[k]
+        corners = textbook(q + move, *geometry)[0] + textbook(q - move, *geometry)[0]
+        edges = ahead[j][0] + behind[j][0] + ahead[k][0] + behind[k][0]
+        second[j, k] = second[k, j] = (corners - edges + 2 * x) / (2 * h**2)
+    derivatives = (x, np.array(J).T, np.array(angular).T, second.T)
+    return [torch.from_numpy(np.array(v, dtype=float)) for v in derivatives]
+
+
+def within(bound, value, expected, noise=0.0):
+    """Tell whether all errors are below a part of the largest entry, or below a noise."""
+    scale = float(expected.abs().max())
+    return float((value.double() - expected).abs().max()) <= max(bound * scale, noise)
+
+
+BENDS = [
+    *(0.0, 1e-12, 1e-8, 1e-4, 0.1, 0.999999, 1.0, 1.000001),
+    *(1.5, 2.0, math.pi, 5.0, 2 * math.pi),
+]
+
+
+@pytest.mark.parametrize("theta", BENDS)
+@pytest.mark.parametrize("n_segments", [1, 3])
+@pytest.mark.parametrize("kind", ["chambers", "tendons"])
+def test_against_the_textbook_in_a_hundred_digits(kind, n_segments, theta):
+    """Errors are relative to the largest entry of x, of J, of the second derivatives."""
+    if kind == "chambers":
+        radii, lengths, offsets, center = RADII[:n_segments], None, [0.01, 0.0, 0.05], 0.25
+    else:
+        radii, offsets, center = [0.0045, 0.005, 0.004][:n_segments], [0.002, 0.003, 0.01], 0.0
+        lengths = [0.06, 0.0625, 0.064][:n_segments]
+    offsets = offsets[-n_segments:]
+    routing = "segment" if lengths is None else "base"
+    chain = ConstantCurvatureChain(radii, lengths=lengths, offsets=offsets, routing=routing)
+    toward = torch.tensor([0.3, 2.0, -1.1], dtype=torch.float64)[:n_segments, None]
+    bending = theta * torch.cat([toward.cos(), toward.sin()], 1)
+    bending = bending if lengths is None else bending.cumsum(0)
+    shorter = bending @ torch.stack([THREE.cos(), THREE.sin()]) * chain.radii[:, None]
+    q = (center - shorter).flatten()
+
+    with mpmath.workdps(100):
+        geometry = (None if p is None else [*map(mpmath.mpf, p)] for p in (radii, lengths, offsets))
+        expected = textbook_derivatives(np.array([*map(mpmath.mpf, q.tolist())]), *geometry)
+    x, J, angular, second = expected
+    hessians = [take(chain.jacobian)(q) for take in (torch.func.jacfwd, torch.func.jacrev)]
+
+    for value in (chain(q), chain.forward_and_jacobian(q)[0]):
+        assert within(4e-15, value, x)
+    for value in (chain.jacobian(q), chain.pose_jacobian(q)[:3]):
+        assert within(4e-15, value, J)
+    assert within(4e-15, chain.pose_jacobian(q)[3:], angular)
+    for value in hessians:
+        assert within(1e-13, value, second)
+    for value, reference, slope in zip(
+        chain.forward_and_jacobian(q.float()),
+        chain.forward_and_jacobian(q.float().double()),
+        (J, second),
+        strict=True,
+    ):
+        # After a full turn the tip is back at the base and its derivatives are small: what is left
+        # is the rounding of the bends in single precision, six units of it.
+        units = 6.0 if theta > math.pi else 0.0
+        noise = units * 0.5 * torch.finfo(value.dtype).eps * float((slope.abs() @ q.abs()).max())
+        assert within(1e-6, value, reference, noise)
 
 
 def test_absurd_bends_stay_finite():
@@ -154,6 +262,49 @@ def test_consistency_finds_the_broken_reading(rng):
     # Four readings of three unknowns: a quarter of the error, with alternating sign, remains.
     expected = torch.tensor([0.0, 0.0025], dtype=torch.float64)
     assert_close(chain.consistency(q), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_rest_bends_add_to_the_arcs(rng):
+    q, rest = random_q(rng), 0.3 * torch.randn(3, 2, generator=rng, dtype=torch.float64)
+    plain, bent = bha(), bha(rest_bends=rest)
+    length, bending = bent.arcs(q)
+    assert_close(length, plain.arcs(q)[0], rtol=0, atol=1e-15)
+    assert_close(bending, plain.arcs(q)[1] + rest, rtol=0, atol=1e-15)
+    assert_close(bent.consistency(q), plain.consistency(q), rtol=0, atol=1e-15)
+
+
+def test_a_quarter_circle_at_rest():
+    chain = ConstantCurvatureChain([0.1], rest_bends=[[math.pi / 2, 0.0]])
+    expected = torch.tensor([0.8 / math.pi, 0.0, 0.8 / math.pi], dtype=torch.float64)
+    assert_close(chain(torch.full_like(THREE, 0.4)), expected, rtol=1e-14, atol=1e-16)
+
+
+@pytest.mark.parametrize("routing", ["segment", "base"])
+def test_actuator_zeros_are_read_too_much(routing, rng):
+    zeros = 1e-3 * torch.randn(9, generator=rng, dtype=torch.float64)
+    q, plain = random_q(rng, center=0.0, width=0.005), tendons(routing)
+    for value in (zeros, zeros.unflatten(0, (3, 3)).tolist()):
+        chain = tendons(routing, actuator_zeros=value)
+        x, J = chain.forward_and_jacobian(q + zeros)
+        assert_close((x, J), plain.forward_and_jacobian(q), rtol=1e-12, atol=1e-14)
+        assert_close(chain.consistency(q + zeros), plain.consistency(q), rtol=0, atol=1e-15)
+    common = tendons(routing, actuator_zeros=0.001)
+    assert_close(common(q + 0.001), plain(q), rtol=1e-12, atol=1e-14)
+
+
+def test_gradcheck_of_rest_bends_and_zeros(rng):
+    chain, q = CHAINS["pre-curved"][0], random_q(rng, 2, center=0.0, width=0.005)
+
+    def tip_and_jacobian(rest_bends, actuator_zeros):
+        chain_there = chain.with_geometry(rest_bends=rest_bends, actuator_zeros=actuator_zeros)
+        return chain_there.forward_and_jacobian(q)
+
+    for scale in (0.0, 1.0):
+        rest, zeros = (
+            (scale * chain.geometry()[name]).requires_grad_()
+            for name in ("rest_bends", "actuator_zeros")
+        )
+        assert torch.autograd.gradcheck(tip_and_jacobian, (rest, zeros))
 
 
 @pytest.mark.parametrize("routing", ["segment", "base"])
@@ -258,7 +409,14 @@ def test_splitting_a_segment_changes_nothing(rng):
     q = random_q(rng, 5, 3)
     whole = ConstantCurvatureChain([0.1])
     halves = ConstantCurvatureChain([0.1, 0.1])
-    assert_close(halves(torch.cat([q, q], 1) / 2), whole(q), rtol=1e-13, atol=1e-14)
+    x, J = halves.forward_and_jacobian(torch.cat([q, q], 1) / 2)
+    expected = whole.forward_and_jacobian(q)
+    assert_close((x, J.unflatten(2, (2, 3)).mean(2)), expected, rtol=1e-13, atol=1e-14)
+    # Tendons that also run through the first half read the whole bend.
+    q = 0.1 * (q - q.mean(1, keepdim=True))
+    whole = ConstantCurvatureChain([0.01], lengths=[0.1])
+    halves = ConstantCurvatureChain([0.01, 0.01], lengths=[0.05, 0.05], routing="base")
+    assert_close(halves(torch.cat([q / 2, q], 1)), whole(q), rtol=1e-13, atol=1e-14)
 
 
 def test_permuting_actuators_with_their_angles_changes_nothing(rng):
@@ -277,6 +435,56 @@ def test_turning_the_actuators_turns_the_tip(rng):
     assert_close(turned(q), bha()(q) @ rotation_z(0.4).mT, rtol=1e-13, atol=1e-14)
 
 
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), turns=st.integers(0, 2), spread=st.sampled_from([1.0, 1e-6]))
+def test_a_third_of_a_turn_permutes_the_actuators(seed, turns, spread):
+    rng = torch.Generator().manual_seed(seed)
+    turn = rotation_z(turns * 2 * math.pi / 3)
+    both_ways = torch.block_diag(turn, turn)
+    for chain, center, width in (CHAINS["chambers"], CHAINS["tendons, through"]):
+        q = random_q(rng, 3, center=center, width=spread * width)
+        passed_on = q.unflatten(1, (3, 3)).roll(turns, 2).flatten(1)
+        J = chain.pose_jacobian(passed_on).unflatten(2, (3, 3)).roll(-turns, 3).flatten(2)
+        expected = both_ways @ chain.pose_jacobian(q)
+        assert_close(chain(passed_on), chain(q) @ turn.mT, rtol=0, atol=1e-14)
+        assert_close(J / J.abs().max(), expected / J.abs().max(), rtol=0, atol=1e-14)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), spread=st.sampled_from([1.0, 1e-6]))
+def test_mirrored_actuators_mirror_the_robot(seed, spread):
+    rng = torch.Generator().manual_seed(seed)
+    flip = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)  # in the x-z plane
+    options = {"radii": [0.01, 0.008], "n_actuators": [4, 3], "lengths": [0.1, 0.08]}
+    angles = [[0.1, 1.5, 3.5, 5.0], [0.0, 2.0, 4.5]]
+    rest = torch.randn(2, 2, generator=rng, dtype=torch.float64)
+    mirrored_rest = rest * torch.tensor([1.0, -1.0], dtype=torch.float64)
+    chain = ConstantCurvatureChain(**options, angles=angles, rest_bends=rest, routing="base")
+    angles = [[-angle for angle in row] for row in angles]
+    mirrored = ConstantCurvatureChain(
+        **options, angles=angles, rest_bends=mirrored_rest, routing="base"
+    )
+    q = random_q(rng, 3, 7, 0.0, 0.01 * spread)
+    J, expected = mirrored.pose_jacobian(q), chain.pose_jacobian(q)
+    assert_close(mirrored(q), chain(q) * flip, rtol=0, atol=1e-14)
+    # Angular velocities turn the other way round.
+    expected = expected * torch.cat([flip, -flip])[:, None]
+    assert_close(J / J.abs().max(), expected / J.abs().max(), rtol=0, atol=1e-14)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), more=st.floats(-0.1, 1.0))
+def test_a_common_length_keeps_the_bends(seed, more):
+    rng = torch.Generator().manual_seed(seed)
+    q, chain = random_q(rng, 3), CHAINS["chambers"][0]
+    (length, bending), (longer, as_before) = chain.arcs(q), chain.arcs(q + more)
+    assert_close(longer, length + more, rtol=0, atol=1e-15)
+    assert_close(as_before, bending, rtol=0, atol=5e-14)
+    # At given bends the tip is linear in the lengths.
+    twice = chain(q + 2 * more) - chain(q)
+    assert_close(twice, 2 * (chain(q + more) - chain(q)), rtol=0, atol=5e-14)
+
+
 def test_base_moves_everything(rng):
     q = random_q(rng, 5)
     base = pose(rotation_z(1.0), [1.0, -2.0, 0.5])
@@ -292,6 +500,7 @@ def test_change_of_units(rng):
     with pytest.warns(UserWarning, match="millimetres"):
         in_mm = ConstantCurvatureChain([100.0, 93.0, 79.0])
     assert_close(in_mm(1000 * q), 1000 * bha()(q), rtol=1e-13, atol=1e-11)
+    assert_close(in_mm.jacobian(1000 * q), bha().jacobian(q), rtol=1e-13, atol=1e-13)
 
 
 def test_float32_keeps_its_dtype_and_accuracy(rng):
@@ -357,6 +566,54 @@ def test_functional_transforms(rng):
     assert_close(lifted[:, 2], chain(q)[:, 2] + 1.0, rtol=1e-14, atol=0)
 
 
+def test_blocks_of_rows_are_as_one(rng):
+    """More rows than a block has: under every transform what one pass would give."""
+    chain, q = bha(), random_q(rng, 4097)
+    both, one = chain.forward_and_jacobian, torch.ones((), dtype=torch.float64)
+    expected = chain._forward_and_jacobian(q)
+    two = torch.stack([q, 0.9 * q])
+    assert_close(both(q), expected, rtol=0, atol=1e-14)
+    assert_close(torch.func.vmap(both)(two), both(two), rtol=0, atol=1e-14)
+    compiled = torch.compile(both, backend="eager", fullgraph=True)
+    assert_close(compiled(q), expected, rtol=0, atol=1e-14)
+    with torch.no_grad():
+        assert_close(both(q.clone().requires_grad_()), expected, rtol=0, atol=1e-14)
+
+    def of_scale(function):
+        return lambda scale: function(scale * q)[1].sum((0, 1))
+
+    for take in (torch.func.jacrev, torch.func.jacfwd):
+        slopes = [take(of_scale(f))(one) for f in (both, chain._forward_and_jacobian)]
+        assert_close(*slopes, rtol=1e-11, atol=1e-9)
+        slopes = [torch.func.vmap(take(of_scale(both)))(one[None])[0], slopes[1]]
+        assert_close(*slopes, rtol=1e-11, atol=1e-9)
+    q.requires_grad_()
+    slopes = [torch.autograd.grad(f(q)[1].sum(), q)[0] for f in (both, chain._forward_and_jacobian)]
+    assert_close(*slopes, rtol=1e-11, atol=1e-9)
+    empty = both(q.new_empty(2, 0, 9))
+    assert [tuple(part.shape) for part in empty] == [(2, 0, 3), (2, 0, 3, 9)]
+
+
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+def test_compiled(backend, rng):
+    chain, q = tendons(), random_q(rng, 3, center=0.0, width=0.005)
+    for function in (chain.forward, chain.forward_and_jacobian):
+        compiled = torch.compile(function, backend=backend, fullgraph=True)
+        assert_close(compiled(q), function(q), rtol=0, atol=1e-14)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@each_chain
+def test_on_a_cuda_device(chain, center, width, rng):
+    q = random_q(rng, 5000, chain.n_actuators, center, width)
+    for there in (chain, copy.deepcopy(chain).cuda()):  # the geometry follows q
+        x, J = there.forward_and_jacobian(q.cuda())
+        assert x.is_cuda
+        assert J.is_cuda
+        expected = chain.forward_and_jacobian(q)
+        assert_close((x.cpu(), J.cpu()), expected, rtol=1e-12, atol=1e-12)
+
+
 def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
     q = random_q(rng, 4)
     chain = bha()
@@ -380,6 +637,101 @@ def test_pickle_copy_and_hash(chain, center, width, rng):
         assert joblib.hash(twin) == joblib.hash(chain)
     assert_close(chain.float()(q).double(), chain(q).double(), rtol=0, atol=0)
     chain.double()
+
+
+PARTS = [0.3, 1.0, 1.5, 2.0, 2.75, 3.0]
+
+
+@pytest.mark.parametrize("at", PARTS)
+@pytest.mark.parametrize("name", ["chambers", "tendons, through", "pre-curved"])
+def test_another_tip_lies_on_the_backbone(name, at, rng):
+    whole, center, width = CHAINS[name]
+    chain, q = whole.with_tip(at), random_q(rng, 4, 9, center, width)
+    x, J = chain.forward_and_jacobian(q)
+    assert_close(x, chain(q), rtol=0, atol=1e-15)
+    if at == int(at):
+        expected = whole.poses(q)[:, int(at)]
+        assert_close(x, expected[:, :3, 3], rtol=0, atol=2e-15)
+    else:
+        # The first n - 1 of n points of a segment lie on its arc.
+        points = whole.backbone(q, n_points=20)
+        assert_close(x, points[:, round(20 * at)], rtol=0, atol=2e-15)
+    _, J_reverse = forward_and_reverse_jacobian(chain.forward, q)
+    assert_close(J, J_reverse, rtol=1e-13, atol=1e-13 * float(J.abs().max()))
+    J_pose = chain.pose_jacobian(q)
+    assert_close(J_pose[:, :3], J, rtol=1e-13, atol=1e-13)
+    later = J_pose[..., 3 * math.ceil(at) :]
+    assert_close(later, torch.zeros_like(later), rtol=0, atol=1e-15 * float(J_pose.abs().max()))
+    for own, others in zip(chain.arcs(q), whole.arcs(q), strict=True):
+        assert torch.equal(own, others)
+    assert torch.equal(chain.poses(q), whole.poses(q))
+    assert torch.equal(chain.backbone(q), whole.backbone(q))
+
+
+def test_the_last_tip_is_the_chain_itself(rng):
+    chain, q = tendons(), random_q(rng, 4, center=0.0, width=0.005)
+    same = chain.with_tip(1.5).with_tip(3)
+    assert torch.equal(same(q), chain(q))
+    assert torch.equal(same.pose_jacobian(q), chain.pose_jacobian(q))
+    assert repr(same) == repr(chain)
+    assert "tip at 1.5" in repr(chain.with_tip(1.5))
+    assert chain.tip_at == 3.0
+
+
+def test_another_tip_survives_copies(rng):
+    chain, q = tendons().with_tip(1.5), random_q(rng, 4, center=0.0, width=0.005)
+    for twin in (
+        pickle.loads(pickle.dumps(chain)),
+        copy.deepcopy(chain),
+        chain.with_geometry(radii=chain.radii.clone()),
+    ):
+        assert twin.tip_at == 1.5
+        assert torch.equal(twin.jacobian(q), chain.jacobian(q))
+    assert joblib.hash(chain) != joblib.hash(tendons())
+
+
+def test_another_tip_has_its_own_transform(rng):
+    pytest.importorskip("pytorch_kinematics")
+    whole, q = tendons(), random_q(rng, 4, center=0.0, width=0.005)
+    for at in PARTS:
+        chain = whole.with_tip(at)
+        matrix = chain.tip_transform(q).get_matrix()
+        assert_close(matrix[:, :3, 3], chain(q), rtol=0, atol=2e-15)
+        if at == int(at):
+            assert_close(matrix, whole.poses(q)[:, int(at)], rtol=0, atol=2e-15)
+        angular, frame = chain.pose_jacobian(q)[:, 3:], matrix[:, :3, :3]
+        for j, move in enumerate(1e-8 * torch.eye(9, dtype=torch.float64)):
+            ahead, behind = (chain.tip_transform(q + m).get_matrix() for m in (move, -move))
+            spin = (ahead - behind)[:, :3, :3] / 2e-8 @ frame.mT
+            spin = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], -1)
+            scale = angular.abs().max()
+            assert_close(spin / scale, angular[..., j] / scale, rtol=0, atol=1e-7)
+
+
+FUNCTIONS = {
+    **{name: chain for name, (chain, _, _) in CHAINS.items()},
+    "tool and base": bha(offsets=[0, 0, 0.1], base=pose(rotation_z(0.7), [0.1, 0.2, 0.3])),
+    "another tip": tendons().with_tip(1.5),
+    "single precision": tendons(dtype=torch.float32),
+}
+
+
+@pytest.mark.parametrize("chain", FUNCTIONS.values(), ids=FUNCTIONS)
+def test_numpy_function_is_the_chain(chain, rng):
+    tip_and_jacobian = chain.numpy_function()
+    center = 0.25 if chain.lengths is None else 0.0
+    widest = 4.0 * float(chain.radii.mean())  # [m], several full turns
+    for width in (0.0, 1e-12, 1e-6, 0.1 * widest, widest):
+        q = random_q(rng, 1, chain.n_actuators, center, width)[0].numpy()
+        before = q.copy()
+        x, J = tip_and_jacobian(q)
+        expected = chain.forward_and_jacobian(torch.from_numpy(q))
+        assert x.shape == (3,)
+        assert J.shape == (3, chain.n_actuators)
+        for value, tensor in zip((x, J), expected, strict=True):
+            assert value.dtype == np.float64
+            assert within(4e-15, torch.from_numpy(value), tensor)
+        np.testing.assert_array_equal(q, before)
 
 
 def test_transform3d_both_ways(rng):
@@ -416,6 +768,12 @@ def test_reverse_mode_jacobian_of_any_module(rng):
         (lambda: bha(lengths=[0.1, 0.1, 0.0]), "`lengths` must be positive"),
         (lambda: bha(routing="through"), "`routing` must be one of"),
         (lambda: bha(offsets=[0.0]), r"`offsets` must have shape \(3,\)"),
+        (lambda: bha(rest_bends=[0.0, 1.0]), r"`rest_bends` must have shape \(3, 2\)"),
+        (lambda: bha(rest_bends=math.nan), "`rest_bends` must be finite"),
+        (lambda: bha(actuator_zeros=[0.0]), r"`actuator_zeros` must have shape \(9,\)"),
+        (lambda: bha().with_tip(0), r"`at` must lie in \(0, 3\]"),
+        (lambda: bha().with_tip(3.01), r"`at` must lie in \(0, 3\]"),
+        (lambda: bha().with_tip(math.nan), r"`at` must lie in \(0, 3\]"),
         (lambda: bha(base=np.eye(3)), r"`base` must be one pose of shape \(4, 4\)"),
         (lambda: bha(base=2 * np.eye(4)), "`base` must hold a rotation"),
         (lambda: bha()(torch.zeros(4, 6, dtype=torch.float64)), r"`q` must have shape \(..., 9\)"),

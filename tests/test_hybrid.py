@@ -162,6 +162,7 @@ def test_calibration_happens_inside_fit(log):
     assert_allclose(model.mechanical_model_.radii, bha().radii, rtol=0, atol=1e-9)
     assert_allclose(nominal.radii, [0.12] * 3)
     assert model.calibration_.cv_rmse is None
+    nominal = ConstantCurvatureChain([0.10, 0.10, 0.10])
     model = HybridForwardModel(nominal, "drop", calibrate=("radii",)).fit(q, x, groups=groups)
     assert model.calibration_.cv_rmse > model.calibration_.rmse
 

@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
+from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
     ELMRegressor,
     HybridForwardModel,
+    RigidChain,
     load_model,
     robots,
     save_model,
@@ -30,7 +33,7 @@ def log():
     return q, x
 
 
-def tendon_chain():
+def tendon_chain(**options):
     return ConstantCurvatureChain(
         [0.005, 0.004],
         n_actuators=[3, 4],
@@ -38,15 +41,108 @@ def tendon_chain():
         routing="base",
         offsets=[0.0, 0.01],
         base=np.diag([1.0, -1.0, -1.0, 1.0]),
+        **options,
     )
 
 
-@pytest.mark.parametrize("chain", [robots.bionic_handling_assistant(0.1), tendon_chain()])
+def bent_chain(**options):
+    """A chain that uses all that a chain can hold."""
+    zeros = 1e-4 * np.arange(7)
+    return tendon_chain(rest_bends=[[0.1, 0.2], [0.0, -0.3]], actuator_zeros=zeros, **options)
+
+
+def arm(**options):
+    origins = np.stack([np.eye(4)] * 3)
+    origins[1:, 0, 3] = 0.3, 0.2
+    options = {
+        "kinds": ["revolute", "prismatic", "revolute"],
+        "names": ["turn", "slide", "wrist"],
+        "q_min": [-2.0, 0.0, -np.inf],
+        "q_max": [2.5, 0.4, np.inf],
+        "tip": np.diag([-1.0, -1.0, 1.0, 1.0]),
+        "tool": [0.1, 0.0, 0.02],
+        "base": np.diag([1.0, -1.0, -1.0, 1.0]),
+        **options,
+    }
+    return RigidChain(origins, [[0, 0, 1], [1, 0, 2], [0, 1, 0]], **options)
+
+
+def header_of(path):
+    with safe_open(path, framework="numpy") as file:
+        return json.loads(file.metadata()["hybridkin"])
+
+
+def rewrite(path, arrays, **changes):
+    """Write a saved model again with other arrays and a changed header."""
+    header = {**header_of(path), **changes}
+    save_file(arrays, path, metadata={"hybridkin": json.dumps(header)})
+
+
+@pytest.mark.parametrize(
+    "chain",
+    [
+        robots.bionic_handling_assistant(0.1),
+        tendon_chain(),
+        bent_chain(),
+        bent_chain().with_tip(1.5),
+        bent_chain(dtype=torch.float32).with_tip(0.5),
+    ],
+)
 def test_chain_comes_back(tmp_path, chain):
     save_model(chain, tmp_path / "chain.safetensors")
     twin = load_model(tmp_path / "chain.safetensors")
     q = torch.full((chain.n_actuators,), 0.2, dtype=torch.float64)
+    for was, came in zip(chain.forward_and_jacobian(q), twin.forward_and_jacobian(q), strict=True):
+        assert torch.equal(came, was)
+    assert repr(twin) == repr(chain)
+    assert {k: v.dtype for k, v in twin.named_buffers()} == {
+        k: v.dtype for k, v in chain.named_buffers()
+    }
+
+
+@pytest.mark.parametrize("chain", [arm(), arm(dtype=torch.float32), arm(q_min=None, q_max=None)])
+def test_rigid_arm_comes_back(tmp_path, chain):
+    save_model(chain, tmp_path / "arm.safetensors")
+    twin = load_model(tmp_path / "arm.safetensors")
+    assert (twin.kinds, twin.names) == (chain.kinds, chain.names)
+    # Axes and rotations are made orthonormal anew, which may change the last bit.
+    was, came = dict(chain.named_buffers()), dict(twin.named_buffers())
+    eps = torch.finfo(chain.base.dtype).eps
+    assert_close(came, was, rtol=0, atol=2 * eps)
+
+
+def test_files_from_before_rest_bends_and_tips(tmp_path):
+    path = tmp_path / "old"
+    header = {
+        "format": "hybridkin-model",
+        "version": 1,
+        "kind": "chain",
+        "actuators_per_segment": [3, 4],
+        "routing": "base",
+    }
+    chain = tendon_chain()
+    new = ("rest_bends", "actuator_zeros")
+    arrays = {k: v.numpy() for k, v in chain.geometry().items() if k not in new}
+    save_file(arrays, path, metadata={"hybridkin": json.dumps(header)})
+    twin = load_model(path)
+    q = torch.full((7,), 0.002, dtype=torch.float64)
     assert torch.equal(twin(q), chain(q))
+    assert twin.tip_at == 2.0
+    for name in new:
+        assert not getattr(twin, name).any()
+
+
+def test_hybrid_of_a_rigid_arm_comes_back(tmp_path, rng):
+    q = 2 * torch.rand(80, 3, generator=rng, dtype=torch.float64) - 1
+    x = arm()(q) - torch.cat([0.0 * q[:, :2], 0.01 * q[:, 1:2].cos()], 1)
+    model = HybridForwardModel(arm(), random_state=0).fit(q.numpy(), x.numpy())
+    save_model(model, tmp_path / "model")
+    twin = load_model(tmp_path / "model")
+    for was, came in zip(
+        model.predict_and_jacobian(q.numpy()), twin.predict_and_jacobian(q.numpy()), strict=True
+    ):
+        assert_allclose(came, was, rtol=1e-13, atol=1e-14)
+    assert isinstance(twin.mechanical_model, RigidChain)
 
 
 @pytest.mark.parametrize("guard", ["leverage", "box", None])
@@ -114,27 +210,59 @@ def test_foreign_and_damaged_files(tmp_path, log):
         load_model(path)
 
     save_model(HybridForwardModel(None, random_state=0).fit(*log), path)
-    arrays = load_file(path)
-    from safetensors import safe_open
+    arrays, header = load_file(path), header_of(path)
+    damage = [
+        ("install a newer one", arrays, {"version": 99}),
+        ("unknown kind", arrays, {"kind": "something"}),
+        ("is damaged", {k: v for k, v in arrays.items() if k != "error.input_weights_"}, {}),
+        ("is damaged", {**arrays, "error.input_weights_": np.zeros((5, 5))}, {}),
+        ("is damaged", arrays, {"error": {"kind": "os.system"}}),
+        ("is damaged", arrays, {"mechanical": {"kind": "hybrid"}}),
+        ("is damaged", arrays, {"mechanical": [1]}),
+    ]
+    for message, parts, changes in damage:
+        rewrite(path, parts, **{**header, **changes})
+        with pytest.raises(ValueError, match=message):
+            load_model(path)
 
-    with safe_open(path, framework="numpy") as file:
-        header = json.loads(file.metadata()["hybridkin"])
 
-    def rewrite(arrays, **changes):
-        save_file(arrays, path, metadata={"hybridkin": json.dumps({**header, **changes})})
+@pytest.mark.parametrize("header", ["[]", "3", "null", "{", "[" * 100_000, '{"format": 1}'])
+def test_foreign_headers(tmp_path, header):
+    path = tmp_path / "model"
+    save_file({"a": np.zeros(3)}, path, metadata={"hybridkin": header})
+    with pytest.raises(ValueError, match="is not a model"):
+        load_model(path)
 
-    rewrite(arrays, version=99)
-    with pytest.raises(ValueError, match="install a newer one"):
-        load_model(path)
-    rewrite(arrays, kind="something")
-    with pytest.raises(ValueError, match="unknown kind"):
-        load_model(path)
-    rewrite({k: v for k, v in arrays.items() if k != "error.input_weights_"})
-    with pytest.raises(ValueError, match="is damaged"):
-        load_model(path)
-    rewrite({**arrays, "error.input_weights_": np.zeros((5, 5))})
-    with pytest.raises(ValueError, match="is damaged"):
-        load_model(path)
-    rewrite(arrays, error={"kind": "os.system"})
+
+@pytest.mark.parametrize(
+    ("chain", "changes", "arrays"),
+    [
+        (bent_chain(), {"tip_at": 3.0}, {}),
+        (bent_chain(), {"tip_at": float("nan")}, {}),
+        (bent_chain(), {"tip_at": "end"}, {}),
+        (bent_chain(), {"routing": ["base"]}, {}),
+        (bent_chain(), {"kind": "rigid"}, {}),
+        (bent_chain(), {"kind": ["chain"]}, {}),
+        (bent_chain(), {"actuators_per_segment": [3, 10**12]}, {}),
+        (bent_chain(), {"actuators_per_segment": [3, float("inf")]}, {}),
+        (bent_chain(), {}, {"rest_bends": np.zeros((2, 3))}),
+        (bent_chain(), {}, {"actuator_zeros": np.full(7, np.nan)}),
+        (bent_chain(), {}, {"base": np.eye(4, dtype=np.int64)}),
+        (bent_chain(), {}, {"offsets": None}),
+        (arm(), {"kind": "chain"}, {}),
+        (arm(), {"kinds": ["revolute"] * 2}, {}),
+        (arm(), {"kinds": 3}, {}),
+        (arm(), {"names": None}, {"origins": None}),
+        (arm(), {}, {"tool": None}),
+        (arm(), {}, {"axes": np.zeros((3, 3))}),
+        (arm(), {}, {"origins": np.ones((3, 4, 4))}),
+        (arm(), {}, {"q_min": np.full(3, 9.0)}),
+    ],
+)
+def test_damaged_chains(tmp_path, chain, changes, arrays):
+    path = tmp_path / "chain"
+    save_model(chain, path)
+    whole = {**load_file(path), **arrays}
+    rewrite(path, {k: v for k, v in whole.items() if v is not None}, **changes)
     with pytest.raises(ValueError, match="is damaged"):
         load_model(path)

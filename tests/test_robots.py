@@ -72,6 +72,30 @@ def test_description_is_the_chain_it_describes(write):
     assert robot.log == robots.LogFormat(tuple("abcdefghij"), ("x", "y", "z"), "mm", "m", -1)
 
 
+def test_rest_bends_and_zeros(write):
+    text = """
+    [[segment]]
+    radius = 0.01
+    length = 0.1
+    rest_bend_deg = [90, -4.5]
+    zeros = [0.001, 0, -0.002]
+    repeat = 2
+    [[segment]]
+    radius = 0.01
+    length = 0.1
+    actuators = 4
+    """
+    chain = robots.from_toml(write(text))
+    expected = ConstantCurvatureChain(
+        [0.01] * 3,
+        n_actuators=[3, 3, 4],
+        lengths=[0.1] * 3,
+        rest_bends=[[math.pi / 2, -math.pi / 40]] * 2 + [[0.0, 0.0]],
+        actuator_zeros=[0.001, 0.0, -0.002] * 2 + [0.0] * 4,
+    )
+    assert_close(chain.geometry(), expected.geometry(), rtol=1e-15, atol=0)
+
+
 def test_defaults_are_chambers_named_after_the_file(write):
     robot = robots.read_description(write("[[segment]]\nradius = 0.1\n"))
     assert robot.name == "robot"
@@ -90,6 +114,13 @@ def test_defaults_are_chambers_named_after_the_file(write):
         ("[[segment]]\nradius = '0.1'", "`radius` in .* must be a number"),
         ("[[segment]]\nradius = -0.1", "`radii` must be positive"),
         ("[[segment]]\nradius = 0.1\nactuators = 2", "at least 3"),
+        ("[[segment]]\nradius = 0.1\nrest_bend_deg = [1]", "`rest_bend_deg` in .* 1 must hold 2"),
+        ("[[segment]]\nradius = 0.1\nrest_bend_deg = 90", "`rest_bend_deg` in .* must hold 2"),
+        ("[[segment]]\nradius = 0.1\nzeros = [0, 0]", "`zeros` in .*segment.* 1 must hold 3"),
+        ("[[segment]]\nradius = 0.1\nzeros = ['0', '0', '0']", "`zeros` in .* must hold 3"),
+        ("[[segment]]\nradius = 0.1\nzeros = [0, [0], 0]", "`zeros` in .* must hold 3"),
+        ("[[segment]]\nradius = 0.1\nzeros = [0, nan, 0]", "`zeros` in .* must hold 3"),
+        ("[[segment]]\nradius = 0.1\n[base]\nposition = 'here'", "`position` in .* must hold 3"),
         ("[[segment]]\nradius = 0.1\nlength = 1\n[[segment]]\nradius = 0.1", "in every"),
         ("model = 'rigid'\n[[segment]]\nradius = 0.1", "`model` must be"),
         ("calibrate = 'radii'\n[[segment]]\nradius = 0.1", "`calibrate` must be a list"),

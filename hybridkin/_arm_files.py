@@ -1,0 +1,187 @@
+"""Rigid arms as files describe them: the joints from a root to an end, of URDF, MJCF and chains."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from pytorch_kinematics.chain import Chain
+
+_MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
+
+
+class Joint(NamedTuple):
+    """A joint of a robot description, fixed or moving, and its pose in the link before it."""
+
+    origin: NDArray
+    kind: str = "fixed"
+    axis: NDArray | tuple[float, float, float] = (0.0, 0.0, 1.0)
+    name: str = ""
+    limits: Sequence[float] | None = None
+
+
+def limits_of(joint: Joint) -> tuple[float, float]:
+    """Return the limits of a joint, infinite where they are missing or empty."""
+    low, high = (-math.inf, math.inf) if joint.limits is None else joint.limits
+    return (float(low), float(high)) if low < high else (-math.inf, math.inf)
+
+
+def _source(text_or_path: str | PathLike[str]) -> str | Path:
+    """Return XML text as it is, else the path of an existing file."""
+    if isinstance(text_or_path, str) and text_or_path.lstrip().startswith("<"):
+        return text_or_path.strip()
+    path = Path(text_or_path)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"`text_or_path` must be XML text, starting with '<', or an existing file, got {path}."
+        )
+    return path
+
+
+def _one_of(name: str, known: Sequence[str], argument: str) -> str:
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {close[0]!r}? It has" if close else "it has"
+        raise ValueError(f"`{argument}` {name!r} is not in the robot; {hint} {list(known)}.")
+    return name
+
+
+def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[Joint]:
+    """Return the joints of a URDF from one link to another."""
+    from pytorch_kinematics.urdf import URDF  # takes a second and loads pyplot
+
+    source = _source(text_or_path)
+    text = source.read_bytes() if isinstance(source, Path) else source.encode()
+    try:
+        robot: Any = URDF.from_xml_string(text)
+    except Exception as error:  # the reader has no exception of its own for all its failures
+        raise ValueError(f"`text_or_path` must be a valid URDF: {error}.") from error
+    by_child = {joint.child: joint for joint in robot.joints}
+    known = [link.name for link in robot.links]
+    link = _one_of(end_link, known, "end_link")
+    root = None if root_link is None else _one_of(root_link, known, "root_link")
+    path: list[Joint] = []
+    while link != root and link in by_child:
+        joint = by_child.pop(link)  # so that a circle ends
+        path.insert(0, _urdf_joint(joint))
+        link = joint.parent
+    if root is not None and link != root:
+        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root!r} does not.")
+    return path
+
+
+def _urdf_joint(joint: Any) -> Joint:
+    if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
+        raise ValueError(
+            f"joint {joint.name!r} is {joint.type}; only revolute, continuous, prismatic and fixed "
+            "joints are supported on the way to `end_link`; choose a `root_link` after it."
+        )
+    if joint.mimic is not None:
+        raise ValueError(
+            f"joint {joint.name!r} mimics {joint.mimic.joint!r}, which is not supported on the way "
+            "to `end_link`."
+        )
+    origin = np.eye(4)
+    if joint.origin is not None:
+        origin[:3, :3] = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()
+        origin[:3, 3] = joint.origin.xyz or [0, 0, 0]
+    kind = "revolute" if joint.type == "continuous" else joint.type
+    axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # the URDF default
+    limits = None
+    if joint.type != "continuous" and joint.limit is not None:
+        limits = (joint.limit.lower, joint.limit.upper)
+    return Joint(origin, kind, axis, joint.name, limits)
+
+
+def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[Joint]:
+    """Return the joints of a MuJoCo model from one body to another body or site."""
+    try:
+        mujoco: Any = import_module("mujoco")
+    except ImportError as error:
+        raise ImportError(
+            "RigidChain.from_mjcf needs MuJoCo: pip install 'hybridkin[sim]'."
+        ) from error
+    source = _source(text_or_path)
+    try:
+        if isinstance(source, Path):
+            model = mujoco.MjModel.from_xml_path(str(source))
+        else:
+            model = mujoco.MjModel.from_xml_string(source)
+    except ValueError as error:
+        raise ValueError(f"`text_or_path` must be a valid MJCF: {error}.") from error
+    bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
+    sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
+    _one_of(end_link, [*bodies, *sites], "end_link")
+    root = 0 if root_link is None else bodies[_one_of(root_link, list(bodies), "root_link")]
+    path: list[Joint] = []
+    body = bodies.get(end_link, -1)
+    if body < 0:
+        site = sites[end_link]
+        path.append(Joint(_mjcf_pose(model.site_pos[site], model.site_quat[site])))
+        body = model.site_bodyid[site]
+    while body not in (root, 0):
+        path = [*_mjcf_joints(model, body), *path]
+        body = model.body_parentid[body]
+    if body != root:
+        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root_link!r} does not.")
+    return path
+
+
+def _mjcf_joints(model: Any, body: int) -> list[Joint]:
+    """Return the steps of one body: its pose, then every joint about its own anchor."""
+    steps = [Joint(_mjcf_pose(model.body_pos[body], model.body_quat[body]))]
+    first = model.body_jntadr[body]
+    for j in range(first, first + model.body_jntnum[body]):
+        name, kind = model.joint(j).name, int(model.jnt_type[j])
+        if kind not in _MJCF_KINDS:
+            raise ValueError(
+                f"joint {name!r} of body {model.body(body).name!r} is free or a ball; only hinges "
+                "and slides are supported on the way to `end_link`; choose a `root_link` after it."
+            )
+        axis, anchor, zero = model.jnt_axis[j], model.jnt_pos[j], model.qpos0[model.jnt_qposadr[j]]
+        origin, back = np.eye(4), np.eye(4)
+        origin[:3, 3], back[:3, 3] = anchor, -anchor
+        if _MJCF_KINDS[kind] == "revolute":
+            origin[:3, :3] = Rotation.from_rotvec(-zero * axis).as_matrix()
+        else:
+            origin[:3, 3] -= zero * axis
+        limits = model.jnt_range[j] if model.jnt_limited[j] else None
+        steps += [Joint(origin, _MJCF_KINDS[kind], axis, name, limits), Joint(back)]
+    return steps
+
+
+def _mjcf_pose(position: NDArray, quaternion: NDArray) -> NDArray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # w comes first
+    matrix[:3, 3] = position
+    return matrix
+
+
+def chain_path(chain: Chain) -> list[Joint]:
+    """Return the joints of a pytorch_kinematics chain without branches."""
+    path: list[Joint] = []
+    for name in chain.get_frame_names(exclude_fixed=False):
+        frame: Any = chain.find_frame(name)
+        if len(frame.children) > 1:
+            raise ValueError(
+                f"`chain` must be serial, but {name!r} has {len(frame.children)} children; choose "
+                "one end by pytorch_kinematics.SerialChain(chain, end_frame_name)."
+            )
+        origin = np.eye(4)
+        for offset in (frame.link.offset, frame.joint.offset):
+            if offset is not None:
+                origin = origin @ offset.get_matrix()[0].detach().cpu().double().numpy()
+        joint = frame.joint
+        axis = joint.axis.detach().cpu().double().numpy()
+        path.append(Joint(origin, joint.joint_type, axis, joint.name, joint.limits))
+    return path
