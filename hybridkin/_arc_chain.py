@@ -44,9 +44,7 @@ class ArcChain(PortableModule):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        length, bending = self._split(self._to_tip(self._arcs(q)))
-        tail = tip(length, bending, stumpff((bending**2).sum(0)), self._tip_offsets().to(q))
-        return self._in_measuring_frame(tail, q)
+        return in_blocks(self._forward, q)[0]
 
     def jacobian(self, q: Tensor) -> Tensor:
         """Return the position Jacobian dx/dq, shape (..., 3, n_actuators), in closed form."""
@@ -67,6 +65,7 @@ class ArcChain(PortableModule):
         J : Tensor of shape (..., 3, n_actuators)
             Closed-form Jacobian dx/dq [-].
         """
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
         x, J = in_blocks(self._forward_and_jacobian, q)
         return x, J
 
@@ -289,6 +288,11 @@ class ArcChain(PortableModule):
             poses.append(pose)
         return torch.stack(poses, dim=-3)
 
+    def _forward(self, q: Tensor) -> tuple[Tensor]:
+        length, bending = self._split(self._to_tip(self._arcs(q)))
+        tail = tip(length, bending, stumpff((bending**2).sum(0)), self._tip_offsets().to(q))
+        return (self._in_measuring_frame(tail, q),)
+
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         arcs, slope = self._arcs_and_slope(self._rows(q))
         length, bending = self._split(self._to_tip(arcs))
@@ -303,8 +307,8 @@ class ArcChain(PortableModule):
         """Fold the slope of the arcs and the base into columns (3, 3 m, N)."""
         columns = (self.base.to(q)[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
         slope = self._to_tip(slope)
-        if slope.ndim == 2:
-            J = torch.matmul(slope.T, columns)  # (3, n, N)
-        else:
-            J = (columns[:, :, None] * slope).sum(1)
-        return J.flatten(0, 1).T.contiguous().reshape(*q.shape[:-1], 3, self.n_actuators)
+        if slope.ndim == 3:
+            J = torch.matmul(columns.permute(2, 0, 1), slope.permute(2, 0, 1))
+            return J.reshape(*q.shape[:-1], 3, self.n_actuators)
+        J = torch.matmul(slope.T, columns)  # (3, n, N)
+        return J.permute(2, 0, 1).reshape(*q.shape[:-1], 3, self.n_actuators)

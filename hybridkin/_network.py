@@ -96,7 +96,7 @@ class ELM(PortableModule):
 
     def _slope(self, a, s):
         slope = ACTIVATIONS[self.activation][1](a, s)
-        J = (slope @ self.tangent.to(s)).unflatten(-1, (len(self.intercept), -1))
+        J = (self.tangent.to(s) @ slope.T).T.unflatten(-1, (len(self.intercept), -1))
         if len(self.output_weights) > s.shape[-1]:
             J = J + (self.output_weights[s.shape[-1] :].T / self.input_scale).to(s)
         return J
@@ -130,7 +130,7 @@ class ELM(PortableModule):
 
 
 def _refresh_tangent(elm, incompatible_keys=None):
-    # J = sigma' @ T with T = w_out (x) w_in
+    # J = T @ sigma' with T = w_out (x) w_in
     w_in = elm.input_weights / elm.input_scale
     w_out = elm.output_weights[: len(w_in)]
-    elm.tangent = (w_out[:, :, None] * w_in[:, None, :]).flatten(1)
+    elm.tangent = (w_out.T[:, None] * w_in.T).flatten(0, 1)

@@ -346,6 +346,7 @@ class RigidChain(PortableModule):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
         return in_blocks(self._tip, q)[0]
 
     def jacobian(self, q: Tensor) -> Tensor:
@@ -367,6 +368,7 @@ class RigidChain(PortableModule):
         J : Tensor of shape (..., 3, n_actuators)
             Closed-form Jacobian dx/dq [m/rad], of prismatic joints [-].
         """
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
         x, J = in_blocks(self._forward_and_jacobian, q)
         return x, J
 
