@@ -270,8 +270,8 @@ class ArcChain(PortableModule):
     @staticmethod
     def _split(arcs: Tensor) -> tuple[Tensor, Tensor]:
         """Return lengths (S, N) and bending vectors (2, S, N)."""
-        length, x, y = arcs.unflatten(0, (3, -1))
-        return length, torch.stack([x, y])
+        parts = arcs.unflatten(0, (3, -1))
+        return parts[0], parts[1:]
 
     def _leading(self, arcs: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return lengths (..., S) and bending vectors (..., S, 2)."""
@@ -290,7 +290,7 @@ class ArcChain(PortableModule):
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         length, bending = self._split(self._to_tip(self._arcs(q)))
-        tail = tip(length, bending, stumpff((bending**2).sum(0)), self._tip_offsets().to(q))
+        tail = tip(length, bending, self._tip_offsets().to(q))
         return (self._in_measuring_frame(tail, q),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ written once, by components, for tensors and for plain numbers: `fma(a, b, c)` i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -74,9 +74,11 @@ def _turned(by: _Arithmetic, v: Any, b: Any, arc: Any) -> Vector:
     return by.fma(v[0], b[0], m), by.fma(v[1], b[1], m), by.fms(c * v[2], f, along)
 
 
-def tip(length: Tensor, bending: Tensor, arc: Stumpff, offsets: Tensor) -> Tensor:
+def tip(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     """Return the tip (3, N) in the base frame, carried from the last segment to the first."""
-    return torch.stack(_all_carried(length, bending, arc, offsets)[0].point)
+    x, y = bending.unbind()
+    arc = stumpff(torch.addcmul(x * x, y, y))
+    return torch.stack(_all_carried(length, (x, y), arc, offsets)[0][0].point)
 
 
 def tip_and_columns(
@@ -92,48 +94,46 @@ def tip_and_columns(
     Columns are the lengths of all segments, then the x-, then the y-bendings. With `angular`,
     3 S columns of angular velocity follow, with `rigid`, S columns for the offsets.
     """
-    arc = stumpff((bending**2).sum(0))
-    carried = _all_carried(length, bending, arc, offsets)
+    x, y = bending.unbind()
+    arc = stumpff(torch.addcmul(x * x, y, y))
+    carried, segments = _all_carried(length, (x, y), arc, offsets)
     tails = tuple(torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
     rest = torch.stack([at.rest for at in carried])
     across = torch.stack([at.across for at in carried])
     # The segments' own columns all at once, then turned by every segment before them.
     at = _Carried(carried[0].point, tails, rest, across)
-    by_length, by_x, by_y = _columns(_TENSORS, at, bending, arc)
-    kinds = [torch.stack([*by_length, *by_x, *by_y])]
+    entries = [entry for column in _columns(_TENSORS, at, (x, y), arc) for entry in column]
     if angular:
-        kinds.append(torch.stack(_spins(bending, arc)))
+        entries += _spins(x, y, arc)
     if rigid:
-        kinds.append(torch.stack([*(arc.f * bending), arc.c]))
-    columns = torch.cat([kind.unflatten(0, (-1, 3)) for kind in kinds]).transpose(0, 1)
+        entries += [arc.f * x, arc.f * y, arc.c]
+    columns = torch.stack(entries).unflatten(0, (-1, 3)).transpose(0, 1)
     turned = columns[:, :, -1:]
-    bends, arcs = _by_segment(bending), _by_segment(arc)
     for k in range(len(length) - 2, -1, -1):
-        ahead = torch.stack(_turned(_TENSORS, turned.unbind(), bends[k], arcs[k]))
+        ahead = torch.stack(_turned(_TENSORS, turned.unbind(), *segments[k]))
         turned = torch.cat([columns[:, :, k : k + 1], ahead], dim=2)
     return torch.stack(carried[0].point), turned.flatten(1, 2)
 
 
-def _all_carried(length: Tensor, bending: Tensor, arc: Stumpff, offsets: Tensor) -> list[_Carried]:
-    """Return the tip in the start frame of every segment."""
+def _all_carried(
+    length: Tensor, bending: tuple[Tensor, Tensor], arc: Stumpff, offsets: Tensor
+) -> tuple[list[_Carried], list[tuple[Any, Any]]]:
+    """Return the tip in the start frame of every segment, and each segment's bending and arc."""
+    bends, arcs = (
+        [*zip(*(part.unbind() for part in parts), strict=True)] for parts in (bending, arc)
+    )
     zero = torch.zeros_like(length[0])
     point, carried = (zero, zero, zero), []
-    parts = zip(length, _by_segment(bending), _by_segment(arc), offsets, strict=True)
-    for of_length, b, of_arc, offset in [*parts][::-1]:
+    parts = [*zip(length.unbind(), bends, arcs, offsets.unbind(), strict=True)]
+    for of_length, b, of_arc, offset in reversed(parts):
         carried.append(_carried(_TENSORS, point, of_length, b, of_arc, offset))
         point = carried[-1].point
-    return carried[::-1]
+    return carried[::-1], [*zip(bends, arcs, strict=True)]
 
 
-def _by_segment(parts: Iterable[Tensor]) -> list[tuple[Tensor, ...]]:
-    """Return for every segment its row of each part (S, N)."""
-    return [*zip(*(part.unbind() for part in parts), strict=True)]
-
-
-def _spins(bending: Tensor, arc: Stumpff) -> list[Tensor]:
+def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:
     """Return the nine entries of the angular velocity by (l, bx, by), each (S, N)."""
-    (x, y), zero = bending, torch.zeros_like(bending[0])
-    c3, g = arc.c3, arc.g
+    zero, c3, g = torch.zeros_like(x), arc.c3, arc.g
     by_x = -c3 * x * y, 1.0 - c3 * y * y, -g * y
     by_y = c3 * x * x - 1.0, c3 * x * y, g * x
     return [zero, zero, zero, *by_x, *by_y]

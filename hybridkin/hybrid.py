@@ -123,7 +123,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (N, n)
-            Actuator vectors q [m].
+            Actuator vectors q [m], of revolute joints [rad].
         y : array-like of shape (N, m) or (N,)
             Measured tip positions x [m].
         sample_weight : array-like of shape (N,), optional
