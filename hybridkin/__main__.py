@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import textwrap
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +19,9 @@ from hybridkin.simulation import NotSettledError
 _USER_ERRORS = (ValueError, TypeError, OSError, ImportError, NotSettledError)
 
 _PAPER = """\
-Reproduce the paper on the simulated trunk: Table 1, error histogram, workspace, and a figure
-eight and a spiral tracked with the mechanical and with the hybrid model. Needs the extra `sim`
-(MuJoCo)."""
+Reproduce the paper on the simulated trunk: Table 1, error histogram, workspace, a figure eight and
+a spiral tracked with the mechanical and with the hybrid model, and what the paper's samples tell
+about the trunk's geometry. Needs the extra `sim` (MuJoCo)."""
 
 _FIT = """\
 Calibrate a robot to a measured log, compare mechanical, data-driven and hybrid models on motions
@@ -181,6 +182,24 @@ def _show_paper(report: Any) -> None:
     print("Tracking error on the simulated trunk, both paths, mean [cm]")
     for name, stats in report.record["tracking"]["both"].items():
         print(f"  {name:34s} {100 * stats['mean']:6.2f}")
+    _show_identifiability(report.record["identifiability"])
+
+
+def _show_identifiability(found: dict[str, Any]) -> None:
+    print(
+        f"What {found['n_single']} rows of one segment and {found['n_random']} random rows of the "
+        "simulated trunk tell about its geometry"
+    )
+    print("  parameter                 calibrated  std. error   prior narrowed")
+    for entry in found["asked"]["entries"]:
+        name = f"{entry['name']} [{entry['unit']}]"
+        print(
+            f"  {name:24s} {entry['value']:11.2f} {entry['std_error']:11.2f} "
+            f"{entry['narrowing']:10.3g} x  {'told' if entry['told'] else 'not told'}"
+        )
+    print("  They leave open:")
+    for sentence in found["asked"]["unidentified"]:
+        print(textwrap.fill(sentence, 96, initial_indent="  - ", subsequent_indent="    "))
 
 
 def _show_fit(report: Any) -> None:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import qr
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
 from hybridkin._least_squares import Fit, Rows, solve
+from hybridkin._open_directions import sentences
 from hybridkin._parameters import ALIASES, POSITIVE, Problem, parameter_names
 from hybridkin._starts import Start, starts
 
@@ -27,7 +27,6 @@ _EQUAL = 1.0 - 1e-4  # of starts that explain the tips alike the given one count
 _BETTER = 0.8  # another handedness than the given one must explain the tips this much better,
 _FAR_BETTER = 0.5  # and this much where the user has not asked for it
 _UNPHYSICAL = 1.75  # positive geometry that moves by this factor is worth a word
-_STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%")}
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,6 +48,8 @@ class CalibrationResult:
         Correlation of the P free parameters, ordered as `names`.
     names : tuple of P str
         Free parameters, as "radii[0]" or "base[rot x]".
+    narrowing : ndarray of shape (P,)
+        How many times the data narrow the prior of each of `names`.
     identifiable : dict of str to bool array
         False where the data narrow the prior less than tenfold: that value is an assumption.
     singular_values : ndarray of shape (P,)
@@ -69,6 +70,7 @@ class CalibrationResult:
     std_errors: dict[str, Any]
     correlations: NDArray
     names: tuple[str, ...]
+    narrowing: NDArray
     identifiable: dict[str, NDArray]
     singular_values: NDArray
     unidentified: tuple[str, ...]
@@ -247,9 +249,11 @@ def _warn_unphysical(fit: Fit) -> None:
                 words.append(f"{label} went to {np.exp(moved):.2g} times its start")
         if part.entry == "offsets":
             offsets = fit.chain().geometry()["offsets"]
-            worse = (offsets < -0.02 * part.units[0]) & (offsets < before["offsets"])
+            further = before["offsets"] - offsets > 1e-3 * part.units[0]
+            worse = further & (offsets < -0.02 * part.units[0])
             for k in worse.nonzero().flatten().tolist():
-                words.append(f"offsets[{k}] became {1e3 * float(offsets[k]):.3g} mm")
+                label = "tool" if part.name == "tool" else part.labels[k]
+                words.append(f"{label} became {1e3 * float(offsets[k]):.3g} mm")
     if words:
         warnings.warn(
             f"calibration left what is physical: {'; '.join(words)}. Check the units and the "
@@ -286,43 +290,14 @@ def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> C
         std_errors=std_errors,
         correlations=covariance / np.outer(safe, safe),
         names=problem.labels,
+        narrowing=prior_std / safe,
         identifiable=identifiable,
         singular_values=told,
-        unidentified=_sentences(fit, open_ones * prior_std, float(rows.weight.sum())),
+        unidentified=sentences(fit, open_ones, float(rows.weight.sum())),
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
         converged=fit.converged,
     )
-
-
-def _sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
-    """Say which moves of the parameters (K, P) hardly move the tips, each by few of them."""
-    if not len(directions):
-        return ()
-    problem = fit.problem
-    units = np.concatenate([part.units for part in problem.parameters])
-    steps = [_STEPS[kind] for part in problem.parameters for kind in part.kind]
-    sizes = np.array([size for size, _ in steps])
-    # Each direction led by one parameter that the others do not hold: few terms in each.
-    _, order = cast(
-        tuple[NDArray, NDArray], qr(directions / problem.prior_std, mode="r", pivoting=True)
-    )
-    leads = order[: len(directions)]
-    moves = np.linalg.solve(directions[:, leads].T, directions)
-    sentences = []
-    for lead, move in sorted(zip(leads, moves, strict=True), key=lambda pair: pair[0]):
-        shown = move * units / sizes
-        shown, move = shown / shown[lead], move / shown[lead]
-        tips = 1e3 * np.linalg.norm(fit.jacobian @ move) / np.sqrt(n_rows)
-        terms = [i for i in np.argsort(-np.abs(shown)) if abs(shown[i]) > 0.05 and i != lead][:6]
-        words = [f"{problem.labels[i]} {shown[i]:+.3g} {steps[i][1]}" for i in [lead, *terms]]
-        advice = f"leave {problem.labels[lead]} out or measure it"
-        if terms:
-            others = " or ".join(problem.labels[i] for i in [lead, *terms[:1]])
-            advice = f"leave out or measure {others}"
-        move = " with ".join(filter(None, [words[0], ", ".join(words[1:])]))
-        sentences.append(f"{move} moves the tips by {tips:.2g} mm rms: {advice}.")
-    return tuple(sentences)
 
 
 def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:

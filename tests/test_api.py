@@ -18,6 +18,7 @@ ORDER = [
     "guards",
     "calibration",
     "_starts",
+    "_open_directions",
     "_least_squares",
     "_parameters",
     "ik",

@@ -5,9 +5,17 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import datasets, experiments, load_model, robots
+from hybridkin import (
+    ConstantCurvatureChain,
+    calibrate,
+    datasets,
+    experiments,
+    load_model,
+    robots,
+)
 from hybridkin.__main__ import main
-from hybridkin.experiments.paper import summary
+from hybridkin.experiments._report import geometry_entries
+from hybridkin.experiments.paper import ASKED, TELLABLE, identifiability, summary
 
 ROBOT = """
 calibrate = ["radii", "base"]
@@ -67,17 +75,71 @@ def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
     out = tmp_path / "results"
     options = ["--splits", "2", "--seeds", "2", "--points", "25", "--jobs", "1"]
     assert main(["paper", "--out", str(out), *options]) == 0
-    printed = capsys.readouterr().out
+    printed, errors = capsys.readouterr()
+    assert "warning" not in errors
     record = json.loads((out / "report.json").read_text())
     report = (out / "report.md").read_text()
     assert record["tracking_mechanical_over_hybrid"]["nominal"] > 2.0
     assert len(record["table1"]) == 11
+    told = record["identifiability"]
+    assert (
+        "What 1500 rows of one segment and 400 random rows of the simulated trunk tell" in printed
+    )
+    assert len(told["asked"]["entries"]) == 28
+    for entry in told["asked"]["entries"]:
+        assert re.search(
+            rf"{re.escape(entry['name'])} .* {'' if entry['told'] else 'not '}told\n", printed
+        )
+        assert f"| {entry['name']} [{entry['unit']}] | " in report
+    for sentence in told["asked"]["unidentified"]:
+        assert f"- {sentence}" in report
+        assert sentence in re.sub(r"\s+", " ", printed)
     pictures = set(re.findall(r"\((\w+\.png)\)", report))
     assert len(pictures) == 6
     for name in pictures | {"report.json", "report.md"}:
         assert (out / name).stat().st_size > 500
         assert str(out / name) in printed
     assert [p.name for p in tmp_path.iterdir()] == ["results"]
+
+
+def test_what_the_protocol_tells_about_the_geometry():
+    found = identifiability(datasets.load_trunk())
+    assert (found["n_train"], found["n_single"], found["n_random"]) == (1900, 1500, 400)
+    told = {entry["name"]: entry["told"] for entry in found["asked"]["entries"]}
+    assert all(told[f"radii[{k}]"] for k in range(3))
+    # A turn of all rings is one of the base, a rest bend is what the zeros of its sensors say.
+    assert not told["base[rot z]"]
+    assert not any(told[f"turns[{k}]"] for k in range(3))
+    assert not any(told[f"actuator_zeros[{k}]"] for k in range(9))
+    sentences = found["asked"]["unidentified"]
+    assert sum("turns" in line and "base[rot z]" in line for line in sentences) == 1
+    assert sum("rest_bends" in line and "actuator_zeros" in line for line in sentences) == 9
+    assert len(sentences) == 10
+    # Asked for once each, all is told, and the tip errs no more.
+    assert set(TELLABLE) < set(ASKED)
+    assert all(entry["told"] for entry in found["tellable"]["entries"])
+    assert found["tellable"]["unidentified"] == ()
+    assert found["tellable"]["test"] == pytest.approx(found["asked"]["test"], rel=0.01)
+    assert found["tellable"]["test"] < found["default"]["test"]
+
+
+def test_entries_of_a_calibration_have_units_a_user_reads(rng):
+    q = 0.25 + 0.05 * (2 * torch.rand(100, 6, generator=rng, dtype=torch.float64) - 1)
+    base = np.eye(4)
+    base[:3] = [[0, -1, 0, 0.01], [1, 0, 0, 0.02], [0, 0, 1, 0.03]]
+    truth = ConstantCurvatureChain([0.1, 0.08], base=base, rest_bends=[[0.1, 0], [0, 0.2]])
+    start = ConstantCurvatureChain([0.09, 0.09])
+    result = calibrate(start, q, truth(q), ("radii", "rest_bends", "base"))
+    entries = {entry["name"]: entry for entry in geometry_entries(start, result)}
+    assert tuple(entries) == result.names
+    expected = {"radii[0]": (90, 100, "mm"), "rest_bends[1, y]": (0, np.degrees(0.2), "deg")}
+    expected |= {"base[rot z]": (0, 90, "deg"), "base[y]": (0, 20, "mm")}
+    for name, (before, value, unit) in expected.items():
+        entry = entries[name]
+        assert entry["unit"] == unit
+        assert [entry["start"], entry["value"]] == pytest.approx([before, value], abs=1e-6)
+        assert entry["told"]
+        assert entry["narrowing"] > 10
 
 
 def test_fit_command_on_a_log(log, tmp_path, capsys):
@@ -97,6 +159,25 @@ def test_fit_command_on_a_log(log, tmp_path, capsys):
     )
     errors = np.linalg.norm(model.predict(data.q) - data.x, axis=1)
     assert errors.mean() < held_out["hybrid, ELM"]["mean"]
+
+
+def test_fit_of_ring_turns_tells_that_they_are_turns_of_the_base(log, tmp_path):
+    path, robot = log
+    robot.write_text(ROBOT.replace('"base"]', '"turns", "base"]'))
+    report, _ = experiments.fit_log(path, robot, tmp_path / "m", n_folds=2, n_seeds=1, n_jobs=1)
+    text = (tmp_path / "m" / "report.md").read_text()
+    assert re.search(r"\| turns\[1\] \[deg\] \|.*\| no \|", text)
+    (sentence,) = report.record["calibration"]["unidentified"]
+    assert sentence.startswith("all turns +1 deg with base[rot z] -1 deg")
+    assert f"- {sentence}" in text
+
+
+def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
+    path, robot = log
+    robot.write_text(ROBOT.replace("0.11", "0.05"))
+    with pytest.warns(UserWarning, match="left what is physical") as caught:
+        experiments.fit_log(path, robot, tmp_path / "m", n_folds=2, n_seeds=1, n_jobs=1)
+    assert len(caught) == 1
 
 
 def test_without_a_column_of_motions_the_log_is_cut_into_stretches(log, tmp_path):

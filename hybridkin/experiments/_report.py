@@ -14,9 +14,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
+
+from hybridkin._parameters import parameter
+from hybridkin.calibration import CalibrationResult
+
+TOLD = 10.0
+"""The data tell a parameter whose prior they narrow so many times."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
@@ -35,6 +42,56 @@ def quadratic() -> Any:
 def distance(a: NDArray, b: NDArray) -> NDArray:
     """Return the distances (N,) between points (N, 3)."""
     return np.linalg.norm(a - b, axis=-1)
+
+
+def geometry_entries(start: Any, result: CalibrationResult) -> list[dict[str, Any]]:
+    """Return what a calibration from `start` found, one entry for each free parameter.
+
+    Returns
+    -------
+    list of dict
+        "name"; "unit", "mm" or "deg"; "start", "value" and "std_error" in that unit, of the base
+        its turn from the start and its position; "narrowing" and "told".
+    """
+    entries = []
+    narrowing = iter(result.narrowing.tolist())
+    for name, value in result.values.items():
+        part = parameter(start, name)
+        value, std = np.asarray(value), np.ravel(np.asarray(result.std_errors[name]))
+        if name == "base":
+            first = part.start.numpy()
+            turn = Rotation.from_matrix(value[:3, :3] @ first[:3, :3].T).as_rotvec()
+            before = np.concatenate([np.zeros(3), first[:3, 3]])
+            value = np.concatenate([turn, value[:3, 3]])
+        else:
+            before = part.value(part.start).numpy().ravel()
+        for label, kind, *numbers in zip(
+            part.labels, part.kind, before, value.ravel(), std, strict=True
+        ):
+            scale, unit = (180.0 / np.pi, "deg") if kind == "rad" else (1e3, "mm")
+            entry = dict(
+                zip(("start", "value", "std_error"), scale * np.array(numbers), strict=True)
+            )
+            told = next(narrowing)
+            entries.append({"name": label, "unit": unit, **entry, "narrowing": told})
+            entries[-1]["told"] = told >= TOLD
+    return entries
+
+
+def geometry_rows(entries: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return entries of a calibration as rows of a table; see `GEOMETRY_HEADER`."""
+    return [
+        [
+            f"{entry['name']} [{entry['unit']}]",
+            *(f"{entry[key]:.2f}" for key in ("start", "value", "std_error")),
+            f"{entry['narrowing']:.3g}",
+            "yes" if entry["told"] else "no",
+        ]
+        for entry in entries
+    ]
+
+
+GEOMETRY_HEADER = ("parameter", "start", "calibrated", "standard error", "prior narrowed", "told")
 
 
 class Report:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +18,14 @@ from hybridkin import datasets, plots, robots
 from hybridkin.calibration import CalibrationResult, calibrate
 from hybridkin.elm import ELMRegressor
 from hybridkin.experiments._report import (
+    GEOMETRY_HEADER,
+    TOLD,
     Progress,
     Report,
     check_out,
     distance,
+    geometry_entries,
+    geometry_rows,
     linear,
     quadratic,
     quiet,
@@ -223,10 +228,10 @@ def _one_fold(
     def with_elm(fitted: Any, choice: Choice) -> NDArray:
         return held_out(*(_elm_model(fitted, choice, seed) for seed in range(settings.n_seeds)))
 
-    calibrated = calibrate(chain, *rows, settings.parameters, loss=settings.loss).chain
+    calibrated = _calibrated(chain, *rows, settings.parameters, settings.loss)
     nominal = chain
     if "base" in settings.parameters:
-        nominal = calibrate(chain, *rows, ("base",), loss=settings.loss).chain
+        nominal = _calibrated(chain, *rows, ("base",), settings.loss)
     data_choice, hybrid_choice = (
         _choose(start, *rows, groups[train], candidates, settings)
         for start, candidates in ((None, _DATA_CHOICES), (chain, _HYBRID_CHOICES))
@@ -258,12 +263,19 @@ def _choose(
     for train, test in folds.split(q, groups=groups):
         fitted = chain
         if chain is not None and settings.parameters:
-            result = calibrate(chain, q[train], x[train], settings.parameters, loss=settings.loss)
-            fitted = result.chain
+            fitted = _calibrated(chain, q[train], x[train], settings.parameters, settings.loss)
         for i, candidate in enumerate(candidates):
             model = _elm_model(fitted, candidate, 0).fit(q[train], x[train])
             errors[i] += distance(model.predict(q[test]), x[test]).sum()
     return candidates[int(errors.argmin())]
+
+
+def _calibrated(chain: Any, q: NDArray, x: NDArray, parameters: tuple[str, ...], loss: str) -> Any:
+    """Return the chain calibrated on a part of the log, in silence: the whole log has its say."""
+    with warnings.catch_warnings():
+        for message in ("calibration left what is physical", "the actuators run the other way"):
+            warnings.filterwarnings("ignore", message)
+        return calibrate(chain, q, x, parameters, loss=loss).chain
 
 
 def _elm_model(chain: Any, choice: Choice, seed: int) -> HybridForwardModel:
@@ -384,59 +396,22 @@ def _write_comparison(
 
 
 def _write_calibration(report: Report, chain: Any, result: CalibrationResult) -> None:
-    start = {name: value.numpy() for name, value in chain.geometry().items()}
-    start["tool"] = start["offsets"][-1]
+    entries = geometry_entries(chain, result)
     report.text(
         "## Calibration on all motions",
-        f"Root mean square tip error {1000 * result.rmse:.2f} mm. Values in metres and radians; "
-        "standard errors count every row as independent and are too small where rows follow each "
-        "other closely.",
+        f"Root mean square tip error {1000 * result.rmse:.2f} mm. Standard errors count every row "
+        "as independent and are too small where rows follow each other closely. What narrows the "
+        f"prior of a parameter less than {TOLD:.0f} times does not tell it: its value is an "
+        "assumption. The base by its turn from the start and its position.",
     )
-    rows = []
-    for name, value in result.values.items():
-        value, errors = np.asarray(value), np.asarray(result.std_errors[name])
-        if name == "base":
-            rows.append(
-                [
-                    "base position",
-                    _row(start[name][:3, 3]),
-                    _row(value[:3, 3]),
-                    _row(errors[3:]),
-                    _known(result.identifiable[name][3:]),
-                ]
-            )
-            rows.append(
-                [
-                    "base orientation",
-                    "",
-                    "",
-                    _row(errors[:3]),
-                    _known(result.identifiable[name][:3]),
-                ]
-            )
-        else:
-            rows.append(
-                [
-                    name,
-                    _row(start[name]),
-                    _row(value),
-                    _row(errors),
-                    _known(result.identifiable[name]),
-                ]
-            )
-    report.table(["parameter", "start", "calibrated", "standard error", "told by the data"], rows)
+    report.table(GEOMETRY_HEADER, geometry_rows(entries))
+    if result.unidentified:
+        report.text("What the log leaves open:", *(f"- {line}" for line in result.unidentified))
     report.record["calibration"] = {
         "values": result.values,
         "std_errors": result.std_errors,
         "rmse": result.rmse,
         "identifiable": result.identifiable,
+        "entries": entries,
+        "unidentified": result.unidentified,
     }
-
-
-def _row(values: NDArray) -> str:
-    return " ".join(f"{value:.4g}" for value in np.atleast_1d(values))
-
-
-def _known(flags: NDArray) -> str:
-    flags = np.atleast_1d(flags)
-    return "yes" if flags.all() else "no" if not flags.any() else "in part"
