@@ -44,7 +44,7 @@ class ArcChain(PortableModule):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        return in_blocks(self._forward, q)[0]
+        return in_blocks(self._forward, q, 8192)[0]
 
     def jacobian(self, q: Tensor) -> Tensor:
         """Return the position Jacobian dx/dq, shape (..., 3, n_actuators), in closed form."""

@@ -48,7 +48,9 @@ def _tensor(value: Any, name: str, dtype: torch.dtype) -> Tensor:
     return tensor
 
 
-def actuator_counts(n_actuators: Any, n_segments: int) -> tuple[int, ...]:
+def actuator_counts(
+    n_actuators: Any, n_segments: int, name: str = "n_actuators", least: int = 3
+) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
     if np.ndim(n_actuators) == 0:
         counts = (int(n_actuators),) * n_segments
@@ -56,14 +58,12 @@ def actuator_counts(n_actuators: Any, n_segments: int) -> tuple[int, ...]:
         counts = tuple(int(n) for n in n_actuators)
     if len(counts) != n_segments:
         raise ValueError(
-            f"`n_actuators` must be one number or {n_segments} numbers, one per segment as in "
+            f"`{name}` must be one number or {n_segments} numbers, one per segment as in "
             f"`radii`, got {len(counts)}."
         )
-    if min(counts) < 3:
-        raise ValueError(
-            f"`n_actuators` must be at least 3 on every segment, got {counts}; two actuators do "
-            "not determine which way a segment bends."
-        )
+    if min(counts) < least:
+        why = "; two actuators do not determine which way a segment bends" if least == 3 else ""
+        raise ValueError(f"`{name}` must be at least {least} on every segment, got {counts}{why}.")
     return counts
 
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from hybridkin._numerics import stumpff
 
 ALIASES = {"turns": "angles", "tool": "offsets"}  # name -> the entry that it moves a part of
-POSITIVE = ("radii", "lengths", "bending_stiffness", "axial_stiffness")
-_FARTHEST = math.log(5.0)  # positive geometry stays within this factor of its start, both ways
+# Positive geometry, and the factor of its start within which it stays, both ways.
+SCALED = {"radii": 5.0, "lengths": 5.0, "bending_stiffness": 1e4, "axial_stiffness": 1e4}
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
 
 
@@ -87,7 +87,8 @@ class Scaled(Parameter):
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
         start = self.start.numpy().ravel()
         if bound is None:
-            return np.full(start.size, -_FARTHEST), np.full(start.size, _FARTHEST)
+            farthest = math.log(SCALED[self.name])
+            return np.full(start.size, -farthest), np.full(start.size, farthest)
         if bound[0] < 0:
             raise ValueError(f"`bounds` of {self.name!r} must not be negative, got {bound}.")
         with np.errstate(divide="ignore"):
@@ -215,7 +216,7 @@ def parameter(chain: Any, name: str) -> Parameter:
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
     labels, size = _labels(name, tuple(start.shape)), start.numel()
-    if name in POSITIVE:
+    if name in SCALED:
         return Scaled(name, name, start, labels, np.ones(size), ("-",) * size)
     unit, kind, physical = reach, "m", (-np.inf, np.inf)
     if name == "rest_bends":

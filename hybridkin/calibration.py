@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hybridkin._least_squares import Fit, Rows, solve
 from hybridkin._open_directions import sentences
-from hybridkin._parameters import ALIASES, POSITIVE, Problem, parameter_names
+from hybridkin._parameters import ALIASES, Problem, parameter_names
 from hybridkin._starts import Start, starts
 
 __all__ = ["CalibrationResult", "calibrate"]
@@ -26,7 +26,8 @@ _KNOWN = 0.1  # k parameters that share one unknown direction narrow to 1 / sqrt
 _EQUAL = 1.0 - 1e-4  # of starts that explain the tips alike the given one counts
 _BETTER = 0.8  # another handedness than the given one must explain the tips this much better,
 _FAR_BETTER = 0.5  # and this much where the user has not asked for it
-_UNPHYSICAL = 1.75  # positive geometry that moves by this factor is worth a word
+_MEASURED = ("radii", "lengths")  # sizes that a ruler tells:
+_UNPHYSICAL = 1.75  # one that moves by this factor is worth a word
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,20 +128,21 @@ def calibrate(
         Measured tip positions [m].
     parameters : sequence of str, default=("radii", "base")
         Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
-        chains), "offsets", "rest_bends", "actuator_zeros", "base" (pose); or instead of all angles
+        chains), "offsets", "rest_bends", "actuator_zeros", "base" (pose), of elastic tendon chains
+        "bending_stiffness", "axial_stiffness" and "tendon_zeros"; or instead of all angles
         "turns", of each segment's ring of actuators as a whole, and instead of all offsets "tool",
         the last one.
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
         All but "linear" bound the influence of outliers.
     bounds : dict of str to (low, high), optional
         Limits of all entries of a name, in its own unit. Default: a factor of 5 on radii and
-        lengths, half a turn on rest bends, and offsets that are no shorter than minus a tenth of
-        the robot's length.
+        lengths and of 10 000 on stiffnesses, half a turn on rest bends, and offsets that are no
+        shorter than minus a tenth of the robot's length.
     prior : float or dict of str to float, default=0.5
-        Standard deviation of the weak prior in natural units: a fraction of radii and lengths, of
-        the mean radius for "actuator_zeros", of the robot's length for "offsets", "tool" and the
-        base position, radians for angles, rest bends and the base orientation. ``inf`` turns it
-        off.
+        Standard deviation of the weak prior in natural units: a fraction of radii, lengths and
+        stiffnesses, of the mean radius for actuator and tendon zeros, of the robot's length for
+        "offsets", "tool" and the base position, radians for angles, rest bends and the base
+        orientation. ``inf`` turns it off.
     groups : array-like of shape (N,), optional
         Motion of every row; asks for `cv_rmse` on motions held out.
     sample_weight : array-like of shape (N,), optional
@@ -160,7 +162,8 @@ def calibrate(
     -----
     UserWarning
         Where a value ran into a bound or left what is physical, and where the mirror image of the
-        given robot explains the data far better: then that is returned.
+        given robot explains the data far better: then that is returned. For tendons of a
+        ConstantCurvatureChain that contradict each other, as slack does.
 
     References
     ----------
@@ -201,6 +204,9 @@ def calibrate(
     if len(candidates) > 1:
         best = solve(best.problem, rows, best.theta, loss)
     _warn_unphysical(best)
+    result_chain = best.chain()
+    if hasattr(result_chain, "warn_contradictory"):
+        result_chain.warn_contradictory(q)
     cv_rmse = None
     if groups is not None:
         cv_rmse = _cross_validate(best, rows, groups[kept.numpy()], loss)
@@ -245,7 +251,7 @@ def _warn_unphysical(fit: Fit) -> None:
     before = problem.chain.geometry()
     for part, at in zip(problem.parameters, problem.parts(theta), strict=True):
         for label, moved in zip(part.labels, at, strict=True):
-            if part.name in POSITIVE and abs(moved) > np.log(_UNPHYSICAL):
+            if part.name in _MEASURED and abs(moved) > np.log(_UNPHYSICAL):
                 words.append(f"{label} went to {np.exp(moved):.2g} times its start")
         if part.entry == "offsets":
             offsets = fit.chain().geometry()["offsets"]

@@ -5,7 +5,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import jacobian
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, jacobian
+
+GOALS = {"vmap(jacrev)": 8, "3 backward passes": 3}
 
 
 def test_against_automatic_derivatives(race, chain, draw, batch, autodiff):
@@ -18,6 +20,42 @@ def test_against_automatic_derivatives(race, chain, draw, batch, autodiff):
         lambda: chain.forward_and_jacobian(q),
         lambda: derive(chain, q),
         rows=batch,
+        at_least=GOALS[name],
+    )
+
+
+def test_against_a_rigid_arm(race, chain, draw, arm, batch):
+    """Another robot with as many joints: its J has six rows, ours three, with x."""
+    q = draw(batch)
+    assert chain.jacobian(q).shape == arm.jacobian(q)[:, :3].shape
+    race(
+        "chain: tip + J",
+        "pytorch_kinematics (9 joints): J",
+        lambda: chain.forward_and_jacobian(q),
+        lambda: arm.jacobian(q),
+        rows=batch,
+        at_least=4,
+    )
+
+
+@pytest.mark.parametrize("what", ["tip", "tip + J"])
+def test_tendons_that_can_only_pull(race, batch, what):
+    """What slack costs: half of the rows have slack tendons."""
+    elastic = ElasticTendonChain([0.0045] * 3, [0.06] * 3)
+    plain = ConstantCurvatureChain([0.0045] * 3, lengths=[0.06] * 3, routing="base")
+    generator = torch.Generator().manual_seed(0)
+    q = 0.01 * (torch.rand(batch, 9, dtype=torch.float64, generator=generator) - 0.5)
+    ours, peer, goal = elastic, plain, 5
+    if what == "tip + J":
+        ours, peer, goal = elastic.forward_and_jacobian, plain.forward_and_jacobian, 4
+    assert_close(elastic.jacobian(q), jacobian(lambda q: elastic(q), q))
+    race(
+        f"elastic tendon chain: {what}",
+        "constant-curvature chain",
+        lambda: ours(q),
+        lambda: peer(q),
+        rows=batch,
+        at_most=goal,
     )
 
 

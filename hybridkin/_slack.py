@@ -1,0 +1,128 @@
+"""Which tendons are taut, and how an elastic shape answers while they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+MOST = 62  # a set of tendons is the bits of one integer
+_WHOLE_STEPS = 8  # then one tendon at a time, which ends for certain
+_MOST_TURNS = 12  # two to this power, should rounding keep it from an end
+
+
+class Elasticity(NamedTuple):
+    """What shapes the backbone: shapes are the length changes, then the x- and y-bendings."""
+
+    readings: Tensor  # (n, 3 S), tendon paths by shape
+    units: Tensor  # (3 S,), shapes of like effect on the paths
+    stiffness: Tensor  # (3 S,)
+    rest: Tensor  # (3 S,), the shape without tendons
+    zeros: Tensor  # (n,)
+
+
+class Responses(NamedTuple):
+    """For M sets of taut tendons how the shape answers; the actuators come as (q, 1)."""
+
+    shape: Tensor  # (M, 3 S, n + 1)
+    stretch: Tensor  # (M, n, n + 1), slack counts as negative
+    compliance: Tensor  # (M, 3 S, 3 S), shape by a generalised force
+
+
+def responses_of(
+    taut: Tensor, readings: Tensor, units: Tensor, stiffness: Tensor, rest: Tensor, zeros: Tensor
+) -> Responses:
+    """Return the linear answers of sets of taut tendons (M, n)."""
+    pulling = readings.T * taut[:, None]  # (M, 3 S, n)
+    hessian = torch.diag(stiffness) + pulling @ readings
+    scaled = units[:, None] * hessian * units
+    compliance = units[:, None] * torch.linalg.inv_ex(scaled).inverse * units
+    force = torch.cat([pulling, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1)
+    shape = compliance @ force
+    given = torch.cat([torch.eye(len(zeros)).to(zeros), -zeros[:, None]], dim=-1)
+    return Responses(shape, readings @ shape - given, compliance)
+
+
+def extended(rows: Tensor) -> Tensor:
+    return nn.functional.pad(rows, (0, 1), value=1.0)
+
+
+def applied(maps: Tensor, vectors: Tensor) -> Tensor:
+    return torch.matmul(maps, vectors[..., None])[..., 0]
+
+
+def as_mask(codes: Tensor, n: int) -> Tensor:
+    """Return sets given as bits of a number (N,) as a mask (N, n)."""
+    return ((codes[:, None] >> torch.arange(n, device=codes.device)) & 1) > 0
+
+
+def stretch_from_table(codes: Tensor, table: Tensor) -> Tensor:
+    return table.index_select(0, codes)
+
+
+def stretch_by_solving(codes: Tensor, *elasticity: Tensor) -> Tensor:
+    return responses_of(as_mask(codes, len(elasticity[0])), *elasticity).stretch
+
+
+def _find_taut(stretch_of: Callable[..., Tensor], rows: Tensor, *parts: Tensor) -> Tensor:
+    """Return which tendons are taut, as the bits of one number per row (N,).
+
+    The stretches of a set of taut tendons come as maps (N, n, n + 1) from `stretch_of`.
+    """
+    n, x = rows.shape[1], extended(rows)
+    bits = 2 ** torch.arange(n, device=rows.device)
+    full = stretch_of(2**n - 1 + 0 * bits[:1], *parts)[0]
+    here = ((full @ x.T >= 0) * bits[:, None]).sum(0)
+    codes, at = here.clone(), torch.arange(len(rows), device=rows.device)
+    for step in range(_WHOLE_STEPS + 2 ** min(n, _MOST_TURNS)):
+        maps = stretch_of(here, *parts)
+        stretch = applied(maps, x)
+        found = ((stretch >= 0) * bits).sum(-1)
+        if step >= _WHOLE_STEPS:  # one at a time, and none for a rounding error
+            rounding = 4.0 * torch.finfo(x.dtype).eps * applied(maps.abs(), x.abs())
+            wrong = (found ^ here) & ((stretch.abs() > rounding) * bits).sum(-1)
+            found = here ^ (wrong & -wrong)
+        moved = (found != here).nonzero()[:, 0]
+        if not len(moved):
+            break
+        at, x, here = (part.index_select(0, moved) for part in (at, x, found))
+        codes[at] = here
+    return codes
+
+
+class FindTaut(torch.autograd.Function):
+    """`_find_taut` under every transform: its result is constant between the kinks."""
+
+    @staticmethod
+    def forward(stretch_of: Callable[..., Tensor], rows: Tensor, *parts: Tensor) -> Tensor:
+        return _find_taut(stretch_of, rows, *parts)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        return None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        return None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
+        stretch_of, tensors, dims = args[0], args[1:], in_dims[1:]
+        if all(dim is None for dim in dims[1:]):  # the same robot: the batch is more rows
+            rows = tensors[0].movedim(dims[0], 0)
+            codes = FindTaut.apply(stretch_of, rows.flatten(0, 1), *tensors[1:])
+            return codes.unflatten(0, rows.shape[:2]), 0
+        each = [
+            [
+                part if dim is None else part.select(dim, k)
+                for part, dim in zip(tensors, dims, strict=True)
+            ]
+            for k in range(info.batch_size)
+        ]
+        return torch.stack([FindTaut.apply(stretch_of, *parts) for parts in each]), 0
