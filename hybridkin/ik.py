@@ -55,9 +55,10 @@ class InverseKinematics:
         Limits of q, in the unit of q.
     dq_max : float or array-like of shape (n,), optional
         Largest speed of every actuator [unit of q per second]: a step is at most ``dq_max dt``.
-    q_pref : float or array-like of shape (n,), optional
-        Preferred configuration. Default: the middle of the limits where both are finite, else
-        there is no posture term.
+    q_pref : float, array-like of shape (n,) or callable, optional
+        Preferred configuration, or a function that gives it for configurations (..., n), torch to
+        torch, as `ElasticTendonChain.taut_posture`. Default: the middle of the limits where both
+        are finite, else there is no posture term.
     beta : float, default=1.0
         Rate of the posture [1/s], with 0 <= beta dt <= 1.
     gain : float, optional
@@ -126,13 +127,14 @@ class InverseKinematics:
         self.q_min = _bound(q_min, "q_min", -math.inf)
         self.q_max = _bound(q_max, "q_max", math.inf)
         self.dq_max = _bound(dq_max, "dq_max", math.inf)
+        fixed_pref = None if q_pref is None or callable(q_pref) else _bound(q_pref, "q_pref", 0.0)
         sizes = {
             name: len(value)
             for name, value in (
                 ("q_min", self.q_min),
                 ("q_max", self.q_max),
                 ("dq_max", self.dq_max),
-                ("q_pref", None if q_pref is None else _bound(q_pref, "q_pref", 0.0)),
+                ("q_pref", fixed_pref),
             )
             if value is not None and value.ndim == 1
         }
@@ -155,13 +157,13 @@ class InverseKinematics:
                 f"`dq_max` must be positive [unit of q per second], got {self.dq_max.tolist()}; "
                 "to lock an actuator give it equal limits."
             )
-        if q_pref is None:
-            middle = 0.5 * (self.q_min + self.q_max)
-            self.q_pref = middle if torch.isfinite(middle).all() else None
-        else:
-            self.q_pref = _bound(q_pref, "q_pref", 0.0)
-            if not torch.isfinite(self.q_pref).all():
-                raise ValueError(f"`q_pref` must be finite, got {self.q_pref.tolist()}.")
+        middle = 0.5 * (self.q_min + self.q_max)
+        self._middle = middle if torch.isfinite(middle).all() else None
+        self.q_pref: Any = q_pref
+        if not callable(q_pref):
+            self.q_pref = self._middle if fixed_pref is None else fixed_pref
+            if fixed_pref is not None and not torch.isfinite(fixed_pref).all():
+                raise ValueError(f"`q_pref` must be finite, got {fixed_pref.tolist()}.")
         if not (dt > 0 and math.isfinite(dt)):
             raise ValueError(f"`dt` must be a positive period [s], got {dt!r}.")
         self.dt = float(dt)
@@ -390,7 +392,7 @@ class InverseKinematics:
         at = torch.where(fine, q, 0.0)
         posture = None
         if self.q_pref is not None and beta > 0.0:
-            posture = torch.where(fine, beta * (self.q_pref.to(q) - at), 0.0)
+            posture = torch.where(fine, beta * (self._preferred(at) - at), 0.0)
         bounds = self._step_bounds(q, self.dq_max.to(q) * period)
         J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
         move = self._resolve(J, v, posture, *bounds)
@@ -505,7 +507,7 @@ class InverseKinematics:
         n = q.shape[-1]
         points: list[Tensor] = []
         if from_preferred and restarts > 0 and self.q_pref is not None:
-            points = [self.q_pref.to(q).expand(n)]
+            points = [self._start(q)]
         draws = max(restarts - len(points), 0)
         if draws == 0:
             return points
@@ -524,16 +526,15 @@ class InverseKinematics:
         rows = (found.error <= tol).nonzero()[:, 0]
         if self.q_pref is None or self.beta == 0.0 or rows.numel() == 0:
             return
-        pref = self.q_pref.to(found.q)
-        all_rows, nearest = rows, (pref - found.q).norm(dim=-1)
+        all_rows, nearest = rows, (self._preferred(found.q) - found.q).norm(dim=-1)
         live = [a[rows] for a in (found.q, found.x, found.J, target, nearest)]
         share = torch.ones_like(live[-1])
         for iteration in range(_POSTURE_STEPS):
             q, x, J, aim, gap = live
             task_only = iteration == _POSTURE_STEPS - 1
-            posture = None if task_only else share[:, None] * (pref - q)
+            posture = None if task_only else share[:, None] * (self._preferred(q) - q)
             move, new, x_new, J_new, error_new = self._try_step(q, x, J, aim, posture)
-            gap_new = (pref - new).norm(dim=-1)
+            gap_new = (self._preferred(new) - new).norm(dim=-1)
             loose = _POSTURE_SLIP * J.flatten(1).norm(dim=-1) * move.dq.norm(dim=-1)
             ok = (error_new <= loose.clamp_min(tol)) & (gap_new < gap) | task_only
             error = (aim - x).norm(dim=-1)
@@ -641,16 +642,25 @@ class InverseKinematics:
             )
         return x.to(q), J.to(q)
 
+    def _preferred(self, q: Tensor) -> Tensor:
+        """Return the preferred configurations, of shape (n,) or that of q."""
+        wanted: Any = self.q_pref(q) if callable(self.q_pref) else self.q_pref
+        return wanted.to(q)
+
     def _start(self, target: Tensor) -> Tensor:
-        if self.q_pref is None:
-            raise ValueError("a start is needed: give `q0`, `q_pref`, or finite `q_min`, `q_max`.")
+        start = self._middle if callable(self.q_pref) else self.q_pref
+        if start is None:
+            raise ValueError(
+                "a start is needed: give `q0`, `q_pref` of shape (n,), or finite `q_min`, `q_max`."
+            )
         n = self._size
         if n is None:
             raise ValueError(
                 "the number of actuators is not known from scalar limits and this model; give "
                 "`q0`, or `q_pref` of shape (n,)."
             )
-        return self.q_pref.to(target).expand(n)
+        start = start.to(target).expand(n)
+        return self._preferred(start) if callable(self.q_pref) else start
 
     def _configurations(self, value: Any, name: str, like: Tensor | None = None) -> Tensor:
         q = _tensor(value, name, self._device() if like is None else like.device)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -243,14 +245,43 @@ class ElasticTendonChain(ArcChain):
         >>> chain.tensions(torch.zeros(3))
         tensor([0.0010, 0.0010, 0.0010])
         """
-        rows = self._rows(q)
-        codes, at, responses = self._find(rows)
-        stretch = applied(responses.stretch.index_select(0, at), extended(rows)).relu()
-        return (stretch * as_mask(codes, self.n_actuators)).reshape(q.shape)
+        codes, stretch = self._stretch(q)
+        return (stretch.relu() * as_mask(codes, self.n_actuators)).reshape(q.shape)
 
     def slack(self, q: Tensor) -> Tensor:
         """Return which tendons hang slack, a bool tensor of the shape of q."""
         return ~as_mask(self._find(self._rows(q))[0], self.n_actuators).reshape(q.shape)
+
+    def taut_posture(self, minimum: float = 0.0) -> Callable[[Tensor], Tensor]:
+        """Return a posture that keeps tendons taut, for `InverseKinematics(q_pref=...)`.
+
+        Parameters
+        ----------
+        minimum : float, default=0.0
+            Stretch that every tendon should keep [m].
+
+        Returns
+        -------
+        function
+            Maps q (..., n_actuators) to itself with every tendon shortened by what it lacks. In the
+            null space of the task the inverse kinematics moves there and leaves the tip alone; how
+            far that goes the task decides.
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ElasticTendonChain
+        >>> chain = ElasticTendonChain([0.005], [0.1], axial_stiffness=100.0)
+        >>> chain.taut_posture(1e-3)(torch.zeros(3))
+        tensor([-0.0010, -0.0010, -0.0010])
+        """
+        if not (minimum >= 0.0 and math.isfinite(minimum)):
+            raise ValueError(f"`minimum` must be a stretch >= 0 [m], got {minimum!r}.")
+        return partial(self._shortened, minimum=minimum)
+
+    def _shortened(self, q: Tensor, minimum: float) -> Tensor:
+        lacking = (minimum - self._stretch(q)[1]).clamp(min=0.0)
+        return q - lacking.reshape(q.shape)
 
     def check_actuators(self, q: Tensor, name: str = "q") -> None:
         """Raise where q cannot be a log of this robot, and warn where it looks like millimetres.
@@ -330,6 +361,12 @@ class ElasticTendonChain(ArcChain):
         )
         each = torch.arange(len(rows), device=rows.device)
         return codes, each, responses_of(as_mask(codes, self.n_actuators), *elasticity)
+
+    def _stretch(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the sets of taut tendons (N,) as bits, and stretches (N, n), slack negative."""
+        rows = self._rows(q)
+        codes, at, responses = self._find(rows)
+        return codes, applied(responses.stretch.index_select(0, at), extended(rows))
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         _, at, responses = self._find(rows)

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, _slack, calibrate, tendons
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    InverseKinematics,
+    _slack,
+    calibrate,
+    tendons,
+)
 from hybridkin._arcs import levers, reading_matrix
 
 RADII, LENGTHS = [0.0045, 0.005, 0.004], [0.06, 0.0625, 0.064]
@@ -509,3 +516,23 @@ def test_bad_input_says_what_is_needed(make, message):
 def test_displacements_in_millimetres_are_noticed():
     with pytest.warns(UserWarning, match="millimetres"):
         robot().check_actuators(torch.full((9,), 5.0))
+
+
+def test_taut_posture_keeps_tendons_taut_and_leaves_the_tip_alone(rng):
+    chain = ElasticTendonChain([0.005] * 3, [0.06] * 3, tendon_zeros=0.0005)
+    q = 0.004 * (2.0 * torch.rand(30, 9, dtype=torch.float64, generator=rng) - 1.0)
+    target = chain(q)
+    assert chain.slack(q).any(-1).float().mean() > 0.5
+    ik = InverseKinematics(chain, q_pref=chain.taut_posture(2e-4), q_min=-0.02, q_max=0.02)
+    for solution in (ik.solve(target, q0=q), ik.solve(target)):
+        assert (solution.error < 1e-4).all()
+        assert (chain.tensions(solution.q).amin(-1) > 1.5e-4).float().mean() > 0.9
+    # A step with the posture moves the tip no further than one without, to first order.
+    steps = [
+        InverseKinematics(chain, q_pref=posture, limits="off").step(q, target).dq
+        for posture in (None, chain.taut_posture(2e-4))
+    ]
+    assert (chain.jacobian(q) @ (steps[1] - steps[0])[..., None]).abs().max() < 1e-12
+    assert (steps[1] - steps[0]).norm(dim=-1).mean() > 1e-6
+    with pytest.raises(ValueError, match="stretch >= 0"):
+        chain.taut_posture(-1.0)
