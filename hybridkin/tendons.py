@@ -26,12 +26,14 @@ from hybridkin._geometry import (
 from hybridkin._numerics import check_vectors
 from hybridkin._slack import (
     MOST,
+    Balance,
     Elasticity,
     FindTaut,
     Responses,
     applied,
     as_mask,
     extended,
+    relaxed,
     responses_of,
     stretch_by_solving,
     stretch_from_table,
@@ -44,7 +46,14 @@ _SHAPING = (
     *("radii", "angles", "bending_stiffness", "axial_stiffness", "rest_bends", "tendon_zeros"),
 )
 _GEOMETRY = (*_SHAPING, "lengths", "offsets", "base")
-_STRUCTURE = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
+_STRUCTURE = (
+    "n_segments",
+    "actuators_per_segment",
+    "n_actuators",
+    "routing",
+    "tip_at",
+    "smoothing",
+)
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are kept
 
 
@@ -88,6 +97,9 @@ class ElasticTendonChain(ArcChain):
         hangs slack. A list of lists, one per segment, will do as well.
     rest_bends : float or array-like of shape (S, 2), default=0.0
         Pre-curvature: bending vector of each segment without tendons [rad].
+    smoothing : float, default=0.0
+        Width over which a tendon's tension sets in [m], for derivatives without kinks:
+        ``(e + sqrt(e^2 + smoothing^2)) / 2`` in place of ``max(0, e)``. Slower, row by row.
     offsets : float or array-like of shape (S,), default=0.0
         Rigid length after each segment along its tangent [m]; the last one is the tool.
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
@@ -144,6 +156,7 @@ class ElasticTendonChain(ArcChain):
         axial_stiffness: Any = None,
         tendon_zeros: Any = 0.0,
         rest_bends: Any = 0.0,
+        smoothing: float = 0.0,
         offsets: Any = 0.0,
         base: Any = None,
         dtype: torch.dtype = torch.float64,
@@ -161,6 +174,9 @@ class ElasticTendonChain(ArcChain):
         self.n_actuators = sum(counts)
         self.routing = routing
         self.tip_at = float(n_segments)
+        if not (smoothing >= 0.0 and math.isfinite(smoothing)):
+            raise ValueError(f"`smoothing` must be a width >= 0 [m], got {smoothing!r}.")
+        self.smoothing = float(smoothing)
         stiffness = {
             "bending_stiffness": 0.01 * radii**2
             if bending_stiffness is None
@@ -245,12 +261,11 @@ class ElasticTendonChain(ArcChain):
         >>> chain.tensions(torch.zeros(3))
         tensor([0.0010, 0.0010, 0.0010])
         """
-        codes, stretch = self._stretch(q)
-        return (stretch.relu() * as_mask(codes, self.n_actuators)).reshape(q.shape)
+        return self._balance(self._rows(q)).pull.reshape(q.shape)
 
     def slack(self, q: Tensor) -> Tensor:
         """Return which tendons hang slack, a bool tensor of the shape of q."""
-        return ~as_mask(self._find(self._rows(q))[0], self.n_actuators).reshape(q.shape)
+        return (self._balance(self._rows(q)).share < 0.5).reshape(q.shape)
 
     def taut_posture(self, minimum: float = 0.0) -> Callable[[Tensor], Tensor]:
         """Return a posture that keeps tendons taut, for `InverseKinematics(q_pref=...)`.
@@ -280,8 +295,10 @@ class ElasticTendonChain(ArcChain):
         return partial(self._shortened, minimum=minimum)
 
     def _shortened(self, q: Tensor, minimum: float) -> Tensor:
-        lacking = (minimum - self._stretch(q)[1]).clamp(min=0.0)
-        return q - lacking.reshape(q.shape)
+        rows = self._rows(q)
+        zeros, readings = self.tendon_zeros.to(q), self._elasticity().readings.to(q)
+        stretch = self._balance(rows).shape @ readings.T - rows + zeros
+        return q - (minimum - stretch).clamp(min=0.0).reshape(q.shape)
 
     def check_actuators(self, q: Tensor, name: str = "q") -> None:
         """Raise where q cannot be a log of this robot, and warn where it looks like millimetres.
@@ -362,16 +379,26 @@ class ElasticTendonChain(ArcChain):
         each = torch.arange(len(rows), device=rows.device)
         return codes, each, responses_of(as_mask(codes, self.n_actuators), *elasticity)
 
-    def _stretch(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the sets of taut tendons (N,) as bits, and stretches (N, n), slack negative."""
-        rows = self._rows(q)
+    def _balance(self, rows: Tensor) -> Balance:
         codes, at, responses = self._find(rows)
-        return codes, applied(responses.stretch.index_select(0, at), extended(rows))
+        shape, stretch = (
+            applied(maps.index_select(0, at), extended(rows)) for maps in responses[:2]
+        )
+        if self.smoothing > 0.0:
+            elasticity = Elasticity(*(part.to(rows) for part in self._elasticity()))
+            return relaxed(rows, shape, self.smoothing, elasticity)
+        taut = as_mask(codes, self.n_actuators).to(rows)
+        compliance = responses.compliance.index_select(0, at)
+        return Balance(shape, stretch.relu() * taut, taut, compliance)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        straight = nn.functional.pad(self.lengths.to(rows), (0, 2 * self.n_segments))
+        if self.smoothing > 0.0:
+            shape, _, share, compliance = self._balance(rows)
+            slope = compliance @ (self._elasticity().readings.to(rows).T * share[:, None])
+            return (shape + straight).T.contiguous(), slope.permute(1, 2, 0)
         _, at, responses = self._find(rows)
         maps = responses.shape.index_select(0, at)
-        straight = nn.functional.pad(self.lengths.to(rows), (0, 2 * self.n_segments))
         arcs = (applied(maps, extended(rows)) + straight).T.contiguous()
         return arcs, maps[..., :-1].permute(1, 2, 0)
 
@@ -387,17 +414,14 @@ class ElasticTendonChain(ArcChain):
         turned = torch.stack([-crossing[1], crossing[0]]) * change["angles"][:, None]
         moved = turned + levers(change["radii"], self.angles.to(rows), counts)
         by_readings = nn.functional.pad(reading_matrix(moved, counts, self.routing, False), (S, 0))
-        readings, _, stiffness, rest, zeros = (part.to(rows) for part in self._elasticity())
-        codes, at, responses = self._find(rows)
-        taut, compliance = as_mask(codes, len(zeros)), responses.compliance.index_select(0, at)
-        shape = applied(responses.shape.index_select(0, at), extended(rows))
+        readings, _, stiffness, rest, _ = (part.to(rows) for part in self._elasticity())
+        shape, pull, share, compliance = self._balance(rows)
         bending = change["bending_stiffness"]
         by_stiffness = torch.cat([change["axial_stiffness"], bending, bending], dim=-1)
         by_rest = nn.functional.pad(change["rest_bends"].mT.flatten(1), (S, 0))
         # By the implicit function theorem: the forces out of balance, times the compliance.
         force = stiffness * by_rest + (rest - shape)[:, None] * by_stiffness
-        pull = taut * (shape @ readings.T - rows + zeros)
         force = force - torch.einsum("ni,pik->npk", pull, by_readings)
         stretch = torch.einsum("nk,pik->npi", shape, by_readings) + change["tendon_zeros"]
-        moves = (force - (stretch * taut[:, None]) @ readings) @ compliance
+        moves = (force - (stretch * share[:, None]) @ readings) @ compliance
         return moves + nn.functional.pad(change["lengths"], (0, 2 * S))

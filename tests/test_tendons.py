@@ -536,3 +536,45 @@ def test_taut_posture_keeps_tendons_taut_and_leaves_the_tip_alone(rng):
     assert (steps[1] - steps[0]).norm(dim=-1).mean() > 1e-6
     with pytest.raises(ValueError, match="stretch >= 0"):
         chain.taut_posture(-1.0)
+
+
+@pytest.mark.parametrize("width", [1e-6, 1e-4, 1e-3])
+def test_smoothed_tension_balances_and_has_no_kinks(rng, width):
+    chain, q = robot(smoothing=width), random_q(rng, 100)
+    shape, pull, share, _ = chain._balance(q)
+    readings, _, stiffness, rest, zeros = chain._elasticity()
+    stretch = shape @ readings.T - q + zeros
+    assert_close(pull, 0.5 * (stretch + (stretch**2 + width**2).sqrt()))
+    forces = stiffness * (shape - rest) + pull @ readings
+    assert forces.abs().max() < 1e-14 * pull.abs().max()
+    assert_close(chain.slack(q), share < 0.5)
+    by_autograd = torch.func.vmap(torch.func.jacrev(chain))(q)
+    assert_close(chain.jacobian(q), by_autograd, rtol=0, atol=1e-11)
+    tangents = {
+        name: torch.randn(2, *value.shape, generator=rng, dtype=torch.float64)
+        for name, value in chain.geometry().items()
+    }
+
+    def moved(theta):
+        changes = {name: torch.tensordot(theta, part, 1) for name, part in tangents.items()}
+        return chain.with_geometry(
+            **{name: value + changes[name] for name, value in chain.geometry().items()}
+        )(q[:5])
+
+    expected = torch.func.jacfwd(moved)(torch.zeros(2, dtype=torch.float64))
+    assert_close(chain.geometry_jacobian(q[:5], tangents), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_smoothing_fades_into_the_exact_model(rng):
+    q = random_q(rng, 200)
+    errors = [
+        (robot(smoothing=width)(q) - robot()(q)).norm(dim=-1).max() for width in (1e-4, 1e-6, 1e-8)
+    ]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+    assert errors[2] < 1e-7
+    chain = robot(smoothing=5e-4)
+    corner = torch.zeros(9, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradgradcheck(chain, corner, eps=1e-7, atol=1e-2, rtol=1e-3)
+    assert copy.deepcopy(chain).with_tip(1.5).smoothing == 5e-4
+    with pytest.raises(ValueError, match="`smoothing`"):
+        robot(smoothing=-1.0)
