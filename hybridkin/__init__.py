@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from hybridkin.hybrid import HybridForwardModel
     from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Step, Track
     from hybridkin.persistence import load_model, save_model
+    from hybridkin.play import PlayFit, PlayOperator, PlayState, fit_play
     from hybridkin.rigid import RigidChain
+    from hybridkin.tendons import ElasticTendonChain
 
 __version__ = "0.1.0"
 
@@ -20,10 +22,14 @@ __all__ = [
     "CalibrationResult",
     "ConstantCurvatureChain",
     "ELMRegressor",
+    "ElasticTendonChain",
     "HybridForwardModel",
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
+    "PlayFit",
+    "PlayOperator",
+    "PlayState",
     "RigidChain",
     "Step",
     "Track",
@@ -31,6 +37,7 @@ __all__ = [
     "calibrate",
     "datasets",
     "experiments",
+    "fit_play",
     "jacobian",
     "load_model",
     "plots",
@@ -45,14 +52,19 @@ _ROOM_OF = {
     "CalibrationResult": "calibration",
     "ConstantCurvatureChain": "chain",
     "ELMRegressor": "elm",
+    "ElasticTendonChain": "tendons",
     "HybridForwardModel": "hybrid",
     "IKSolution": "ik",
     "IKStatus": "ik",
     "InverseKinematics": "ik",
+    "PlayFit": "play",
+    "PlayOperator": "play",
+    "PlayState": "play",
     "RigidChain": "rigid",
     "Step": "ik",
     "Track": "ik",
     "calibrate": "calibration",
+    "fit_play": "play",
     "jacobian": "_numerics",
     "load_model": "persistence",
     "save_model": "persistence",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -27,6 +28,8 @@ from hybridkin._numerics import check_vectors
 __all__ = ["ConstantCurvatureChain"]
 
 _ROUTINGS = ("segment", "base")
+_CONTRADICTED = 0.3  # of the readings that the arcs explain, in one segment
+_WORTH_A_WORD = 0.1  # of the radius: a bend of a tenth of a radian would read as much
 _GEOMETRY = ("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base")
 
 _STRUCTURE = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
@@ -206,10 +209,77 @@ class ConstantCurvatureChain(ArcChain):
         rows = self._rows(q) - self.actuator_zeros.to(q)
         readings, arc_matrix = self._readings().to(q), self.arc_matrix.to(q)
         residual = rows - rows @ (readings @ arc_matrix[-readings.shape[1] :]).T
-        parts = residual.split(self.actuators_per_segment, dim=-1)
-        norms = [torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5 for part in parts]
-        rms = torch.stack(norms, dim=-1)
-        return rms.reshape(*q.shape[:-1], self.n_segments)
+        return self._by_segment(residual, q)
+
+    def contradictory(self, q: Tensor) -> Tensor:
+        """Return where the readings of a segment contradict each other too much to be believed.
+
+        That is where their `consistency` residual exceeds both 30 % of the readings that the arcs
+        explain and a tenth of the segment's radius, which a bend of 0.1 rad would read. On tendon
+        chains slack does that: a single tendon pulled while the others stay leaves 71 % of what
+        bends the segment, balanced tendons leave nothing. Extensible segments take a common change
+        up as length.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        Tensor of shape (..., S)
+            Bool.
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ConstantCurvatureChain
+        >>> chain = ConstantCurvatureChain([0.01], lengths=[0.1])
+        >>> chain.contradictory(torch.tensor([[-0.004, 0.002, 0.002], [-0.004, 0.0, 0.0]]))
+        tensor([[False],
+                [ True]])
+        """
+        readings = self._by_segment(self._rows(q) - self.actuator_zeros.to(q), q)
+        residual = self.consistency(q)
+        explained = (readings.square() - residual.square()).clamp(min=0.0).sqrt()
+        tall = residual > _WORTH_A_WORD * self.radii.to(q)
+        return tall & (residual > _CONTRADICTED * explained)
+
+    def warn_contradictory(self, q: Tensor, name: str = "q", stacklevel: int = 3) -> None:
+        """Warn where the tendons of an inextensible chain contradict each other, as slack does.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Tendon length changes [m].
+        name : str, default="q"
+            What to call `q` in the message.
+        stacklevel : int, default=3
+            Of `warnings.warn`.
+
+        Warns
+        -----
+        UserWarning
+            Once, with the number of rows that are `contradictory`, and the worst of them.
+        """
+        if self.lengths is None:
+            return
+        with torch.no_grad():
+            rows = q.reshape(-1, self.n_actuators)
+            wrong = self.contradictory(rows)
+            if not wrong.any():
+                return
+            residual = self.consistency(rows) * wrong
+        row, segment = divmod(int(residual.argmax()), self.n_segments)
+        warnings.warn(
+            f"{int(wrong.any(-1).sum())} of {len(rows)} rows of `{name}` pull the tendons of a "
+            "segment together or let them go, which bends nothing in a ConstantCurvatureChain "
+            "but compresses a robot or leaves tendons slack: worst is row "
+            f"{row}, segment {segment + 1}, {1e3 * float(residual[row, segment]):.3g} mm rms. "
+            "ElasticTendonChain knows tendons "
+            "that can only pull.",
+            stacklevel=stacklevel,
+        )
 
     def numpy_function(self) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
         """Return a NumPy function for one configuration at a time, without torch's overhead.
@@ -299,6 +369,12 @@ class ConstantCurvatureChain(ArcChain):
         offset = torch.cat([straight, *rest_bends.T]) - matrix @ actuator_zeros
         self.register_buffer("arc_matrix", matrix)
         self.register_buffer("arc_offset", offset)
+
+    def _by_segment(self, rows: Tensor, q: Tensor) -> Tensor:
+        """Return the root mean square (..., S) of rows (N, n) over each segment's actuators."""
+        parts = rows.split(self.actuators_per_segment, dim=-1)
+        norms = [torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5 for part in parts]
+        return torch.stack(norms, dim=-1).reshape(*q.shape[:-1], self.n_segments)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         matrix = self.arc_matrix.to(rows)

@@ -141,6 +141,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ValueError
             For parameters out of their set, shapes that do not fit the mechanical model, and
             data that are not finite.
+
+        Warns
+        -----
+        UserWarning
+            Where tendons of a ConstantCurvatureChain contradict each other, as slack does; so do
+            `predict` and the Jacobians.
         """
         self._check_settings()
         X, y = validate_data(self, X, y=y, multi_output=True, dtype=[np.float64, np.float32])
@@ -163,6 +169,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 mechanical, q, torch.from_numpy(y), names, groups=groups, sample_weight=weights
             )
             mechanical = self.calibration_.chain
+        else:
+            _warn_contradictory(mechanical, q)
         error = y - _mechanical_tips(mechanical, q, y)
         self.mechanical_model_ = mechanical
         self.error_model_ = None
@@ -194,7 +202,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def predict_error(self, X: Any) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m]."""
-        return self._by_blocks(lambda module, q: (module.error_part(q),), X)[0]
+        return self._by_blocks(lambda module, q: (module.error_part(q),), X, mechanical=False)[0]
 
     def jacobian(self, X: Any) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n)."""
@@ -207,13 +215,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def in_domain(self, X: Any) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
-        return self._by_blocks(lambda module, q: (module.in_domain(q),), X)[0]
+        return self._by_blocks(lambda module, q: (module.in_domain(q),), X, mechanical=False)[0]
 
     def _by_blocks(
-        self, function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]], X: Any
+        self,
+        function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]],
+        X: Any,
+        mechanical: bool = True,
     ) -> list[NDArray]:
         check_is_fitted(self)
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
+        if mechanical:
+            _warn_contradictory(self.mechanical_model_, torch.from_numpy(X.astype(np.float64)))
         blocks = []
         with torch.no_grad():
             for start in range(0, len(X), _BLOCK):
@@ -305,9 +318,14 @@ class HybridModule(nn.Module):
         if self.error is None:
             return forward_and_jacobian(self.mechanical, q)
         x, J = forward_and_jacobian(self.error, q)
-        if self.guard is not None and not self.in_domain(q).all():  # else it is exactly one
-            weight, slope = forward_and_reverse_jacobian(self.guard, q)
-            x, J = weight * x, weight[..., None] * J + x[..., None] * slope
+        if self.guard is not None:
+            outside = (~self.in_domain(q)).nonzero()[:, 0]  # inside it is exactly one
+            if len(outside):
+                weight, slope = forward_and_reverse_jacobian(self.guard, q[outside])
+                own, J_own = x[outside], J[outside]
+                J_own = weight[..., None] * J_own + own[..., None] * slope
+                x = x.index_copy(0, outside, weight * own)
+                J = J.index_copy(0, outside, J_own)
         if self.mechanical is not None:
             x_mech, J_mech = forward_and_jacobian(self.mechanical, q)
             x, J = x_mech + x, J_mech + J
@@ -403,6 +421,11 @@ def _error_module(regressor: Any, q: Tensor) -> nn.Module:
     if isinstance(regressor, (LinearRegression, Ridge)):
         return AffineModule(regressor.coef_, regressor.intercept_)
     return RegressorModule(regressor, q)
+
+
+def _warn_contradictory(mechanical: Any, q: Tensor) -> None:
+    if hasattr(mechanical, "warn_contradictory"):
+        mechanical.warn_contradictory(q, "X", stacklevel=5)
 
 
 def _mechanical_tips(mechanical: nn.Module | None, q: Tensor, y: NDArray) -> NDArray | float:

@@ -21,26 +21,39 @@ from hybridkin.elm import ELMRegressor, _Statistics
 from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
 from hybridkin.hybrid import AffineModule, HybridForwardModel, HybridModule
 from hybridkin.rigid import RigidChain
+from hybridkin.tendons import ElasticTendonChain
 
 __all__ = ["load_model", "save_model"]
 
 _FORMAT = "hybridkin-model"
 _VERSION = 1
-# Every kind of chain: its arrays, and what its header says.
+# Every kind of chain: its arrays, what its header says, and how its constructor calls the counts.
 _CHAINS = {
     "chain": (
         ConstantCurvatureChain,
         ("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),
         ("actuators_per_segment", "routing", "tip_at"),
+        "n_actuators",
+    ),
+    "elastic_tendon_chain": (
+        ElasticTendonChain,
+        (
+            *("radii", "angles", "lengths", "bending_stiffness", "axial_stiffness"),
+            *("tendon_zeros", "rest_bends", "offsets", "base"),
+        ),
+        ("actuators_per_segment", "routing", "tip_at", "smoothing"),
+        "n_tendons",
     ),
     "rigid": (
         RigidChain,
         ("origins", "axes", "q_min", "q_max", "tip", "tool", "base"),
         ("kinds", "names"),
+        "",
     ),
 }
+_OF_ALL_ARCS = ("actuators_per_segment", "tip_at")
 _DAMAGE = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-_OPTIONAL = ("lengths", "rest_bends", "actuator_zeros")
+_OPTIONAL = {"chain": ("lengths", "rest_bends", "actuator_zeros")}
 _ELM_ARRAYS = (
     *("input_weights_", "input_bias_", "input_center_", "input_scale_"),
     *("output_weights_", "intercept_", "noise_variance_"),
@@ -49,7 +62,9 @@ _ELM_ARRAYS = (
 _ELM_SETTINGS = ("solver_", "n_samples_seen_", "n_features_in_", "_activation", "_y_ndim")
 
 Arrays = dict[str, NDArray]
-Chain = ConstantCurvatureChain | RigidChain
+Chain = ConstantCurvatureChain | ElasticTendonChain | RigidChain
+_CLASSES = (ConstantCurvatureChain, ElasticTendonChain, RigidChain)
+_NAMES = "a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain"
 
 
 def save_model(model: Any, path: str | Path) -> None:
@@ -57,7 +72,7 @@ def save_model(model: Any, path: str | Path) -> None:
 
     Parameters
     ----------
-    model : ConstantCurvatureChain, RigidChain or fitted HybridForwardModel
+    model : ConstantCurvatureChain, ElasticTendonChain, RigidChain or fitted HybridForwardModel
         The hybrid's mechanical model must be one of these chains or None, its error model an
         ELMRegressor, a LinearRegression, or "drop".
     path : str or Path
@@ -78,14 +93,13 @@ def save_model(model: Any, path: str | Path) -> None:
     ConstantCurvatureChain(extensible, 3 segments, 9 actuators, routing 'segment')
     """
     arrays: Arrays = {}
-    if isinstance(model, (ConstantCurvatureChain, RigidChain)):
+    if isinstance(model, _CLASSES):
         header = _store_chain(model, arrays, "")
     elif isinstance(model, HybridForwardModel):
         header = _store_hybrid(model, arrays)
     else:
         raise TypeError(
-            "`model` must be a ConstantCurvatureChain, a RigidChain or a fitted "
-            f"HybridForwardModel, got {type(model).__name__}."
+            f"`model` must be {_NAMES} or a fitted HybridForwardModel, got {type(model).__name__}."
         )
     header = {"format": _FORMAT, "version": _VERSION, **header}
     path = Path(path)
@@ -111,7 +125,7 @@ def load_model(path: str | Path) -> Any:
 
     Returns
     -------
-    ConstantCurvatureChain, RigidChain or HybridForwardModel
+    ConstantCurvatureChain, ElasticTendonChain, RigidChain or HybridForwardModel
         On the CPU, ready to predict.
 
     Raises
@@ -157,7 +171,7 @@ def load_model(path: str | Path) -> Any:
 
 def _store_chain(chain: Chain, arrays: Arrays, prefix: str) -> dict[str, Any]:
     kind = next(kind for kind, (cls, *_) in _CHAINS.items() if isinstance(chain, cls))
-    _, tensors, settings = _CHAINS[kind]
+    _, tensors, settings, _ = _CHAINS[kind]
     for name in tensors:
         if getattr(chain, name) is not None:
             arrays[prefix + name] = getattr(chain, name).detach().cpu().numpy()
@@ -165,8 +179,9 @@ def _store_chain(chain: Chain, arrays: Arrays, prefix: str) -> dict[str, Any]:
 
 
 def _restored_chain(header: dict[str, Any], arrays: Arrays, prefix: str) -> Chain:
-    cls, tensors, _ = _CHAINS[header["kind"]]
-    needed = [name for name in tensors if name not in _OPTIONAL or prefix + name in arrays]
+    cls, tensors, settings, counts_name = _CHAINS[header["kind"]]
+    optional = _OPTIONAL.get(header["kind"], ())
+    needed = [name for name in tensors if name not in optional or prefix + name in arrays]
     stored: dict[str, Any] = {name: arrays[prefix + name] for name in needed}
     dtype = torch.from_numpy(stored["base"]).dtype
     if not dtype.is_floating_point:
@@ -175,9 +190,8 @@ def _restored_chain(header: dict[str, Any], arrays: Arrays, prefix: str) -> Chai
         return RigidChain(**stored, kinds=header["kinds"], names=header["names"], dtype=dtype)
     counts = [int(n) for n in header["actuators_per_segment"]]
     stored["angles"] = np.split(stored["angles"], np.cumsum(counts)[:-1])
-    chain = ConstantCurvatureChain(
-        **stored, n_actuators=counts, routing=header["routing"], dtype=dtype
-    )
+    options = {name: header[name] for name in settings if name not in _OF_ALL_ARCS}
+    chain = cls(**stored, **options, **{counts_name: counts}, dtype=dtype)
     return chain.with_tip(header.get("tip_at", chain.n_segments))
 
 
@@ -197,10 +211,10 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
     }
     for key, part in (("mechanical", model.mechanical_model_), ("nominal", model.mechanical_model)):
         if part is not None:
-            if not isinstance(part, (ConstantCurvatureChain, RigidChain)):
+            if not isinstance(part, _CLASSES):
                 raise TypeError(
-                    "`model` must have a ConstantCurvatureChain, a RigidChain or None as "
-                    f"`mechanical_model` to be saved, got {type(part).__name__}."
+                    f"`model` must have {_NAMES} or None as `mechanical_model` to be saved, got "
+                    f"{type(part).__name__}."
                 )
             header[key] = _store_chain(part, arrays, f"{key}.")
     header["error"] = _store_error(model.error_model_, arrays)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridkin.chain import ConstantCurvatureChain
+from hybridkin.tendons import ElasticTendonChain
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -37,6 +38,10 @@ BHA_WORKING_BOX = (0.19, 0.31)
 """Chamber lengths it works in: 0.25 m, give or take 0.06 m."""
 
 _UNITS = ("m", "cm", "mm")
+_MODELS = ("constant-curvature", "elastic-tendon")
+_STIFFNESS = ("bending_stiffness", "axial_stiffness")
+
+Chain = ConstantCurvatureChain | ElasticTendonChain
 
 
 def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
@@ -101,7 +106,7 @@ class RobotDescription:
     ----------
     name : str
         What to call it.
-    chain : ConstantCurvatureChain
+    chain : ConstantCurvatureChain or ElasticTendonChain
         Its nominal kinematics.
     calibrate : tuple of str
         Geometry that should be fitted to data.
@@ -110,12 +115,12 @@ class RobotDescription:
     """
 
     name: str
-    chain: ConstantCurvatureChain
+    chain: Chain
     calibrate: tuple[str, ...]
     log: LogFormat | None
 
 
-def from_toml(path: str | Path) -> ConstantCurvatureChain:
+def from_toml(path: str | Path) -> Chain:
     """Return the chain that a TOML file describes; see `read_description` for the format."""
     return read_description(path).chain
 
@@ -129,9 +134,9 @@ def read_description(path: str | Path) -> RobotDescription:
         A file like this one::
 
             name = "my trunk"
-            model = "constant-curvature"    # the default
-            routing = "base"                # or "segment", the default
-            calibrate = ["radii", "base"]   # optional
+            model = "constant-curvature"    # the default, or "elastic-tendon"
+            routing = "base"                # or "segment", the default; of elastic tendons "base"
+            calibrate = ["radii", "base"]   # optional, else the chain's own list
 
             [[segment]]                     # base to tip
             radius = 0.0045                 # of the actuator circle [m]
@@ -142,6 +147,9 @@ def read_description(path: str | Path) -> RobotDescription:
             offset = 0.0                    # rigid length after the segment [m]
             rest_bend_deg = [0.0, 0.0]      # its pre-curvature: a bending vector
             zeros = [0.0, 0.0, 0.0]         # what the sensor of each actuator reads too much [m]
+                                            # of elastic tendons their `tendon_zeros`
+            bending_stiffness = 2.0e-7      # of elastic tendons only, in all segments or in none
+            axial_stiffness = 10.0          # likewise; units and defaults: `ElasticTendonChain`
             repeat = 2                      # as many segments like this one
 
             [base]                          # optional
@@ -184,30 +192,23 @@ def read_description(path: str | Path) -> RobotDescription:
 def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
     top = {"name", "model", "routing", "calibrate", "segment", "base", "log"}
     _known(content, top, "the file")
-    model = content.get("model", "constant-curvature")
-    if model != "constant-curvature":
-        raise ValueError(f"`model` must be 'constant-curvature', got {model!r}.")
+    model = content.get("model", _MODELS[0])
+    if model not in _MODELS:
+        raise ValueError(f"`model` must be one of {_MODELS}, got {model!r}.")
     segments = []
     tables = content.get("segment", [])
     if not isinstance(tables, list) or not tables:
         raise ValueError("`segment` is missing; describe each segment in a [[segment]] table.")
     for i, table in enumerate(tables):
         segments += _segments(table, f"[[segment]] {i + 1}")
-    lengths = [segment["length"] for segment in segments]
-    if any(length is None for length in lengths) and any(length is not None for length in lengths):
-        raise ValueError(
-            "`length` must stand in every [[segment]] (tendons) or in none (chambers)."
-        )
-    chain = ConstantCurvatureChain(
-        [segment["radius"] for segment in segments],
-        n_actuators=[len(segment["angles"]) for segment in segments],
+    build = _elastic_chain if model == "elastic-tendon" else _plain_chain
+    chain = build(
+        {key: [segment[key] for segment in segments] for key in segments[0]},
         angles=[segment["angles"] for segment in segments],
-        lengths=None if lengths[0] is None else lengths,
-        routing=content.get("routing", "segment"),
         offsets=[segment["offset"] for segment in segments],
         rest_bends=[segment["rest_bend"] for segment in segments],
-        actuator_zeros=[segment["zeros"] for segment in segments],
         base=_base(content.get("base", {})),
+        **({"routing": content["routing"]} if "routing" in content else {}),
     )
     calibrate = content.get("calibrate", chain.default_parameters)
     if not isinstance(calibrate, (list, tuple)):
@@ -216,9 +217,53 @@ def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
     return RobotDescription(str(content.get("name", stem)), chain, tuple(calibrate), log)
 
 
+def _plain_chain(segments: Mapping[str, list[Any]], **options: Any) -> ConstantCurvatureChain:
+    for name in _STIFFNESS:
+        if any(value is not None for value in segments[name]):
+            raise ValueError(
+                f"`{name}` in [[segment]] is not known to model 'constant-curvature'; leave it "
+                'out, or set model = "elastic-tendon".'
+            )
+    lengths = _all_or_none(segments, "length", "every [[segment]] (tendons) or in none (chambers)")
+    return ConstantCurvatureChain(
+        segments["radius"],
+        n_actuators=[len(angles) for angles in segments["angles"]],
+        lengths=lengths,
+        actuator_zeros=segments["zeros"],
+        **options,
+    )
+
+
+def _elastic_chain(segments: Mapping[str, list[Any]], **options: Any) -> ElasticTendonChain:
+    for i, length in enumerate(segments["length"]):
+        if length is None:
+            raise ValueError(
+                f"`length` is missing for segment {i + 1}; model 'elastic-tendon' needs the "
+                "backbone length [m] in every [[segment]]."
+            )
+    stiffness = {
+        name: _all_or_none(segments, name, "every [[segment]] or in none") for name in _STIFFNESS
+    }
+    return ElasticTendonChain(
+        segments["radius"],
+        segments["length"],
+        n_tendons=[len(angles) for angles in segments["angles"]],
+        tendon_zeros=segments["zeros"],
+        **stiffness,
+        **options,
+    )
+
+
+def _all_or_none(segments: Mapping[str, list[Any]], key: str, where: str) -> list[Any] | None:
+    given = [value is not None for value in segments[key]]
+    if any(given) and not all(given):
+        raise ValueError(f"`{key}` must stand in {where}.")
+    return segments[key] if any(given) else None
+
+
 def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
     keys = {"radius", "length", "actuators", "angle_deg", "angles_deg", "clockwise", "offset"}
-    _known(table, keys | {"rest_bend_deg", "zeros", "repeat"}, where)
+    _known(table, keys | {"rest_bend_deg", "zeros", "repeat", *_STIFFNESS}, where)
     if "radius" not in table:
         raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
     if "angles_deg" in table:
@@ -232,12 +277,13 @@ def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         angles = math.radians(_number(table, "angle_deg", where, 0.0)) + step * np.arange(n)
     segment = {
         "radius": _number(table, "radius", where),
-        "length": _number(table, "length", where) if "length" in table else None,
         "offset": _number(table, "offset", where, 0.0),
         "angles": angles,
         "rest_bend": np.radians(_numbers(table, "rest_bend_deg", where, 2)),
         "zeros": _numbers(table, "zeros", where, len(angles)),
     }
+    for key in ("length", *_STIFFNESS):
+        segment[key] = _number(table, key, where) if key in table else None
     return [segment] * int(_number(table, "repeat", where, 1))
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, jacobian
+from hybridkin import ConstantCurvatureChain, datasets, jacobian
 from hybridkin._numerics import forward_and_reverse_jacobian, stumpff
 
 RADII = [0.100, 0.093, 0.079]
@@ -262,6 +262,46 @@ def test_consistency_finds_the_broken_reading(rng):
     # Four readings of three unknowns: a quarter of the error, with alternating sign, remains.
     expected = torch.tensor([0.0, 0.0025], dtype=torch.float64)
     assert_close(chain.consistency(q), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_contradictory_readings_by_segment():
+    chain = ConstantCurvatureChain([0.01, 0.02], lengths=[0.1, 0.1])
+    balanced = torch.tensor([-2.0, 1.0, 1.0], dtype=torch.float64)  # 1.41 rms
+    own = [
+        (balanced, False),
+        (0.0 * balanced, False),
+        (balanced + 0.4, False),  # 28 % of what bends
+        (100 * balanced + 5.0, False),
+        (balanced + 1.1, True),
+        (torch.tensor([-4.0, 0.0, 0.0]), True),
+        (torch.full((3,), 0.9), False),  # a common change below a tenth of the radius
+        (torch.full((3,), -1.1), True),
+    ]
+    for first, wrong in own:
+        q = 1e-3 * torch.cat([first.double(), 2.0 * balanced])
+        assert chain.contradictory(q).tolist() == [wrong, False]
+        swapped = 1e-3 * torch.cat([balanced, 2.0 * first.double()])  # of twice the radius
+        assert chain.contradictory(swapped).tolist() == [False, wrong]
+    zeros = 1e-3 * torch.tensor([2.0] * 3 + [0.0] * 3, dtype=torch.float64)
+    q = 1e-3 * torch.cat([balanced, balanced]) + zeros
+    assert chain.contradictory(q.expand(2, 1, 6)).tolist() == [[[True, False]]] * 2
+    assert not chain.with_geometry(actuator_zeros=zeros).contradictory(q).any()
+    assert not bha().contradictory(STRAIGHT + 0.1).any()
+
+
+def test_single_tendons_of_a_real_robot_contradict_and_balanced_ones_hardly(data_home):
+    data = datasets.load_ftdcr(data_home)
+    turns = (-3.03, -2.52, -2.01)
+    chain = ConstantCurvatureChain(
+        [0.0045] * 3,
+        lengths=[0.060, 0.0625, 0.064],
+        routing="base",
+        angles=[[turn + 2 * math.pi / 3 * i for i in range(3)] for turn in turns],
+    )
+    wrong = chain.contradictory(torch.from_numpy(data.q)).any(-1).numpy()
+    single = np.array(["tendon" in group for group in data.groups])
+    assert wrong[single].mean() > 0.95
+    assert wrong[~single].mean() < 0.05
 
 
 def test_rest_bends_add_to_the_arcs(rng):

@@ -7,6 +7,7 @@ import torch
 
 from hybridkin import (
     ConstantCurvatureChain,
+    ElasticTendonChain,
     calibrate,
     datasets,
     experiments,
@@ -178,6 +179,77 @@ def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
     with pytest.warns(UserWarning, match="left what is physical") as caught:
         experiments.fit_log(path, robot, tmp_path / "m", n_folds=2, n_seeds=1, n_jobs=1)
     assert len(caught) == 1
+
+
+@pytest.fixture
+def slack_log(tmp_path):
+    """A log of an elastic robot of one segment, its tendons pulled at random, in 6 motions."""
+    rng = np.random.default_rng(0)
+    q = 0.004 * rng.uniform(-1, 1, (120, 3))
+    truth = ElasticTendonChain(
+        [0.005], [0.1], bending_stiffness=1e-6, axial_stiffness=2.0, tendon_zeros=-2e-4
+    )
+    x = truth(torch.from_numpy(q)).numpy() + 1e-4 * rng.standard_normal((120, 3))
+    rows = np.column_stack([-1000 * q, 1000 * x, np.repeat(np.arange(6), 20)])
+    path = tmp_path / "slack.csv"
+    header = "a,b,c,x,y,z,motion"
+    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
+    return path, {"q": q, "x": x}
+
+
+SLACK_ROBOT = """
+[[segment]]
+radius = 0.005
+length = 0.1
+[log]
+q = ["a", "b", "c"]
+x = ["x", "y", "z"]
+q_unit = "mm"
+x_unit = "mm"
+q_sign = -1
+"""
+
+
+def test_fit_of_elastic_tendons(slack_log, tmp_path):
+    path, data = slack_log
+    robot = tmp_path / "elastic.toml"
+    robot.write_text('model = "elastic-tendon"\n' + SLACK_ROBOT)
+    report, paths = experiments.fit_log(
+        path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, n_jobs=1
+    )
+    held_out = report.record["held_out"]
+    assert held_out["mechanical, calibrated"]["mean"] < 0.0005
+    assert (
+        held_out["mechanical, calibrated"]["mean"] < 0.3 * held_out["data-driven, linear"]["mean"]
+    )
+    entries = {entry["name"]: entry for entry in report.record["calibration"]["entries"]}
+    stiffness = entries["bending_stiffness[0]"], entries["axial_stiffness[0]"]
+    assert [entry["unit"] for entry in stiffness] == ["mm²/rad²", "-"]
+    assert [entry["start"] for entry in stiffness] == pytest.approx([0.25, 10.0])
+    for entry, true in zip(stiffness, (1.0, 2.0), strict=True):
+        assert entry["value"] == pytest.approx(true, rel=0.2)
+        assert 0 < entry["std_error"] < 0.2 * true
+    assert entries["tendon_zeros[0]"]["unit"] == "mm"
+    assert report.record["calibration"]["warnings"] == []
+    assert {"held_out.png", "error_histogram.png"} <= {path.name for path in paths}
+    model = load_model(tmp_path / "m" / "model.safetensors")
+    assert isinstance(model.mechanical_model_, ElasticTendonChain)
+    errors = np.linalg.norm(model.predict(data["q"]) - data["x"], axis=1)
+    assert errors.mean() < 0.0005
+
+
+def test_fit_of_the_plain_chain_tells_of_slack_once(slack_log, tmp_path):
+    path, _ = slack_log
+    robot = tmp_path / "plain.toml"
+    robot.write_text('calibrate = ["base"]\n' + SLACK_ROBOT)
+    with pytest.warns(UserWarning, match="of 120 rows of `q` pull the tendons") as caught:
+        experiments.fit_log(
+            path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, n_jobs=1
+        )
+    assert len(caught) == 1
+    text = (tmp_path / "m" / "report.md").read_text()
+    assert text.count("pull the tendons") == 1
+    assert f"Warning: {caught[0].message}" in text
 
 
 def test_without_a_column_of_motions_the_log_is_cut_into_stretches(log, tmp_path):

@@ -19,6 +19,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from hybridkin import (
     ConstantCurvatureChain,
+    ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
     jacobian,
@@ -249,3 +250,82 @@ def test_bad_data(log):
         warnings.simplefilter("always")
         HybridForwardModel(bha()).fit(1000 * q, x)
     assert any("millimetres" in str(w.message) for w in caught)
+
+
+SLACK = ".* pull the tendons of a segment together"
+
+
+@pytest.fixture(scope="module")
+def slack_log():
+    """Tips of an elastic backbone whose tendons are pulled one by one or let go, in 12 motions."""
+    rng = np.random.default_rng(1)
+    truth = ElasticTendonChain(
+        [0.005] * 2,
+        [0.1, 0.1],
+        bending_stiffness=1e-6,
+        axial_stiffness=[2.0, 3.0],
+        rest_bends=[[0.1, -0.1], [0.0, 0.1]],
+        tendon_zeros=-2e-4,
+    )
+    q = 0.004 * rng.uniform(-1, 1, (240, 6))
+    x = truth(torch.from_numpy(q)).numpy() + 2e-4 * rng.standard_normal((240, 3))
+    return q, x, np.repeat(np.arange(12), 20)
+
+
+def elastic():
+    return ElasticTendonChain([0.005] * 2, [0.1, 0.1])
+
+
+@pytest.mark.filterwarnings(f"ignore:{SLACK}")
+def test_slack_is_better_known_than_learned(slack_log):
+    q, x, groups = slack_log
+    train = groups < 9
+    plain = ConstantCurvatureChain([0.005] * 2, lengths=[0.1, 0.1], routing="base")
+    errors = [
+        error_of(
+            HybridForwardModel(chain, calibrate=("base", *names), random_state=0).fit(
+                q[train], x[train]
+            ),
+            *(q[~train], x[~train]),
+        )
+        for chain, names in (
+            (plain, ("radii", "lengths", "rest_bends")),
+            (elastic(), ("rest_bends", "bending_stiffness", "axial_stiffness", "tendon_zeros")),
+        )
+    ]
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 0.001
+
+
+def test_elastic_chain_as_the_mechanical_model(slack_log):
+    q, x, _ = slack_log
+    model = HybridForwardModel(elastic(), calibrate="default", random_state=0).fit(q, x)
+    assert set(model.calibration_.values) == set(elastic().default_parameters)
+    named = HybridForwardModel(elastic(), "drop", calibrate=("base", "angles")).fit(q, x)
+    assert set(named.calibration_.values) == {"base", "angles"}
+    assert model.in_domain(q).all()
+    assert not model.in_domain(40 * q).all()
+    points = np.concatenate([q[:3], 1.6 * q[:3]])  # inside the domain and beyond
+    J = model.jacobian(points)
+    moves = 1e-7 * np.eye(6)
+    columns = [(model.predict(points + m) - model.predict(points - m)) / 2e-7 for m in moves]
+    assert_allclose(np.stack(columns, -1), J, rtol=0, atol=1e-5 * np.abs(J).max())
+
+
+def test_the_plain_chain_tells_of_slack_once_per_call(slack_log):
+    q, x, _ = slack_log
+    chain = ConstantCurvatureChain([0.005] * 2, lengths=[0.1, 0.1], routing="base")
+    fitted = None
+    for error_model, calibrated in ((None, ()), ("drop", ("base",))):
+        model = HybridForwardModel(chain, error_model, calibrate=calibrated, random_state=0)
+        with pytest.warns(UserWarning, match=SLACK) as caught:
+            fitted = model.fit(q, x)
+        assert len(caught) == 1
+    for name in ("predict", "predict_mechanical", "jacobian", "predict_and_jacobian"):
+        with pytest.warns(UserWarning, match=r"\d+ of 240 rows of `X` .* mm rms") as caught:
+            getattr(fitted, name)(q)
+        assert len(caught) == 1
+    fitted.in_domain(q)
+    fitted.predict_error(q)
+    parts = q.reshape(-1, 2, 3)
+    fitted.predict((parts - parts.mean(2, keepdims=True)).reshape(q.shape))

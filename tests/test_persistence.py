@@ -14,6 +14,7 @@ from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
+    ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
     RigidChain,
@@ -51,6 +52,23 @@ def bent_chain(**options):
     return tendon_chain(rest_bends=[[0.1, 0.2], [0.0, -0.3]], actuator_zeros=zeros, **options)
 
 
+def elastic_chain(**options):
+    """An elastic chain that uses all that it can hold."""
+    return ElasticTendonChain(
+        [0.005, 0.004],
+        [0.06, 0.05],
+        n_tendons=[3, 4],
+        routing="segment",
+        bending_stiffness=[2e-7, 3e-7],
+        axial_stiffness=[3.0, 4.0],
+        tendon_zeros=1e-4 * np.arange(7),
+        rest_bends=[[0.1, 0.2], [0.0, -0.3]],
+        offsets=[0.0, 0.01],
+        base=np.diag([1.0, -1.0, -1.0, 1.0]),
+        **options,
+    )
+
+
 def arm(**options):
     origins = np.stack([np.eye(4)] * 3)
     origins[1:, 0, 3] = 0.3, 0.2
@@ -86,15 +104,19 @@ def rewrite(path, arrays, **changes):
         bent_chain(),
         bent_chain().with_tip(1.5),
         bent_chain(dtype=torch.float32).with_tip(0.5),
+        elastic_chain(),
+        elastic_chain(dtype=torch.float32, smoothing=1e-4).with_tip(1.5),
     ],
 )
 def test_chain_comes_back(tmp_path, chain):
     save_model(chain, tmp_path / "chain.safetensors")
     twin = load_model(tmp_path / "chain.safetensors")
+    assert type(twin) is type(chain)
     q = torch.full((chain.n_actuators,), 0.2, dtype=torch.float64)
     for was, came in zip(chain.forward_and_jacobian(q), twin.forward_and_jacobian(q), strict=True):
         assert torch.equal(came, was)
     assert repr(twin) == repr(chain)
+    assert getattr(twin, "smoothing", None) == getattr(chain, "smoothing", None)
     assert {k: v.dtype for k, v in twin.named_buffers()} == {
         k: v.dtype for k, v in chain.named_buffers()
     }
@@ -143,6 +165,24 @@ def test_hybrid_of_a_rigid_arm_comes_back(tmp_path, rng):
     ):
         assert_allclose(came, was, rtol=1e-13, atol=1e-14)
     assert isinstance(twin.mechanical_model, RigidChain)
+
+
+def test_hybrid_of_an_elastic_chain_comes_back(tmp_path):
+    rng = np.random.default_rng(0)
+    q = 0.003 * rng.uniform(-1, 1, (100, 7))
+    x = elastic_chain()(torch.from_numpy(q)).numpy() + 0.001 * np.sin(300 * q[:, :3])
+    names = ("base", "rest_bends")
+    model = HybridForwardModel(elastic_chain(), calibrate=names, random_state=0).fit(q, x)
+    save_model(model, tmp_path / "model")
+    twin = load_model(tmp_path / "model")
+    for points in (q, 3 * q):
+        for was, came in zip(
+            model.predict_and_jacobian(points), twin.predict_and_jacobian(points), strict=True
+        ):
+            assert_allclose(came, was, rtol=1e-12, atol=1e-13)
+    assert isinstance(twin.mechanical_model_, ElasticTendonChain)
+    assert twin.calibrate == names
+    assert header_of(tmp_path / "model")["mechanical"]["kind"] == "elastic_tendon_chain"
 
 
 @pytest.mark.parametrize("guard", ["leverage", "box", None])
@@ -249,6 +289,11 @@ def test_foreign_headers(tmp_path, header):
         (bent_chain(), {}, {"actuator_zeros": np.full(7, np.nan)}),
         (bent_chain(), {}, {"base": np.eye(4, dtype=np.int64)}),
         (bent_chain(), {}, {"offsets": None}),
+        (bent_chain(), {"kind": "elastic_tendon_chain"}, {}),
+        (elastic_chain(), {}, {"tendon_zeros": None}),
+        (elastic_chain(), {}, {"rest_bends": None}),
+        (elastic_chain(), {}, {"bending_stiffness": -np.ones(2)}),
+        (elastic_chain(), {"actuators_per_segment": [3, 5]}, {}),
         (arm(), {"kind": "chain"}, {}),
         (arm(), {"kinds": ["revolute"] * 2}, {}),
         (arm(), {"kinds": 3}, {}),

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, robots
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
 
 TENDONS = """
 name = "three by three"
@@ -29,6 +29,30 @@ q = ["a", "b", "c", "d", "e", "f", "g", "h", "i", "j"]
 x = ["x", "y", "z"]
 q_unit = "mm"
 q_sign = -1
+"""
+
+
+ELASTIC = """
+model = "elastic-tendon"
+[[segment]]
+radius = 0.0045
+length = 0.06
+angle_deg = 30
+clockwise = true
+rest_bend_deg = [90, -4.5]
+zeros = [0.001, 0, -0.002]
+bending_stiffness = 1e-6
+axial_stiffness = 3
+repeat = 2
+[[segment]]
+radius = 0.004
+length = 0.05
+offset = 0.01
+angles_deg = [0, 90]
+bending_stiffness = 2e-6
+axial_stiffness = 4
+[base]
+position = [0, 0, 1]
 """
 
 
@@ -94,6 +118,61 @@ def test_rest_bends_and_zeros(write):
         actuator_zeros=[0.001, 0.0, -0.002] * 2 + [0.0] * 4,
     )
     assert_close(chain.geometry(), expected.geometry(), rtol=1e-15, atol=0)
+
+
+def test_elastic_tendons(write):
+    robot = robots.read_description(write(ELASTIC))
+    base = torch.eye(4, dtype=torch.float64)
+    base[2, 3] = 1.0
+    ring = [math.radians(30) - 2 * math.pi / 3 * i for i in range(3)]
+    expected = ElasticTendonChain(
+        [0.0045, 0.0045, 0.004],
+        [0.06, 0.06, 0.05],
+        n_tendons=[3, 3, 2],
+        angles=[ring, ring, [0.0, math.pi / 2]],
+        bending_stiffness=[1e-6, 1e-6, 2e-6],
+        axial_stiffness=[3.0, 3.0, 4.0],
+        tendon_zeros=[0.001, 0.0, -0.002] * 2 + [0.0] * 2,
+        rest_bends=[[math.pi / 2, -math.pi / 40]] * 2 + [[0.0, 0.0]],
+        offsets=[0.0, 0.0, 0.01],
+        base=base,
+    )
+    assert isinstance(robot.chain, ElasticTendonChain)
+    assert_close(robot.chain.geometry(), expected.geometry(), rtol=1e-15, atol=1e-15)
+    assert robot.chain.routing == "base"
+    assert robot.calibrate == expected.default_parameters
+    q = 1e-3 * torch.arange(-4, 4, dtype=torch.float64)
+    assert_close(robots.from_toml(write(ELASTIC))(q), expected(q), rtol=1e-13, atol=1e-15)
+
+
+def test_elastic_tendons_by_default(write):
+    text = "model = 'elastic-tendon'\nrouting = 'segment'\ncalibrate = ['base']\n"
+    robot = robots.read_description(write(text + "[[segment]]\nradius = 0.01\nlength = 0.1\n"))
+    expected = ElasticTendonChain([0.01], [0.1], routing="segment")
+    assert_close(robot.chain.geometry(), expected.geometry(), rtol=1e-15, atol=0)
+    assert repr(robot.chain) == repr(expected)
+    assert robot.calibrate == ("base",)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('model = "elastic-tendon"', ""), "`bending_stiffness` in .* not known to model"),
+        (("length = 0.05\n", ""), "`length` is missing for segment 3"),
+        (("axial_stiffness = 4\n", ""), "`axial_stiffness` must stand in every"),
+        (("bending_stiffness = 1e-6\n", ""), "`bending_stiffness` must stand in every"),
+        (("axial_stiffness = 4", "axial_stiffness = 'soft'"), "`axial_stiffness` in .* a number"),
+        (("axial_stiffness = 4", "axial_stifness = 4"), "did you mean `axial_stiffness`"),
+        (("axial_stiffness = 4", "axial_stiffness = -4"), "`axial_stiffness` must be positive"),
+        (("zeros = [0.001, 0, -0.002]", "zeros = [0.001]"), "`zeros` in .* must hold 3"),
+        (('"elastic-tendon"', '"elastic"'), "`model` must be one of .*'elastic-tendon'"),
+        (("[[segment]]", "routing = 'tip'\n[[segment]]"), "`routing` must be one of"),
+    ],
+)
+def test_bad_elastic_descriptions_name_the_key(write, change, message):
+    assert change[0] in ELASTIC
+    with pytest.raises(ValueError, match=message):
+        robots.read_description(write(ELASTIC.replace(*change, 1)))
 
 
 def test_defaults_are_chambers_named_after_the_file(write):

@@ -22,6 +22,8 @@ from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 from hybridkin._parameters import parameter
 from hybridkin.calibration import CalibrationResult
 
+_UNITS = {"bending_stiffness": (1e6, "mm²/rad²"), "axial_stiffness": (1.0, "-")}
+
 TOLD = 10.0
 """The data tell a parameter whose prior they narrow so many times."""
 
@@ -50,8 +52,8 @@ def geometry_entries(start: Any, result: CalibrationResult) -> list[dict[str, An
     Returns
     -------
     list of dict
-        "name"; "unit", "mm" or "deg"; "start", "value" and "std_error" in that unit, of the base
-        its turn from the start and its position; "narrowing" and "told".
+        "name"; "unit", "mm", "deg", "mm²/rad²" or "-"; "start", "value" and "std_error" in that
+        unit, of the base its turn from the start and its position; "narrowing" and "told".
     """
     entries = []
     narrowing = iter(result.narrowing.tolist())
@@ -68,7 +70,7 @@ def geometry_entries(start: Any, result: CalibrationResult) -> list[dict[str, An
         for label, kind, *numbers in zip(
             part.labels, part.kind, before, value.ravel(), std, strict=True
         ):
-            scale, unit = (180.0 / np.pi, "deg") if kind == "rad" else (1e3, "mm")
+            scale, unit = (180.0 / np.pi, "deg") if kind == "rad" else _UNITS.get(name, (1e3, "mm"))
             entry = dict(
                 zip(("start", "value", "std_error"), scale * np.array(numbers), strict=True)
             )

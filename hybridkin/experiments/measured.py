@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,7 +86,7 @@ def compare_by_group(
 
     Parameters
     ----------
-    chain : ConstantCurvatureChain
+    chain : ConstantCurvatureChain or ElasticTendonChain
         Nominal kinematics.
     q, x : ndarray of shape (N, n) and (N, 3)
         Log [m].
@@ -182,10 +183,15 @@ def fit_log(
         progress=progress,
     )
     progress("fitting the model to all motions", 0, 1)
-    result = calibrate(chain, data.q, data.x, names, loss=loss)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = calibrate(chain, data.q, data.x, names, loss=loss)
+    for warning in caught:
+        warnings.warn(warning.message, stacklevel=2)
     settings = _Settings(names, loss, n_seeds)
-    choice = _choose(chain, data.q, data.x, motions, _HYBRID_CHOICES, settings)
-    model = _elm_model(result.chain, choice, 0).fit(data.q, data.x)
+    with _silence():  # all that is to say has been said of the whole log
+        choice = _choose(chain, data.q, data.x, motions, _HYBRID_CHOICES, settings)
+        model = _elm_model(result.chain, choice, 0).fit(data.q, data.x)
     progress("fitting the model to all motions", 1, 1)
     report = Report(f"{description.name}: hybrid model of {Path(log).name}")
     report.record.update(
@@ -203,12 +209,26 @@ def fit_log(
         f"Chosen for the saved model, by the same cross-validation on all motions: **{choice}**. "
         f"Chosen in the folds: " + "; ".join(c["hybrid, ELM"] for c in choices) + "."
     )
-    _write_calibration(report, chain, result)
+    _write_calibration(report, chain, result, [str(warning.message) for warning in caught])
     report.file("model.safetensors", lambda path: save_model(model, path))
     report.text("The model: `hybridkin.load_model('model.safetensors')`.")
     return report, report.write(out)
 
 
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep back what would be said of every part of the log: the whole log has its say."""
+    with warnings.catch_warnings():
+        for message in (
+            "calibration left what is physical",
+            "the actuators run the other way",
+            r"\d+ of \d+ rows of `\w+` pull the tendons of a segment together",
+        ):
+            warnings.filterwarnings("ignore", message)
+        yield
+
+
+@_silence()
 @threadpool_limits.wrap(limits=1)  # the processes share the cores already
 def _one_fold(
     chain: Any,
@@ -271,11 +291,7 @@ def _choose(
 
 
 def _calibrated(chain: Any, q: NDArray, x: NDArray, parameters: tuple[str, ...], loss: str) -> Any:
-    """Return the chain calibrated on a part of the log, in silence: the whole log has its say."""
-    with warnings.catch_warnings():
-        for message in ("calibration left what is physical", "the actuators run the other way"):
-            warnings.filterwarnings("ignore", message)
-        return calibrate(chain, q, x, parameters, loss=loss).chain
+    return calibrate(chain, q, x, parameters, loss=loss).chain
 
 
 def _elm_model(chain: Any, choice: Choice, seed: int) -> HybridForwardModel:
@@ -395,7 +411,9 @@ def _write_comparison(
     )
 
 
-def _write_calibration(report: Report, chain: Any, result: CalibrationResult) -> None:
+def _write_calibration(
+    report: Report, chain: Any, result: CalibrationResult, warned: list[str]
+) -> None:
     entries = geometry_entries(chain, result)
     report.text(
         "## Calibration on all motions",
@@ -405,12 +423,14 @@ def _write_calibration(report: Report, chain: Any, result: CalibrationResult) ->
         "assumption. The base by its turn from the start and its position.",
     )
     report.table(GEOMETRY_HEADER, geometry_rows(entries))
+    report.text(*(f"Warning: {message}" for message in warned))
     if result.unidentified:
         report.text("What the log leaves open:", *(f"- {line}" for line in result.unidentified))
     report.record["calibration"] = {
         "values": result.values,
         "std_errors": result.std_errors,
         "rmse": result.rmse,
+        "warnings": warned,
         "identifiable": result.identifiable,
         "entries": entries,
         "unidentified": result.unidentified,
