@@ -1,4 +1,6 @@
+import runpy
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, PlayOperator, fit_play
 
+EXAMPLE = Path(__file__).parent.parent / "examples" / "plot_slack_tendons.py"
 ROWS = st.integers(1, 12).flatmap(
     lambda T: arrays(np.float64, (T, 3), elements=st.floats(-0.01, 0.01))
 )
@@ -199,3 +202,25 @@ def test_one_motion_is_too_few():
     truth, q, x, _ = log_of(0.0, 0.0)
     with pytest.raises(ValueError, match="at least 2 motions"):
         fit_play(truth, q, x, np.zeros(len(q)))
+
+
+def test_example_shows_what_slack_costs(data_home, monkeypatch):
+    monkeypatch.setenv("HYBRIDKIN_DATA", str(data_home))
+    space = runpy.run_path(str(EXAMPLE))
+    data, results = space["data"], space["found"]["5 folds"]
+    assert sorted(np.concatenate([test for test, _ in results])) == [*range(len(data.q))]
+    plain, elastic = (
+        1e3
+        * np.mean(
+            [np.linalg.norm(one[name] - data.x[test], axis=1).mean() for test, one in results]
+        )
+        for name in ("plain", "elastic")
+    )
+    assert elastic < 4.2
+    assert elastic < 0.6 * plain
+
+
+def test_example_says_when_the_recording_is_absent(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
+    runpy.run_path(str(EXAMPLE))
+    assert "Skipped: ftdcr_v4/train.csv is not part of hybridkin" in capsys.readouterr().out
