@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._arcs import arc_transforms, tip, tip_and_columns
+from hybridkin._geometry import check_replacements
 from hybridkin._numerics import PortableModule, check_vectors, in_blocks, stumpff
 
 if TYPE_CHECKING:
@@ -21,8 +22,14 @@ if TYPE_CHECKING:
 class ArcChain(PortableModule):
     """A chain of circular arcs; its kinds differ in how the actuators shape them.
 
-    A kind sets the attributes below and gives `_arcs_and_slope` and `_arc_tangents`.
+    A kind names its geometry in `_entries` and what else makes it in `_structure`, sets the
+    attributes below and gives `_set_geometry`, `_arcs_and_slope` and `_arc_tangents`.
     """
+
+    _entries: ClassVar[tuple[str, ...]]
+    _structure: ClassVar[tuple[str, ...]] = (
+        *("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at"),
+    )
 
     n_segments: int
     n_actuators: int
@@ -30,6 +37,37 @@ class ArcChain(PortableModule):
     tip_at: float  # the point that is steered, in segments from the base
     offsets: Tensor  # (S,)
     base: Tensor  # (4, 4)
+
+    def geometry(self) -> dict[str, Tensor]:
+        """Return the geometry by name, as in the constructor; what a kind lacks is left out."""
+        tensors = {name: getattr(self, name) for name in self._entries}
+        return {name: value for name, value in tensors.items() if value is not None}
+
+    def with_geometry(self, **geometry: Tensor) -> Self:
+        """Return a chain with some of the geometry replaced, differentiable in the new values.
+
+        Parameters
+        ----------
+        **geometry : Tensor
+            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
+
+        Returns
+        -------
+        ArcChain
+            A new chain of the same kind; this one is left as it was.
+        """
+        current = self.geometry()
+        check_replacements(geometry, current)
+        chain = type(self).__new__(type(self))
+        nn.Module.__init__(chain)
+        for name in self._structure:
+            setattr(chain, name, getattr(self, name))
+        chain._set_geometry({**dict.fromkeys(self._entries), **current, **geometry})
+        return chain
+
+    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
+        for name in self._entries:
+            self.register_buffer(name, geometry[name])
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the tip position.

@@ -16,7 +16,6 @@ from hybridkin._arcs import levers, reading_matrix, tip_and_columns_of_numbers
 from hybridkin._geometry import (
     actuator_counts,
     check_finite_rows,
-    check_replacements,
     filled,
     flat_angles,
     pose,
@@ -30,9 +29,6 @@ __all__ = ["ConstantCurvatureChain"]
 _ROUTINGS = ("segment", "base")
 _CONTRADICTED = 0.3  # of the readings that the arcs explain, in one segment
 _WORTH_A_WORD = 0.1  # of the radius: a bend of a tenth of a radian would read as much
-_GEOMETRY = ("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base")
-
-_STRUCTURE = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
 
 
 class ConstantCurvatureChain(ArcChain):
@@ -86,6 +82,8 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
+    _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
+
     radii: Tensor
     angles: Tensor
     lengths: Tensor | None
@@ -131,13 +129,15 @@ class ConstantCurvatureChain(ArcChain):
                     "3 actuators at different angles [rad]."
                 )
         self._set_geometry(
-            radii=radii,
-            angles=angles,
-            lengths=lengths,
-            offsets=filled(offsets, "offsets", dtype, (n_segments,)),
-            rest_bends=filled(rest_bends, "rest_bends", dtype, (n_segments, 2)),
-            actuator_zeros=filled(actuator_zeros, "actuator_zeros", dtype, (sum(counts),)),
-            base=pose(base, "base", dtype),
+            {
+                "radii": radii,
+                "angles": angles,
+                "lengths": lengths,
+                "offsets": filled(offsets, "offsets", dtype, (n_segments,)),
+                "rest_bends": filled(rest_bends, "rest_bends", dtype, (n_segments, 2)),
+                "actuator_zeros": filled(actuator_zeros, "actuator_zeros", dtype, (sum(counts),)),
+                "base": pose(base, "base", dtype),
+            }
         )
         warn_millimetres("radii", radii, 1.0)
         if lengths is not None:
@@ -152,33 +152,6 @@ class ConstantCurvatureChain(ArcChain):
     def reach(self) -> Tensor:
         """The natural size of the robot, shape () [m]: its backbone, or else 10 mean radii."""
         return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
-
-    def geometry(self) -> dict[str, Tensor]:
-        """Return the geometry by name, as in the constructor; lengths on tendon chains only."""
-        tensors = {name: getattr(self, name) for name in _GEOMETRY}
-        return {name: value for name, value in tensors.items() if value is not None}
-
-    def with_geometry(self, **geometry: Tensor) -> ConstantCurvatureChain:
-        """Return a chain with some of the geometry replaced, differentiable in the new values.
-
-        Parameters
-        ----------
-        **geometry : Tensor
-            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
-
-        Returns
-        -------
-        ConstantCurvatureChain
-            A new chain; this one is left as it was.
-        """
-        current = self.geometry()
-        check_replacements(geometry, current)
-        chain = type(self).__new__(type(self))
-        nn.Module.__init__(chain)
-        for name in _STRUCTURE:
-            setattr(chain, name, getattr(self, name))
-        chain._set_geometry(**{"lengths": None, **current, **geometry})
-        return chain
 
     def consistency(self, q: Tensor) -> Tensor:
         """Return how far the actuator readings of each segment contradict each other.
@@ -344,19 +317,9 @@ class ConstantCurvatureChain(ArcChain):
         kind = "extensible" if self.lengths is None else "inextensible"
         return f"{kind}, {super().extra_repr()}, routing {self.routing!r}"
 
-    def _set_geometry(
-        self,
-        radii: Tensor,
-        angles: Tensor,
-        lengths: Tensor | None,
-        offsets: Tensor,
-        rest_bends: Tensor,
-        actuator_zeros: Tensor,
-        base: Tensor,
-    ) -> None:
-        values = (radii, angles, lengths, offsets, rest_bends, actuator_zeros, base)
-        for name, value in zip(_GEOMETRY, values, strict=True):
-            self.register_buffer(name, value)
+    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
+        super()._set_geometry(geometry)
+        radii, lengths = self.radii, self.lengths
         readings = self._readings()
         # In bendings times radius: one unit for all, or half of the digits would go.
         units = torch.cat([torch.ones_like(radii), 1.0 / radii, 1.0 / radii])
@@ -366,7 +329,7 @@ class ConstantCurvatureChain(ArcChain):
         inverse = inverse + (torch.eye(len(inverse)).to(inverse) - inverse @ scaled) @ inverse
         matrix = nn.functional.pad(inverse, (0, 0, len(units) - len(inverse), 0)) * units[:, None]
         straight = torch.zeros_like(radii) if lengths is None else lengths
-        offset = torch.cat([straight, *rest_bends.T]) - matrix @ actuator_zeros
+        offset = torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
         self.register_buffer("arc_matrix", matrix)
         self.register_buffer("arc_offset", offset)
 

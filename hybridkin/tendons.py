@@ -16,7 +16,6 @@ from hybridkin._arcs import levers, reading_matrix
 from hybridkin._geometry import (
     actuator_counts,
     check_finite_rows,
-    check_replacements,
     filled,
     flat_angles,
     pose,
@@ -44,15 +43,6 @@ __all__ = ["ElasticTendonChain"]
 _ROUTINGS = ("segment", "base")
 _SHAPING = (
     *("radii", "angles", "bending_stiffness", "axial_stiffness", "rest_bends", "tendon_zeros"),
-)
-_GEOMETRY = (*_SHAPING, "lengths", "offsets", "base")
-_STRUCTURE = (
-    "n_segments",
-    "actuators_per_segment",
-    "n_actuators",
-    "routing",
-    "tip_at",
-    "smoothing",
 )
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are kept
 
@@ -136,6 +126,9 @@ class ElasticTendonChain(ArcChain):
     tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
     """
 
+    _entries = (*_SHAPING, "lengths", "offsets", "base")
+    _structure = (*ArcChain._structure, "smoothing", "_table")  # the table knows its geometry
+
     radii: Tensor
     angles: Tensor
     lengths: Tensor
@@ -189,15 +182,18 @@ class ElasticTendonChain(ArcChain):
         for name, value in stiffness.items():
             if not (value > 0).all():
                 raise ValueError(f"`{name}` must be positive, got {value.tolist()}.")
+        self._table: tuple[Any, ...] | None = None
         self._set_geometry(
-            radii=radii,
-            angles=flat_angles(angles, counts, dtype),
-            lengths=vector(lengths, "lengths", dtype, size=n_segments, positive=True),
-            rest_bends=filled(rest_bends, "rest_bends", dtype, (n_segments, 2)),
-            tendon_zeros=filled(tendon_zeros, "tendon_zeros", dtype, (sum(counts),)),
-            offsets=filled(offsets, "offsets", dtype, (n_segments,)),
-            base=pose(base, "base", dtype),
-            **stiffness,
+            {
+                "radii": radii,
+                "angles": flat_angles(angles, counts, dtype),
+                "lengths": vector(lengths, "lengths", dtype, size=n_segments, positive=True),
+                "rest_bends": filled(rest_bends, "rest_bends", dtype, (n_segments, 2)),
+                "tendon_zeros": filled(tendon_zeros, "tendon_zeros", dtype, (sum(counts),)),
+                "offsets": filled(offsets, "offsets", dtype, (n_segments,)),
+                "base": pose(base, "base", dtype),
+                **stiffness,
+            }
         )
         warn_millimetres("radii", radii, 1.0)
         warn_millimetres("lengths", self.lengths, 10.0)
@@ -212,33 +208,6 @@ class ElasticTendonChain(ArcChain):
     def reach(self) -> Tensor:
         """The natural size of the robot, shape () [m]: its backbone."""
         return self.lengths.sum()
-
-    def geometry(self) -> dict[str, Tensor]:
-        """Return the geometry by name, as in the constructor."""
-        return {name: getattr(self, name) for name in _GEOMETRY}
-
-    def with_geometry(self, **geometry: Tensor) -> ElasticTendonChain:
-        """Return a chain with some of the geometry replaced, differentiable in the new values.
-
-        Parameters
-        ----------
-        **geometry : Tensor
-            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
-
-        Returns
-        -------
-        ElasticTendonChain
-            A new chain; this one is left as it was.
-        """
-        current = self.geometry()
-        check_replacements(geometry, current)
-        chain = type(self).__new__(type(self))
-        nn.Module.__init__(chain)
-        for name in _STRUCTURE:
-            setattr(chain, name, getattr(self, name))
-        chain._set_geometry(**{**current, **geometry})
-        chain._table = self._table
-        return chain
 
     def tensions(self, q: Tensor) -> Tensor:
         """Return how far every tendon is stretched.
@@ -326,11 +295,6 @@ class ElasticTendonChain(ArcChain):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_table": None}
-
-    def _set_geometry(self, **geometry: Tensor) -> None:
-        for name in _GEOMETRY:
-            self.register_buffer(name, geometry[name])
-        self._table: tuple[Any, ...] | None = None
 
     def _elasticity(self) -> Elasticity:
         counts = self.actuators_per_segment
