@@ -184,12 +184,12 @@ def hybrids(chain, trunk):
 
 @pytest.fixture(params=["vmap(jacrev)", "3 backward passes"])
 def autodiff(request):
-    """A name, and what gives the Jacobian of any module by that way of automatic derivation."""
+    """A name, what gives the Jacobian of any module by that way, and how much faster to be."""
     ways = {
-        "vmap(jacrev)": lambda module, q: torch.func.vmap(torch.func.jacrev(module))(q),
-        "3 backward passes": lambda module, q: forward_and_reverse_jacobian(module, q)[1],
+        "vmap(jacrev)": (lambda module, q: torch.func.vmap(torch.func.jacrev(module))(q), 8),
+        "3 backward passes": (lambda module, q: forward_and_reverse_jacobian(module, q)[1], 3),
     }
-    return request.param, ways[request.param]
+    return request.param, *ways[request.param]
 
 
 @pytest.fixture(scope="session")
