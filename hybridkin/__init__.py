@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from hybridkin.calibration import CalibrationResult, calibrate
     from hybridkin.chain import ConstantCurvatureChain
     from hybridkin.elm import ELMRegressor
+    from hybridkin.elm_cv import ELMRegressorCV
     from hybridkin.hybrid import HybridForwardModel
     from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Step, Track
     from hybridkin.persistence import load_model, save_model
@@ -22,6 +23,7 @@ __all__ = [
     "CalibrationResult",
     "ConstantCurvatureChain",
     "ELMRegressor",
+    "ELMRegressorCV",
     "ElasticTendonChain",
     "HybridForwardModel",
     "IKSolution",
@@ -52,6 +54,7 @@ _ROOM_OF = {
     "CalibrationResult": "calibration",
     "ConstantCurvatureChain": "chain",
     "ELMRegressor": "elm",
+    "ELMRegressorCV": "elm_cv",
     "ElasticTendonChain": "tendons",
     "HybridForwardModel": "hybrid",
     "IKSolution": "ik",

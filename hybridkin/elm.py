@@ -2,32 +2,22 @@
 
 import warnings
 from numbers import Integral, Real
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy import linalg
-from scipy.linalg.blas import dsyrk  # pyright: ignore
-from scipy.linalg.lapack import dpocon, dpotrf, dtrtri  # pyright: ignore
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
 from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from hybridkin._network import ACTIVATIONS, ELM, LAYER, READOUT
+from hybridkin._readout import Statistics, accumulate, fit_readout, merge
 
 __all__ = ["ELM", "ELMRegressor"]
 
-_DTYPES = (np.float64, np.float32)
+DTYPES = (np.float64, np.float32)
 _BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
-
-
-class _Statistics(NamedTuple):
-    """Total weight, mean, and scatter about the mean, of the rows [features, targets]."""
-
-    n: float
-    mean: np.ndarray
-    scatter: np.ndarray
 
 
 def _scaling(X, sample_weight, input_scaling):
@@ -59,97 +49,56 @@ def _scaling(X, sample_weight, input_scaling):
     return center, scale
 
 
-def _accumulate(stats, elm, X, y, sample_weight, block_size):
-    """Return `stats` with the rows of `X`, `y` added, block by block.
-
-    A block is centred about its own mean. The step from the old mean to the block's enters as one
-    more row, so that all of it is one symmetric product per block, and exact.
-    """
-    n_features, device = len(elm.output_weights), elm.input_center.device
-    n, mean = stats.n, torch.tensor(stats.mean, device=device)
-    scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is kept up
-    buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
-    for rows in gen_batches(len(X), block_size):
-        q = torch.tensor(X[rows], dtype=torch.float64, device=device)
-        z = buffer[: len(q) + 1]
-        block = z[:-1]
-        elm._write_features(q, block[:, :n_features])
-        block[:, n_features:] = torch.tensor(y[rows], device=device)
-        if sample_weight is None:
-            n_block, mean_block = float(len(block)), block.mean(0)
-            block -= mean_block
-        else:
-            w = torch.tensor(sample_weight[rows], device=device)
-            n_block = w.sum().item()
-            mean_block = w @ block / n_block
-            block -= mean_block
-            block *= w.sqrt()[:, None]
-        step = mean_block - mean
-        torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
-        n += n_block
-        mean += step * (n_block / n)
-        if z.device.type == "cpu":  # half the work of a general product
-            c = dsyrk(1.0, z.T.numpy(), beta=1.0, c=scatter.numpy(), overwrite_c=True, lower=True)
-            scatter = torch.from_numpy(c)
-        else:
-            scatter.addmm_(z.T, z)
-    lower = np.tril(scatter.cpu().numpy())
-    return _Statistics(n, mean.cpu().numpy(), lower + np.tril(lower, -1).T)
+def check_rows(estimator, X, y, sample_weight, reset=True):
+    """Return `X`, float64 `y`, the weights, and the rows of positive weight; None for all."""
+    checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
+    X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
+    kept = None
+    if sample_weight is not None:
+        sample_weight = _check_sample_weight(
+            sample_weight, X, dtype=np.float64, ensure_non_negative=True
+        )
+        if not sample_weight.all():
+            kept = np.flatnonzero(sample_weight)
+    return X, y.astype(np.float64, copy=False), sample_weight, kept
 
 
-def _merge(a, b):
-    """Return the statistics of the rows of both (parallel variance formula)."""
-    n, step = a.n + b.n, b.mean - a.mean
-    scatter = a.scatter + b.scatter + np.outer(step, step) * (a.n / n * b.n)
-    return _Statistics(n, a.mean + step * (b.n / n), scatter)
+def draw_layer(params, X, sample_weight):
+    """Return the hidden layer that an estimator's parameters ask for, without a readout."""
+    rng, shape = check_random_state(params.random_state), (params.n_hidden, X.shape[1])
+    W = rng.uniform(-params.weight_scale, params.weight_scale, shape)
+    b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
+    layer = (W, b, *_scaling(X, sample_weight, params.input_scaling))
+    n_features = params.n_hidden + params.direct_link * X.shape[1]
+    return _without_readout(dict(zip(LAYER, layer, strict=True)), params.activation, n_features)
 
 
-def _ridge(G, C, alpha):
-    """Return W = (G + alpha 1)^-1 C, R with R R' = (G + alpha 1)^-1, tr(R' G R), and the solver.
-
-    Where G + alpha 1 is singular, W is the solution of minimum norm, and R takes the eigenvalues
-    that rounding has swallowed at their rounding error: large, as there are no data.
-    """
-    A = G + alpha * np.eye(len(G))
-    eps = len(G) * np.finfo(np.float64).eps
-    # Unit diagonal: features of different units are not what makes a system singular.
-    root = np.sqrt(A.diagonal())[:, None]
-    root[root == 0] = 1.0
-    scaled = A / root / root.T
-    L, info = dpotrf(scaled, lower=True)
-    if info == 0 and dpocon(L, np.abs(scaled).sum(0).max(), uplo="L")[0] > eps:
-        W = linalg.cho_solve((L, True), C / root) / root
-        R = dtrtri(L, lower=True)[0].T / root
-        return W, R, len(G) - alpha * np.sum(R * R), "cholesky"
-    eigenvalues, V = linalg.eigh(G)
-    shifted = eigenvalues + alpha
-    cutoff = max(eps * shifted[-1], np.finfo(np.float64).tiny)
-    kept = shifted > cutoff
-    W = V[:, kept] @ ((V[:, kept].T @ C) / shifted[kept, None])
-    R = V / np.sqrt(np.maximum(shifted, cutoff))
-    return W, R, np.sum(eigenvalues[kept] / shifted[kept]), "eigh"
+def _without_readout(layer, activation, n_features):
+    # No outputs: the features come from the one kernel there is.
+    shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
+    blank = {name: np.zeros(shape) for name, shape in zip(READOUT, shapes, strict=True)}
+    return ELM({**layer, **blank}, activation)
 
 
-def _fit_readout(stats, n_features, alpha, fit_intercept):
-    """Return the arrays of the readout (eq. 3), the noise variance (m,) and the solver."""
-    n, mean, scatter = stats
-    if not fit_intercept:
-        # Both terms are positive: going back from the mean to the origin cancels nothing.
-        scatter = scatter + n * np.outer(mean, mean)
-        mean = np.zeros_like(mean)
-    G, C = scatter[:n_features, :n_features], scatter[:n_features, n_features:]
-    W, R, dof, solver = _ridge(G, C, alpha)
-    # This form of the residual is stationary in W: rounding in W enters squared.
-    rss = scatter.diagonal()[n_features:] - np.sum(W * (2 * C - G @ W), axis=0)
-    dof_left = n - dof - fit_intercept
-    resolved = dof_left > np.sqrt(np.finfo(np.float64).eps) * n
-    noise = np.maximum(rss, 0.0) / dof_left if resolved else np.full_like(rss, np.nan)
-    mu, offset = mean[:n_features], np.float64(1 / n if fit_intercept else 0)
-    arrays = (W, mean[n_features:] - mu @ W, mu, R, offset)
-    return dict(zip(READOUT, arrays, strict=True)), noise, solver
+def gather(stats, elm, X, y, sample_weight, block_size):
+    """Return the statistics `stats` (None: of no rows) with the rows of `X` and `y` added."""
+    n_features = len(elm.output_weights)
+    n_columns = n_features + y.shape[1]
+    if stats is None:
+        stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
+    block_size = block_size or max(1, _BLOCK_ELEMENTS // n_columns)
+    with torch.no_grad():
+        stats = accumulate(stats, elm, X, y, sample_weight, block_size)
+    if not np.isfinite(stats.scatter[:, :n_features]).all():
+        raise ValueError(
+            "`X` and `y` must give finite sums of products of features and targets in float64, "
+            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
+        )
+    return stats
 
 
-def _device(name):
+def device_named(name):
+    """Return the torch device of that name (None: the CPU), where float64 works."""
     try:
         device = torch.device("cpu" if name is None else name)
         torch.zeros(1, dtype=torch.float64, device=device).item()
@@ -174,9 +123,9 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ----------
     n_hidden : int, default=100
         Number of hidden neurons H.
-    alpha : float, default=0.1
-        Weight of the penalty on the readout (lambda of [1]_). With 0 a singular system is solved
-        by the readout of minimum norm.
+    alpha : float or array-like of shape (n_outputs,), default=0.1
+        Weight of the penalty on the readout (lambda of [1]_), for all outputs or for each. With 0 a
+        singular system is solved by the readout of minimum norm.
     activation : {"logistic", "tanh", "sin"}, default="logistic"
         Activation function sigma.
     input_scaling : {"minmax", "standard"}, None or array of shape (2, n_inputs), default="minmax"
@@ -205,7 +154,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     output_weights_, intercept_ : ndarray of shape (n_features, n_outputs) and (n_outputs,)
         Readout [unit of y]; `n_features` is `n_hidden`, plus `n_inputs` with a direct link.
     leverage_center_, leverage_factor_, leverage_offset_ : ndarray
-        See :class:`ELM`.
+        See :class:`ELM`; of the smallest `alpha`, if each output has its own.
     noise_variance_ : ndarray of shape (n_outputs,)
         Residual sum of squares over ``n - tr(G (G + alpha 1)^-1) - fit_intercept`` [unit of y^2]; G
         the features' Gram matrix, n the sum of the sample weights. NaN if that leaves nothing.
@@ -244,7 +193,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     _parameter_constraints = {  # noqa: RUF012
         "n_hidden": [Interval(Integral, 1, None, closed="left")],
-        "alpha": [Interval(Real, 0, None, closed="left")],
+        "alpha": [Interval(Real, 0, None, closed="left"), "array-like"],
         "activation": [StrOptions(set(ACTIVATIONS))],
         "input_scaling": [StrOptions({"minmax", "standard"}), None, "array-like"],
         "weight_scale": [Interval(Real, 0, None, closed="neither")],
@@ -301,7 +250,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._learn(X, y, sample_weight, first=True)
 
     @_fit_context(prefer_skip_nested_validation=True)
-    def partial_fit(self, X, y, sample_weight=None):
+    def partial_fit(self, X, y, sample_weight=None, decay=1.0):
         """Add rows to those already seen; the result is that of one `fit` to all of them.
 
         The first call draws the hidden layer and fixes the input scaling, for good.
@@ -310,13 +259,20 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X, y, sample_weight : array-like
             The new rows, as for `fit`.
+        decay : float, default=1.0
+            Factor in (0, 1] on the weights of all earlier rows, to follow a drift.
 
         Returns
         -------
         self : ELMRegressor
             The fitted estimator.
         """
-        return self._learn(X, y, sample_weight, first=not hasattr(self, "module_"))
+        if not 0.0 < decay <= 1.0:
+            raise ValueError(
+                f"`decay` must lie in (0, 1], got {decay!r}; 1 forgets nothing, 0.99 forgets a "
+                f"hundredth of what earlier rows count."
+            )
+        return self._learn(X, y, sample_weight, first=not hasattr(self, "module_"), decay=decay)
 
     def merge(self, other):
         """Add the rows that `other` has seen; the result is that of one `fit` to all of them.
@@ -348,8 +304,8 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"{other.output_weights_.shape}; fit both models with the same `direct_link` and "
                 f"the same columns of `y`."
             )
-        stats = _merge(self._stats, other._stats)
-        return self._solve(stats, len(self.output_weights_), _device(self.device))
+        stats = merge(self._stats, other._stats)
+        return self._solve(stats, len(self.output_weights_), device_named(self.device))
 
     def predict(self, X, return_std=False):
         """Return the prediction at `X`, in the dtype of `X`.
@@ -422,62 +378,46 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         return self._map(X, lambda elm, q: (elm.leverage(q),))[0]
 
-    def _learn(self, X, y, sample_weight, first):
-        checks = {"dtype": _DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
-        X, y = map(np.asarray, validate_data(self, X, y, reset=first, **checks))
-        device = _device(self.device)
-        if sample_weight is not None:
-            sample_weight = _check_sample_weight(
-                sample_weight, X, dtype=np.float64, ensure_non_negative=True
-            )
-            present = sample_weight > 0
-            if not present.all():
-                X, y, sample_weight = X[present], y[present], sample_weight[present]
-        y_ndim, y = y.ndim, y.reshape(len(y), -1).astype(np.float64, copy=False)
+    def _learn(self, X, y, sample_weight, first, decay=1.0):
+        X, y, sample_weight, kept = check_rows(self, X, y, sample_weight, reset=first)
+        if kept is not None:
+            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]
+        device = device_named(self.device)
+        y_ndim, y = y.ndim, y.reshape(len(y), -1)
         if first:
-            rng, shape = check_random_state(self.random_state), (self.n_hidden, X.shape[1])
-            W = rng.uniform(-self.weight_scale, self.weight_scale, shape)
-            b = rng.uniform(-self.weight_scale, self.weight_scale, self.n_hidden)
-            layer = (W, b, *_scaling(X, sample_weight, self.input_scaling))
-            activation = self.activation
-            n_features = self.n_hidden + self.direct_link * X.shape[1]
-            n_columns = n_features + y.shape[1]
-            stats = _Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
+            elm, stats = draw_layer(self, X, sample_weight).to(device), None
         else:
-            layer = [getattr(self, f"{name}_") for name in LAYER]
-            activation, stats = self._activation, self._stats
-            n_features, n_columns = len(self.output_weights_), len(stats.mean)
-            if n_features + y.shape[1] != n_columns:
+            layer = {name: getattr(self, f"{name}_") for name in LAYER}
+            elm = _without_readout(layer, self._activation, len(self.output_weights_)).to(device)
+            n_outputs = self.output_weights_.shape[1]
+            if y.shape[1] != n_outputs:
                 raise ValueError(
-                    f"`y` must have {n_columns - n_features} columns as in earlier calls, got "
-                    f"{y.shape[1]}; call `fit` to start afresh."
+                    f"`y` must have {n_outputs} columns as in earlier calls, got {y.shape[1]}; "
+                    f"call `fit` to start afresh."
                 )
-            y_ndim = self._y_ndim
-        layer = dict(zip(LAYER, layer, strict=True))
-        # A readout with no outputs: the features come from the one kernel there is.
-        shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
-        blank = {name: np.zeros(shape) for name, shape in zip(READOUT, shapes, strict=True)}
-        elm = ELM({**layer, **blank}, activation).to(device)
-        block_size = self.block_size or max(1, _BLOCK_ELEMENTS // n_columns)
-        with torch.no_grad():
-            stats = _accumulate(stats, elm, X, y, sample_weight, block_size)
-        if not np.isfinite(stats.scatter[:, :n_features]).all():
-            raise ValueError(
-                "`X` and `y` must give finite sums of products of features and targets in float64, "
-                "got an overflow; change their unit, or scale the inputs by `input_scaling`."
-            )
-        self._activation, self._y_ndim = activation, y_ndim
-        for name, array in layer.items():
-            setattr(self, f"{name}_", array)
-        return self._solve(stats, n_features, device)
+            n, mean, scatter = self._stats
+            stats, y_ndim = Statistics(decay * n, mean, decay * scatter), self._y_ndim
+        stats = gather(stats, elm, X, y, sample_weight, self.block_size)
+        self._activation, self._y_ndim = elm.activation, y_ndim
+        for name in LAYER:
+            setattr(self, f"{name}_", getattr(elm, name).numpy(force=True))
+        return self._solve(stats, len(elm.output_weights), device)
 
     def _solve(self, stats, n_features, device):
-        readout, self.noise_variance_, self.solver_ = _fit_readout(
+        n_outputs = len(stats.mean) - n_features
+        if np.ndim(self.alpha):
+            alpha = np.asarray(self.alpha, dtype=np.float64)
+            if alpha.shape != (n_outputs,) or not (np.isfinite(alpha) & (alpha >= 0)).all():
+                raise ValueError(
+                    f"`alpha` must be a number >= 0, or {n_outputs} of them, one for each column "
+                    f"of `y`, got {self.alpha!r}."
+                )
+        readout, self.noise_variance_, self.solver_ = fit_readout(
             stats, n_features, self.alpha, self.fit_intercept
         )
         if self.solver_ == "eigh":
             warnings.warn(
-                f"The system of {n_features} features is singular at alpha={self.alpha:g}; solved "
+                f"The system of {n_features} features is singular at alpha={self.alpha}; solved "
                 f"by its eigenvectors. Raise `alpha` or lower `n_hidden`.",
                 linalg.LinAlgWarning,
                 stacklevel=2,
@@ -495,7 +435,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _map(self, X, function):
         """Return the arrays that `function(module, q)` gives, computed block by block."""
         check_is_fitted(self, "module_")
-        X = np.asarray(validate_data(self, X, reset=False, dtype=_DTYPES, order="C"))
+        X = np.asarray(validate_data(self, X, reset=False, dtype=DTYPES, order="C"))
         elm, outputs = self.module_, ()
         width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
@@ -515,7 +455,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         super().__setstate__(state)
         if hasattr(self, "_stats"):
             try:
-                device = _device(self.device)
+                device = device_named(self.device)
             except RuntimeError:
                 device = torch.device("cpu")
             self._build(device)

@@ -17,7 +17,8 @@ from sklearn.linear_model import LinearRegression
 from torch import nn
 
 from hybridkin.chain import ConstantCurvatureChain
-from hybridkin.elm import ELMRegressor, _Statistics
+from hybridkin._readout import Statistics
+from hybridkin.elm import ELMRegressor
 from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
 from hybridkin.hybrid import AffineModule, HybridForwardModel, HybridModule
 from hybridkin.rigid import RigidChain
@@ -286,7 +287,7 @@ def _restored_error(header: Any, arrays: Arrays) -> tuple[Any, nn.Module | None]
         settings = {name: header["settings"][name] for name in _ELM_SETTINGS}
         stored = {name: arrays[f"error.{name}"] for name in _ELM_ARRAYS}
         mean, scatter = arrays["error.mean"], arrays["error.scatter"]
-        statistics = _Statistics(float(settings["n_samples_seen_"]), mean, scatter)
+        statistics = Statistics(float(settings["n_samples_seen_"]), mean, scatter)
         elm.__setstate__({**elm.get_params(), **stored, **settings, "_stats": statistics})
         return elm, elm.module_
     if header["kind"] == "linear":

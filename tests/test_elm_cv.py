@@ -1,0 +1,388 @@
+"""The ELM that chooses its complexity: its errors on rows left out, its choices, its manners."""
+
+import pickle
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+import sklearn
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
+from sklearn.datasets import make_friedman1
+from sklearn.model_selection import (
+    GroupKFold,
+    KFold,
+    ShuffleSplit,
+    TimeSeriesSplit,
+    cross_val_score,
+)
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler
+from sklearn.utils.estimator_checks import parametrize_with_checks
+from torch.testing import assert_close
+
+from hybridkin import ELMRegressor, ELMRegressorCV
+from hybridkin.datasets import load_trunk
+
+ALPHAS = np.logspace(-3, 2, 6)
+
+
+def data(n=60, d=3, m=2, seed=0, noise=0.05):
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-1, 1, (n, d))
+    A = np.random.default_rng(99).standard_normal((d, m))
+    return X, np.sin(2 * X @ A) + 0.3 + noise * rng.standard_normal((n, m))
+
+
+def quick(n_hidden=20, alphas=ALPHAS, weight_scales=(0.7,), **params):
+    params = {"relevance_rounds": 0, "random_state": 0, **params}
+    return ELMRegressorCV(n_hidden, alphas, weight_scales, **params)
+
+
+def refitted(model, alpha, X, y, train, test, sample_weight=None):
+    """Errors of a fresh fit to the training rows, in the hidden layer of all rows."""
+    fitted = model.best_estimator_
+    half = fitted.input_scale_
+    bounds = [fitted.input_center_ - half, fitted.input_center_ + half]
+    fresh = ELMRegressor(**{**model.best_params_, "alpha": alpha, "input_scaling": bounds})
+    weights = None if sample_weight is None else sample_weight[train]
+    return y[test] - fresh.fit(X[train], y[train], weights).predict(X[test])
+
+
+@parametrize_with_checks(
+    [
+        ELMRegressorCV(n_hidden=20),
+        ELMRegressorCV(n_hidden=[5, 10], alphas=[0.01, 1.0], weight_scales=[1.0], cv=2),
+        ELMRegressorCV(10, cv=KFold(3), alpha_per_target=True, direct_link=False),
+    ]
+)
+def test_scikit_learn_checks(estimator, check):
+    check(estimator)
+
+
+# Errors on rows left out
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+@pytest.mark.parametrize("n", [12, 24, 60])  # fewer rows than features, about as many, more
+def test_each_row_alone_equals_brute_force(n, fit_intercept):
+    X, y = data(n)
+    model = quick(fit_intercept=fit_intercept).fit(X, y)
+    brute = np.empty((len(ALPHAS), *y.shape))
+    for i in range(n):
+        rest = np.delete(np.arange(n), i)
+        for j, alpha in enumerate(ALPHAS):
+            brute[j, i] = refitted(model, alpha, X, y, rest, [i])[0]
+    expected = np.mean(brute**2, axis=(1, 2))
+    assert_allclose(model.cv_results_["mean_squared_error"][0], expected, rtol=1e-10)
+    best = expected.argmin()
+    assert model.alpha_ == ALPHAS[best]
+    assert_allclose(model.left_out_errors_, brute[best], rtol=0, atol=1e-10)
+    assert_allclose(model.best_score_, -expected[best], rtol=1e-10)
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+@pytest.mark.parametrize("sizes", [[3, 1, 8, 5, 13], [30, 40, 50], [70, 2, 4]])
+def test_groups_equal_refits(sizes, fit_intercept):
+    groups = np.random.default_rng(0).permutation(np.repeat(np.arange(len(sizes)), sizes))
+    X, y = data(len(groups))
+    weights = np.random.default_rng(1).uniform(0.2, 3.0, len(groups))
+    model = quick(fit_intercept=fit_intercept).fit(X, y, weights, groups)
+    brute = np.empty((len(ALPHAS), *y.shape))
+    for group in np.unique(groups):
+        train, test = np.flatnonzero(groups != group), np.flatnonzero(groups == group)
+        for j, alpha in enumerate(ALPHAS):
+            brute[j, test] = refitted(model, alpha, X, y, train, test, weights)
+    expected = np.average(brute**2, axis=1, weights=weights).mean(axis=1)
+    assert_allclose(model.cv_results_["mean_squared_error"][0], expected, rtol=1e-10)
+    assert_allclose(model.left_out_errors_, brute[expected.argmin()], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "cv",
+    [
+        KFold(4),
+        KFold(2),
+        ShuffleSplit(5, test_size=0.1, train_size=0.5, random_state=0),
+        TimeSeriesSplit(4),
+    ],
+    ids=lambda cv: type(cv).__name__,
+)
+@pytest.mark.parametrize("n", [15, 90])
+def test_any_splitter_equals_refits(cv, n):
+    X, y = data(n)
+    model = quick(cv=cv).fit(X, y)
+    total, count = np.zeros(len(ALPHAS)), np.zeros(n)
+    sums = np.zeros((len(ALPHAS), *y.shape))
+    for train, test in cv.split(X):
+        for j, alpha in enumerate(ALPHAS):
+            errors = refitted(model, alpha, X, y, train, test)
+            total[j] += np.sum(errors**2)
+            sums[j, test] += errors
+        count[test] += 1
+    assert_allclose(
+        model.cv_results_["mean_squared_error"][0], total / (2 * count.sum()), rtol=1e-10
+    )
+    seen = count > 0
+    found = model.left_out_errors_
+    assert_allclose(
+        found[seen], (sums[total.argmin()] / np.maximum(count, 1)[:, None])[seen], atol=1e-10
+    )
+    assert np.isnan(found[~seen]).all()
+
+
+@pytest.mark.parametrize("n", [10, 60])
+def test_weights_are_repetitions_of_which_one_is_left_out(n):
+    X, y = data(n)
+    weights = np.random.default_rng(0).integers(0, 4, n)
+    repeated = np.repeat(np.arange(n), weights)
+    weighed = quick().fit(X, y, sample_weight=weights)
+    longhand = quick().fit(X[repeated], y[repeated])
+    assert_allclose(
+        weighed.cv_results_["mean_squared_error"],
+        longhand.cv_results_["mean_squared_error"],
+        rtol=1e-10,
+    )
+    assert_allclose(weighed.predict(X), longhand.predict(X), rtol=0, atol=1e-9)
+    assert_array_equal(np.isnan(weighed.left_out_errors_).any(axis=1), weights == 0)
+
+
+def test_hopeless_penalties_are_never_chosen():
+    # A row that alone holds a direction has leverage 1 as the penalty goes: no error to speak of.
+    X, y = data(40)
+    X[0] = 50.0
+    model = quick(30, "auto").fit(X, y)
+    assert np.isfinite(model.left_out_errors_).all()
+    assert np.isfinite(model.best_score_)
+
+
+# Choices
+
+
+def test_best_params_give_the_chosen_model():
+    X, y = data(80)
+    model = quick([5, 20], "auto", (0.3, 1.0), relevance_rounds=2).fit(X, y)
+    again = ELMRegressor(**model.best_params_).fit(X, y)
+    assert_array_equal(again.predict(X), model.predict(X))
+    assert model.alpha_ == model.best_params_["alpha"]
+    results = model.cv_results_
+    assert min(results["mean_squared_error"].ravel()) == -model.best_score_
+    assert {len(values) for values in results.values()} == {len(results["alphas"])}
+    assert len(results["alphas"]) >= 2 * 2 + 4
+
+
+def test_each_target_may_have_its_own_penalty():
+    rng = np.random.default_rng(0)
+    X, y = data(200, noise=0.0)
+    y = np.column_stack([y[:, 0], rng.standard_normal(200)])  # a smooth one and pure noise
+    model = quick(50, "auto", alpha_per_target=True).fit(X, y)
+    assert model.alpha_[1] > 1e3 * model.alpha_[0]
+    for j in range(2):
+        alone = quick(50, "auto").fit(X, y[:, j])
+        assert alone.alpha_ == model.alpha_[j]
+        assert_allclose(model.predict(X)[:, j], alone.predict(X), rtol=0, atol=1e-9)
+        assert_allclose(model.left_out_errors_[:, j], alone.left_out_errors_, atol=1e-9)
+    assert model.predict(X, return_std=True)[1].shape == (200, 2)
+
+
+def test_irrelevant_and_linear_inputs_cost_nothing():
+    # Friedman's first: five of ten inputs do nothing, two act linearly.
+    X, y = make_friedman1(1000, noise=1.0, random_state=0)
+    X_test, y_test = make_friedman1(4000, random_state=1)
+    plain, relevant = (
+        ELMRegressorCV(200, relevance_rounds=rounds, random_state=0).fit(X, y) for rounds in (0, 5)
+    )
+    error, reduced = (np.std(model.predict(X_test) - y_test) for model in (plain, relevant))
+    assert reduced < 0.7 * error
+    best = relevant.cv_results_["mean_squared_error"].min(axis=1).argmin()
+    relevance = relevant.cv_results_["relevance"][best]
+    assert relevance[:3].min() > 10 * relevance[3:].max()
+
+
+def test_no_worse_than_a_straight_line_where_that_is_the_truth():
+    rng = np.random.default_rng(0)
+    X = rng.standard_normal((60, 5))
+    y = X @ np.arange(1.0, 6.0) + 0.1 * rng.standard_normal(60)
+    X_test = rng.standard_normal((2000, 5))
+    model = ELMRegressorCV(random_state=0).fit(X, y)
+    line = np.linalg.lstsq(np.column_stack([X, np.ones(60)]), y, rcond=None)[0]
+    straight = np.column_stack([X_test, np.ones(2000)]) @ line
+    truth = X_test @ np.arange(1.0, 6.0)
+    assert np.std(model.predict(X_test) - truth) < 1.5 * np.std(straight - truth)
+
+
+def test_groups_protect_from_leaking_motions():
+    # Ten rows of a motion share its offset: row by row it can be memorised, by groups it cannot.
+    rng = np.random.default_rng(0)
+    motion = np.repeat(np.arange(30), 10)
+    X = rng.uniform(-1, 1, (30, 4))[motion] + 0.01 * rng.standard_normal((300, 4))
+    y = X[:, 0] + 0.5 * rng.standard_normal(30)[motion]
+    by_rows = ELMRegressorCV(100, random_state=0).fit(X, y)
+    by_motions = ELMRegressorCV(100, random_state=0).fit(X, y, groups=motion)
+    assert by_rows.best_score_ > 0.1 * by_motions.best_score_
+    X_new = rng.uniform(-1, 1, (2000, 4))
+    rms = [np.sqrt(np.mean((m.predict(X_new) - X_new[:, 0]) ** 2)) for m in (by_rows, by_motions)]
+    assert rms[1] < 0.5 * rms[0]
+
+
+# Numbers
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_units_do_not_matter(unit):
+    X, y = data(80)
+    one = quick(30, "auto", relevance_rounds=2).fit(X, y)
+    other = quick(30, "auto", relevance_rounds=2).fit(unit * X, y / unit)
+    assert_allclose(other.predict(unit * X), one.predict(X) / unit, rtol=1e-6)
+
+
+@pytest.mark.parametrize("block_size", [1, 7, None])
+def test_blocks_do_not_matter(block_size, monkeypatch):
+    X, y = data(60)
+    expected = quick().fit(X, y)
+    monkeypatch.setattr("hybridkin._left_out._BLOCK_ELEMENTS", 200)
+    model = quick(block_size=block_size).fit(X, y)
+    assert_allclose(model.left_out_errors_, expected.left_out_errors_, rtol=0, atol=1e-10)
+
+
+def test_constant_repeated_and_collinear_columns():
+    X, y = data(80)
+    X = np.column_stack([X, np.full(80, 3.0), X[:, 0], X @ [1.0, 2.0, 3.0]])
+    model = quick(30, "auto", relevance_rounds=3).fit(X, y)
+    assert np.isfinite(model.predict(X)).all()
+    assert model.score(X, y) > 0.97
+
+
+def test_a_constant_target():
+    X, _ = data(40)
+    model = ELMRegressorCV(20, random_state=0).fit(X, np.full(40, 7.0))
+    assert_allclose(model.predict(X), 7.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_a_handful_of_rows(n):
+    X, y = data(n)
+    model = ELMRegressorCV(random_state=0).fit(X, y)
+    assert np.isfinite(model.predict(X)).all()
+
+
+def test_float32_data_give_float32_and_the_same_choice():
+    X, y = data(100)
+    single = quick(30).fit(X.astype(np.float32), y.astype(np.float32))
+    double = quick(30).fit(X, y)
+    assert single.predict(X.astype(np.float32)).dtype == np.float32
+    assert single.alpha_ == double.alpha_
+    assert_allclose(single.predict(X.astype(np.float32)), double.predict(X), atol=1e-4)
+
+
+@pytest.mark.parametrize("m", [1, 3])
+def test_return_std_covers_new_measurements(m):
+    """90 % intervals on 2000 new rows of the noise model, means over ten draws."""
+    covered = []
+    for seed in range(10):
+        X, y = data(400, m=m, seed=seed, noise=0.1)
+        X_new, y_new = data(2000, m=m, seed=1000 + seed, noise=0.1)
+        mean, std = ELMRegressorCV(200, random_state=seed).fit(X, y).predict(X_new, True)
+        covered.append(np.mean(np.abs(y_new - mean) < 1.6449 * std))
+    assert 0.87 < np.mean(covered) < 0.93
+
+
+# Manners
+
+
+def test_module_and_derivatives_are_those_of_the_chosen_model():
+    X, y = data(60)
+    model = quick().fit(X, y)
+    values, J = model.predict_and_jacobian(X)
+    assert_array_equal(values, model.predict(X))
+    assert_array_equal(J, model.jacobian(X))
+    step = 1e-6
+    for j in range(3):
+        move = np.zeros(3)
+        move[j] = step
+        slope = (model.predict(X + move) - model.predict(X - move)) / (2 * step)
+        assert_allclose(J[..., j], slope, atol=1e-8)
+    assert model.leverage(X).max() <= 1
+    import torch
+
+    assert_close(model.module_(torch.from_numpy(X)), torch.from_numpy(values))
+
+
+def test_seeds_and_clones():
+    X, y = data(60)
+    state = np.random.RandomState(3)
+    a, b = (quick(random_state=state).fit(X, y) for _ in range(2))
+    assert not np.array_equal(a.predict(X), b.predict(X))
+    assert_array_equal(clone(quick()).fit(X, y).predict(X), quick().fit(X, y).predict(X))
+    model = quick(random_state=None).fit(X, y)
+    again = ELMRegressor(**model.best_params_).fit(X, y)
+    assert_array_equal(again.predict(X), model.predict(X))
+    restored = pickle.loads(pickle.dumps(model))
+    assert_array_equal(restored.predict(X), model.predict(X))
+
+
+@pytest.mark.parametrize("frame", [pd.DataFrame, lambda X, columns: pl.DataFrame(X, columns)])
+def test_named_columns(frame):
+    X, y = data(60)
+    model = quick().fit(frame(X, columns=["a", "b", "c"]), y)
+    assert_array_equal(model.feature_names_in_, ["a", "b", "c"])
+    with pytest.raises(ValueError, match="feature names"):
+        model.predict(frame(X, columns=["b", "a", "c"]))
+    assert_array_equal(
+        model.predict(frame(X, columns=["a", "b", "c"])), quick().fit(X, y).predict(X)
+    )
+
+
+def test_groups_and_weights_are_routed():
+    X, y = data(90)
+    groups, weights = np.repeat(np.arange(9), 10), np.linspace(1, 2, 90)
+    with sklearn.config_context(enable_metadata_routing=True):
+        model = quick().set_fit_request(groups=True, sample_weight=True)
+        model.set_score_request(sample_weight=True)
+        pipeline = make_pipeline(MinMaxScaler(), model)
+        pipeline.fit(X, y, groups=groups, sample_weight=weights)
+        direct = quick().fit(MinMaxScaler().fit_transform(X), y, weights, groups)
+        assert_array_equal(pipeline[-1].left_out_errors_, direct.left_out_errors_)
+        scores = cross_val_score(
+            pipeline, X, y, cv=GroupKFold(3), params={"groups": groups, "sample_weight": weights}
+        )
+    assert np.isfinite(scores).all()
+
+
+def test_integers_with_groups_split_whole_groups():
+    X, y = data(90)
+    groups = np.repeat(np.arange(9), 10)
+    by_number = quick(cv=3).fit(X, y, groups=groups)
+    by_splitter = quick(cv=GroupKFold(3)).fit(X, y, groups=groups)
+    assert_array_equal(by_number.left_out_errors_, by_splitter.left_out_errors_)
+
+
+@pytest.mark.parametrize(
+    ("params", "fit", "message"),
+    [
+        ({"n_hidden": [5, 0]}, {}, "`n_hidden` must be one or more positive integers"),
+        ({"n_hidden": [5.5]}, {}, "`n_hidden` must be one or more positive integers"),
+        ({"alphas": [0.0, 1.0]}, {}, "`alphas` must be one or more positive numbers"),
+        ({"alphas": []}, {}, "`alphas` must be one or more positive numbers"),
+        ({"weight_scales": [np.nan]}, {}, "`weight_scales` must be one or more positive numbers"),
+        ({}, {"groups": np.zeros(7)}, r"`groups` must have shape \(60,\)"),
+        ({"cv": [(np.arange(60), np.arange(5))]}, {}, "must not test on rows that it trains on"),
+        ({}, {"sample_weight": np.eye(60)[0]}, "at least 2 rows of positive weight"),
+    ],
+)
+def test_clear_errors(params, fit, message):
+    X, y = data(60)
+    with pytest.raises(ValueError, match=message):
+        quick(**params).fit(X, y, **fit)
+
+
+def test_errors_of_the_trunk_beat_the_paper_s_fixed_settings():
+    trunk = load_trunk()
+    X, y = trunk.q[:600], trunk.x[:600]
+    chosen = ELMRegressorCV(200, random_state=0).fit(X, y)
+    fixed = ELMRegressor(random_state=0).fit(X, y)
+    rms = [
+        np.sqrt(np.mean((m.predict(trunk.q[600:]) - trunk.x[600:]) ** 2)) for m in (chosen, fixed)
+    ]
+    assert rms[0] < 0.7 * rms[1]
