@@ -56,8 +56,12 @@ class ELM(PortableModule):
         super().__init__()
         self.activation = activation
         for name in LAYER + READOUT:
-            dtype = None if isinstance(arrays[name], torch.Tensor) else torch.float64
-            self.register_buffer(name, torch.as_tensor(arrays[name], dtype=dtype).detach().clone())
+            value = arrays[name]
+            if isinstance(value, torch.Tensor):
+                value = value.detach().clone()
+            else:  # copied at once, or a read-only array would warn
+                value = torch.tensor(value, dtype=torch.float64)
+            self.register_buffer(name, value)
         self.register_buffer("tangent", None, persistent=False)
         _refresh_tangent(self)
         self.register_load_state_dict_post_hook(_refresh_tangent)

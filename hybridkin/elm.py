@@ -189,6 +189,10 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     (500, 2, 3)
     """
 
+    n_features_in_: int
+    feature_names_in_: np.ndarray
+    input_center_: np.ndarray
+    input_scale_: np.ndarray
     output_weights_: np.ndarray
 
     _parameter_constraints = {  # noqa: RUF012
@@ -381,7 +385,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _learn(self, X, y, sample_weight, first, decay=1.0):
         X, y, sample_weight, kept = check_rows(self, X, y, sample_weight, reset=first)
         if kept is not None:
-            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]
+            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]  # pyright: ignore
         device = device_named(self.device)
         y_ndim, y = y.ndim, y.reshape(len(y), -1)
         if first:

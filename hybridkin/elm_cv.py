@@ -2,7 +2,7 @@
 
 from itertools import product
 from numbers import Integral
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -172,7 +172,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X, y, sample_weight, kept = check_rows(self, X, y, sample_weight)
         n_rows, y_shape = len(y), y.shape
         if kept is not None:
-            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]
+            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]  # pyright: ignore
         if len(y) < 2:
             raise ValueError(
                 f"`X` must have at least 2 rows of positive weight, so that one can be left out, "
@@ -350,10 +350,11 @@ def _splits(cv, y_shape, groups, kept):
         if cv is None:
             cv = LeaveOneGroupOut()
         elif isinstance(cv, Integral):
-            cv = GroupKFold(cv)
+            cv = GroupKFold(int(cv))
     rows = np.zeros(y_shape[0])
     splits = []
-    for train, test in check_cv(cv).split(rows, rows, groups):
+    splitter: Any = check_cv(cv)
+    for train, test in splitter.split(rows, rows, groups):
         used, asked = rows.astype(bool), rows.astype(bool)
         used[train], asked[test] = True, True
         if (used & asked).any():

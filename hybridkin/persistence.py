@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from sklearn.linear_model import LinearRegression
+from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
-from hybridkin.chain import ConstantCurvatureChain
 from hybridkin._readout import Statistics
+from hybridkin.chain import ConstantCurvatureChain
 from hybridkin.elm import ELMRegressor
+from hybridkin.elm_cv import ELMRegressorCV
 from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
 from hybridkin.hybrid import AffineModule, HybridForwardModel, HybridModule
 from hybridkin.rigid import RigidChain
@@ -65,6 +67,7 @@ _ELM_SETTINGS = ("solver_", "n_samples_seen_", "n_features_in_", "_activation", 
 Arrays = dict[str, NDArray]
 Chain = ConstantCurvatureChain | ElasticTendonChain | RigidChain
 _CLASSES = (ConstantCurvatureChain, ElasticTendonChain, RigidChain)
+_ELMS = (ELMRegressor, ELMRegressorCV)
 _NAMES = "a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain"
 
 
@@ -73,9 +76,10 @@ def save_model(model: Any, path: str | Path) -> None:
 
     Parameters
     ----------
-    model : ConstantCurvatureChain, ElasticTendonChain, RigidChain or fitted HybridForwardModel
-        The hybrid's mechanical model must be one of these chains or None, its error model an
-        ELMRegressor, a LinearRegression, or "drop".
+    model : a chain, a fitted HybridForwardModel, ELMRegressor or ELMRegressorCV
+        A chain is a ConstantCurvatureChain, ElasticTendonChain or RigidChain. The hybrid's
+        mechanical model must be one of these or None, its error model an ELM, a LinearRegression,
+        or "drop". Of an ELMRegressorCV the chosen ELMRegressor is stored.
     path : str or Path
         File to write, usually ``*.safetensors``. It is replaced only once all is written.
 
@@ -98,9 +102,13 @@ def save_model(model: Any, path: str | Path) -> None:
         header = _store_chain(model, arrays, "")
     elif isinstance(model, HybridForwardModel):
         header = _store_hybrid(model, arrays)
+    elif isinstance(model, _ELMS):
+        check_is_fitted(model)
+        header = _store_elm(model, arrays, "")
     else:
         raise TypeError(
-            f"`model` must be {_NAMES} or a fitted HybridForwardModel, got {type(model).__name__}."
+            f"`model` must be {_NAMES}, a fitted HybridForwardModel or a fitted ELM, got "
+            f"{type(model).__name__}."
         )
     header = {"format": _FORMAT, "version": _VERSION, **header}
     path = Path(path)
@@ -126,7 +134,7 @@ def load_model(path: str | Path) -> Any:
 
     Returns
     -------
-    ConstantCurvatureChain, ElasticTendonChain, RigidChain or HybridForwardModel
+    ConstantCurvatureChain, ElasticTendonChain, RigidChain, HybridForwardModel or ELMRegressor
         On the CPU, ready to predict.
 
     Raises
@@ -158,14 +166,11 @@ def load_model(path: str | Path) -> Any:
             return _restored_chain(header, arrays, "")
         if header["kind"] == "hybrid":
             return _restored_hybrid(header, arrays)
-    except (
-        LookupError,
-        AttributeError,
-        TypeError,
-        ValueError,
-        RuntimeError,
-        ArithmeticError,
-    ) as error:
+        if header["kind"] == "elm":
+            elm = _restored_elm(header, arrays, "")
+            elm.module_.forward_and_jacobian(torch.ones(1, elm.n_features_in_).double())
+            return elm
+    except _DAMAGE as error:
         raise ValueError(f"{path} is damaged: {error!r}.") from error
     raise ValueError(f"{path} holds a model of unknown kind {header['kind']!r}.")
 
@@ -250,31 +255,46 @@ def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardMod
     return model
 
 
+def _store_elm(regressor: Any, arrays: Arrays, prefix: str) -> dict[str, Any]:
+    elm = getattr(regressor, "best_estimator_", regressor)
+    for name in _ELM_ARRAYS:
+        arrays[prefix + name] = np.asarray(getattr(elm, name))
+    arrays[prefix + "mean"], arrays[prefix + "scatter"] = elm._stats.mean, elm._stats.scatter
+    params = elm.get_params()
+    params["device"] = None
+    if not isinstance(params["random_state"], (int, np.integer)):
+        params["random_state"] = None
+    return {
+        "kind": "elm",
+        "params": {name: _plain(value) for name, value in params.items()},
+        "settings": {name: _plain(getattr(elm, name)) for name in _ELM_SETTINGS},
+        "feature_names_in": [str(name) for name in getattr(regressor, "feature_names_in_", [])],
+    }
+
+
+def _restored_elm(header: Any, arrays: Arrays, prefix: str) -> ELMRegressor:
+    elm = ELMRegressor(**header["params"])
+    settings = {name: header["settings"][name] for name in _ELM_SETTINGS}
+    stored = {name: arrays[prefix + name] for name in _ELM_ARRAYS}
+    mean, scatter = arrays[prefix + "mean"], arrays[prefix + "scatter"]
+    statistics = Statistics(float(settings["n_samples_seen_"]), mean, scatter)
+    elm.__setstate__({**elm.get_params(), **stored, **settings, "_stats": statistics})
+    if header.get("feature_names_in"):
+        elm.feature_names_in_ = np.array(header["feature_names_in"], dtype=object)
+    return elm
+
+
 def _store_error(regressor: Any, arrays: Arrays) -> dict[str, Any] | None:
     if regressor is None:
         return None
-    if isinstance(regressor, ELMRegressor):
-        for name in _ELM_ARRAYS:
-            arrays[f"error.{name}"] = np.asarray(getattr(regressor, name))
-        arrays["error.mean"], arrays["error.scatter"] = (
-            regressor._stats.mean,
-            regressor._stats.scatter,
-        )
-        params = regressor.get_params()
-        params["device"] = None
-        if not isinstance(params["random_state"], (int, np.integer)):
-            params["random_state"] = None
-        return {
-            "kind": "elm",
-            "params": {name: _plain(value) for name, value in params.items()},
-            "settings": {name: _plain(getattr(regressor, name)) for name in _ELM_SETTINGS},
-        }
+    if isinstance(regressor, _ELMS):
+        return _store_elm(regressor, arrays, "error.")
     if isinstance(regressor, LinearRegression):
         arrays["error.coef"] = np.asarray(regressor.coef_)
         arrays["error.intercept"] = np.asarray(regressor.intercept_)
         return {"kind": "linear"}
     raise TypeError(
-        "`model` must have an ELMRegressor, a LinearRegression or 'drop' as `error_model` to be "
+        "`model` must have an ELM, a LinearRegression or 'drop' as `error_model` to be "
         f"saved, got {type(regressor).__name__}, which could only be stored as code."
     )
 
@@ -283,12 +303,7 @@ def _restored_error(header: Any, arrays: Arrays) -> tuple[Any, nn.Module | None]
     if header is None:
         return None, None
     if header["kind"] == "elm":
-        elm = ELMRegressor(**header["params"])
-        settings = {name: header["settings"][name] for name in _ELM_SETTINGS}
-        stored = {name: arrays[f"error.{name}"] for name in _ELM_ARRAYS}
-        mean, scatter = arrays["error.mean"], arrays["error.scatter"]
-        statistics = Statistics(float(settings["n_samples_seen_"]), mean, scatter)
-        elm.__setstate__({**elm.get_params(), **stored, **settings, "_stats": statistics})
+        elm = _restored_elm(header, arrays, "error.")
         return elm, elm.module_
     if header["kind"] == "linear":
         linear = LinearRegression()

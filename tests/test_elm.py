@@ -233,6 +233,22 @@ def test_alpha_can_change_between_calls():
     assert_same_model(model.partial_fit(X[200:], Y[200:]), elm(input_scaling=BOUNDS).fit(X, Y))
 
 
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_every_output_may_have_its_own_alpha(fit_intercept):
+    X, Y = trunk()
+    alphas = [1e-3, 10.0, 0.1]
+    model = elm(alpha=alphas, fit_intercept=fit_intercept).fit(X, Y)
+    for j, alpha in enumerate(alphas):
+        alone = elm(alpha=alpha, fit_intercept=fit_intercept).fit(X, Y[:, j])
+        assert_allclose(model.predict(X)[:, j], alone.predict(X), rtol=0, atol=1e-10)
+        assert_allclose(model.noise_variance_[j], alone.noise_variance_[0], rtol=1e-9)
+    flexible = elm(alpha=1e-3, fit_intercept=fit_intercept).fit(X, Y)
+    assert_allclose(model.leverage(X), flexible.leverage(X), rtol=1e-12)
+    for wrong in ([0.1, 0.2], [0.1, 0.2, -1.0], [0.1, 0.2, np.nan], [[0.1, 0.2, 0.3]]):
+        with pytest.raises(ValueError, match="`alpha` must be a number >= 0, or 3 of them"):
+            elm(alpha=wrong).fit(X, Y)
+
+
 @pytest.mark.parametrize("block_size", [1, 7, 299, 10**6])
 def test_block_size_does_not_matter(block_size):
     X, Y = trunk()

@@ -3,11 +3,13 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
+from sklearn.exceptions import NotFittedError
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 from torch.testing import assert_close
@@ -16,6 +18,7 @@ from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
     ELMRegressor,
+    ELMRegressorCV,
     HybridForwardModel,
     RigidChain,
     load_model,
@@ -220,6 +223,56 @@ def test_a_loaded_network_can_learn_on(tmp_path, log):
     twin = load_model(tmp_path / "m")
     was = model.error_model_.partial_fit(q[100:], x[100:]).predict(q)
     assert_array_equal(twin.error_model_.partial_fit(q[100:], x[100:]).predict(q), was)
+
+
+@pytest.mark.parametrize(
+    "elm",
+    [
+        ELMRegressor(20, [0.1, 1.0, 10.0], direct_link=True, random_state=0),
+        ELMRegressor(20, input_scaling=np.array([[0.1] * 9, [0.4] * 9]), random_state=0),
+        ELMRegressorCV(20, relevance_rounds=1, random_state=np.random.RandomState(0)),
+    ],
+    ids=["penalties", "bounds", "chosen"],
+)
+def test_network_comes_back_and_can_learn_on(tmp_path, log, elm):
+    q, x = log
+    frame = pd.DataFrame(q, columns=[f"c{i}" for i in range(9)])
+    elm.fit(frame[:100], x[:100])
+    save_model(elm, tmp_path / "elm.safetensors")
+    back = load_model(tmp_path / "elm.safetensors")
+    assert_array_equal(back.predict(frame), elm.predict(frame))
+    assert_array_equal(back.predict(frame, return_std=True)[1], elm.predict(frame, True)[1])
+    assert_array_equal(back.feature_names_in_, frame.columns)
+    chosen = getattr(elm, "best_estimator_", elm)
+    again = ELMRegressor(**chosen.get_params()).fit(q[:100], x[:100])
+    assert_allclose(
+        back.partial_fit(frame[100:], x[100:]).predict(frame),
+        again.partial_fit(q[100:], x[100:]).predict(q),
+        rtol=1e-10,
+    )
+
+
+def test_hybrid_with_a_chosen_network_comes_back(tmp_path, log):
+    q, x = log
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, ELMRegressorCV(20, relevance_rounds=0, random_state=0))
+    model.fit(q, x)
+    save_model(model, tmp_path / "model.safetensors")
+    back = load_model(tmp_path / "model.safetensors")
+    assert_array_equal(back.predict(q), model.predict(q))
+    assert isinstance(back.error_model_, ELMRegressor)
+
+
+def test_damaged_networks(tmp_path, log):
+    path = tmp_path / "elm.safetensors"
+    with pytest.raises(NotFittedError):
+        save_model(ELMRegressor(), path)
+    save_model(ELMRegressor(5, random_state=0).fit(*log), path)
+    arrays = load_file(path)
+    arrays["output_weights_"] = arrays["output_weights_"][:3]
+    save_file(arrays, path, metadata={"hybridkin": json.dumps(header_of(path))})
+    with pytest.raises(ValueError, match="is damaged"):
+        load_model(path)
 
 
 def test_what_needs_code_is_refused_and_nothing_is_written(tmp_path, log):
