@@ -10,13 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.linear_model import LinearRegression, Ridge
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
+from hybridkin._error_modules import error_module
 from hybridkin._numerics import (
-    PortableModule,
     forward_and_jacobian,
     forward_and_reverse_jacobian,
     in_blocks,
@@ -174,7 +172,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         error = y - _mechanical_tips(mechanical, q, y)
         self.mechanical_model_ = mechanical
         self.error_model_ = None
-        error_module = guard = None
+        error_part = guard = None
         if not (isinstance(self.error_model, str) and self.error_model == "drop"):
             regressor: Any
             if self.error_model is None:
@@ -183,12 +181,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 regressor = clone(self.error_model)
             given = {} if weights is None else {"sample_weight": weights}
             self.error_model_ = regressor.fit(X, error, **given)
-            error_module = _error_module(regressor, q)
+            error_part = error_module(regressor, q)
             kept = q if weights is None else q[torch.from_numpy(weights > 0)]
-            guard = fit_guard(self.guard, error_module, kept)
+            guard = fit_guard(self.guard, error_part, kept)
         if mechanical is None:
             guard = None  # there is nothing to fall back on
-        self.module_ = HybridModule(mechanical, error_module, guard)
+        self.module_ = HybridModule(mechanical, error_part, guard)
         self._single_output = y.ndim == 1
         return self
 
@@ -336,91 +334,6 @@ class HybridModule(nn.Module):
         if self.guard is None:
             return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self.guard.strangeness(q) <= 1.0
-
-
-class AffineModule(PortableModule):
-    """A fitted linear regressor as a torch module."""
-
-    coef: Tensor
-    bias: Tensor
-
-    def __init__(self, coef: ArrayLike, intercept: ArrayLike) -> None:
-        super().__init__()
-        matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64)
-        bias = torch.tensor(np.asarray(intercept), dtype=torch.float64)
-        self.register_buffer("coef", matrix)
-        self.register_buffer("bias", bias.expand(len(matrix)).clone())
-
-    def forward(self, q: Tensor) -> Tensor:
-        """Return coef q + bias, shape (..., m)."""
-        return q @ self.coef.to(q).mT + self.bias.to(q)
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return the constant matrix for every row, shape (..., m, n)."""
-        coef = self.coef.to(q)
-        return coef.expand(*q.shape[:-1], *coef.shape)
-
-
-class RegressorModule(nn.Module):
-    """Any fitted scikit-learn regressor as a torch module, its Jacobian by central differences.
-
-    The step is the cube root of machine precision times the training range of each input, which
-    leaves a relative error near 1e-10 for smooth regressors. Trees are piecewise constant: their
-    Jacobian is zero almost everywhere.
-    """
-
-    def __init__(self, regressor: Any, q: Tensor) -> None:
-        super().__init__()
-        self.regressor = regressor
-        width = (q.amax(0) - q.amin(0)).numpy()
-        self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(width > 0, width, 1.0)
-
-    def forward(self, q: Tensor) -> Tensor:
-        """Return the regressor's prediction, shape (..., m)."""
-        return _Differenced.apply(q, self)
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return dx/dq, shape (..., m, n)."""
-        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
-        columns = []
-        for j, step in enumerate(self._step):
-            move = np.zeros(rows.shape[1])
-            move[j] = step
-            columns.append((self._predict(rows + move) - self._predict(rows - move)) / (2 * step))
-        J = torch.from_numpy(np.stack(columns, axis=-1)).to(q)
-        return J.reshape(*q.shape[:-1], *J.shape[1:])
-
-    def evaluate(self, q: Tensor) -> Tensor:
-        """Return the prediction outside any graph, shape (..., m)."""
-        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
-        x = torch.from_numpy(self._predict(rows)).to(q)
-        return x.reshape(*q.shape[:-1], x.shape[-1])
-
-    def _predict(self, rows: NDArray) -> NDArray:
-        return np.asarray(self.regressor.predict(rows), dtype=np.float64).reshape(len(rows), -1)
-
-
-class _Differenced(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, q: Tensor, module: RegressorModule) -> Tensor:
-        ctx.save_for_backward(q)
-        ctx.module = module
-        return module.evaluate(q)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore
-        (q,) = ctx.saved_tensors
-        return (grad[..., None, :] @ ctx.module.jacobian(q))[..., 0, :], None
-
-
-def _error_module(regressor: Any, q: Tensor) -> nn.Module:
-    module = getattr(regressor, "module_", None)
-    if isinstance(module, nn.Module):
-        return module
-    if isinstance(regressor, (LinearRegression, Ridge)):
-        return AffineModule(regressor.coef_, regressor.intercept_)
-    return RegressorModule(regressor, q)
 
 
 def _warn_contradictory(mechanical: Any, q: Tensor) -> None:

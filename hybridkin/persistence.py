@@ -17,12 +17,13 @@ from sklearn.linear_model import LinearRegression
 from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
+from hybridkin._error_modules import AffineModule
 from hybridkin._readout import Statistics
 from hybridkin.chain import ConstantCurvatureChain
 from hybridkin.elm import ELMRegressor
 from hybridkin.elm_cv import ELMRegressorCV
 from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
-from hybridkin.hybrid import AffineModule, HybridForwardModel, HybridModule
+from hybridkin.hybrid import HybridForwardModel, HybridModule
 from hybridkin.rigid import RigidChain
 from hybridkin.tendons import ElasticTendonChain
 

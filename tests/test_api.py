@@ -15,6 +15,7 @@ ORDER = [
     "experiments",
     "persistence",
     "hybrid",
+    "_error_modules",
     "guards",
     "play",
     "calibration",
