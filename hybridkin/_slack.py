@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 MOST = 62  # a set of tendons is the bits of one integer
+_MANY = 2000  # rows from which on steps in single precision save more than they cost
+_ROUGH_STEPS = 5
 _WHOLE_STEPS = 8  # then one tendon at a time, which ends for certain
 _MOST_TURNS = 12  # two to this power, should rounding keep it from an end
 _NEWTON_STEPS = 20
@@ -69,26 +72,71 @@ def as_mask(codes: Tensor, n: int) -> Tensor:
     return ((codes[:, None] >> torch.arange(n, device=codes.device)) & 1) > 0
 
 
-def stretch_from_table(codes: Tensor, table: Tensor) -> Tensor:
-    return table.index_select(0, codes)
+def find_in_table(rows: Tensor, table: Tensor, rough: Tensor, size: Tensor) -> Tensor:
+    """Return which tendons are taut (N,), from the stretches of all sets; see `rough_of`."""
+    x, at = extended(rows), torch.arange(len(rows), device=rows.device)
+    codes = _pulling_if_taut(table[-1], x)
+    if len(rows) >= _MANY:
+        at = _pivoted_roughly(codes, at, x, rough, size)
+    return _pivoted(partial(table.index_select, 0), codes, at, x)
 
 
-def stretch_by_solving(codes: Tensor, *elasticity: Tensor) -> Tensor:
-    return responses_of(as_mask(codes, len(elasticity[0])), *elasticity).stretch
-
-
-def _find_taut(stretch_of: Callable[..., Tensor], rows: Tensor, *parts: Tensor) -> Tensor:
-    """Return which tendons are taut, as the bits of one number per row (N,).
-
-    The stretches of a set of taut tendons come as maps (N, n, n + 1) from `stretch_of`.
-    """
+def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
+    """Return which tendons are taut (N,), from the elasticity."""
     n, x = rows.shape[1], extended(rows)
-    bits = 2 ** torch.arange(n, device=rows.device)
-    full = stretch_of(2**n - 1 + 0 * bits[:1], *parts)[0]
-    here = ((full @ x.T >= 0) * bits[:, None]).sum(0)
-    codes, at = here.clone(), torch.arange(len(rows), device=rows.device)
+
+    def maps_of(codes: Tensor) -> Tensor:
+        return responses_of(as_mask(codes, n), *elasticity).stretch
+
+    at = torch.arange(len(rows), device=rows.device)
+    codes = _pulling_if_taut(maps_of(at.new_tensor([2**n - 1]))[0], x)
+    return _pivoted(maps_of, codes, at, x)
+
+
+def rough_of(table: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the columns of maps (M, n, n + 1) in single precision, (M (n + 1), n), and a bound.
+
+    No entry of a map is larger than the bound (n + 1,) of its column.
+    """
+    return table.mT.float().flatten(0, 1), table.abs().amax((0, 1))
+
+
+def _pulling_if_taut(full: Tensor, x: Tensor) -> Tensor:
+    bits = 2 ** torch.arange(len(full), device=x.device)
+    return ((full @ x.T >= 0) * bits[:, None]).sum(0)
+
+
+def _pivoted_roughly(codes: Tensor, at: Tensor, x: Tensor, rough: Tensor, size: Tensor) -> Tensor:
+    """Change codes (N,) by block principal pivoting in single precision.
+
+    Returns the rows where that did not settle them: it never errs, it leaves what is too close.
+    """
+    here, n = codes, x.shape[1] - 1
+    # Stretches in units of a bound on their rounding errors: from one on the sign is certain.
+    error = 4 * (n + 1) * torch.finfo(rough.dtype).eps * (x.abs() @ size)
+    x = (x / error[:, None]).to(rough).nan_to_num()
+    bits, ones = 2.0 ** torch.arange(n).to(rough), rough.new_ones(n)
+    for _ in range(_ROUGH_STEPS):
+        terms = here[:, None] * (n + 1) + torch.arange(n + 1, device=at.device)
+        stretch = nn.functional.embedding_bag(terms, rough, per_sample_weights=x, mode="sum")
+        signs = stretch.clamp(-1.0, 1.0)
+        found = (0.5 * (signs @ bits + (2**n - 1))).long()
+        left = ((found != here) | (signs.abs() @ ones < n)).nonzero()[:, 0]
+        at, x, here = (part.index_select(0, left) for part in (at, x, found))
+        codes[at] = here
+    return at
+
+
+def _pivoted(maps_of: Callable[[Tensor], Tensor], codes: Tensor, at: Tensor, x: Tensor) -> Tensor:
+    """Return the codes (N,) of the taut tendons by block principal pivoting in the rows `at`.
+
+    The stretches of sets of taut tendons come as maps (N, n, n + 1) from `maps_of`.
+    """
+    n = x.shape[1] - 1
+    bits = 2 ** torch.arange(n, device=x.device)
+    x, here = (part.index_select(0, at) for part in (x, codes))
     for step in range(_WHOLE_STEPS + 2 ** min(n, _MOST_TURNS)):
-        maps = stretch_of(here, *parts)
+        maps = maps_of(here)
         stretch = applied(maps, x)
         found = ((stretch >= 0) * bits).sum(-1)
         if step >= _WHOLE_STEPS:  # one at a time, and none for a rounding error
@@ -104,11 +152,11 @@ def _find_taut(stretch_of: Callable[..., Tensor], rows: Tensor, *parts: Tensor) 
 
 
 class FindTaut(torch.autograd.Function):
-    """`_find_taut` under every transform: its result is constant between the kinks."""
+    """Which tendons are taut, under every transform: its result is constant between the kinks."""
 
     @staticmethod
-    def forward(stretch_of: Callable[..., Tensor], rows: Tensor, *parts: Tensor) -> Tensor:
-        return _find_taut(stretch_of, rows, *parts)
+    def forward(find: Callable[..., Tensor], rows: Tensor, *parts: Tensor) -> Tensor:
+        return find(rows, *parts)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -124,10 +172,10 @@ class FindTaut(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        stretch_of, tensors, dims = args[0], args[1:], in_dims[1:]
+        find, tensors, dims = args[0], args[1:], in_dims[1:]
         if all(dim is None for dim in dims[1:]):  # the same robot: the batch is more rows
             rows = tensors[0].movedim(dims[0], 0)
-            codes = FindTaut.apply(stretch_of, rows.flatten(0, 1), *tensors[1:])
+            codes = FindTaut.apply(find, rows.flatten(0, 1), *tensors[1:])
             return codes.unflatten(0, rows.shape[:2]), 0
         each = [
             [
@@ -136,7 +184,7 @@ class FindTaut(torch.autograd.Function):
             ]
             for k in range(info.batch_size)
         ]
-        return torch.stack([FindTaut.apply(stretch_of, *parts) for parts in each]), 0
+        return torch.stack([FindTaut.apply(find, *parts) for parts in each]), 0
 
 
 def tension(stretch: Tensor, width: float) -> tuple[Tensor, Tensor]:

@@ -32,10 +32,11 @@ from hybridkin._slack import (
     applied,
     as_mask,
     extended,
+    find_by_solving,
+    find_in_table,
     relaxed,
     responses_of,
-    stretch_by_solving,
-    stretch_from_table,
+    rough_of,
 )
 
 __all__ = ["ElasticTendonChain"]
@@ -308,16 +309,16 @@ class ElasticTendonChain(ArcChain):
             self.tendon_zeros,
         )
 
-    def _all_responses(self, rows: Tensor) -> Responses:
+    def _all_responses(self, rows: Tensor) -> tuple[Responses, tuple[Tensor, Tensor]]:
         """Return the responses of all sets of tendons, kept while the geometry stays."""
         shaping = [getattr(self, name) for name in _SHAPING]
         learning = torch.is_grad_enabled() and any(value.requires_grad for value in shaping)
         passing = learning or any(value.is_inference() for value in shaping)
         key = None if passing else (rows.dtype, rows.device, *(v._version for v in shaping))
         if key is not None and self._table is not None:
-            kept, kept_key, responses = self._table
+            kept, kept_key, responses, rough = self._table
             if key == kept_key and all(a is b for a, b in zip(kept, shaping, strict=True)):
-                return responses
+                return responses, rough
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
         guard = contextlib.nullcontext()
         if torch.is_inference_mode_enabled():  # or derivatives could not use what is kept
@@ -326,19 +327,21 @@ class ElasticTendonChain(ArcChain):
             elasticity = Elasticity(*(part.double() for part in self._elasticity()))
             responses = responses_of(as_mask(codes, self.n_actuators), *elasticity)
             responses = Responses(*(part.to(rows) for part in responses))
+            rough = rough_of(responses.stretch.detach())
         if not passing:
-            self._table = (shaping, key, responses)
-        return responses
+            self._table = (shaping, key, responses, rough)
+        return responses, rough
 
     def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, Responses]:
         """Return the sets of taut tendons (N,) as bits, and where among responses they stand."""
         if self.n_actuators <= _TABLE:
-            table = self._all_responses(rows)
-            codes = FindTaut.apply(stretch_from_table, rows.detach(), table.stretch.detach())
+            table, rough = self._all_responses(rows)
+            stretch = table.stretch.detach()
+            codes = FindTaut.apply(find_in_table, rows.detach(), stretch, *rough)
             return codes, codes, table
         elasticity = [part.to(rows) for part in self._elasticity()]
         codes = FindTaut.apply(
-            stretch_by_solving, rows.detach(), *(part.detach() for part in elasticity)
+            find_by_solving, rows.detach(), *(part.detach() for part in elasticity)
         )
         each = torch.arange(len(rows), device=rows.device)
         return codes, each, responses_of(as_mask(codes, self.n_actuators), *elasticity)
