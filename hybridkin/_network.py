@@ -121,16 +121,33 @@ class ELM(PortableModule):
 
     def forward_and_jacobian(self, q):
         """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
-        return in_blocks(self._forward_and_jacobian, q, max(1, _BLOCK // len(self.input_weights)))
+        x, J, _ = self.forward_jacobian_and(q, lambda features: features[..., :0])
+        return x, J
 
-    def _forward_and_jacobian(self, q):
-        u, a, s = self._hidden(q)
-        return self._readout(u, s), self._slope(a, s)
+    def forward_jacobian_and(self, q, function):
+        """Return ``forward(q), jacobian(q), function(features(q))``, the last (..., k) for any k."""
+
+        def rows(q):
+            u, a, s = self._hidden(q)
+            return self._readout(u, s), self._slope(a, s), function(self._features(u, s))
+
+        return in_blocks(rows, q, max(1, _BLOCK // len(self.input_weights)))
 
     def leverage(self, q):
         """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
         r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
         return (r * r).sum(-1) + self.leverage_offset.to(q)
+
+    def leverage_is_below(self, limit, features):
+        """Return where the leverage is certainly below `limit`, shape (...), bool.
+
+        In single precision, at half the price; what is close to the limit is left out.
+        """
+        center, factor = self.leverage_center.float(), self.leverage_factor.float()
+        deviation = features.float() - center
+        rounding = 8 * len(center) ** 0.5 * torch.finfo(torch.float32).eps * factor.norm()
+        bound = (deviation @ factor).norm(dim=-1) + rounding * deviation.norm(dim=-1)
+        return bound < (limit - self.leverage_offset).clamp(min=0.0).sqrt()
 
 
 def _refresh_tangent(elm, incompatible_keys=None):

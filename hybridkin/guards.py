@@ -55,6 +55,10 @@ class LeverageGuard(Guard):
         h = readout.leverage(q)  # pyright: ignore[reportCallIssue]
         return cls(readout, (h / (1.0 - h).clamp(min=1e-9)).max())
 
+    def is_inside(self, features: Tensor) -> Tensor:
+        """Return where the strangeness is certainly below 1, from the readout's features."""
+        return self.readout.leverage_is_below(self.limit, features)  # pyright: ignore
+
     def strangeness(self, q: Tensor) -> Tensor:
         """Return the leverage of q over the limit, shape (...)."""
         return self.readout.leverage(q) / self.limit.to(q)  # pyright: ignore[reportCallIssue]

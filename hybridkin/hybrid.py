@@ -20,8 +20,8 @@ from hybridkin._numerics import (
     in_blocks,
 )
 from hybridkin.calibration import CalibrationResult, calibrate
-from hybridkin.elm import ELMRegressor
-from hybridkin.guards import GUARDS, Guard, fit_guard
+from hybridkin.elm import ELM, ELMRegressor
+from hybridkin.guards import GUARDS, Guard, LeverageGuard, fit_guard
 
 __all__ = ["HybridForwardModel"]
 
@@ -315,19 +315,29 @@ class HybridModule(nn.Module):
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         if self.error is None:
             return forward_and_jacobian(self.mechanical, q)
-        x, J = forward_and_jacobian(self.error, q)
-        if self.guard is not None:
-            outside = (~self.in_domain(q)).nonzero()[:, 0]  # inside it is exactly one
-            if len(outside):
-                weight, slope = forward_and_reverse_jacobian(self.guard, q[outside])
-                own, J_own = x[outside], J[outside]
-                J_own = weight[..., None] * J_own + own[..., None] * slope
-                x = x.index_copy(0, outside, weight * own)
-                J = J.index_copy(0, outside, J_own)
+        x, J, outside = self._error_and_outside(q)
+        if outside is not None and len(outside):
+            weight, slope = forward_and_reverse_jacobian(self.guard, q[outside])
+            own, J_own = x[outside], J[outside]
+            J_own = weight[..., None] * J_own + own[..., None] * slope
+            x = x.index_copy(0, outside, weight * own)
+            J = J.index_copy(0, outside, J_own)
         if self.mechanical is not None:
             x_mech, J_mech = forward_and_jacobian(self.mechanical, q)
             x, J = x_mech + x, J_mech + J
         return x, J
+
+    def _error_and_outside(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return eps, its Jacobian, and the rows where its weight may be less than one."""
+        guard = self.guard
+        if isinstance(guard, LeverageGuard) and guard.readout is self.error is not None:
+            if isinstance(self.error, ELM):  # its features serve both
+                x, J, inside = self.error.forward_jacobian_and(
+                    q, lambda features: guard.is_inside(features)[..., None]
+                )
+                return x, J, (~inside[:, 0]).nonzero()[:, 0]
+        outside = None if guard is None else (~self.in_domain(q)).nonzero()[:, 0]
+        return *forward_and_jacobian(self.error, q), outside
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether the error model is fully trusted, shape (...), bool."""

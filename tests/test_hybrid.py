@@ -16,12 +16,14 @@ from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, PolynomialFeatures
 from sklearn.utils.estimator_checks import parametrize_with_checks
+from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
+    datasets,
     jacobian,
     robots,
 )
@@ -329,3 +331,24 @@ def test_the_plain_chain_tells_of_slack_once_per_call(slack_log):
     fitted.predict_error(q)
     parts = q.reshape(-1, 2, 3)
     fitted.predict((parts - parts.mean(2, keepdims=True)).reshape(q.shape))
+
+
+@pytest.mark.parametrize("alpha", [0.1, 1e-6])
+def test_guard_in_single_precision_never_errs(alpha):
+    """Rows that the screening lets pass are inside; the sum is that of value and weight."""
+    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, ELMRegressor(alpha=alpha, random_state=0)).fit(data.q, data.x)
+    module = model.module_
+    rng = np.random.default_rng(0)
+    low, high = data.q.min(0), data.q.max(0)
+    wide = low + (high - low) * rng.uniform(-0.7, 1.7, (4000, 9))
+    q = torch.from_numpy(np.concatenate([data.q, wide]))
+    passed = module.guard.is_inside(module.error.features(q))
+    inside = module.in_domain(q)
+    assert not (passed & ~inside).any()
+    assert (passed & inside).sum() > 0.5 * inside.sum()
+    assert (~inside).any()
+    x, J = module.forward_and_jacobian(q)
+    assert_close(x, module(q), rtol=0, atol=1e-12)
+    expected = torch.func.vmap(torch.func.jacrev(module))(q[::50])
+    assert_close(J[::50], expected, rtol=1e-8, atol=1e-9)
