@@ -10,7 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+from sklearn.utils.validation import (
+    _check_sample_weight,
+    check_is_fitted,
+    has_fit_parameter,
+    validate_data,
+)
 from torch import Tensor, nn
 
 from hybridkin._error_modules import error_module
@@ -19,6 +24,7 @@ from hybridkin._numerics import (
     forward_and_reverse_jacobian,
     in_blocks,
 )
+from hybridkin._radius import Radius, conformal_radius
 from hybridkin.calibration import CalibrationResult, calibrate
 from hybridkin.elm import ELM, ELMRegressor
 from hybridkin.guards import GUARDS, Guard, LeverageGuard, fit_guard
@@ -51,6 +57,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Where eps is trusted. "leverage": where the inputs are as close to the training rows, in
         the error model's features, as these are to each other; "box": within the training range;
         None: everywhere. Beyond, eps fades out and f_mech remains.
+    coverage : float, optional
+        Share of tips, 0.9 for example, that shall lie within the radius of
+        ``predict(Q, return_radius=True)``. It costs five more fits, each with a fifth of the
+        groups held out. Default: no radius.
     random_state : int, RandomState or None, default=None
         Seed of the default error model; one that is given brings its own.
 
@@ -64,6 +74,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         The fitted error model.
     calibration_ : CalibrationResult or None
         What the calibration found.
+    radius_ : Radius or None
+        Where a coverage was asked for: the radii ``inside`` and ``outside`` the domain [m].
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)
@@ -93,6 +105,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         coupling: str = "parallel",
         calibrate: Sequence[str] | str = (),
         guard: str | None = "leverage",
+        coverage: float | None = None,
         random_state: int | np.random.RandomState | None = None,
     ) -> None:
         self.mechanical_model = mechanical_model
@@ -100,6 +113,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.coupling = coupling
         self.calibrate = calibrate
         self.guard = guard
+        self.coverage = coverage
         self.random_state = random_state
 
     def set_params(self, **params: Any) -> HybridForwardModel:
@@ -127,7 +141,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         sample_weight : array-like of shape (N,), optional
             How many times each row counts.
         groups : array-like of shape (N,), optional
-            Motion of every row; adds ``calibration_.cv_rmse`` on motions held out.
+            Motion of every row: what is held out together, by the calibration
+            (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
 
         Returns
         -------
@@ -179,7 +194,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 regressor = ELMRegressor(random_state=self.random_state)
             else:
                 regressor = clone(self.error_model)
-            given = {} if weights is None else {"sample_weight": weights}
+            given: dict[str, Any] = {} if weights is None else {"sample_weight": weights}
+            if groups is not None and has_fit_parameter(regressor, "groups"):
+                given["groups"] = groups
             self.error_model_ = regressor.fit(X, error, **given)
             error_part = error_module(regressor, q)
             kept = q if weights is None else q[torch.from_numpy(weights > 0)]
@@ -188,11 +205,39 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             guard = None  # there is nothing to fall back on
         self.module_ = HybridModule(mechanical, error_part, guard)
         self._single_output = y.ndim == 1
+        self.radius_: Radius | None = None
+        if self.coverage is not None:
+            self.radius_ = conformal_radius(self, X, y, weights, groups, self.coverage)
         return self
 
-    def predict(self, X: Any) -> NDArray:
-        """Return tip positions f_mech(q) + w(q) eps(q), shape (N, m) or (N,) as in `fit` [m]."""
-        return self._by_blocks(lambda module, q: (module(q),), X)[0]
+    def predict(self, X: Any, return_radius: bool = False) -> Any:
+        """Return tip positions f_mech(q) + w(q) eps(q).
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n)
+            Actuator vectors.
+        return_radius : bool, default=False
+            Whether to return how far off the tips may be as well; needs `coverage`.
+
+        Returns
+        -------
+        x : ndarray of shape (N, m), or (N,) as in `fit`
+            Tips [m].
+        radius : ndarray of shape (N,)
+            Only if `return_radius`: a share `coverage` of the tips lies within [m], of motions like
+            those of the fit; wider where the error model is not trusted.
+        """
+        if not return_radius:
+            return self._by_blocks(lambda module, q: (module(q),), X)[0]
+        check_is_fitted(self)
+        if self.radius_ is None:
+            raise ValueError(
+                "`return_radius` needs a model that was fitted with `coverage`, for example "
+                "HybridForwardModel(..., coverage=0.9)."
+            )
+        x, weight = self._by_blocks(lambda module, q: (module(q), module.error_weight(q)), X)
+        return x, self.radius_.at(weight.astype(np.float64)).astype(x.dtype)
 
     def predict_mechanical(self, X: Any) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
@@ -214,6 +259,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def in_domain(self, X: Any) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
         return self._by_blocks(lambda module, q: (module.in_domain(q),), X, mechanical=False)[0]
+
+    def error_weight(self, X: Any) -> NDArray:
+        """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
+        return self._by_blocks(lambda module, q: (module.error_weight(q),), X, mechanical=False)[0]
 
     def _by_blocks(
         self,
@@ -241,6 +290,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _check_settings(self) -> None:
         if self.coupling != "parallel":
             raise ValueError(f"`coupling` must be 'parallel', got {self.coupling!r}.")
+        if self.coverage is not None and not 0.0 < self.coverage < 1.0:
+            raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {self.coverage!r}.")
         if self.guard not in GUARDS:
             raise ValueError(f"`guard` must be one of {GUARDS}, got {self.guard!r}.")
         if isinstance(self.error_model, str) and self.error_model != "drop":
@@ -338,6 +389,10 @@ class HybridModule(nn.Module):
                 return x, J, (~inside[:, 0]).nonzero()[:, 0]
         outside = None if guard is None else (~self.in_domain(q)).nonzero()[:, 0]
         return *forward_and_jacobian(self.error, q), outside
+
+    def error_weight(self, q: Tensor) -> Tensor:
+        """Return the weight w(q) of the error model, shape (...)."""
+        return q.new_ones(q.shape[:-1]) if self.guard is None else self.guard(q)[..., 0]
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether the error model is fully trusted, shape (...), bool."""

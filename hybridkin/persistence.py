@@ -18,6 +18,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
 from hybridkin._error_modules import AffineModule
+from hybridkin._radius import Radius
 from hybridkin._readout import Statistics
 from hybridkin.chain import ConstantCurvatureChain
 from hybridkin.elm import ELMRegressor
@@ -210,6 +211,8 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
         "coupling": model.coupling,
         "calibrate": model.calibrate if isinstance(model.calibrate, str) else [*model.calibrate],
         "guard": model.guard,
+        "coverage": model.coverage,
+        "radius": None if model.radius_ is None else model.radius_._asdict(),
         "n_features_in": model.n_features_in_,
         "feature_names_in": [str(name) for name in getattr(model, "feature_names_in_", [])],
         "single_output": model._single_output,
@@ -242,7 +245,10 @@ def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardMod
         coupling=header["coupling"],
         calibrate=names if isinstance(names, str) else tuple(names),
         guard=header["guard"],
+        coverage=header.get("coverage"),
     )
+    radius = header.get("radius")
+    model.radius_ = None if radius is None else Radius(**radius)
     model.mechanical_model_, model.error_model_ = mechanical, error
     model.calibration_ = None
     model.n_features_in_ = int(header["n_features_in"])

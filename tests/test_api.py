@@ -16,6 +16,7 @@ ORDER = [
     "persistence",
     "hybrid",
     "_error_modules",
+    "_radius",
     "guards",
     "play",
     "calibration",
