@@ -13,10 +13,24 @@ GUARDS = ("leverage", "box", None)
 
 
 class Guard(PortableModule):
-    """Weight w(q) of the error model: 1 where `strangeness` is at most 1, fading beyond.
+    """Trust in an error model: a weight w(q), and a length that no correction goes far beyond.
 
-    Twice continuously differentiable, so the full Jacobian stays continuous.
+    The weight is 1 where `strangeness` is at most 1, and fades beyond. Both are twice continuously
+    differentiable, so the full Jacobian stays continuous.
+
+    Parameters
+    ----------
+    largest : Tensor of shape ()
+        The longest correction of a training row [m]. Longer ones are shortened, to less than
+        `MOST` times this: nowhere can the hybrid be farther than that from the mechanical model.
     """
+
+    MOST = 1.5
+    largest: Tensor
+
+    def __init__(self, largest: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("largest", largest)
 
     def strangeness(self, q: Tensor) -> Tensor:
         """Return how far q is from the training rows, at most 1 among them, shape (...)."""
@@ -26,6 +40,39 @@ class Guard(PortableModule):
         """Return w(q), shape (..., 1)."""
         beyond = (self.strangeness(q) - 1.0).clamp(min=0.0)
         return (1.0 / (1.0 + beyond**3))[..., None]
+
+    def shortened(self, error: Tensor) -> Tensor:
+        """Return corrections (..., m), those beyond the largest shortened [m]."""
+        relative = self._relative(error)
+        return error * (self._kept(relative)[0] / relative)
+
+    def shortened_with_jacobian(self, error: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the same of corrections (N, m), and their Jacobians (N, m, n)."""
+        long = (self._relative(error) > 1.0).nonzero()[:, 0]
+        if not len(long):
+            return error, J
+        own, J_own = error[long], J[long]
+        relative = self._relative(own)
+        kept, slope = self._kept(relative)
+        factor = kept / relative
+        along = (own[:, None] @ J_own)[:, 0] / (relative * self._unit(own) ** 2)
+        fading = (slope - factor) / relative * along
+        J_own = factor[..., None] * J_own + own[..., None] * fading[:, None]
+        return error.index_copy(0, long, factor * own), J.index_copy(0, long, J_own)
+
+    def _unit(self, error: Tensor) -> Tensor:
+        return self.largest.to(error).clamp(min=torch.finfo(error.dtype).tiny ** 0.25)
+
+    def _relative(self, error: Tensor) -> Tensor:
+        # Up to the largest it counts as one: the root stays smooth, and nothing changes.
+        squares = (error / self._unit(error)).square().sum(-1, keepdim=True)
+        return squares.clamp(min=1.0).sqrt()
+
+    def _kept(self, relative: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the length kept of one, both in units of the largest, and its slope."""
+        over = self.MOST - 1.0
+        bent = torch.tanh((relative - 1.0) / over)
+        return 1.0 + over * bent, 1.0 - bent.square()
 
 
 class LeverageGuard(Guard):
@@ -37,23 +84,25 @@ class LeverageGuard(Guard):
         With ``leverage(q)`` of shape (...).
     limit : Tensor of shape ()
         The leverage that counts as strangeness 1.
+    largest : Tensor of shape ()
+        The longest correction of a training row [m].
     """
 
     limit: Tensor
 
-    def __init__(self, readout: nn.Module, limit: Tensor) -> None:
-        super().__init__()
+    def __init__(self, readout: nn.Module, limit: Tensor, largest: Tensor) -> None:
+        super().__init__(largest)
         self.readout = readout
         self.register_buffer("limit", limit)
 
     @classmethod
-    def fit(cls, readout: nn.Module, q: Tensor) -> LeverageGuard:
+    def fit(cls, readout: nn.Module, q: Tensor, largest: Tensor) -> LeverageGuard:
         """Return the guard whose limit is the largest leverage of a training row, itself left out.
 
         That is h / (1 - h), with h the leverage of a row that took part in the fit.
         """
         h = readout.leverage(q)  # pyright: ignore[reportCallIssue]
-        return cls(readout, (h / (1.0 - h).clamp(min=1e-9)).max())
+        return cls(readout, (h / (1.0 - h).clamp(min=1e-9)).max(), largest)
 
     def is_inside(self, features: Tensor) -> Tensor:
         """Return where the strangeness is certainly below 1, from the readout's features."""
@@ -71,13 +120,15 @@ class BoxGuard(Guard):
     ----------
     low, high : Tensor of shape (n,)
         Corners of the box.
+    largest : Tensor of shape ()
+        The longest correction of a training row [m].
     """
 
     low: Tensor
     high: Tensor
 
-    def __init__(self, low: Tensor, high: Tensor) -> None:
-        super().__init__()
+    def __init__(self, low: Tensor, high: Tensor, largest: Tensor) -> None:
+        super().__init__(largest)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
 
@@ -138,7 +189,9 @@ def fit_guard(kind: str | None, error_module: nn.Module, q: Tensor) -> Guard | N
     """Return the guard of an error model trained on rows q (N, n)."""
     if kind is None:
         return None
-    if kind == "box":
-        return BoxGuard(q.amin(0), q.amax(0))
-    own = hasattr(error_module, "leverage")
-    return LeverageGuard.fit(error_module if own else QuadraticReadout.fit(q), q)
+    with torch.no_grad():
+        largest = error_module(q).norm(dim=-1).max()
+        if kind == "box":
+            return BoxGuard(q.amin(0), q.amax(0), largest)
+        own = hasattr(error_module, "leverage")
+        return LeverageGuard.fit(error_module if own else QuadraticReadout.fit(q), q, largest)

@@ -56,7 +56,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     guard : {"leverage", "box", None}, default="leverage"
         Where eps is trusted. "leverage": where the inputs are as close to the training rows, in
         the error model's features, as these are to each other; "box": within the training range;
-        None: everywhere. Beyond, eps fades out and f_mech remains.
+        None: everywhere. Beyond, eps fades out and f_mech remains. With a guard f_hyb is nowhere
+        farther from f_mech than 1.5 times the longest correction of a training row.
     coverage : float, optional
         Share of tips, 0.9 for example, that shall lie within the radius of
         ``predict(Q, return_radius=True)``. It costs five more fits, each with a fifth of the
@@ -352,7 +353,7 @@ class HybridModule(nn.Module):
         if self.error is None:
             return 0.0 * self.mechanical_part(q)
         error = self.error(q)
-        return error if self.guard is None else self.guard(q) * error
+        return error if self.guard is None else self.guard.shortened(self.guard(q) * error)
 
     def jacobian(self, q: Tensor) -> Tensor:
         """Return dx/dq of the sum, shape (..., m, n)."""
@@ -373,6 +374,8 @@ class HybridModule(nn.Module):
             J_own = weight[..., None] * J_own + own[..., None] * slope
             x = x.index_copy(0, outside, weight * own)
             J = J.index_copy(0, outside, J_own)
+        if self.guard is not None:
+            x, J = self.guard.shortened_with_jacobian(x, J)
         if self.mechanical is not None:
             x_mech, J_mech = forward_and_jacobian(self.mechanical, q)
             x, J = x_mech + x, J_mech + J

@@ -323,6 +323,7 @@ def _restored_error(header: Any, arrays: Arrays) -> tuple[Any, nn.Module | None]
 def _store_guard(guard: Guard | None, arrays: Arrays) -> str | None:
     if guard is None:
         return None
+    arrays["guard.largest"] = guard.largest.cpu().numpy()
     if isinstance(guard, BoxGuard):
         names, kind, module = ("low", "high"), "box", guard
     else:
@@ -344,13 +345,15 @@ def _restored_guard(kind: Any, arrays: Arrays, error_module: nn.Module | None) -
     }
     if kind is None:
         return None
+    # Files from before corrections had a largest length: none is too long.
+    largest = tensors.pop("largest", torch.tensor(float("inf"), dtype=torch.float64))
     if kind == "box":
-        return BoxGuard(tensors["low"], tensors["high"])
+        return BoxGuard(tensors["low"], tensors["high"], largest)
     if kind == "leverage":
         limit = tensors.pop("limit")
-        return LeverageGuard(QuadraticReadout(**tensors), limit)
+        return LeverageGuard(QuadraticReadout(**tensors), limit, largest)
     if kind == "leverage of the error model" and error_module is not None:
-        return LeverageGuard(error_module, tensors["limit"])
+        return LeverageGuard(error_module, tensors["limit"], largest)
     raise ValueError(f"unknown guard {kind!r}")
 
 

@@ -352,3 +352,42 @@ def test_guard_in_single_precision_never_errs(alpha):
     assert_close(x, module(q), rtol=0, atol=1e-12)
     expected = torch.func.vmap(torch.func.jacrev(module))(q[::50])
     assert_close(J[::50], expected, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("guard", ["leverage", "box"])
+@pytest.mark.parametrize(
+    "error_model",
+    [
+        ELMRegressor(alpha=1e-9, random_state=0),
+        make_pipeline(MinMaxScaler(), PolynomialFeatures(3), LinearRegression()),
+    ],
+    ids=["elm", "cubic"],
+)
+def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
+    """An optimiser looks for the longest correction in and far out of the box."""
+    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
+    q, x = data.q[::6], data.x[::6]
+    module = HybridForwardModel(chain, error_model, guard=guard).fit(q, x).module_
+    rows = torch.from_numpy(q)
+    longest = module.error_part(rows).norm(dim=-1).max()
+    low, high = rows.amin(0), rows.amax(0)
+    free = HybridForwardModel(chain, error_model, guard=None).fit(q, x).module_
+    worst = {}
+    for name, model in (("guarded", module), ("free", free)):
+        generator = torch.Generator().manual_seed(0)
+        u = 4.0 * torch.rand(200, 9, generator=generator, dtype=torch.float64) - 1.5
+        u.requires_grad_()
+        optimiser = torch.optim.Adam([u], lr=0.05)
+        for _ in range(60):
+            loss = -model.error_part(low + (high - low) * u).square().sum()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        worst[name] = model.error_part(low + (high - low) * u).norm(dim=-1).max()
+    assert worst["free"] > 5 * longest
+    assert worst["guarded"] <= (1.5 + 1e-12) * longest
+    # Beyond the largest, value and Jacobian of the sum are still each other's.
+    at = (low + (high - low) * u).detach()[:20]
+    assert_close(module.forward_and_jacobian(at)[0], module(at), rtol=0, atol=1e-9)
+    reverse = torch.func.vmap(torch.func.jacrev(module))(at)
+    assert_close(module.jacobian(at), reverse, rtol=1e-6, atol=1e-6 * float(reverse.abs().max()))
