@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,7 @@ class AffineModule(PortableModule):
 
     def __init__(self, coef: ArrayLike, intercept: ArrayLike) -> None:
         super().__init__()
-        matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64)
+        matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64).contiguous()
         bias = torch.tensor(np.asarray(intercept), dtype=torch.float64)
         self.register_buffer("coef", matrix)
         self.register_buffer("bias", bias.expand(len(matrix)).clone())
@@ -88,6 +89,11 @@ class AffineModule(PortableModule):
         """Return the constant matrix for every row, shape (..., m, n)."""
         coef = self.coef.to(q)
         return coef.expand(*q.shape[:-1], *coef.shape)
+
+    def numpy_function(self) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
+        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
+        coef, bias = (part.cpu().double().numpy().copy() for part in (self.coef, self.bias))
+        return lambda q: (coef.dot(q) + bias, coef.copy())
 
 
 class PolynomialModule(PortableModule):

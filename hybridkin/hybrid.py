@@ -18,13 +18,15 @@ from sklearn.utils.validation import (
 )
 from torch import Tensor, nn
 
-from hybridkin._error_modules import error_module
+from hybridkin._drift import Drift
+from hybridkin._error_modules import AffineModule, error_module
 from hybridkin._numerics import (
     forward_and_jacobian,
     forward_and_reverse_jacobian,
     in_blocks,
 )
 from hybridkin._radius import Radius, conformal_radius
+from hybridkin._realtime import NumpyFunction, numpy_function
 from hybridkin.calibration import CalibrationResult, calibrate
 from hybridkin.elm import ELM, ELMRegressor
 from hybridkin.guards import GUARDS, Guard, LeverageGuard, fit_guard
@@ -206,9 +208,62 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             guard = None  # there is nothing to fall back on
         self.module_ = HybridModule(mechanical, error_part, guard)
         self._single_output = y.ndim == 1
+        n_outputs = 1 if y.ndim == 1 else y.shape[1]
+        self._drift = Drift.of_range(q.amin(0).numpy(), q.amax(0).numpy(), n_outputs)
         self.radius_: Radius | None = None
         if self.coverage is not None:
             self.radius_ = conformal_radius(self, X, y, weights, groups, self.coverage)
+        return self
+
+    def partial_fit(
+        self,
+        X: Any,
+        y: Any,
+        sample_weight: ArrayLike | None = None,
+        *,
+        decay: float = 0.98,
+        alpha: float = 1.0,
+    ) -> HybridForwardModel:
+        """Follow a change of the robot, a payload or wear, by new measurements in order of time.
+
+        Mechanical model and error model stay as they were fitted. What they now miss is learned as
+        an affine function of q that old measurements leave again: ``f_hyb(q) + B [1, q]``.
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n)
+            Actuator vectors, a single row too.
+        y : array-like of shape (N, m) or (N,)
+            Measured tips [m].
+        sample_weight : array-like of shape (N,), optional
+            How many times each row counts.
+        decay : float, default=0.98
+            Factor in (0, 1] on the weight of all earlier rows with every row: 0.98 forgets within
+            some fifty measurements.
+        alpha : float, default=1.0
+            Penalty on B, in measurements: how soon a single one is believed.
+
+        Returns
+        -------
+        HybridForwardModel
+            This estimator; fitted by `fit`, if it was not yet.
+        """
+        if not hasattr(self, "module_"):
+            return self.fit(X, y, sample_weight)
+        for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
+            if not 0.0 < value <= high:
+                raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
+        X, y = validate_data(
+            self, X, y=y, multi_output=True, dtype=[np.float64, np.float32], reset=False
+        )
+        q, y = torch.from_numpy(X.astype(np.float64)), np.asarray(y, dtype=np.float64)
+        weights = _check_sample_weight(sample_weight, X, dtype=np.float64, ensure_non_negative=True)
+        fitted = HybridModule(self.mechanical_model_, self.module_.error, self.module_.guard)
+        with torch.no_grad():
+            residual = y.reshape(len(y), -1) - fitted(q).numpy()
+        self._drift = self._drift.learned(q.numpy(), residual, weights, decay)
+        fitted.drift = self._drift.correction(alpha)
+        self.module_ = fitted
         return self
 
     def predict(self, X: Any, return_radius: bool = False) -> Any:
@@ -256,6 +311,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return `predict(X)` and `jacobian(X)` in one pass."""
         x, J = self._by_blocks(lambda module, q: module.forward_and_jacobian(q), X)
         return x, J
+
+    def numpy_function(self) -> NumpyFunction:
+        """Return a NumPy function of one configuration, for control loops.
+
+        Returns
+        -------
+        function
+            Maps q of shape (n,) to `predict` (m,) [m] and its Jacobian (m, n), in float64 and some
+            ten times faster. It is not told by a later `fit`.
+        """
+        check_is_fitted(self)
+        return self.module_.numpy_function()
 
     def in_domain(self, X: Any) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
@@ -321,15 +388,22 @@ class HybridModule(nn.Module):
         The parts; at least one of them.
     guard : nn.Module or None
         The weight w(q) in [0, 1], shape (..., 1). None: one everywhere.
+    drift : AffineModule or None
+        What has changed since, w(q) (B q + c), is added.
     """
 
     def __init__(
-        self, mechanical: nn.Module | None, error: nn.Module | None, guard: Guard | None = None
+        self,
+        mechanical: nn.Module | None,
+        error: nn.Module | None,
+        guard: Guard | None = None,
+        drift: AffineModule | None = None,
     ) -> None:
         super().__init__()
         self.mechanical = mechanical
         self.error = error
         self.guard = guard
+        self.drift = drift
 
     @property
     def n_actuators(self) -> int | None:
@@ -340,7 +414,7 @@ class HybridModule(nn.Module):
         """Return x of shape (..., m) [m]."""
         if self.mechanical is None:
             return self.error_part(q)
-        if self.error is None:
+        if self.error is None and self.drift is None:
             return self.mechanical(q)
         return self.mechanical(q) + self.error_part(q)
 
@@ -349,11 +423,15 @@ class HybridModule(nn.Module):
         return self.mechanical(q) if self.mechanical is not None else 0.0 * self.error_part(q)
 
     def error_part(self, q: Tensor) -> Tensor:
-        """Return w(q) eps(q), zero without an error model, shape (..., m) [m]."""
+        """Return what is added to f_mech(q), w(q) eps(q) and the drift, shape (..., m) [m]."""
         if self.error is None:
-            return 0.0 * self.mechanical_part(q)
-        error = self.error(q)
-        return error if self.guard is None else self.guard.shortened(self.guard(q) * error)
+            return 0.0 * self.mechanical_part(q) if self.drift is None else self.drift(q)
+        parts = [self.error(q)] if self.drift is None else [self.error(q), self.drift(q)]
+        if self.guard is not None:
+            weight = self.guard(q)
+            parts = [weight * part for part in parts]
+            parts[0] = self.guard.shortened(parts[0])
+        return sum(parts[1:], parts[0])
 
     def jacobian(self, q: Tensor) -> Tensor:
         """Return dx/dq of the sum, shape (..., m, n)."""
@@ -365,20 +443,24 @@ class HybridModule(nn.Module):
         return x, J
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        if self.error is None:
-            return forward_and_jacobian(self.mechanical, q)
-        x, J, outside = self._error_and_outside(q)
-        if outside is not None and len(outside):
-            weight, slope = forward_and_reverse_jacobian(self.guard, q[outside])
-            own, J_own = x[outside], J[outside]
-            J_own = weight[..., None] * J_own + own[..., None] * slope
-            x = x.index_copy(0, outside, weight * own)
-            J = J.index_copy(0, outside, J_own)
-        if self.guard is not None:
-            x, J = self.guard.shortened_with_jacobian(x, J)
+        parts = []
         if self.mechanical is not None:
-            x_mech, J_mech = forward_and_jacobian(self.mechanical, q)
-            x, J = x_mech + x, J_mech + J
+            parts.append(forward_and_jacobian(self.mechanical, q))
+        fading = None
+        if self.error is not None:
+            x, J, outside = self._error_and_outside(q)
+            if outside is not None and len(outside):
+                fading = outside, *forward_and_reverse_jacobian(self.guard, q[outside])
+                x, J = _faded(x, J, *fading)
+            if self.guard is not None:
+                x, J = self.guard.shortened_with_jacobian(x, J)
+            parts.append((x, J))
+        if self.drift is not None:
+            x, J = forward_and_jacobian(self.drift, q)
+            parts.append((x, J) if fading is None else _faded(x, J, *fading))
+        (x, J), *rest = parts
+        for x_part, J_part in rest:
+            x, J = x + x_part, J + J_part
         return x, J
 
     def _error_and_outside(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -393,6 +475,29 @@ class HybridModule(nn.Module):
         outside = None if guard is None else (~self.in_domain(q)).nonzero()[:, 0]
         return *forward_and_jacobian(self.error, q), outside
 
+    def numpy_function(self) -> NumpyFunction:
+        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n).
+
+        The sum of what the parts offer as ``numpy_function``, without torch's overhead; in float64,
+        with their present parameters.
+        """
+        if self.error is None:
+            return numpy_function(self.mechanical)
+        guard = self.guard
+        correction = (
+            numpy_function(self.error) if guard is None else guard.numpy_correction(self.error)
+        )
+        if self.mechanical is None:
+            return correction
+        mechanical = numpy_function(self.mechanical)
+
+        def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
+            x, J = mechanical(q)
+            more, slope = correction(q)
+            return x + more, J + slope
+
+        return tip_and_jacobian
+
     def error_weight(self, q: Tensor) -> Tensor:
         """Return the weight w(q) of the error model, shape (...)."""
         return q.new_ones(q.shape[:-1]) if self.guard is None else self.guard(q)[..., 0]
@@ -402,6 +507,15 @@ class HybridModule(nn.Module):
         if self.guard is None:
             return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self.guard.strangeness(q) <= 1.0
+
+
+def _faded(
+    x: Tensor, J: Tensor, rows: Tensor, weight: Tensor, slope: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return x (N, m) and J (N, m, n), in some rows times a weight (k, 1) of slope (k, 1, n)."""
+    own, J_own = x[rows], J[rows]
+    J_own = weight[..., None] * J_own + own[..., None] * slope
+    return x.index_copy(0, rows, weight * own), J.index_copy(0, rows, J_own)
 
 
 def _warn_contradictory(mechanical: Any, q: Tensor) -> None:

@@ -17,6 +17,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
+from hybridkin._drift import Drift
 from hybridkin._error_modules import AffineModule
 from hybridkin._radius import Radius
 from hybridkin._readout import Statistics
@@ -229,6 +230,10 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
             header[key] = _store_chain(part, arrays, f"{key}.")
     header["error"] = _store_error(model.error_model_, arrays)
     header["fitted_guard"] = _store_guard(model.module_.guard, arrays)
+    arrays |= {f"drift.{name}": array for name, array in model._drift._asdict().items()}
+    if model.module_.drift is not None:
+        arrays["drift.coef"] = model.module_.drift.coef.cpu().numpy()
+        arrays["drift.bias"] = model.module_.drift.bias.cpu().numpy()
     return header
 
 
@@ -256,7 +261,12 @@ def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardMod
         model.feature_names_in_ = np.array(header["feature_names_in"], dtype=object)
     model._single_output = bool(header["single_output"])
     guard = _restored_guard(header["fitted_guard"], arrays, error_module)
-    model.module_ = HybridModule(mechanical, error_module, guard)
+    drift = None
+    if "drift.coef" in arrays:
+        drift = AffineModule(arrays["drift.coef"], arrays["drift.bias"])
+    if "drift.gram" in arrays:  # files from before partial_fit have none
+        model._drift = Drift(*(arrays[f"drift.{name}"] for name in Drift._fields))
+    model.module_ = HybridModule(mechanical, error_module, guard, drift)
     with torch.no_grad():  # a file whose arrays do not fit together fails here, not in use
         model.module_.forward_and_jacobian(torch.ones(1, model.n_features_in_, dtype=torch.float64))
     return model

@@ -1,0 +1,116 @@
+"""Following a change of the robot measurement by measurement, without forgetting the fit."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.linear_model import Ridge
+from torch.testing import assert_close
+
+from hybridkin import HybridForwardModel, datasets, load_model, robots, save_model
+
+PAYLOAD = np.array([[0.1, -0.2, 0.0], [0.0, 0.1, 0.3], [0.05, 0.0, -0.1]])
+
+
+def changed(q):
+    """What a payload adds to the tip [m], simulated as an affine function of the first segment."""
+    return 0.01 + (q[:, :3] - 0.25) @ PAYLOAD.T
+
+
+@pytest.fixture(scope="module")
+def trunk():
+    data = datasets.load_trunk()
+    return data.q[::4], data.x[::4]
+
+
+@pytest.fixture(params=[None, "drop", Ridge(1e-3)], ids=["elm", "drop", "ridge"])
+def fitted(request, trunk):
+    chain = robots.bionic_handling_assistant()
+    return HybridForwardModel(chain, request.param, random_state=0).fit(*trunk)
+
+
+def rms(model, q, x):
+    return np.sqrt(np.mean(np.sum((model.predict(q) - x) ** 2, axis=1)))
+
+
+def test_a_change_is_learned_and_left_again(fitted, trunk):
+    q, x = trunk
+    loaded = x + changed(q)
+    model, rng = copy.deepcopy(fitted), np.random.default_rng(0)
+    before, off = rms(model, q, x), rms(model, q, loaded)
+    for i in rng.permutation(len(q))[:150]:
+        model.partial_fit(q[i : i + 1], loaded[i : i + 1])
+    assert rms(model, q, loaded) < before + 0.25 * (off - before)
+    for i in rng.permutation(len(q))[:300]:  # the payload is gone
+        model.partial_fit(q[i : i + 1], x[i : i + 1])
+    assert rms(model, q, x) < 1.05 * before
+
+
+def test_what_was_learned_before_stays_where_nothing_changed(trunk):
+    q, x = trunk
+    model = HybridForwardModel(robots.bionic_handling_assistant(), random_state=0).fit(q, x)
+    before = rms(model, q, x)
+    near = q[np.linalg.norm(q - q[0], axis=1) < 0.12]
+    for _ in range(20):
+        model.partial_fit(near[:20], x[: len(near)][:20] * 0 + model.predict(near[:20]))
+    assert rms(model, q, x) < 1.01 * before
+
+
+def test_one_row_at_a_time_equals_many(fitted, trunk):
+    q, x = trunk
+    at_once, one_by_one = copy.deepcopy(fitted), copy.deepcopy(fitted)
+    weights = np.random.default_rng(0).uniform(0, 2, 30)
+    at_once.partial_fit(q[:30], x[:30] + 0.01, weights, decay=0.9)
+    for i in range(30):
+        one_by_one.partial_fit(q[i : i + 1], x[i : i + 1] + 0.01, weights[i : i + 1], decay=0.9)
+    assert_allclose(at_once.predict(q), one_by_one.predict(q), rtol=0, atol=1e-12)
+
+
+def test_the_drift_is_the_weighted_ridge_of_the_residuals(fitted, trunk):
+    q, x = trunk
+    model = copy.deepcopy(fitted).partial_fit(q[:80], x[:80] + changed(q[:80]), decay=0.95, alpha=2)
+    residual = x[:80] + changed(q[:80]) - fitted.predict(q[:80])
+    low, high = q.min(0), q.max(0)
+    u = (2 * q - low - high) / (high - low)
+    phi = np.column_stack([np.ones(len(q)), u])
+    weights = 0.95 ** np.arange(79, -1, -1)
+    ridge = Ridge(2.0, fit_intercept=False).fit(phi[:80], residual, sample_weight=weights)
+    assert_allclose(model.predict(q) - fitted.predict(q), ridge.predict(phi), rtol=0, atol=1e-10)
+
+
+def test_value_and_jacobian_agree_in_and_out_of_the_domain(fitted, trunk):
+    q, x = trunk
+    module = copy.deepcopy(fitted).partial_fit(q[:50], x[:50] + 0.02).module_
+    rng = np.random.default_rng(0)
+    at = torch.from_numpy(q[:20] + rng.uniform(-0.15, 0.15, (20, 9)))
+    tips, J = module.forward_and_jacobian(at)
+    assert_close(tips, module(at), rtol=0, atol=1e-12)
+    reverse = torch.func.vmap(torch.func.jacrev(module))(at)
+    assert_close(J, reverse, rtol=1e-8, atol=1e-8)
+
+
+def test_unfitted_it_fits_and_it_is_saved(tmp_path, trunk):
+    q, x = trunk
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, random_state=0).partial_fit(q, x)
+    assert_array_equal(
+        model.predict(q), HybridForwardModel(chain, random_state=0).fit(q, x).predict(q)
+    )
+    model.partial_fit(q[:9], x[:9] + 0.03)
+    save_model(model, tmp_path / "model.safetensors")
+    back = load_model(tmp_path / "model.safetensors")
+    assert_array_equal(back.predict(q), model.predict(q))
+    assert_array_equal(
+        back.partial_fit(q[9:12], x[9:12]).predict(q),
+        model.partial_fit(q[9:12], x[9:12]).predict(q),
+    )
+
+
+@pytest.mark.parametrize(
+    "settings", [{"decay": 0.0}, {"decay": 1.1}, {"alpha": -1.0}, {"alpha": 0}]
+)
+def test_clear_errors(fitted, trunk, settings):
+    with pytest.raises(ValueError, match=f"`{next(iter(settings))}` must lie in"):
+        fitted.partial_fit(*trunk, **settings)
