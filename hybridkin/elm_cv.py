@@ -20,6 +20,7 @@ __all__ = ["ELMRegressorCV"]
 
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)  # times the largest eigenvalue of the features' Gram matrix
 _ZOOM = (0.5, 1.0, 2.0, 4.0)  # weight scales tried with new input scales, times the best so far
+_WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
 _LEAST_RELEVANCE = 0.01
 _ROWS_OF_JACOBIANS = 10_000
 _SHARED = (
@@ -54,6 +55,9 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Whether each output gets its own penalty.
     relevance_rounds : int, default=5
         How often at most the inputs are rescaled by their relevance.
+    max_hidden : int, default=2000
+        Up to so many neurons their number is doubled, as long as the error falls by 2 %. With 0
+        only `n_hidden` is tried: fewer neurons make a faster model.
     activation, input_scaling, fit_intercept, direct_link, block_size, device, random_state
         As for `ELMRegressor`. One hidden layer is drawn for all weight scales.
 
@@ -108,6 +112,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "cv": ["cv_object"],
         "alpha_per_target": ["boolean"],
         "relevance_rounds": [Interval(Integral, 0, None, closed="left")],
+        "max_hidden": [Interval(Integral, 0, None, closed="left")],
         "activation": [StrOptions(set(ACTIVATIONS))],
         "input_scaling": [StrOptions({"minmax", "standard"}), None, "array-like"],
         "fit_intercept": ["boolean"],
@@ -126,6 +131,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         cv=None,
         alpha_per_target=False,
         relevance_rounds=5,
+        max_hidden=2000,
         activation="logistic",
         input_scaling="minmax",
         fit_intercept=True,
@@ -140,6 +146,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.cv = cv
         self.alpha_per_target = alpha_per_target
         self.relevance_rounds = relevance_rounds
+        self.max_hidden = max_hidden
         self.activation = activation
         self.input_scaling = input_scaling
         self.fit_intercept = fit_intercept
@@ -201,6 +208,12 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             best = min(best, *tried[-len(_ZOOM) :], key=lambda candidate: candidate.score)
             if best is before:
                 break
+        while 2 * best.params["n_hidden"] <= self.max_hidden:
+            params = {**best.params, "n_hidden": 2 * best.params["n_hidden"]}
+            tried.append(_candidate(params, best.relevance, task))
+            if not tried[-1].score < _WORTH_GROWING * best.score:
+                break
+            best = tried[-1]
         self.alpha_ = best.params["alpha"]
         self.best_params_, self.best_score_ = best.params, -best.score
         self.best_estimator_ = ELMRegressor(**best.params).fit(X, y, sample_weight)

@@ -36,7 +36,7 @@ def data(n=60, d=3, m=2, seed=0, noise=0.05):
 
 
 def quick(n_hidden=20, alphas=ALPHAS, weight_scales=(0.7,), **params):
-    params = {"relevance_rounds": 0, "random_state": 0, **params}
+    params = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0, **params}
     return ELMRegressorCV(n_hidden, alphas, weight_scales, **params)
 
 
@@ -52,9 +52,11 @@ def refitted(model, alpha, X, y, train, test, sample_weight=None):
 
 @parametrize_with_checks(
     [
-        ELMRegressorCV(n_hidden=20),
-        ELMRegressorCV(n_hidden=[5, 10], alphas=[0.01, 1.0], weight_scales=[1.0], cv=2),
-        ELMRegressorCV(10, cv=KFold(3), alpha_per_target=True, direct_link=False),
+        ELMRegressorCV(n_hidden=20, max_hidden=40),
+        ELMRegressorCV(
+            n_hidden=[5, 10], alphas=[0.01, 1.0], weight_scales=[1.0], cv=2, max_hidden=0
+        ),
+        ELMRegressorCV(10, cv=KFold(3), alpha_per_target=True, direct_link=False, max_hidden=0),
     ]
 )
 def test_scikit_learn_checks(estimator, check):
@@ -191,7 +193,8 @@ def test_irrelevant_and_linear_inputs_cost_nothing():
     X, y = make_friedman1(1000, noise=1.0, random_state=0)
     X_test, y_test = make_friedman1(4000, random_state=1)
     plain, relevant = (
-        ELMRegressorCV(200, relevance_rounds=rounds, random_state=0).fit(X, y) for rounds in (0, 5)
+        ELMRegressorCV(200, relevance_rounds=rounds, max_hidden=0, random_state=0).fit(X, y)
+        for rounds in (0, 5)
     )
     error, reduced = (np.std(model.predict(X_test) - y_test) for model in (plain, relevant))
     assert reduced < 0.7 * error
@@ -218,8 +221,8 @@ def test_groups_protect_from_leaking_motions():
     motion = np.repeat(np.arange(30), 10)
     X = rng.uniform(-1, 1, (30, 4))[motion] + 0.01 * rng.standard_normal((300, 4))
     y = X[:, 0] + 0.5 * rng.standard_normal(30)[motion]
-    by_rows = ELMRegressorCV(100, random_state=0).fit(X, y)
-    by_motions = ELMRegressorCV(100, random_state=0).fit(X, y, groups=motion)
+    by_rows = ELMRegressorCV(100, max_hidden=0, random_state=0).fit(X, y)
+    by_motions = ELMRegressorCV(100, max_hidden=0, random_state=0).fit(X, y, groups=motion)
     assert by_rows.best_score_ > 0.1 * by_motions.best_score_
     X_new = rng.uniform(-1, 1, (2000, 4))
     rms = [np.sqrt(np.mean((m.predict(X_new) - X_new[:, 0]) ** 2)) for m in (by_rows, by_motions)]
@@ -283,7 +286,9 @@ def test_return_std_covers_new_measurements(m):
     for seed in range(10):
         X, y = data(400, m=m, seed=seed, noise=0.1)
         X_new, y_new = data(2000, m=m, seed=1000 + seed, noise=0.1)
-        mean, std = ELMRegressorCV(200, random_state=seed).fit(X, y).predict(X_new, True)
+        mean, std = (
+            ELMRegressorCV(200, max_hidden=0, random_state=seed).fit(X, y).predict(X_new, True)
+        )
         covered.append(np.mean(np.abs(y_new - mean) < 1.6449 * std))
     assert 0.87 < np.mean(covered) < 0.93
 
@@ -380,9 +385,24 @@ def test_clear_errors(params, fit, message):
 def test_errors_of_the_trunk_beat_the_paper_s_fixed_settings():
     trunk = load_trunk()
     X, y = trunk.q[:600], trunk.x[:600]
-    chosen = ELMRegressorCV(200, random_state=0).fit(X, y)
+    chosen = ELMRegressorCV(200, max_hidden=0, random_state=0).fit(X, y)
     fixed = ELMRegressor(random_state=0).fit(X, y)
     rms = [
         np.sqrt(np.mean((m.predict(trunk.q[600:]) - trunk.x[600:]) ** 2)) for m in (chosen, fixed)
     ]
     assert rms[0] < 0.7 * rms[1]
+
+
+def test_neurons_are_doubled_while_that_pays():
+    rng = np.random.default_rng(0)
+    X = rng.uniform(-1, 1, (800, 4))
+    bent = np.sin(6 * X[:, 0] * X[:, 1]) + np.cos(5 * X[:, 2] * X[:, 3])
+    plain = X @ np.arange(4.0) + 0.1 * rng.standard_normal(800)
+    many, few = (
+        ELMRegressorCV(50, relevance_rounds=0, max_hidden=400, random_state=0).fit(X, y)
+        for y in (bent, plain)
+    )
+    assert many.best_params_["n_hidden"] == 400
+    assert few.best_params_["n_hidden"] == 50
+    fixed = ELMRegressorCV(50, relevance_rounds=0, max_hidden=0, random_state=0).fit(X, bent)
+    assert many.best_score_ > 0.5 * fixed.best_score_
