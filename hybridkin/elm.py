@@ -271,7 +271,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self : ELMRegressor
             The fitted estimator.
         """
-        if not 0.0 < decay <= 1.0:
+        if not isinstance(decay, Real) or not 0.0 < decay <= 1.0:
             raise ValueError(
                 f"`decay` must lie in (0, 1], got {decay!r}; 1 forgets nothing, 0.99 forgets a "
                 f"hundredth of what earlier rows count."
