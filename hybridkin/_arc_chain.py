@@ -274,6 +274,22 @@ class ArcChain(PortableModule):
         """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
         raise NotImplementedError
 
+    def _coordinates_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the arcs (3 m, N) up to the tip and their derivative, (3 m, n) or (3 m, n, N)."""
+        arcs, slope = self._arcs_and_slope(rows)
+        return self._to_tip(arcs), self._to_tip(slope)
+
+    def _tip_of(self, arcs: Tensor) -> Tensor:
+        """Return the tip (N, 3) of arcs (3 m, N) up to it."""
+        tail = tip(*self._split(arcs), self._tip_offsets().to(arcs))
+        return self._in_measuring_frame(tail, arcs.T)
+
+    def _tip_and_columns_of(self, arcs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip (N, 3) of arcs (3 m, N) up to it, and its derivative (N, 3, 3 m)."""
+        tail, columns = tip_and_columns(*self._split(arcs), self._tip_offsets().to(arcs))
+        turned = (self.base.to(arcs)[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
+        return self._in_measuring_frame(tail, arcs.T), turned.permute(2, 0, 1)
+
     def _rows(self, q: Tensor) -> Tensor:
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         return q.reshape(-1, self.n_actuators)

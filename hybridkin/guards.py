@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.linalg import lapack
 from torch import Tensor, nn
 
 from hybridkin._numerics import PortableModule
+from hybridkin._realtime import NumpyFunction, numpy_function
 
 __all__ = ["GUARDS", "BoxGuard", "Guard", "LeverageGuard", "QuadraticReadout", "fit_guard"]
 
 GUARDS = ("leverage", "box", None)
+
+NumpyStrangeness = Callable[[NDArray], tuple[float, "NDArray | None"]]
 
 
 class Guard(PortableModule):
@@ -39,7 +49,38 @@ class Guard(PortableModule):
     def forward(self, q: Tensor) -> Tensor:
         """Return w(q), shape (..., 1)."""
         beyond = (self.strangeness(q) - 1.0).clamp(min=0.0)
-        return (1.0 / (1.0 + beyond**3))[..., None]
+        return self._weight(beyond)[..., None]
+
+    def numpy_function(self) -> NumpyStrangeness:
+        """Return a NumPy function q (n,) -> strangeness, and its gradient (n,) where above 1."""
+        raise NotImplementedError
+
+    def numpy_correction(self, error: nn.Module) -> NumpyFunction:
+        """Return a NumPy function q (n,) -> the guarded correction (m,) and its Jacobian (m, n)."""
+        correction = self._numpy_parts(error)
+        largest = float(self._unit(self.largest.double()))
+
+        def guarded(q: NDArray) -> tuple[NDArray, NDArray]:
+            x, J, strangeness, gradient = correction(q)
+            if strangeness > 1.0:
+                beyond = strangeness - 1.0
+                weight = self._weight(beyond)
+                slope = -3.0 * (beyond * weight) ** 2 * gradient
+                x, J = weight * x, weight * J + x[:, None] * slope
+            relative = math.sqrt(x.dot(x)) / largest
+            if relative > 1.0:
+                kept, slope = self._kept(relative, math.tanh)
+                factor = kept / relative
+                fading = (slope - factor) / (relative * largest) ** 2 * x.dot(J)
+                x, J = factor * x, factor * J + x[:, None] * fading
+            return x, J
+
+        return guarded
+
+    def _numpy_parts(self, error: nn.Module) -> Callable[[NDArray], Any]:
+        """Return a NumPy function q -> correction, Jacobian, strangeness and its gradient."""
+        correction, strangeness = numpy_function(error), self.numpy_function()
+        return lambda q: (*correction(q), *strangeness(q))
 
     def shortened(self, error: Tensor) -> Tensor:
         """Return corrections (..., m), those beyond the largest shortened [m]."""
@@ -60,6 +101,10 @@ class Guard(PortableModule):
         J_own = factor[..., None] * J_own + own[..., None] * fading[:, None]
         return error.index_copy(0, long, factor * own), J.index_copy(0, long, J_own)
 
+    def is_long(self, error: Tensor) -> Tensor:
+        """Return which corrections (..., m) are longer than the largest, shape (...)."""
+        return self._relative(error)[..., 0] > 1.0
+
     def _unit(self, error: Tensor) -> Tensor:
         return self.largest.to(error).clamp(min=torch.finfo(error.dtype).tiny ** 0.25)
 
@@ -68,11 +113,15 @@ class Guard(PortableModule):
         squares = (error / self._unit(error)).square().sum(-1, keepdim=True)
         return squares.clamp(min=1.0).sqrt()
 
-    def _kept(self, relative: Tensor) -> tuple[Tensor, Tensor]:
+    def _kept(self, relative: Any, tanh: Callable[[Any], Any] = torch.tanh) -> tuple[Any, Any]:
         """Return the length kept of one, both in units of the largest, and its slope."""
         over = self.MOST - 1.0
-        bent = torch.tanh((relative - 1.0) / over)
-        return 1.0 + over * bent, 1.0 - bent.square()
+        bent = tanh((relative - 1.0) / over)
+        return 1.0 + over * bent, 1.0 - bent * bent
+
+    @staticmethod
+    def _weight(beyond: Any) -> Any:
+        return 1.0 / (1.0 + beyond**3)
 
 
 class LeverageGuard(Guard):
@@ -112,6 +161,33 @@ class LeverageGuard(Guard):
         """Return the leverage of q over the limit, shape (...)."""
         return self.readout.leverage(q) / self.limit.to(q)  # pyright: ignore[reportCallIssue]
 
+    def numpy_function(self) -> NumpyStrangeness:
+        """Return a NumPy function q (n,) -> strangeness, and its gradient (n,) where above 1."""
+        limit, readout = float(self.limit), self.readout
+        if hasattr(readout, "numpy_leverage"):
+            leverage = readout.numpy_leverage(limit)  # pyright: ignore[reportCallIssue]
+        else:
+            by_torch = numpy_function(lambda q: readout.leverage(q)[..., None])  # pyright: ignore
+
+            def leverage(q: NDArray) -> tuple[float, NDArray]:
+                h, gradient = by_torch(q)
+                return float(h[0]), gradient[0]
+
+        return lambda q: _relative(*leverage(q), limit)
+
+    def _numpy_parts(self, error: nn.Module) -> Callable[[NDArray], Any]:
+        if self.readout is not error or not hasattr(error, "numpy_leverage"):
+            return super()._numpy_parts(error)
+        limit = float(self.limit)
+        # Its features serve both.
+        function = error.numpy_function(limit)  # pyright: ignore[reportCallIssue]
+
+        def parts(q: NDArray) -> Any:
+            x, J, leverage, gradient = function(q)
+            return x, J, *_relative(leverage, gradient, limit)
+
+        return parts
+
 
 class BoxGuard(Guard):
     """Strangeness by the distance outside a box, in tenths of its width.
@@ -138,6 +214,18 @@ class BoxGuard(Guard):
         width = torch.where(high > low, high - low, torch.ones_like(low))
         outside = (low - q).clamp(min=0.0) + (q - high).clamp(min=0.0)
         return 1.0 + (100.0 * (outside / width).square()).sum(-1)
+
+    def numpy_function(self) -> NumpyStrangeness:
+        """Return a NumPy function q (n,) -> strangeness, and its gradient (n,) where above 1."""
+        low, high = _array(self.low), _array(self.high)
+        width = np.where(high > low, high - low, 1.0)
+
+        def strangeness(q: NDArray) -> tuple[float, NDArray | None]:
+            outside = (q - np.minimum(np.maximum(q, low), high)) / width
+            squares = float(outside.dot(outside))
+            return 1.0 + 100.0 * squares, 200.0 * outside / width if squares > 0.0 else None
+
+        return strangeness
 
 
 class QuadraticReadout(PortableModule):
@@ -184,8 +272,28 @@ class QuadraticReadout(PortableModule):
         white = torch.linalg.solve_triangular(self.factor.to(q), features, upper=False)
         return white.square().sum((-2, -1))
 
+    def numpy_leverage(self, limit: float) -> NumpyStrangeness:
+        """Return a NumPy function q (n,) -> leverage, and its gradient (n,) where above a limit."""
+        center, half_width = _array(self.center), _array(self.half_width)
+        factor, n = np.asfortranarray(_array(self.factor)), len(self.center)
+        solve: Any = lapack.dtrtrs  # pyright: ignore[reportAttributeAccessIssue]
 
-def fit_guard(kind: str | None, error_module: nn.Module, q: Tensor) -> Guard | None:
+        def leverage(q: NDArray) -> tuple[float, NDArray | None]:
+            u = (q - center) / half_width
+            white, _ = solve(factor, np.concatenate(([1.0], u, u * u)), lower=1)
+            white = white.ravel()
+            h = float(white.dot(white))
+            if h <= limit:
+                return h, None
+            by_phi = 2.0 * solve(factor, white, lower=1, trans=1)[0].ravel()
+            return h, (by_phi[1 : n + 1] + 2.0 * u * by_phi[n + 1 :]) / half_width
+
+        return leverage
+
+
+def fit_guard(
+    kind: str | None, error_module: Callable[[Tensor], Tensor], q: Tensor
+) -> Guard | None:
     """Return the guard of an error model trained on rows q (N, n)."""
     if kind is None:
         return None
@@ -193,5 +301,16 @@ def fit_guard(kind: str | None, error_module: nn.Module, q: Tensor) -> Guard | N
         largest = error_module(q).norm(dim=-1).max()
         if kind == "box":
             return BoxGuard(q.amin(0), q.amax(0), largest)
-        own = hasattr(error_module, "leverage")
-        return LeverageGuard.fit(error_module if own else QuadraticReadout.fit(q), q, largest)
+        own = isinstance(error_module, nn.Module) and hasattr(error_module, "leverage")
+        readout: Any = error_module if own else QuadraticReadout.fit(q)
+        return LeverageGuard.fit(readout, q, largest)
+
+
+def _relative(
+    leverage: float, gradient: NDArray | None, limit: float
+) -> tuple[float, NDArray | None]:
+    return leverage / limit, None if gradient is None else gradient / limit
+
+
+def _array(tensor: Tensor) -> NDArray:
+    return tensor.detach().cpu().double().numpy().copy()

@@ -18,22 +18,21 @@ from sklearn.utils.validation import (
 )
 from torch import Tensor, nn
 
+from hybridkin._couplings import COUPLINGS, READOUTS, fit_coupled
 from hybridkin._drift import Drift
-from hybridkin._error_modules import AffineModule, error_module
-from hybridkin._numerics import (
-    forward_and_jacobian,
-    forward_and_reverse_jacobian,
-    in_blocks,
-)
+from hybridkin._error_modules import error_module
+from hybridkin._hybrid_modules import HybridModule
 from hybridkin._radius import Radius, conformal_radius
-from hybridkin._realtime import NumpyFunction, numpy_function
+from hybridkin._realtime import NumpyFunction
 from hybridkin.calibration import CalibrationResult, calibrate
-from hybridkin.elm import ELM, ELMRegressor
-from hybridkin.guards import GUARDS, Guard, LeverageGuard, fit_guard
+from hybridkin.elm import ELMRegressor
+from hybridkin.elm_cv import ELMRegressorCV
+from hybridkin.guards import GUARDS, fit_guard
 
 __all__ = ["HybridForwardModel"]
 
 _BLOCK = 65536
+_HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)
 
 
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -47,11 +46,16 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     mechanical_model : nn.Module, optional
         Maps q (..., n) to x (..., m), a `ConstantCurvatureChain` for example. It is copied, never
         changed. None: there is no mechanical part, the data alone decide (f^dat of the paper).
-    error_model : estimator, "drop" or None, default=None
-        None is ``ELMRegressor()``, "drop" the mechanical model alone, else any scikit-learn
-        regressor with as many outputs as x has.
-    coupling : {"parallel"}, default="parallel"
-        The error is added at the tip, eq. (2).
+    error_model : estimator, "linear", "quadratic", "drop" or None, default=None
+        Any scikit-learn regressor with as many outputs as x has; "linear" or "quadratic" features
+        of all actuators, their linear and bent parts penalised apart by errors on rows, or groups,
+        left out, down to no correction at all; "drop" is the mechanical model alone. None is
+        ``ELMRegressor()``, with serial coupling "quadratic".
+    coupling : {"parallel", "serial"}, default="parallel"
+        Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
+        the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q
+        itself for other mechanical models; delta is linear in features of q, so a regressor must
+        be an ELMRegressor (its hidden layer and `alpha` are used) or an ELMRegressorCV.
     calibrate : sequence of str or "default", default=()
         Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
         in every fold of a cross-validation. "default": the chain's own list.
@@ -73,8 +77,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``.
     mechanical_model_ : nn.Module or None
         The mechanical part, calibrated when asked.
-    error_model_ : estimator or None
-        The fitted error model.
+    error_model_ : estimator, SerialFit or None
+        The fitted error model. Of serial coupling, "linear" and "quadratic" it tells the
+        ``alphas`` chosen and the ``residual`` of every row from a fit without it or its group [m].
     calibration_ : CalibrationResult or None
         What the calibration found.
     radius_ : Radius or None
@@ -187,26 +192,24 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             mechanical = self.calibration_.chain
         else:
             _warn_contradictory(mechanical, q)
-        error = y - _mechanical_tips(mechanical, q, y)
         self.mechanical_model_ = mechanical
-        self.error_model_ = None
-        error_part = guard = None
-        if not (isinstance(self.error_model, str) and self.error_model == "drop"):
-            regressor: Any
-            if self.error_model is None:
-                regressor = ELMRegressor(random_state=self.random_state)
-            else:
-                regressor = clone(self.error_model)
-            given: dict[str, Any] = {} if weights is None else {"sample_weight": weights}
-            if groups is not None and has_fit_parameter(regressor, "groups"):
-                given["groups"] = groups
-            self.error_model_ = regressor.fit(X, error, **given)
-            error_part = error_module(regressor, q)
+        error = y - _mechanical_tips(mechanical, q, y)
+        model = self.error_model if self.error_model is not None else self._default_error_model()
+        if isinstance(model, str) and model == "drop":
+            self.error_model_, self.module_ = None, HybridModule(mechanical, None)
+        elif mechanical is not None and (self.coupling == "serial" or isinstance(model, str)):
+            tips = torch.from_numpy(y.reshape(len(y), -1))
+            self.error_model_, self.module_ = fit_coupled(
+                model, self.coupling, mechanical, q, tips, weights, groups, self.guard
+            )
+        else:
+            self.error_model_ = _fit_regressor(clone(model), X, error, weights, groups)
+            error_part = error_module(self.error_model_, q)
             kept = q if weights is None else q[torch.from_numpy(weights > 0)]
-            guard = fit_guard(self.guard, error_part, kept)
-        if mechanical is None:
-            guard = None  # there is nothing to fall back on
-        self.module_ = HybridModule(mechanical, error_part, guard)
+            guard = None  # without a mechanical model there is nothing to fall back on
+            if mechanical is not None:
+                guard = fit_guard(self.guard, error_part, kept)
+            self.module_ = HybridModule(mechanical, error_part, guard)
         self._single_output = y.ndim == 1
         n_outputs = 1 if y.ndim == 1 else y.shape[1]
         self._drift = Drift.of_range(q.amin(0).numpy(), q.amax(0).numpy(), n_outputs)
@@ -258,12 +261,13 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         q, y = torch.from_numpy(X.astype(np.float64)), np.asarray(y, dtype=np.float64)
         weights = _check_sample_weight(sample_weight, X, dtype=np.float64, ensure_non_negative=True)
-        fitted = HybridModule(self.mechanical_model_, self.module_.error, self.module_.guard)
+        module = copy.copy(self.module_)  # what was handed out before stays as it was
+        module._modules = {**self.module_._modules, "drift": None}
         with torch.no_grad():
-            residual = y.reshape(len(y), -1) - fitted(q).numpy()
+            residual = y.reshape(len(y), -1) - module(q).numpy()
         self._drift = self._drift.learned(q.numpy(), residual, weights, decay)
-        fitted.drift = self._drift.correction(alpha)
-        self.module_ = fitted
+        module.drift = self._drift.correction(alpha)
+        self.module_ = module
         return self
 
     def predict(self, X: Any, return_radius: bool = False) -> Any:
@@ -355,22 +359,39 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             results.append(array[:, 0] if self._single_output and array.ndim > 1 else array)
         return results
 
+    def _default_error_model(self) -> Any:
+        if self.coupling == "serial":
+            return "quadratic"
+        return ELMRegressor(random_state=self.random_state)
+
     def _check_settings(self) -> None:
-        if self.coupling != "parallel":
-            raise ValueError(f"`coupling` must be 'parallel', got {self.coupling!r}.")
+        if self.coupling not in COUPLINGS:
+            raise ValueError(f"`coupling` must be one of {[*COUPLINGS]}, got {self.coupling!r}.")
         if self.coverage is not None and not 0.0 < self.coverage < 1.0:
             raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {self.coverage!r}.")
         if self.guard not in GUARDS:
             raise ValueError(f"`guard` must be one of {GUARDS}, got {self.guard!r}.")
-        if isinstance(self.error_model, str) and self.error_model != "drop":
+        named = isinstance(self.error_model, str)
+        if named and self.error_model not in ("drop", *READOUTS):
             raise ValueError(
-                f"`error_model` must be an estimator, None or 'drop', got {self.error_model!r}."
+                f"`error_model` must be an estimator, None or one of {['drop', *READOUTS]}, got "
+                f"{self.error_model!r}."
+            )
+        serial = self.coupling == "serial" and self.error_model != "drop"
+        if serial and not (
+            named or self.error_model is None or isinstance(self.error_model, _HIDDEN_LAYERS)
+        ):
+            raise TypeError(
+                f"`error_model` must give features that can act inside the robot with "
+                f"coupling='serial': None, one of {[*READOUTS]}, an ELMRegressor or an "
+                f"ELMRegressorCV, got {type(self.error_model).__name__}; use coupling='parallel'."
             )
         if self.mechanical_model is None:
-            if self.error_model == "drop":
+            if named or serial:
                 raise ValueError(
-                    "`error_model` must not be 'drop' without a `mechanical_model`: nothing would "
-                    "be left to predict with."
+                    f"`mechanical_model` must be given with coupling={self.coupling!r} and "
+                    f"error_model={self.error_model!r}: the error is that of a mechanical model. "
+                    "For the data alone give an estimator as `error_model`."
                 )
         elif not isinstance(self.mechanical_model, nn.Module):
             raise TypeError(
@@ -379,143 +400,13 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             )
 
 
-class HybridModule(nn.Module):
-    """The sum f_mech(q) + w(q) eps(q) as a torch module q (..., n) -> x (..., m).
-
-    Parameters
-    ----------
-    mechanical, error : nn.Module or None
-        The parts; at least one of them.
-    guard : nn.Module or None
-        The weight w(q) in [0, 1], shape (..., 1). None: one everywhere.
-    drift : AffineModule or None
-        What has changed since, w(q) (B q + c), is added.
-    """
-
-    def __init__(
-        self,
-        mechanical: nn.Module | None,
-        error: nn.Module | None,
-        guard: Guard | None = None,
-        drift: AffineModule | None = None,
-    ) -> None:
-        super().__init__()
-        self.mechanical = mechanical
-        self.error = error
-        self.guard = guard
-        self.drift = drift
-
-    @property
-    def n_actuators(self) -> int | None:
-        """Length of q, where the mechanical model tells it."""
-        return getattr(self.mechanical, "n_actuators", None)
-
-    def forward(self, q: Tensor) -> Tensor:
-        """Return x of shape (..., m) [m]."""
-        if self.mechanical is None:
-            return self.error_part(q)
-        if self.error is None and self.drift is None:
-            return self.mechanical(q)
-        return self.mechanical(q) + self.error_part(q)
-
-    def mechanical_part(self, q: Tensor) -> Tensor:
-        """Return f_mech(q), zero without a mechanical model, shape (..., m) [m]."""
-        return self.mechanical(q) if self.mechanical is not None else 0.0 * self.error_part(q)
-
-    def error_part(self, q: Tensor) -> Tensor:
-        """Return what is added to f_mech(q), w(q) eps(q) and the drift, shape (..., m) [m]."""
-        if self.error is None:
-            return 0.0 * self.mechanical_part(q) if self.drift is None else self.drift(q)
-        parts = [self.error(q)] if self.drift is None else [self.error(q), self.drift(q)]
-        if self.guard is not None:
-            weight = self.guard(q)
-            parts = [weight * part for part in parts]
-            parts[0] = self.guard.shortened(parts[0])
-        return sum(parts[1:], parts[0])
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return dx/dq of the sum, shape (..., m, n)."""
-        return self.forward_and_jacobian(q)[1]
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x (..., m) and dx/dq (..., m, n), closed form where the parts offer it."""
-        x, J = in_blocks(self._forward_and_jacobian, q)
-        return x, J
-
-    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        parts = []
-        if self.mechanical is not None:
-            parts.append(forward_and_jacobian(self.mechanical, q))
-        fading = None
-        if self.error is not None:
-            x, J, outside = self._error_and_outside(q)
-            if outside is not None and len(outside):
-                fading = outside, *forward_and_reverse_jacobian(self.guard, q[outside])
-                x, J = _faded(x, J, *fading)
-            if self.guard is not None:
-                x, J = self.guard.shortened_with_jacobian(x, J)
-            parts.append((x, J))
-        if self.drift is not None:
-            x, J = forward_and_jacobian(self.drift, q)
-            parts.append((x, J) if fading is None else _faded(x, J, *fading))
-        (x, J), *rest = parts
-        for x_part, J_part in rest:
-            x, J = x + x_part, J + J_part
-        return x, J
-
-    def _error_and_outside(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return eps, its Jacobian, and the rows where its weight may be less than one."""
-        guard = self.guard
-        if isinstance(guard, LeverageGuard) and guard.readout is self.error is not None:
-            if isinstance(self.error, ELM):  # its features serve both
-                x, J, inside = self.error.forward_jacobian_and(
-                    q, lambda features: guard.is_inside(features)[..., None]
-                )
-                return x, J, (~inside[:, 0]).nonzero()[:, 0]
-        outside = None if guard is None else (~self.in_domain(q)).nonzero()[:, 0]
-        return *forward_and_jacobian(self.error, q), outside
-
-    def numpy_function(self) -> NumpyFunction:
-        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n).
-
-        The sum of what the parts offer as ``numpy_function``, without torch's overhead; in float64,
-        with their present parameters.
-        """
-        if self.error is None:
-            return numpy_function(self.mechanical)
-        guard = self.guard
-        correction = (
-            numpy_function(self.error) if guard is None else guard.numpy_correction(self.error)
-        )
-        if self.mechanical is None:
-            return correction
-        mechanical = numpy_function(self.mechanical)
-
-        def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
-            x, J = mechanical(q)
-            more, slope = correction(q)
-            return x + more, J + slope
-
-        return tip_and_jacobian
-
-    def error_weight(self, q: Tensor) -> Tensor:
-        """Return the weight w(q) of the error model, shape (...)."""
-        return q.new_ones(q.shape[:-1]) if self.guard is None else self.guard(q)[..., 0]
-
-    def in_domain(self, q: Tensor) -> Tensor:
-        """Return whether the error model is fully trusted, shape (...), bool."""
-        if self.guard is None:
-            return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
-        return self.guard.strangeness(q) <= 1.0
-
-
-def _faded(
-    x: Tensor, J: Tensor, rows: Tensor, weight: Tensor, slope: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return x (N, m) and J (N, m, n), in some rows times a weight (k, 1) of slope (k, 1, n)."""
-    own, J_own = x[rows], J[rows]
-    J_own = weight[..., None] * J_own + own[..., None] * slope
-    return x.index_copy(0, rows, weight * own), J.index_copy(0, rows, J_own)
+def _fit_regressor(
+    regressor: Any, X: Any, error: NDArray, weights: NDArray | None, groups: Any
+) -> Any:
+    given: dict[str, Any] = {} if weights is None else {"sample_weight": weights}
+    if groups is not None and has_fit_parameter(regressor, "groups"):
+        given["groups"] = groups
+    return regressor.fit(X, error, **given)
 
 
 def _warn_contradictory(mechanical: Any, q: Tensor) -> None:

@@ -19,13 +19,17 @@ from torch import nn
 
 from hybridkin._drift import Drift
 from hybridkin._error_modules import AffineModule
+from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
+from hybridkin._hybrid_modules import HybridModule, SerialHybridModule
 from hybridkin._radius import Radius
 from hybridkin._readout import Statistics
+from hybridkin._serial import SerialModule
+from hybridkin._serial_fit import SerialFit
 from hybridkin.chain import ConstantCurvatureChain
 from hybridkin.elm import ELMRegressor
 from hybridkin.elm_cv import ELMRegressorCV
 from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
-from hybridkin.hybrid import HybridForwardModel, HybridModule
+from hybridkin.hybrid import HybridForwardModel
 from hybridkin.rigid import RigidChain
 from hybridkin.tendons import ElasticTendonChain
 
@@ -66,6 +70,14 @@ _ELM_ARRAYS = (
     *("leverage_center_", "leverage_factor_", "leverage_offset_"),
 )
 _ELM_SETTINGS = ("solver_", "n_samples_seen_", "n_features_in_", "_activation", "_y_ndim")
+
+_RANGE = ("center", "scale")
+_FEATURES: dict[str, Any] = {
+    "linear": (Features, _RANGE),
+    "quadratic": (QuadraticFeatures, _RANGE),
+    "hidden": (HiddenFeatures, (*_RANGE, "input_weights", "input_bias")),
+}
+_READOUT_ARRAYS = ("weights", "factor", "noise_variance")
 
 Arrays = dict[str, NDArray]
 Chain = ConstantCurvatureChain | ElasticTendonChain | RigidChain
@@ -229,6 +241,9 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
                 )
             header[key] = _store_chain(part, arrays, f"{key}.")
     header["error"] = _store_error(model.error_model_, arrays)
+    if isinstance(model.error_model_, SerialFit):
+        name = model.error_model
+        header["error_model"] = name if isinstance(name, str) else None
     header["fitted_guard"] = _store_guard(model.module_.guard, arrays)
     arrays |= {f"drift.{name}": array for name, array in model._drift._asdict().items()}
     if model.module_.drift is not None:
@@ -242,11 +257,16 @@ def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardMod
         None if header[key] is None else _restored_chain(header[key], arrays, f"{key}.")
         for key in ("mechanical", "nominal")
     )
-    error, error_module = _restored_error(header["error"], arrays)
+    readout = header["error"] is not None and header["error"]["kind"] == "readout"
+    error, error_module = (None, None) if readout else _restored_error(header["error"], arrays)
+    error_model: Any = "drop" if error is None else error
+    if readout:
+        error = _restored_readout(header["error"], arrays, mechanical)
+        error_module, error_model = error.module, header["error_model"]
     names = header["calibrate"]
     model = HybridForwardModel(
         nominal,
-        "drop" if error is None else error,
+        error_model,
         coupling=header["coupling"],
         calibrate=names if isinstance(names, str) else tuple(names),
         guard=header["guard"],
@@ -261,15 +281,45 @@ def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardMod
         model.feature_names_in_ = np.array(header["feature_names_in"], dtype=object)
     model._single_output = bool(header["single_output"])
     guard = _restored_guard(header["fitted_guard"], arrays, error_module)
-    drift = None
+    drift: AffineModule | None = None
     if "drift.coef" in arrays:
         drift = AffineModule(arrays["drift.coef"], arrays["drift.bias"])
     if "drift.gram" in arrays:  # files from before partial_fit have none
         model._drift = Drift(*(arrays[f"drift.{name}"] for name in Drift._fields))
-    model.module_ = HybridModule(mechanical, error_module, guard, drift)
+    if isinstance(error_module, SerialModule):
+        model.module_ = SerialHybridModule(error_module, guard, drift)
+    else:
+        model.module_ = HybridModule(mechanical, error_module, guard, drift)
     with torch.no_grad():  # a file whose arrays do not fit together fails here, not in use
         model.module_.forward_and_jacobian(torch.ones(1, model.n_features_in_, dtype=torch.float64))
     return model
+
+
+def _store_readout(fit: SerialFit, arrays: Arrays) -> dict[str, Any]:
+    features = fit.module.features
+    kind = next(kind for kind, (cls, _) in _FEATURES.items() if type(features) is cls)
+    for name in _FEATURES[kind][1]:
+        arrays[f"error.{name}"] = getattr(features, name).cpu().numpy()
+    for name in _READOUT_ARRAYS:
+        arrays[f"error.{name}"] = getattr(fit.module, name).cpu().numpy()
+    arrays["error.residual"] = fit.residual
+    header = {"kind": "readout", "features": kind, "place": fit.module.place}
+    if isinstance(features, HiddenFeatures):
+        header["activation"] = features.activation
+    return {**header, "alphas": [*map(str, fit.alphas)], "gradient": fit.gradient}
+
+
+def _restored_readout(header: Any, arrays: Arrays, mechanical: Any) -> SerialFit:
+    cls, names = _FEATURES[header["features"]]
+    tensors: dict[str, Any] = {
+        name: torch.from_numpy(arrays[f"error.{name}"]) for name in (*names, *_READOUT_ARRAYS)
+    }
+    options = {"activation": header["activation"]} if "activation" in header else {}
+    features = cls(**{name: tensors.pop(name) for name in names}, **options)
+    module = SerialModule(mechanical, features, place=header["place"], **tensors)
+    first, second = map(float, header["alphas"])
+    residual = arrays["error.residual"]
+    return SerialFit(module, (first, second), residual, {}, float(header["gradient"]))
 
 
 def _store_elm(regressor: Any, arrays: Arrays, prefix: str) -> dict[str, Any]:
@@ -306,12 +356,14 @@ def _store_error(regressor: Any, arrays: Arrays) -> dict[str, Any] | None:
         return None
     if isinstance(regressor, _ELMS):
         return _store_elm(regressor, arrays, "error.")
+    if isinstance(regressor, SerialFit):
+        return _store_readout(regressor, arrays)
     if isinstance(regressor, LinearRegression):
         arrays["error.coef"] = np.asarray(regressor.coef_)
         arrays["error.intercept"] = np.asarray(regressor.intercept_)
         return {"kind": "linear"}
     raise TypeError(
-        "`model` must have an ELM, a LinearRegression or 'drop' as `error_model` to be "
+        "`model` must have an ELM, a LinearRegression or a name as `error_model` to be "
         f"saved, got {type(regressor).__name__}, which could only be stored as code."
     )
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._arm_files import Joint, chain_path, limits_of, mjcf_path, urdf_path
@@ -372,6 +373,52 @@ class RigidChain(PortableModule):
         x, J = in_blocks(self._forward_and_jacobian, q)
         return x, J
 
+    def numpy_function(self) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
+        """Return a NumPy function for one configuration at a time, without torch's overhead.
+
+        Returns
+        -------
+        function
+            Maps q of shape (n_actuators,) to the tip position (3,) [m] and its Jacobian
+            (3, n_actuators), in float64. It keeps the arm's present geometry.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from hybridkin import RigidChain
+        >>> arm = RigidChain([np.eye(4)], [[0, 0, 1]], tool=[0.2, 0, 0])
+        >>> x, J = arm.numpy_function()(np.zeros(1))
+        >>> J[:, 0]
+        array([0. , 0.2, 0. ])
+        """
+        buffers = (self.motions, self.axes, self._end(self.motions), self.base)
+        motions, axes, end, base = (part.detach().cpu().double().numpy() for part in buffers)
+        # Moving frames turned so that every joint's axis is their z-axis: it can then be read off.
+        turns = np.stack([_frame_along(axis) for axis in axes])
+        motions = motions @ turns[:, None]
+        motions[1:] = turns[:-1, None].swapaxes(-1, -2) @ motions[1:]
+        still, by_u1, by_u2 = (np.ascontiguousarray(part) for part in motions.swapaxes(0, 1))
+        end = turns[-1].T @ end
+        # Rows x, y, z, x, y: a cross product is then two products of slices.
+        first = base[[0, 1, 2, 0, 1]]
+        slides = self.slides.cpu().numpy()
+        sliding = bool(slides.any())
+
+        def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
+            u1 = np.where(slides, q, np.sin(q)) if sliding else np.sin(q)
+            steps = still + u1[:, None, None] * by_u1 + np.cos(q)[:, None, None] * by_u2
+            frame, frames = first, []
+            for step in steps:
+                frame = frame.dot(step)
+                frames.append(frame)
+            tip = frame.dot(end)
+            columns = np.array(frames)
+            z, lever = columns[:, :, 2].T, tip[:, None] - columns[:, :, 3].T
+            J = z[1:4] * lever[2:5] - z[2:5] * lever[1:4]
+            return tip[:3], np.where(slides, z[:3], J) if sliding else J
+
+        return tip_and_jacobian
+
     def pose_jacobian(self, q: Tensor) -> Tensor:
         """Return the tip's linear and angular Jacobian, shape (..., 6, n_actuators).
 
@@ -556,6 +603,16 @@ def _motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
     motions[:, 2, :3, :3] = torch.where(slide, 0.0, eye - along)
     motions[:, 1, :3, 3] = torch.where(slides[:, None], axes, 0.0)
     return origins[:, None] @ motions
+
+
+def _frame_along(axis: NDArray) -> NDArray:
+    """Return a rotation (4, 4) whose z-axis is the given one."""
+    frame, order = np.eye(4), np.argsort(np.abs(axis))
+    frame[:3, 2] = axis
+    x = np.cross(np.eye(3)[order[0]], axis)  # across, and the least of the axis
+    frame[:3, 0] = x / np.linalg.norm(x)
+    frame[:3, 1] = np.cross(axis, frame[:3, 0])
+    return frame
 
 
 def _array(value: Any, name: str, shape: tuple[int | None, ...], *, finite: bool = True) -> Tensor:

@@ -226,10 +226,10 @@ def test_a_tree_has_no_slope_but_predicts(log):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: HybridForwardModel(bha(), coupling="serial"), "`coupling` must be 'parallel'"),
+        (lambda: HybridForwardModel(bha(), coupling="both"), "`coupling` must be one of"),
         (lambda: HybridForwardModel(bha(), guard="ball"), "`guard` must be one of"),
-        (lambda: HybridForwardModel(bha(), "auto"), "`error_model` must be an estimator"),
-        (lambda: HybridForwardModel(None, "drop"), "nothing would be left"),
+        (lambda: HybridForwardModel(bha(), "cubic"), "`error_model` must be an estimator"),
+        (lambda: HybridForwardModel(None, "drop"), "`mechanical_model` must be given"),
         (lambda: HybridForwardModel(bha(), calibrate=("radius",)), "`parameters` must name"),
     ],
 )

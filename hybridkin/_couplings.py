@@ -1,0 +1,91 @@
+"""Error models that are readouts of features of the actuators: at the tip, or inside the robot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
+from hybridkin._hybrid_modules import SerialHybridModule
+from hybridkin._linearised import Pair
+from hybridkin._serial_fit import SerialFit, fit_serial
+from hybridkin.elm import ELMRegressor, draw_layer
+from hybridkin.elm_cv import ELMRegressorCV
+from hybridkin.guards import fit_guard
+
+__all__ = ["COUPLINGS", "READOUTS", "fit_coupled"]
+
+COUPLINGS = {"parallel": "tip", "serial": "coordinates"}
+"""Where the error acts, by the name of the coupling."""
+
+READOUTS = ("linear", "quadratic")
+"""Error models by name: features of the actuators, penalties chosen by rows or groups left out."""
+
+
+def fit_coupled(
+    error_model: Any,
+    coupling: str,
+    mechanical: nn.Module,
+    q: Tensor,
+    x: Tensor,
+    weights: NDArray | None,
+    groups: Any,
+    guard: str | None,
+) -> tuple[SerialFit, SerialHybridModule]:
+    """Return the fitted readout and the hybrid of it, guarded.
+
+    Parameters
+    ----------
+    error_model : {"linear", "quadratic"}, ELMRegressor or ELMRegressorCV
+        The features: of an ELMRegressor its hidden layer, with its `alpha` as the penalty; an
+        ELMRegressorCV gives a hidden layer and has the penalties chosen.
+    coupling : {"parallel", "serial"}
+        Where the error acts.
+    mechanical : nn.Module
+        Maps q (N, n) to x (N, m).
+    q, x : Tensor of shape (N, n) and (N, m)
+        Measured rows.
+    weights, groups : array-like of shape (N,) or None
+        How often each row counts; its motion.
+    guard : {"leverage", "box"} or None
+        Where the error is trusted.
+    """
+    kept = q if weights is None else q[torch.from_numpy(weights > 0)]
+    features, alphas = _features(error_model, kept)
+    fit = fit_serial(
+        mechanical,
+        features,
+        q,
+        x,
+        place=COUPLINGS[coupling],
+        sample_weight=None if weights is None else torch.from_numpy(weights),
+        groups=groups,
+        alphas=alphas,
+    )
+    module = SerialHybridModule(fit.module)
+    module.guard = fit_guard(guard, module.error_part, kept)
+    return fit, module
+
+
+def _features(error_model: Any, q: Tensor) -> tuple[Features, Pair | None]:
+    """Return the features, and the penalties where they are given."""
+    if isinstance(error_model, str):
+        kind = {"linear": Features, "quadratic": QuadraticFeatures}[error_model]
+        return kind.of_range(q), None
+    params = error_model
+    if isinstance(error_model, ELMRegressorCV):
+        params = ELMRegressor(
+            n_hidden=int(np.max(error_model.n_hidden)),
+            activation=error_model.activation,
+            random_state=error_model.random_state,
+        )
+    layer = draw_layer(params, q.numpy(), None)
+    features = HiddenFeatures.of_range(
+        q, layer.input_weights, layer.input_bias, activation=layer.activation
+    )
+    alpha = float(params.alpha)
+    return features, None if params is not error_model else (alpha, alpha)

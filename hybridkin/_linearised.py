@@ -1,0 +1,219 @@
+"""Ridge regression on features times Jacobians: its optimum, its rows left out, its penalties."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from math import inf, log10
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Pair = tuple[float, float]
+_GRID = (inf, 4.0, 0.0, -4.0)  # penalties to start with, in half decades
+_LOW, _HIGH = (-6.0, -12.0), 8.0
+_EQUAL = 1e-3
+_RANK = 1e-8  # of the features' sum of squares
+
+
+class Linearised:
+    """The problem sum_n |y_n - J_n W phi_n|^2 + sum_ck penalty_k W_ck^2.
+
+    A feature whose penalty is infinite takes no part.
+
+    Parameters
+    ----------
+    J : Tensor of shape (N, m, C)
+        Jacobians.
+    phi : Tensor of shape (N, K)
+        Features.
+    y : Tensor of shape (N, m)
+        Targets.
+    """
+
+    def __init__(self, J: Tensor, phi: Tensor, y: Tensor) -> None:
+        self.J, self.phi, self.y = J, phi, y
+        (n, _, C), K = J.shape, phi.shape[1]
+        inner = J.mT @ J
+        self.gram = phi.new_empty(C, K, C, K)  # sum_n (J' J)_ab phi phi'
+        for a in range(C):
+            row = (inner[:, a, : a + 1, None] * phi[:, None]).reshape(n, -1).mT @ phi
+            self.gram[: a + 1, :, a] = row.unflatten(0, (a + 1, K))
+            self.gram[a, :, : a + 1] = self.gram[: a + 1, :, a].transpose(0, 1)
+        self.moment = moment(J, y, phi)
+
+    def factor(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which features take part (K,), and the Cholesky factor (D, D) of their system."""
+        kept = torch.isfinite(penalty)
+        system = self.gram[:, kept][..., kept].flatten(2).flatten(0, 1)
+        system.diagonal().add_(penalty[kept].repeat(len(self.gram)))
+        return kept, torch.linalg.cholesky(system)
+
+    def solve(self, penalty: Tensor) -> Tensor:
+        """Return the optimal readout W (C, K)."""
+        return solve_kept(self.moment, *self.factor(penalty))
+
+    def residual(self, readout: Tensor) -> Tensor:
+        """Return y - J W phi, shape (N, m)."""
+        return self.y - (self.J @ (self.phi @ readout.mT)[..., None])[..., 0]
+
+    def left_out(self, penalty: Tensor, members: list[Tensor] | None = None) -> Tensor:
+        """Return the residual (N, m) of every row from a fit without it, or without its group.
+
+        Exact: (1 - H_SS)^-1 r_S, with H the hat matrix and S the rows of a group; groups with
+        more rows than there are weights are taken out of the system instead.
+
+        Parameters
+        ----------
+        penalty : Tensor of shape (K,)
+            Penalty of every feature.
+        members : list of Tensor, optional
+            Rows of every group. None: every row by itself.
+        """
+        kept, L = self.factor(penalty)
+        phi = self.phi[:, kept]
+        own = self.residual(solve_kept(self.moment, kept, L))
+        inverse = torch.cholesky_inverse(L)
+        if members is None:
+            share = self.J @ self._spread(phi, inverse) @ self.J.mT
+            return torch.linalg.solve(torch.eye(share.shape[1]).to(share) - share, own)
+        result = torch.empty_like(own)
+        for rows in members:
+            A, y = design(self.J[rows], phi[rows]).flatten(0, 1), self.y[rows].flatten()
+            if len(A) <= len(L):
+                share = torch.eye(len(A)).to(A) - A @ inverse @ A.mT
+                left = torch.linalg.solve(share, own[rows].flatten())
+            else:
+                rest = torch.linalg.cholesky(L @ L.mT - A.mT @ A)
+                right = self.moment[:, kept].flatten() - y @ A
+                left = y - A @ torch.cholesky_solve(right[:, None], rest)[:, 0]
+            result[rows] = left.view_as(own[rows])
+        return result
+
+    def posterior(self, penalty: Tensor, count: float) -> tuple[Tensor, Tensor]:
+        """Return R (C, K, D) with R R' the covariance of W, and the variance of the noise.
+
+        The covariance is that for noise of variance 1; `count` is how many numbers were measured.
+        """
+        kept, L = self.factor(penalty)
+        C = len(self.gram)
+        half = torch.linalg.solve_triangular(L.mT, torch.eye(len(L)).to(L), upper=True)
+        factor = half.new_zeros(C, len(kept), len(L))
+        factor[:, kept] = half.unflatten(0, (C, -1))
+        squares = self.residual(solve_kept(self.moment, kept, L)).square().sum()
+        used = len(L) - (penalty[kept].repeat(C) * half.square().sum(1)).sum()
+        free = count - used
+        return factor, squares / torch.where(free > 0, free, torch.nan)
+
+    def _spread(self, phi: Tensor, inverse: Tensor) -> Tensor:
+        """Return the covariance (N, C, C) of W phi, from that of W."""
+        C, K = len(self.gram), phi.shape[1]
+        spread = phi.new_empty(len(phi), C, C)
+        for a in range(C):
+            part = phi @ inverse[a * K : (a + 1) * K, : (a + 1) * K]
+            spread[:, a, : a + 1] = (part.unflatten(1, (a + 1, K)) @ phi[..., None])[..., 0]
+            spread[:, : a + 1, a] = spread[:, a, : a + 1]
+        return spread
+
+
+def moment(J: Tensor, y: Tensor, phi: Tensor) -> Tensor:
+    """Return sum_n J_n' y_n phi_n', shape (C, K)."""
+    return (J.mT @ y[..., None])[..., 0].mT @ phi
+
+
+def solve_kept(right: Tensor, kept: Tensor, L: Tensor) -> Tensor:
+    """Return the solution (C, K) for a right-hand side (C, K), zero for features left out."""
+    solution = torch.zeros_like(right)
+    found = torch.cholesky_solve(right[:, kept].reshape(-1, 1), L)
+    solution[:, kept] = found.reshape(len(right), -1)
+    return solution
+
+
+def design(J: Tensor, phi: Tensor) -> Tensor:
+    """Return the rows (..., m, C P) that take all of W to J W phi."""
+    return (J[..., None] * phi[..., None, None, :]).flatten(-2)
+
+
+def members_of(groups: Any) -> list[Tensor]:
+    """Return the rows of every group, from their labels (N,)."""
+    _, of_row = np.unique(np.asarray(groups), return_inverse=True)
+    order = torch.from_numpy(np.argsort(of_row, kind="stable"))
+    return [*order.split(np.bincount(of_row).tolist())]
+
+
+def basis(phi: Tensor, n_linear: int, most: int) -> Tensor:
+    """Return the basis (P, K) of features (N, P): the linear ones, and what the others add.
+
+    What the first `n_linear` features explain of the others over the rows is taken off them, so
+    that their penalty does not touch it. The rest is turned to its principal axes, which leaves a
+    penalty on it as it is; axes without rows to speak of are dropped, and the weakest of too many.
+    """
+    linear, bent = phi.tensor_split([n_linear], dim=1)
+    explained = torch.linalg.pinv(linear, rtol=1e-6) @ bent
+    rest = bent - linear @ explained
+    sizes, axes = torch.linalg.eigh(rest.mT @ rest)
+    axes = axes[:, sizes > _RANK * bent.square().sum()].flip(1)[:, :most]
+    top = torch.cat([torch.eye(n_linear).to(phi), -explained @ axes], dim=1)
+    return torch.cat([top, torch.nn.functional.pad(axes, (n_linear, 0))])
+
+
+def choose(
+    score: Callable[[Pair], float], start: Pair | None = None
+) -> tuple[Pair, dict[Pair, float]]:
+    """Return the pair of penalties with the least score, and the scores of all that were tried.
+
+    Of those that are as good but for a thousandth it is the largest, which conditions best.
+
+    Parameters
+    ----------
+    score : callable
+        The score of a pair; a penalty may be infinite.
+    start : tuple of two floats, optional
+        Where to look, besides at no correction. Default: everywhere.
+    """
+    scores: dict[Pair, float] = {}  # by half decades
+
+    def best_of(pairs: Iterable[Pair]) -> Pair:
+        for pair in pairs:
+            if pair not in scores:
+                scores[pair] = score(_penalties(pair))
+        good = [p for p in scores if scores[p] <= (1.0 + _EQUAL) * min(scores.values())]
+        return max(good, key=lambda p: (p.count(inf), sum(k for k in p if k < inf), -scores[p]))
+
+    at = (inf, inf)
+    if start is None:
+        at = best_of((a, b) for a in _GRID for b in _GRID)
+    else:
+        at = best_of([at, (_half_decades(start[0]), _half_decades(start[1]))])
+    for step in (2.0, 1.0):
+        previous = None
+        while at != previous:
+            near = [
+                [k for k in (own + step, own, own - step) if k == inf or low <= k <= _HIGH]
+                for own, low in zip(at, _LOW, strict=True)
+            ]
+            previous, at = at, best_of((a, b) for a in near[0] for b in near[1])
+    return _penalties(at), {_penalties(pair): value for pair, value in scores.items()}
+
+
+def _half_decades(penalty: float) -> float:
+    return penalty if penalty == inf else float(round(2.0 * log10(penalty)))
+
+
+def _penalties(half_decades: Pair) -> Pair:
+    return 10.0 ** (half_decades[0] / 2.0), 10.0 ** (half_decades[1] / 2.0)
+
+
+def quasi_newton(
+    slope: Tensor, pairs: list[tuple[Tensor, Tensor]], factor: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Return the inverse Hessian of L-BFGS times a slope, from changes of readout and slope."""
+    shares = []
+    for moved, turned in reversed(pairs):
+        shares.append((moved * slope).sum() / (moved * turned).sum())
+        slope = slope - shares[-1] * turned
+    step = solve_kept(slope, *factor)
+    for (moved, turned), share in zip(pairs, reversed(shares), strict=True):
+        step = step + (share - (turned * step).sum() / (moved * turned).sum()) * moved
+    return step

@@ -1,0 +1,175 @@
+"""Errors that arise inside: x = f(z + W phi(q)), with z the coordinates of a robot model."""
+
+from __future__ import annotations
+
+from math import nan
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hybridkin._arc_chain import ArcChain
+from hybridkin._features import Features
+from hybridkin._linearised import design
+from hybridkin._numerics import PortableModule, forward_and_jacobian, in_blocks
+
+PLACES = ("coordinates", "tip")
+_BLOCK = 2**18  # numbers in the features of a block of rows: near in the cache
+
+
+class SerialModule(PortableModule):
+    """The tip x = f(z(q) + w(q) W phi(q)) as a torch module q (..., n) -> x (..., m).
+
+    Parameters
+    ----------
+    mechanical : nn.Module
+        Maps q to x.
+    features : Features
+        phi, with its slope.
+    weights : Tensor of shape (C, P)
+        Readout W [unit of z].
+    place : {"coordinates", "tip"}, default="coordinates"
+        What z is: the arcs of a chain of arcs (lengths [m] up to the tip, then x- and
+        y-bendings [rad]), q itself for any other module; or the tip, f being the identity.
+    factor : Tensor of shape (C P, K), optional
+        R with R R' the posterior covariance of W for noise of variance 1. Default: none, zero.
+    noise_variance : Tensor of shape (), optional
+        Variance of one coordinate of a measured tip [m^2].
+    guard : nn.Module, optional
+        The weight w(q) in [0, 1], shape (..., 1). None: one everywhere.
+    """
+
+    weights: Tensor
+    factor: Tensor
+    noise_variance: Tensor
+
+    def __init__(
+        self,
+        mechanical: nn.Module,
+        features: Features,
+        weights: Tensor,
+        *,
+        place: str = "coordinates",
+        factor: Tensor | None = None,
+        noise_variance: Tensor | None = None,
+        guard: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        if place not in PLACES:
+            raise ValueError(f"`place` must be one of {PLACES}, got {place!r}.")
+        self.mechanical = mechanical
+        self.features = features
+        self.guard = guard
+        self.place = place
+        self.register_buffer("weights", weights)
+        nothing, unknown = weights.new_zeros(weights.numel(), 0), weights.new_full((), nan)
+        self.register_buffer("factor", nothing if factor is None else factor)
+        self.register_buffer(
+            "noise_variance", unknown if noise_variance is None else noise_variance
+        )
+
+    @property
+    def n_actuators(self) -> int | None:
+        """Length of q, where the mechanical model tells it."""
+        return getattr(self.mechanical, "n_actuators", None)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the tip x, shape (..., m) [m]."""
+        return in_blocks(self._forward, q)[0]
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return dx/dq = J_z (dz/dq + d(w W phi)/dq), shape (..., m, n), in closed form."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., m) and dx/dq (..., m, n) in one pass."""
+        rows = max(256, _BLOCK // self.weights.shape[1])
+        x, J = in_blocks(self._forward_and_jacobian, q, min(rows, 4096))
+        return x, J
+
+    def mechanical_part(self, q: Tensor) -> Tensor:
+        """Return the tip f(z(q)) without correction, shape (..., m) [m]."""
+        return self.mechanical(q)
+
+    def correction(self, q: Tensor) -> Tensor:
+        """Return w(q) W phi(q), shape (..., C) [unit of z]."""
+        delta = self.features(q) @ self.weights.to(q).mT
+        return delta if self.guard is None else self.guard(q) * delta
+
+    def in_domain(self, q: Tensor) -> Tensor:
+        """Return whether the correction is fully trusted, shape (...), bool."""
+        if self.guard is None:
+            return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
+        return self.guard.strangeness(q) <= 1.0  # pyright: ignore[reportCallIssue]
+
+    def tip_covariance(self, q: Tensor) -> Tensor:
+        """Return the posterior covariance of the tip, without noise, shape (..., m, m) [m^2].
+
+        Of the readout linearised at its optimum.
+        """
+        (covariance,) = in_blocks(self._unit_covariance, q, 512)
+        return self.noise_variance.to(q) * covariance
+
+    def leverage(self, q: Tensor) -> Tensor:
+        """Return the variance of the tip over that of the noise, shape (...); below 1 in training.
+
+        It is the mean over the coordinates of x: unlike the largest it is smooth, and unlike any
+        one of them it does not change when the measuring frame is turned.
+        """
+        (covariance,) = in_blocks(self._unit_covariance, q, 512)
+        return covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+
+    def _forward(self, q: Tensor) -> tuple[Tensor]:
+        return (
+            tip(
+                self.mechanical,
+                coordinates(self.mechanical, q, self.place)[0] + self.correction(q),
+                self.place,
+            ),
+        )
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        delta, turn = self.features.readout(q, self.weights.to(q))
+        if self.guard is not None:
+            outside = (~self.in_domain(q)).nonzero()[:, 0]  # inside it is exactly one
+            if len(outside):
+                weight, fading = forward_and_jacobian(self.guard, q[outside])
+                own = weight[..., None] * turn[outside] + delta[outside][..., None] * fading
+                turn = turn.index_copy(0, outside, own)
+                delta = delta.index_copy(0, outside, weight * delta[outside])
+        z, slope = coordinates(self.mechanical, q, self.place)
+        x, J = tip_and_columns(self.mechanical, z + delta, self.place)
+        return x, J @ (slope + turn)
+
+    def _unit_covariance(self, q: Tensor) -> tuple[Tensor]:
+        phi = self.features(q)
+        z = coordinates(self.mechanical, q, self.place)[0] + phi @ self.weights.to(q).mT
+        J = tip_and_columns(self.mechanical, z, self.place)[1]
+        half = design(J, phi) @ self.factor.to(q)
+        return (half @ half.mT,)
+
+
+def coordinates(mechanical: Any, q: Tensor, place: str) -> tuple[Tensor, Tensor]:
+    """Return z (N, C) of rows q (N, n) and dz/dq, (C, n) or (N, C, n)."""
+    if place == "tip":
+        return forward_and_jacobian(mechanical, q)
+    if isinstance(mechanical, ArcChain):
+        arcs, slope = mechanical._coordinates_and_slope(q)
+        return arcs.mT, slope if slope.ndim == 2 else slope.permute(2, 0, 1)
+    return q, torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
+
+
+def tip(mechanical: Any, z: Tensor, place: str) -> Tensor:
+    """Return the tip (N, m) of coordinates z (N, C)."""
+    if place == "tip":
+        return z
+    return mechanical._tip_of(z.mT) if isinstance(mechanical, ArcChain) else mechanical(z)
+
+
+def tip_and_columns(mechanical: Any, z: Tensor, place: str) -> tuple[Tensor, Tensor]:
+    """Return the tip (N, m) of coordinates z (N, C) and its derivative (N, m, C)."""
+    if place == "tip":
+        return z, torch.eye(z.shape[1], dtype=z.dtype, device=z.device).expand(len(z), -1, -1)
+    if isinstance(mechanical, ArcChain):
+        return mechanical._tip_and_columns_of(z.mT)
+    return forward_and_jacobian(mechanical, z)
