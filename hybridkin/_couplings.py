@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,13 +17,20 @@ from hybridkin.elm import ELMRegressor, draw_layer
 from hybridkin.elm_cv import ELMRegressorCV
 from hybridkin.guards import fit_guard
 
-__all__ = ["COUPLINGS", "READOUTS", "fit_coupled"]
+__all__ = ["COUPLINGS", "READOUTS", "Readout", "fit_coupled"]
 
 COUPLINGS = {"parallel": "tip", "serial": "coordinates"}
 """Where the error acts, by the name of the coupling."""
 
 READOUTS = ("linear", "quadratic")
 """Error models by name: features of the actuators, penalties chosen by rows or groups left out."""
+
+
+class Readout(NamedTuple):
+    """An error model by name, with its penalties where they are settled."""
+
+    kind: str
+    alphas: Pair | None = None
 
 
 def fit_coupled(
@@ -74,8 +81,10 @@ def fit_coupled(
 def _features(error_model: Any, q: Tensor) -> tuple[Features, Pair | None]:
     """Return the features, and the penalties where they are given."""
     if isinstance(error_model, str):
-        kind = {"linear": Features, "quadratic": QuadraticFeatures}[error_model]
-        return kind.of_range(q), None
+        error_model = Readout(error_model)
+    if isinstance(error_model, Readout):
+        kinds: dict[str, Any] = {"linear": Features, "quadratic": QuadraticFeatures}
+        return kinds[error_model.kind].of_range(q), error_model.alphas
     params = error_model
     if isinstance(error_model, ELMRegressorCV):
         params = ELMRegressor(

@@ -18,7 +18,8 @@ from sklearn.utils.validation import (
 )
 from torch import Tensor, nn
 
-from hybridkin._couplings import COUPLINGS, READOUTS, fit_coupled
+from hybridkin._auto import choose
+from hybridkin._couplings import COUPLINGS, READOUTS, Readout, fit_coupled
 from hybridkin._drift import Drift
 from hybridkin._error_modules import error_module
 from hybridkin._hybrid_modules import HybridModule
@@ -33,6 +34,7 @@ __all__ = ["HybridForwardModel"]
 
 _BLOCK = 65536
 _HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)
+_NAMED = (str, Readout)
 
 
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -46,11 +48,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     mechanical_model : nn.Module, optional
         Maps q (..., n) to x (..., m), a `ConstantCurvatureChain` for example. It is copied, never
         changed. None: there is no mechanical part, the data alone decide (f^dat of the paper).
-    error_model : estimator, "linear", "quadratic", "drop" or None, default=None
+    error_model : estimator, "auto", "linear", "quadratic", "drop" or None, default=None
         Any scikit-learn regressor with as many outputs as x has; "linear" or "quadratic" features
         of all actuators, their linear and bent parts penalised apart by errors on rows, or groups,
         left out, down to no correction at all; "drop" is the mechanical model alone. None is
-        ``ELMRegressor()``, with serial coupling "quadratic".
+        ``ELMRegressor()``, with serial coupling "quadratic". "auto" tries these and an
+        `ELMRegressorCV`, in both couplings, and takes what errs least on groups, or rows, left out.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
         the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q
@@ -80,6 +83,11 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     error_model_ : estimator, SerialFit or None
         The fitted error model. Of serial coupling, "linear" and "quadratic" it tells the
         ``alphas`` chosen and the ``residual`` of every row from a fit without it or its group [m].
+    cv_results_ : dict or None
+        Of error_model="auto": by candidate the mean distance on rows left out, its spread over the
+        folds [m] and the CPU time [s]; the smallest is ``chosen``. As a choice among several by
+        these very rows it is a little optimistic, and new motions that resemble none in the log
+        are harder than those left out.
     calibration_ : CalibrationResult or None
         What the calibration found.
     radius_ : Radius or None
@@ -194,13 +202,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             _warn_contradictory(mechanical, q)
         self.mechanical_model_ = mechanical
         error = y - _mechanical_tips(mechanical, q, y)
-        model = self.error_model if self.error_model is not None else self._default_error_model()
+        coupling, model = self.coupling, self.error_model
+        if model is None:
+            model = self._default_error_model()
+        self.cv_results_ = None
+        if isinstance(model, str) and model == "auto":
+            coupling, model, self.cv_results_ = choose(self, mechanical, X, y, weights, groups)
         if isinstance(model, str) and model == "drop":
             self.error_model_, self.module_ = None, HybridModule(mechanical, None)
-        elif mechanical is not None and (self.coupling == "serial" or isinstance(model, str)):
+        elif mechanical is not None and (coupling == "serial" or isinstance(model, _NAMED)):
             tips = torch.from_numpy(y.reshape(len(y), -1))
             self.error_model_, self.module_ = fit_coupled(
-                model, self.coupling, mechanical, q, tips, weights, groups, self.guard
+                model, coupling, mechanical, q, tips, weights, groups, self.guard
             )
         else:
             self.error_model_ = _fit_regressor(clone(model), X, error, weights, groups)
@@ -371,10 +384,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {self.coverage!r}.")
         if self.guard not in GUARDS:
             raise ValueError(f"`guard` must be one of {GUARDS}, got {self.guard!r}.")
-        named = isinstance(self.error_model, str)
-        if named and self.error_model not in ("drop", *READOUTS):
+        named, names = isinstance(self.error_model, _NAMED), ("auto", "drop", *READOUTS)
+        if isinstance(self.error_model, str) and self.error_model not in names:
             raise ValueError(
-                f"`error_model` must be an estimator, None or one of {['drop', *READOUTS]}, got "
+                f"`error_model` must be an estimator, None or one of {[*names]}, got "
                 f"{self.error_model!r}."
             )
         serial = self.coupling == "serial" and self.error_model != "drop"

@@ -15,6 +15,7 @@ ORDER = [
     "experiments",
     "persistence",
     "hybrid",
+    "_auto",
     "_couplings",
     "_hybrid_modules",
     "_drift",

@@ -1,0 +1,92 @@
+"""The error model that is chosen by motions left out: what it takes, and what it says of it."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
+
+from hybridkin import HybridForwardModel, RigidChain, datasets, load_model, robots, save_model
+
+
+def bha():
+    return robots.bionic_handling_assistant()
+
+
+@pytest.fixture(scope="module")
+def trunk():
+    data = datasets.load_trunk()
+    order = np.random.default_rng(0).permutation(np.flatnonzero(data.part == 3))
+    return data.q[order], data.x[order]
+
+
+@pytest.fixture(scope="module")
+def chosen(trunk):
+    q, x = trunk
+    model = HybridForwardModel(bha(), "auto", calibrate="default", random_state=0)
+    return model.fit(q[:250], x[:250], groups=np.arange(250) // 5)
+
+
+def test_no_worse_than_the_single_candidates(chosen, trunk):
+    q, x = trunk
+    error = np.linalg.norm(chosen.predict(q[250:]) - x[250:], axis=1).mean()
+    singles = [
+        HybridForwardModel(bha(), name, coupling=coupling, calibrate="default")
+        for name in ("linear", "quadratic", "drop")
+        for coupling in ("parallel", "serial")
+    ]
+    errors = [
+        np.linalg.norm(m.fit(q[:250], x[:250]).predict(q[250:]) - x[250:], axis=1).mean()
+        for m in singles
+    ]
+    assert error < 1.03 * min(errors)
+    assert error < 0.75 * errors[-1]
+
+
+def test_it_says_what_it_chose(chosen):
+    results = chosen.cv_results_
+    n = len(results["candidate"])
+    assert len(set(results["candidate"])) == n >= 6
+    assert results["chosen"] == results["candidate"][results["mean_distance"].argmin()]
+    assert results["fold_distance"].shape == (n, 5)
+    assert_allclose(results["fold_distance"].std(1, ddof=1), results["std_distance"])
+    assert results["rank"][results["candidate"].index(results["chosen"])] == 1
+    assert results["seconds"].sum() < 60
+
+
+def test_nothing_to_learn_is_left_alone():
+    rng = np.random.default_rng(0)
+    q = rng.uniform(0.18, 0.32, (150, 9))
+    x = bha()(torch.from_numpy(q)).numpy() + 0.005 * rng.standard_normal((150, 3))
+    model = HybridForwardModel(bha(), "auto", random_state=0).fit(q, x)
+    off = model.predict(q) - bha()(torch.from_numpy(q)).numpy()
+    assert np.linalg.norm(off, axis=1).max() < 0.003
+
+
+def test_clone_refit_and_file(chosen, trunk, tmp_path):
+    q, x = trunk
+    again = clone(chosen).fit(q[:250], x[:250], groups=np.arange(250) // 5)
+    assert_array_equal(again.predict(q), chosen.predict(q))
+    save_model(chosen, tmp_path / "model.safetensors")
+    assert_array_equal(load_model(tmp_path / "model.safetensors").predict(q), chosen.predict(q))
+
+
+def test_other_mechanical_models_and_single_outputs():
+    rng = np.random.default_rng(0)
+    origins = np.tile(np.eye(4), (2, 1, 1))
+    origins[1, 0, 3] = 0.3
+    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0]], tool=[0.2, 0, 0])
+    q = rng.uniform(-1, 1, (120, 2))
+    x = arm(torch.from_numpy(q + 0.1 * np.sin(q[:, ::-1]))).numpy()
+    model = HybridForwardModel(arm, "auto", random_state=0).fit(q[:80], x[:80])
+    plain = HybridForwardModel(arm, "drop").fit(q[:80], x[:80])
+    errors = [np.linalg.norm(m.predict(q[80:]) - x[80:], axis=1).mean() for m in (model, plain)]
+    assert errors[0] < 0.3 * errors[1]
+
+
+def test_clear_errors(trunk):
+    q, x = trunk
+    with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
+        HybridForwardModel(bha(), "auto").fit(q, x, groups=np.zeros(len(q)))
+    with pytest.raises(ValueError, match="`mechanical_model` must be given"):
+        HybridForwardModel(None, "auto").fit(q, x)
