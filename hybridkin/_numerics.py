@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -53,7 +53,10 @@ def stumpff(s: Tensor) -> Stumpff:
     powers = s.new_tensor(_SERIES[-1 - _DEGREE.get(s.dtype, 7) :])
     powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
     near = s.clamp(max=_SERIES_END)
-    c3, c4 = _horner(powers, near, torch.addcmul).expand(2, *s.shape).unbind()
+    both = powers[0]
+    for power in powers[1:]:
+        both = torch.addcmul(power, both, near)
+    c3, c4 = both.expand(2, *s.shape).unbind()
     far = s.clamp(min=_SERIES_END)
     theta = far.sqrt()
     c, far_c3, far_c4 = _by_trigonometry(far, theta, torch.cos(theta), torch.sin(theta))
@@ -69,20 +72,11 @@ def stumpff_of_number(s: float) -> Stumpff:
         theta = math.sqrt(s)
         c, c3, c4 = _by_trigonometry(s, theta, math.cos(theta), math.sin(theta))
         return Stumpff(c, 1.0 - s * c3, 0.5 - s * c4, c3, c4)
-    c3, c4 = (_horner(powers, s, _multiply_add) for powers in zip(*_SERIES, strict=True))
+    c3 = c4 = 0.0
+    for of_c3, of_c4 in _SERIES:
+        c3, c4 = of_c3 + c3 * s, of_c4 + c4 * s
     g = 0.5 - s * c4
     return Stumpff(1.0 - s * g, 1.0 - s * c3, g, c3, c4)
-
-
-def _horner(powers: Sequence[Any], s: Any, fma: Callable) -> Any:
-    total = powers[0]
-    for coefficient in powers[1:]:
-        total = fma(coefficient, total, s)
-    return total
-
-
-def _multiply_add(a: float, b: float, c: float) -> float:
-    return a + b * c
 
 
 def _by_trigonometry(s: Any, theta: Any, c: Any, sine: Any) -> tuple[Any, Any, Any]:

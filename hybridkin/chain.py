@@ -280,8 +280,8 @@ class ConstantCurvatureChain(ArcChain):
         offsets = self._tip_offsets().tolist()
 
         def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
-            tail, columns = tip_and_columns_of_numbers(matrix @ q + offset, offsets)
-            return rotation @ tail + position, rotation @ (np.array(columns) @ matrix)
+            tail, columns = tip_and_columns_of_numbers(matrix.dot(q) + offset, offsets)
+            return rotation.dot(tail) + position, rotation.dot(np.array(columns).dot(matrix))
 
         return tip_and_jacobian
 
