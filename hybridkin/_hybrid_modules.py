@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -15,7 +13,7 @@ from hybridkin._numerics import (
     forward_and_reverse_jacobian,
     in_blocks,
 )
-from hybridkin._realtime import NumpyFunction, numpy_function
+from hybridkin._realtime import NumpyFunction, by_torch, numpy_function
 from hybridkin._serial import SerialModule
 from hybridkin.guards import Guard, LeverageGuard
 
@@ -125,7 +123,7 @@ class HybridModule(nn.Module):
         with their present parameters.
         """
         if self.drift is not None:
-            return numpy_function(self._by_torch())
+            return by_torch(self)
         if self.error is None:
             return numpy_function(self.mechanical)
         guard = self.guard
@@ -143,10 +141,6 @@ class HybridModule(nn.Module):
 
         return tip_and_jacobian
 
-    def _by_torch(self) -> nn.Module:
-        """Return the module as one that offers no NumPy function of its own."""
-        return _Plain(self)
-
     def error_weight(self, q: Tensor) -> Tensor:
         """Return the weight w(q) of the error model, shape (...)."""
         return q.new_ones(q.shape[:-1]) if self.guard is None else self.guard(q)[..., 0]
@@ -156,18 +150,6 @@ class HybridModule(nn.Module):
         if self.guard is None:
             return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self.guard.strangeness(q) <= 1.0
-
-
-class _Plain(nn.Module):
-    def __init__(self, module: nn.Module) -> None:
-        super().__init__()
-        self.module: Any = module
-
-    def forward(self, q: Tensor) -> Tensor:
-        return self.module(q)
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self.module.forward_and_jacobian(q)
 
 
 class SerialHybridModule(HybridModule):
@@ -218,7 +200,7 @@ class SerialHybridModule(HybridModule):
 
     def numpy_function(self) -> NumpyFunction:
         """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
-        return numpy_function(self._by_torch())
+        return by_torch(self)
 
 
 def _weighed(x: Tensor, J: Tensor, weight: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
