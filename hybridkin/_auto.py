@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.model_selection import GroupKFold, KFold
 
+from hybridkin._arc_chain import ArcChain
 from hybridkin._couplings import Readout
 from hybridkin.calibration import calibrate
 from hybridkin.elm import ELMRegressor
@@ -97,7 +98,7 @@ def choose(
 
 def _candidates(mechanical: Any, seed: Any) -> dict[str, tuple[str, Any]]:
     """Return coupling and error model by name, the simplest first: of equals it is chosen."""
-    inside = ("linear", "quadratic")
+    inside = ("linear", "quadratic", *(("pose",) if isinstance(mechanical, ArcChain) else ()))
     network = ELMRegressorCV(max_hidden=1000, random_state=seed)
     candidates: dict[str, tuple[str, Any]] = {
         "mechanical": ("parallel", "drop"),

@@ -9,9 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hybridkin._arc_chain import ArcChain
 from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
 from hybridkin._hybrid_modules import SerialHybridModule
 from hybridkin._linearised import Pair
+from hybridkin._pose_features import PoseFeatures
 from hybridkin._serial_fit import SerialFit, fit_serial
 from hybridkin.elm import ELMRegressor, draw_layer
 from hybridkin.elm_cv import ELMRegressorCV
@@ -22,8 +24,8 @@ __all__ = ["COUPLINGS", "READOUTS", "Readout", "fit_coupled"]
 COUPLINGS = {"parallel": "tip", "serial": "coordinates"}
 """Where the error acts, by the name of the coupling."""
 
-READOUTS = ("linear", "quadratic")
-"""Error models by name: features of the actuators, penalties chosen by rows or groups left out."""
+READOUTS = ("linear", "quadratic", "pose")
+"""Error models by name: features, whose penalties are chosen by rows or groups left out."""
 
 
 class Readout(NamedTuple):
@@ -47,7 +49,7 @@ def fit_coupled(
 
     Parameters
     ----------
-    error_model : {"linear", "quadratic"}, ELMRegressor or ELMRegressorCV
+    error_model : {"linear", "quadratic", "pose"}, Readout, ELMRegressor or ELMRegressorCV
         The features: of an ELMRegressor its hidden layer, with its `alpha` as the penalty; an
         ELMRegressorCV gives a hidden layer and has the penalties chosen.
     coupling : {"parallel", "serial"}
@@ -62,7 +64,7 @@ def fit_coupled(
         Where the error is trusted.
     """
     kept = q if weights is None else q[torch.from_numpy(weights > 0)]
-    features, alphas = _features(error_model, kept)
+    features, alphas = _features(error_model, mechanical, kept)
     fit = fit_serial(
         mechanical,
         features,
@@ -78,11 +80,19 @@ def fit_coupled(
     return fit, module
 
 
-def _features(error_model: Any, q: Tensor) -> tuple[Features, Pair | None]:
+def _features(error_model: Any, mechanical: Any, q: Tensor) -> tuple[Features, Pair | None]:
     """Return the features, and the penalties where they are given."""
     if isinstance(error_model, str):
         error_model = Readout(error_model)
     if isinstance(error_model, Readout):
+        if error_model.kind == "pose":
+            if not isinstance(mechanical, ArcChain):
+                raise TypeError(
+                    f"`mechanical_model` must be a chain of arcs, a ConstantCurvatureChain or an "
+                    f"ElasticTendonChain, with error_model='pose', got "
+                    f"{type(mechanical).__name__}; use error_model='quadratic'."
+                )
+            return PoseFeatures.of_range(q, mechanical), error_model.alphas
         kinds: dict[str, Any] = {"linear": Features, "quadratic": QuadraticFeatures}
         return kinds[error_model.kind].of_range(q), error_model.alphas
     params = error_model

@@ -48,17 +48,19 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     mechanical_model : nn.Module, optional
         Maps q (..., n) to x (..., m), a `ConstantCurvatureChain` for example. It is copied, never
         changed. None: there is no mechanical part, the data alone decide (f^dat of the paper).
-    error_model : estimator, "auto", "linear", "quadratic", "drop" or None, default=None
-        Any scikit-learn regressor with as many outputs as x has; "linear" or "quadratic" features
-        of all actuators, their linear and bent parts penalised apart by errors on rows, or groups,
-        left out, down to no correction at all; "drop" is the mechanical model alone. None is
+    error_model : estimator, str or None, default=None
+        Any scikit-learn regressor with as many outputs as x has; or by name "linear" or "quadratic"
+        features of all actuators, or "pose", features of a chain's shape that loads act by, linear
+        and other parts penalised apart by errors on rows, or groups, left out, down to no
+        correction at all; "drop" is the mechanical model alone. None is
         ``ELMRegressor()``, with serial coupling "quadratic". "auto" tries these and an
         `ELMRegressorCV`, in both couplings, and takes what errs least on groups, or rows, left out.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
         the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q
         itself for other mechanical models; delta is linear in features of q, so a regressor must
-        be an ELMRegressor (its hidden layer and `alpha` are used) or an ELMRegressorCV.
+        be an ELMRegressor (its hidden layer and `alpha` are used) or an ELMRegressorCV. It needs
+        less data where what is missing in the model is simple inside.
     calibrate : sequence of str or "default", default=()
         Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
         in every fold of a cross-validation. "default": the chain's own list.

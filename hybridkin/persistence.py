@@ -21,6 +21,7 @@ from hybridkin._drift import Drift
 from hybridkin._error_modules import AffineModule
 from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
 from hybridkin._hybrid_modules import HybridModule, SerialHybridModule
+from hybridkin._pose_features import PoseFeatures
 from hybridkin._radius import Radius
 from hybridkin._readout import Statistics
 from hybridkin._serial import SerialModule
@@ -75,6 +76,7 @@ _RANGE = ("center", "scale")
 _FEATURES: dict[str, Any] = {
     "linear": (Features, _RANGE),
     "quadratic": (QuadraticFeatures, _RANGE),
+    "pose": (PoseFeatures, _RANGE),
     "hidden": (HiddenFeatures, (*_RANGE, "input_weights", "input_bias")),
 }
 _READOUT_ARRAYS = ("weights", "factor", "noise_variance")
@@ -314,7 +316,9 @@ def _restored_readout(header: Any, arrays: Arrays, mechanical: Any) -> SerialFit
     tensors: dict[str, Any] = {
         name: torch.from_numpy(arrays[f"error.{name}"]) for name in (*names, *_READOUT_ARRAYS)
     }
-    options = {"activation": header["activation"]} if "activation" in header else {}
+    options: dict[str, Any] = {"chain": mechanical} if cls is PoseFeatures else {}
+    if "activation" in header:
+        options["activation"] = header["activation"]
     features = cls(**{name: tensors.pop(name) for name in names}, **options)
     module = SerialModule(mechanical, features, place=header["place"], **tensors)
     first, second = map(float, header["alphas"])

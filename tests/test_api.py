@@ -25,6 +25,7 @@ ORDER = [
     "_serial_fit",
     "_serial",
     "_linearised",
+    "_pose_features",
     "_features",
     "play",
     "calibration",

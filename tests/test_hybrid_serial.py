@@ -26,11 +26,13 @@ from hybridkin import (
 
 SETTINGS = {
     "serial": {"coupling": "serial"},
+    "serial pose": {"coupling": "serial", "error_model": "pose"},
     "serial linear": {"coupling": "serial", "error_model": "linear"},
     "serial ELM": {"coupling": "serial", "error_model": ELMRegressor(40, 1e-3, random_state=0)},
     "serial chosen": {"coupling": "serial", "error_model": ELMRegressorCV(40, random_state=0)},
     "parallel quadratic": {"error_model": "quadratic"},
     "parallel linear": {"error_model": "linear"},
+    "parallel pose": {"error_model": "pose"},
 }
 
 
@@ -170,6 +172,7 @@ def test_other_mechanical_models_take_the_error_on_q():
     ("make", "kind", "message"),
     [
         (lambda: HybridForwardModel(bha(), Ridge(), coupling="serial"), TypeError, "inside the"),
+        (lambda: HybridForwardModel(torch.nn.Linear(9, 3).double(), "pose"), TypeError, "of arcs"),
         (lambda: HybridForwardModel(None, "quadratic"), ValueError, "must be given with"),
         (lambda: HybridForwardModel(None, coupling="serial"), ValueError, "must be given with"),
     ],
