@@ -4,14 +4,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybridkin import datasets, experiments, plots, robots, simulation, trajectories
+    from hybridkin import datasets, experiments, plots, robots, simulation, tasks, trajectories
     from hybridkin._numerics import jacobian
     from hybridkin.calibration import CalibrationResult, calibrate
     from hybridkin.chain import ConstantCurvatureChain
     from hybridkin.elm import ELMRegressor
     from hybridkin.elm_cv import ELMRegressorCV
     from hybridkin.hybrid import HybridForwardModel
-    from hybridkin.ik import IKSolution, IKStatus, InverseKinematics, Step, Track
+    from hybridkin.ik import (
+        Controller,
+        IKSolution,
+        IKStatus,
+        InverseKinematics,
+        Step,
+        Track,
+        Tracker,
+    )
     from hybridkin.persistence import load_model, save_model
     from hybridkin.play import PlayFit, PlayOperator, PlayState, fit_play
     from hybridkin.rigid import RigidChain
@@ -22,6 +30,7 @@ __version__ = "0.1.0"
 __all__ = [
     "CalibrationResult",
     "ConstantCurvatureChain",
+    "Controller",
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
@@ -35,6 +44,7 @@ __all__ = [
     "RigidChain",
     "Step",
     "Track",
+    "Tracker",
     "__version__",
     "calibrate",
     "datasets",
@@ -46,6 +56,7 @@ __all__ = [
     "robots",
     "save_model",
     "simulation",
+    "tasks",
     "trajectories",
 ]
 
@@ -64,8 +75,10 @@ _ROOM_OF = {
     "PlayOperator": "play",
     "PlayState": "play",
     "RigidChain": "rigid",
+    "Controller": "ik",
     "Step": "ik",
     "Track": "ik",
+    "Tracker": "ik",
     "calibrate": "calibration",
     "fit_play": "play",
     "jacobian": "_numerics",

@@ -7,7 +7,8 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from torch import Tensor
+
+from hybridkin._arrays import as_array
 
 
 class IKStatus(IntEnum):
@@ -52,6 +53,9 @@ class Step:
         lambda used, in the unit of `sigma_min`; 0 where the step is the pseudo-inverse's.
     saturated : bool array of shape (..., n)
         Actuators held at a limit of position or speed by this step.
+    scale : array of shape (...,)
+        How far the step goes along the wanted change of the tip, to first order: 1 is all of it.
+        With mode="direction" the share that the limits leave of it.
     """
 
     dq: Any
@@ -60,6 +64,7 @@ class Step:
     sigma_min: Any
     damping: Any
     saturated: Any
+    scale: Any
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
@@ -81,7 +86,8 @@ class IKSolution:
     x : array of shape (..., 3)
         Tips of the model at `q` [m].
     error : array of shape (...,)
-        Distances from `x` to the targets [m], computed on the returned `q`.
+        Distances from `x` to the targets [m], computed on the returned `q`; of tasks with several
+        parts the root of the weighted sum of squares.
     status : int array of shape (...,)
         `IKStatus` of every target.
     n_iter : int array of shape (...,)
@@ -147,6 +153,24 @@ class Track:
     limit_margin: Any
 
     @property
+    def n_laps(self) -> int:
+        """How often the target repeats itself; 0 for a path that does not end where it starts."""
+        target = as_array(self.target).reshape(len(self.t), -1)
+        near = 1e-9 + 1e-6 * float(np.ptp(target, axis=0).max())
+        n = len(target) - 1
+        for laps in range(n, 0, -1):
+            period = n // laps
+            if n % laps == 0 and np.abs(target[period:] - target[:-period]).max() <= near:
+                return laps
+        return 0
+
+    @property
+    def lap_gap(self) -> np.ndarray:
+        """How far q ends from where it started on every lap, shape (n_laps,), in the unit of q."""
+        marks = as_array(self.q)[:: (len(self.t) - 1) // self.n_laps] if self.n_laps else self.q[:1]
+        return np.linalg.norm(np.diff(as_array(marks), axis=0), axis=1)
+
+    @property
     def mean_error(self) -> float:
         """Mean of `error` over the points where it is known [m]."""
         return float(np.nanmean(as_array(self.error)))
@@ -172,10 +196,6 @@ class Track:
             f"Track({_tally(self.status)}; {_errors(as_array(self.error))}; "
             f"largest step {self.largest_step:.3g})"
         )
-
-
-def as_array(a: Any) -> np.ndarray:
-    return a.cpu().numpy() if isinstance(a, Tensor) else np.asarray(a)
 
 
 def _tally(status: Any) -> str:

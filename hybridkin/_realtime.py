@@ -16,12 +16,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import nn
 
+from hybridkin._box import PROXIMAL_ROUNDS, box_floor
+from hybridkin._law import HEALTHY
 from hybridkin._numerics import forward_and_jacobian
 from hybridkin._outcomes import IKStatus
 
-_HEALTHY = 0.02  # sigma_min / sigma_max above which the pseudo-inverse needs no damping
-_BOX_FLOOR = 1e-6  # lambda^2 of a box-limited step over the norm of J J^T
-_PROXIMAL_ROUNDS = 2
+_BOX_FLOOR = box_floor(torch.float64)  # lambda^2 of a box-limited step over the norm of J J^T
 _NEWTON_STEPS = 60
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
@@ -99,9 +99,8 @@ class Controller:
     --------
     >>> import numpy as np
     >>> from hybridkin import InverseKinematics, robots
-    >>> from hybridkin._realtime import Controller
     >>> ik = InverseKinematics(robots.bionic_handling_assistant(), q_min=0.1, q_max=0.4)
-    >>> controller = Controller(ik, np.full(9, 0.25))
+    >>> controller = ik.controller(np.full(9, 0.25))
     >>> for _ in range(5):
     ...     q = controller.step([0.1, 0.05, 0.7])
     >>> controller.status.name, int(controller.saturated.sum())
@@ -257,11 +256,11 @@ class Controller:
         """Return q after the step with the task v, for J by u = q / unit."""
         unit = self._unit
         self.sigma_min, sigma_max = _singular_values(gram)
-        healthy = self.sigma_min >= _HEALTHY * sigma_max
+        healthy = self.sigma_min >= HEALTHY * sigma_max
         if self._damping == "adaptive":
             damping = 0.0
             if not healthy:
-                threshold = _HEALTHY * sigma_max
+                threshold = HEALTHY * sigma_max
                 damping = threshold * (1.0 - (self.sigma_min / threshold) ** 2)
         else:
             damping = float(self._damping) * sigma_max
@@ -392,7 +391,7 @@ def _proximal_box_step(
     """Return the box-limited step for any lambda^2 >= 0, and its multipliers."""
     used = max(damping_sq, floor)
     excess = used - damping_sq
-    rounds = 1 + _PROXIMAL_ROUNDS if excess > 0.0 else 1
+    rounds = 1 + PROXIMAL_ROUNDS if excess > 0.0 else 1
     low, high = held
     rest = np.where(low, box.lower, np.where(high, box.upper, box.z))
     piece = _Piece(box, ~(low | high), rest, used)

@@ -3,36 +3,24 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from hybridkin._numerics import forward_and_jacobian
-from hybridkin._outcomes import IKSolution, IKStatus, Step, Track, as_array
-from hybridkin._solvers import (
-    adaptive_damping,
-    apply_columns,
-    apply_rows,
-    damped_solve,
-    null_projection,
-    row_gram,
-    strict_box_step,
-)
+from hybridkin._arrays import as_tensor, bound, give_back, is_numpy, leading, rows_of
+from hybridkin._implicit import differentiable as with_derivatives
+from hybridkin._law import HEALTHY, Law
+from hybridkin._outcomes import IKSolution, IKStatus, Step, Track
+from hybridkin._realtime import Controller
+from hybridkin._search import Search
+from hybridkin._solvers import row_gram
+from hybridkin._tracking import FEEDBACKS, Tracker
+from hybridkin.tasks import as_task, device_of
 
-__all__ = ["IKSolution", "IKStatus", "InverseKinematics", "Step", "Track"]
-
-_HEALTHY = 0.02  # sigma_min / sigma_max above which the pseudo-inverse needs no damping
-_FIRST_DAMPING = 0.1  # lambda^2 / sigma_max^2 of the first iteration of `solve`
-_LAST_DAMPING = 1e8  # no descent even with this one: the point is as good as it gets
-_STATIONARY = 1e-4  # sine of the angle between the error and what the limits leave free
-_SLOW_STEPS = 8  # iterations in a row that gain less than 1 % of tol
-_POSTURE_STEPS = 10  # iterations of the null-space descent that follows convergence
-_POSTURE_SLIP = 0.3  # tip error per tip-sized motion that a posture step may leave to the next
+__all__ = ["Controller", "IKSolution", "IKStatus", "InverseKinematics", "Step", "Track", "Tracker"]
 
 
 class InverseKinematics:
@@ -46,19 +34,22 @@ class InverseKinematics:
 
     Parameters
     ----------
-    model : nn.Module or callable
-        Maps q ``(..., n)`` to tips ``(..., 3)`` [m], torch to torch, row by row. Its
-        ``forward_and_jacobian(q)`` is used where it has one, else reverse mode; its
-        ``in_domain(q)``, where it has one, feeds the status OUT_OF_DOMAIN. A fitted estimator
-        is unwrapped to its ``module_``.
+    model : nn.Module, callable, (callable, callable) or Task
+        Maps q ``(..., n)`` to tips ``(..., 3)`` [m], row by row. Its ``forward_and_jacobian(q)``
+        is used where it has one, else reverse mode; a pair is such a function and its Jacobian,
+        for torch or for NumPy. A fitted estimator is unwrapped to its ``module_``. Its
+        ``in_domain(q)``, where it has one, feeds the status OUT_OF_DOMAIN. Poses, several points
+        and priorities are tasks, see `hybridkin.tasks`; then x stands for what they steer, in the
+        shape of their targets.
     q_min, q_max : float or array-like of shape (n,), optional
         Limits of q, in the unit of q.
     dq_max : float or array-like of shape (n,), optional
         Largest speed of every actuator [unit of q per second]: a step is at most ``dq_max dt``.
     q_pref : float, array-like of shape (n,) or callable, optional
         Preferred configuration, or a function that gives it for configurations (..., n), torch to
-        torch, as `ElasticTendonChain.taut_posture`. Default: the middle of the limits where both
-        are finite, else there is no posture term.
+        torch: `ElasticTendonChain.taut_posture`, `tasks.away_from_limits`, or `tasks.downhill` of
+        any gradient. Default: the middle of the limits where both are finite, else there is no
+        posture term.
     beta : float, default=1.0
         Rate of the posture [1/s], with 0 <= beta dt <= 1.
     gain : float, optional
@@ -72,6 +63,13 @@ class InverseKinematics:
         held ones cannot do; "clip": the plain law, clipped afterwards; "off": the plain law.
     dt : float, default=0.01
         Control period [s].
+    weights : float or array-like of shape (n,), optional
+        What a unit of every actuator's motion costs: steps minimise ``sum_i weights_i dq_i^2``,
+        and the preferred configuration is the nearest one in that measure. Default: all alike.
+    mode : {"least_squares", "direction"}, default="least_squares"
+        What `step` and `track` do where the limits leave less than the wanted motion of the tip.
+        "least_squares": come as near to it as possible; "direction": keep its direction and go the
+        largest share of it, the `scale` of the step. For limits="saturate".
 
     Notes
     -----
@@ -83,7 +81,9 @@ class InverseKinematics:
     damped task is solved in the box without posture first, and the posture then only chooses
     among the steps that move the tip the same way (to 1e-8 of the step; where v is also out of
     reach, up to 1e-3 was seen). A start outside the limits walks back at
-    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q.
+    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q. Of two prioritised
+    tasks the first is exact where no limit is met; otherwise the second may cost it 1e-7 of the
+    step where it can be reached, and up to 1e-3 where it is out of reach too.
 
     References
     ----------
@@ -116,18 +116,16 @@ class InverseKinematics:
         damping: str | float = "adaptive",
         limits: str = "saturate",
         dt: float = 0.01,
+        weights: Any = None,
+        mode: str = "least_squares",
     ) -> None:
         self.model = model
-        self._module = getattr(model, "module_", model)
-        if not callable(self._module):
-            raise TypeError(
-                f"`model` must be a torch module or callable q -> x, got {type(model).__name__}; "
-                "an estimator must be fitted first."
-            )
-        self.q_min = _bound(q_min, "q_min", -math.inf)
-        self.q_max = _bound(q_max, "q_max", math.inf)
-        self.dq_max = _bound(dq_max, "dq_max", math.inf)
-        fixed_pref = None if q_pref is None or callable(q_pref) else _bound(q_pref, "q_pref", 0.0)
+        self.task = as_task(model)
+        self.q_min = bound(q_min, "q_min", -math.inf)
+        self.q_max = bound(q_max, "q_max", math.inf)
+        self.dq_max = bound(dq_max, "dq_max", math.inf)
+        fixed_pref = None if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", 0.0)
+        self.weights = None if weights is None else bound(weights, "weights", 1.0)
         sizes = {
             name: len(value)
             for name, value in (
@@ -135,12 +133,12 @@ class InverseKinematics:
                 ("q_max", self.q_max),
                 ("dq_max", self.dq_max),
                 ("q_pref", fixed_pref),
+                ("weights", self.weights),
             )
             if value is not None and value.ndim == 1
         }
-        n_actuators: Any = getattr(self._module, "n_actuators", None)
-        if n_actuators is not None:
-            sizes["model"] = int(n_actuators)
+        if self.task.n_actuators is not None:
+            sizes["model"] = self.task.n_actuators
         if len(set(sizes.values())) > 1:
             raise ValueError(
                 f"limits and posture must agree in the number of actuators, got {sizes}; give "
@@ -180,10 +178,22 @@ class InverseKinematics:
                 f"{damping!r}."
             )
         self.damping = damping
+        if (
+            self.weights is not None
+            and not ((self.weights > 0.0) & torch.isfinite(self.weights)).all()
+        ):
+            raise ValueError(
+                f"`weights` must be positive, got {self.weights.tolist()}; to lock an actuator "
+                "give it equal limits."
+            )
+        if mode not in ("least_squares", "direction"):
+            raise ValueError(f'`mode` must be "least_squares" or "direction", got {mode!r}.')
+        self.mode = mode
 
     def __repr__(self) -> str:
         """Return the settings."""
-        name = type(self._module).__name__
+        shown = self.model if self.model is self.task else self.task.models[0]
+        name = type(shown).__name__
         return (
             f"InverseKinematics({name}, beta={self.beta}, gain={self.gain}, "
             f"damping={self.damping!r}, limits={self.limits!r}, dt={self.dt})"
@@ -200,7 +210,7 @@ class InverseKinematics:
         x_target : array-like of shape (..., 3)
             Present targets [m].
         dx : array-like of shape (..., 3), optional
-            Velocities of the targets [m/s]. Default: at rest.
+            Velocities of the targets [m/s], one for every row of the task. Default: at rest.
         x_measured : array-like of shape (..., 3), optional
             Measured tips [m], to close the loop on. Default: the model's tips.
 
@@ -209,23 +219,27 @@ class InverseKinematics:
         Step
             `dq` and what came with it. A row with a NaN or infinite input holds still.
         """
-        as_numpy = not isinstance(q, Tensor)
+        as_numpy = is_numpy(q)
         q = self._configurations(q, "q")
         target = self._points(x_target, "x_target", q)
-        velocity = None if dx is None else self._points(dx, "dx", q)
         tip = None if x_measured is None else self._points(x_measured, "x_measured", q)
-        given = [a for a in (q, target, velocity, tip) if a is not None]
-        lead = _lead(given)
-        q, target = _flat(q, lead), _flat(target, lead)
-        x, J = self._evaluate(q)
-        e = target - (x if tip is None else _flat(tip, lead))
-        gain, beta = self._rates(self.dt)
+        velocity = None
+        if dx is not None:
+            velocity = self._points(dx, "dx", q, (sum(self.task.parts),))
+        axes = len(self.task.shape)
+        given = [(q, 1), (target, axes), (tip, axes), (velocity, 1)]
+        lead = leading([(a, trailing) for a, trailing in given if a is not None])
+        q, target = rows_of(q, lead), rows_of(target, lead, axes)
+        x, J = self._law.evaluate(q)
+        e = self.task.difference(x if tip is None else rows_of(tip, lead, axes), target)
+        gain, beta, _ = self._rates(self.dt)
         v = gain * e
         if velocity is not None:
-            v = v + self.dt * _flat(velocity, lead)
-        move = self._advance(q, J, v, beta, self.dt)
-        results = (move.dq, x, e.norm(dim=-1), move.sigma_min, move.damping, move.saturated)
-        return Step(*_give_back(results, lead, as_numpy))
+            v = v + self.dt * rows_of(velocity, lead)
+        move = self._law.advance(q, J, v, beta, self.dt)
+        error = e.norm(dim=-1)
+        parts = (move.dq, x, error, move.sigma_min, move.damping, move.saturated, move.scale)
+        return Step(*give_back(parts, lead, as_numpy))
 
     @torch.no_grad()
     def solve(
@@ -233,10 +247,11 @@ class InverseKinematics:
         x_target: Any,
         q0: Any = None,
         *,
-        tol: float = 1e-4,
+        tol: float | Sequence[float] = 1e-4,
         max_iter: int = 50,
         restarts: int = 0,
         random_state: Any = None,
+        differentiable: bool = False,
     ) -> IKSolution:
         """Return configurations that reach the targets, or come as near as the limits allow.
 
@@ -251,8 +266,9 @@ class InverseKinematics:
             Targets [m].
         q0 : array-like of shape (..., n), optional
             Start, moved into the limits first. Default: `q_pref`.
-        tol : float, default=1e-4
-            Error that counts as reached [m].
+        tol : float or sequence of floats, default=1e-4
+            Error that counts as reached [m], or one for every part of the task, as ([m], [rad])
+            for a pose.
         max_iter : int, default=50
             Iterations per start.
         restarts : int, default=0
@@ -260,42 +276,56 @@ class InverseKinematics:
             in the limits, the same for every row.
         random_state : int, Generator or None, default=None
             Seed of the restarts.
+        differentiable : bool, default=False
+            Keep the graph from q to `x_target`, and to parameters of the model that require
+            gradients, by the implicit function theorem at the solution.
 
         Returns
         -------
         IKSolution
             Never raises for an unreachable target; a NaN target marks only its own row.
+
+        Notes
+        -----
+        The derivatives are those of the configuration nearest to `q_pref` among the solutions
+        around the one found, with the actuators that lie at a limit held there; without posture
+        they are J+. They are exact where that configuration is unique and the set of held
+        actuators does not change nearby; rows that have not converged get none. The model must be
+        twice differentiable by torch.
         """
-        if not tol > 0:
-            raise ValueError(f"`tol` must be positive [m], got {tol!r}.")
+        tol = self._tolerance(tol)
         if max_iter < 1 or restarts < 0:
             raise ValueError(
                 f"`max_iter` must be at least 1 and `restarts` at least 0, got {max_iter} and "
                 f"{restarts}."
             )
-        as_numpy = not isinstance(x_target, Tensor)
+        as_numpy, axes = is_numpy(x_target), len(self.task.shape)
+        if differentiable and as_numpy:
+            raise ValueError("`x_target` must be a torch tensor for differentiable=True.")
         target = self._points(x_target, "x_target", None)
         q = self._start(target) if q0 is None else self._configurations(q0, "q0", target)
         target = target.to(q.dtype)
-        lead = _lead([q, target])
-        q, target = self._inside(_flat(q, lead)), _flat(target, lead)
-        found = self._search(q, target, tol, max_iter)
-        gram = row_gram(found.J)
-        singular = gram.sigma_min < _HEALTHY * gram.sigma_max
-        lost = found.stationary & (found.error > tol) & singular
-        self._try_again(found, lost, self._nudged(found), target, tol, max_iter)
-        for point in self._restarts(q, restarts, random_state, q0 is not None):
-            failed = found.error > tol
-            self._try_again(found, failed, point.expand_as(q), target, tol, max_iter)
-        self._settle(found, target, tol)
-        x, J = self._evaluate(found.q)
-        error, gram = (target - x).norm(dim=-1), row_gram(J)
-        singular = gram.sigma_min < _HEALTHY * gram.sigma_max
-        status = self._statuses(found.q, error, tol, found.held, singular)
-        nearest = found.stationary & (error > tol) & torch.isfinite(error)
+        lead = leading([(q, 1), (target, axes)])
+        q, target = rows_of(q, lead), rows_of(target, lead, axes)
+        starts = self._restarts(q, restarts, random_state, q0 is not None)
+        found = Search(self._law, tol, max_iter).solve(q, target, q0 is None, starts)
+        q = found.q
+        if differentiable:
+            with torch.enable_grad():
+                goal = rows_of(x_target.to(q), lead, axes)
+                q = with_derivatives(self._law, q, goal, found.reached)
+        x, J = self._law.evaluate(q.detach())
+        e = self.task.difference(x, target)
+        error, gram = e.norm(dim=-1), row_gram(J)
+        singular = gram.sigma_min < HEALTHY * gram.sigma_max
+        reached = self.task.reached(e, tol)
+        status = self._statuses(q.detach(), error, reached, found.held, singular)
+        nearest = found.stationary & ~reached & torch.isfinite(error)
         status[nearest] = IKStatus.UNREACHABLE
-        results = (found.q, x, error, status, found.n_iter, gram.sigma_min)
-        return IKSolution(*_give_back((*results, self._margin(found.q)), lead, as_numpy))
+        margin = self._law.margin(q.detach())
+        results = (q, x, error, status, found.n_iter, gram.sigma_min, margin)
+        with torch.set_grad_enabled(differentiable):
+            return IKSolution(*give_back(results, lead, as_numpy))
 
     @torch.no_grad()
     def track(
@@ -316,10 +346,11 @@ class InverseKinematics:
 
         Parameters
         ----------
-        path : array-like of shape (T, 3) or Trajectory
-            Points to pass [m]; an object with `x` and `t` brings its own times.
+        path : array-like of shape (T, 3), Trajectory or callable
+            Points to pass [m]; an object with `x` and `t` brings its own times; a function of
+            time is asked for the point at every entry of `t`, a number [s].
         t : array-like of shape (T,), optional
-            Times of the points [s], increasing. Default: multiples of `dt`.
+            Times of the points [s], increasing; needed for a function. Default: multiples of `dt`.
         q0 : array-like of shape (n,), optional
             Start. Default: solved for the first point.
         plant : callable, optional
@@ -339,167 +370,122 @@ class InverseKinematics:
             Where the plant raises, the point is NaN in `x_measured` with status INVALID_INPUT,
             a warning is given and the motion goes on by feed-forward.
         """
-        if feedback not in ("model", "measured", None):
-            raise ValueError(f'`feedback` must be "model", "measured" or None, got {feedback!r}.')
         if feedback == "measured" and plant is None:
             raise ValueError('`feedback="measured"` needs `plant`, a callable q -> measured tip.')
         if hasattr(path, "x") and hasattr(path, "t"):
             path, t = path.x, path.t if t is None else t
-        as_numpy = not isinstance(path, Tensor)
+        elif callable(path):
+            if t is None:
+                raise ValueError("`t` must be given for a path that is a function of time.")
+            points: list[Any] = [path(float(time)) for time in t]
+            path = torch.stack(points) if isinstance(points[0], Tensor) else np.stack(points)
+        as_numpy = is_numpy(path)
         target = self._points(path, "path", None)
-        if target.ndim != 2 or len(target) == 0:
-            raise ValueError(f"`path` must have shape (T, 3), got {tuple(target.shape)}.")
+        if target.ndim != 1 + len(self.task.shape) or len(target) == 0:
+            raise ValueError(
+                f"`path` must have shape {self._shape('T')}, got {tuple(target.shape)}."
+            )
         times, periods = self._times(t, target)
-        if q0 is None:
-            q = _tensor(self.solve(target[0], tol=tol).q, "q0")[None]
-        else:
-            q = self._configurations(q0, "q0", target)
-            if q.ndim != 1:
-                raise ValueError(f"`q0` must have shape (n,), got {tuple(q.shape)}.")
-            q, target = q[None], target.to(q.dtype)
-        points: list[_Point] = []
-        held = damped = target.new_zeros(1, dtype=torch.bool)
-        for i in range(len(target)):
-            if progress is not None:
-                progress(i, len(target))
-            x, J = self._evaluate(q)
-            measured = x if plant is None else _measure(plant, q, i, as_numpy)
-            points.append(_Point(q, x, measured, row_gram(J).sigma_min, held, damped))
-            if i + 1 == len(target):
-                break
-            gain, beta = self._rates(periods[i])
-            v = _known(target[i + 1] - target[i])[None]
-            if feedback is not None:
-                v = v + gain * _known(target[i] - (measured if feedback == "measured" else x))
-            move = self._advance(q, J, v, beta, periods[i])
-            q = q + move.dq
-            held, damped = move.saturated.any(-1), move.damping > 0.0
-        q, x, measured, sigma_min, held, damped = (torch.cat(a) for a in zip(*points, strict=True))
-        error = (target - measured).norm(dim=-1)
-        judged = error if feedback == "measured" else (target - x).norm(dim=-1)
-        status = self._statuses(q, judged, tol, held, damped)
+        tracker = self._tracker(target[0], q0, feedback, tol, as_numpy)
+        q, x, measured, sigma_min, held, damped = tracker.follow(target, periods, plant, progress)
+        target = target.to(q)
+        e_model, e = (self.task.difference(a, target) for a in (x, measured))
+        judged, error = e if feedback == "measured" else e_model, e.norm(dim=-1)
+        reached = self.task.reached(judged, self._tolerance(tol))
+        status = self._statuses(q, judged.norm(dim=-1), reached, held, damped)
         status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
-        results = (q, x, measured, target, error, status, sigma_min, self._margin(q))
-        times, *results = _give_back((times, *results), (len(target),), as_numpy)
+        results = (q, x, measured, target, error, status, sigma_min, self._law.margin(q))
+        times, *results = give_back((times, *results), (len(target),), as_numpy)
         if plant is None:
             results[2] = None
         return Track(times, *results)
 
-    def _advance(self, q: Tensor, J: Tensor, v: Tensor, beta: float, period: float) -> _Move:
-        """Return eq. (1) for one period; rows that are not finite hold still."""
-        fine = torch.isfinite(q).all(-1) & torch.isfinite(J).all(-1).all(-1)
-        fine = (fine & torch.isfinite(v).all(-1))[:, None]
-        at = torch.where(fine, q, 0.0)
-        posture = None
-        if self.q_pref is not None and beta > 0.0:
-            posture = torch.where(fine, beta * (self._preferred(at) - at), 0.0)
-        bounds = self._step_bounds(q, self.dq_max.to(q) * period)
-        J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
-        move = self._resolve(J, v, posture, *bounds)
-        return move._replace(
-            dq=torch.where(torch.isnan(q), 0.0, move.dq),
-            sigma_min=torch.where(fine[:, 0], move.sigma_min, math.nan),
+    def tracker(
+        self,
+        x_target: Any,
+        q0: Any = None,
+        *,
+        feedback: str | None = "model",
+        tol: float | Sequence[float] = 1e-4,
+    ) -> Tracker:
+        """Return what follows a path tick by tick, for a controller that is given it as it goes.
+
+        Parameters
+        ----------
+        x_target : array-like of shape (3,)
+            First point of the path [m].
+        q0 : array-like of shape (n,), optional
+            Start. Default: solved for the first point.
+        feedback : {"model", "measured"} or None, default="model"
+            As for `track`; "measured" takes the tip with every tick.
+        tol : float or sequence of floats, default=1e-4
+            For the start.
+
+        Returns
+        -------
+        Tracker
+            Command its `q`, then call its `tick`.
+        """
+        target = self._points(x_target, "x_target", None)
+        if target.shape != self.task.shape:
+            raise ValueError(
+                f"`x_target` must have shape {self.task.shape}, got {tuple(target.shape)}."
+            )
+        return self._tracker(target, q0, feedback, tol, is_numpy(x_target))
+
+    def controller(self, q0: Any, *, tol: float = 1e-4) -> Controller:
+        """Return the law tick by tick in NumPy, for one robot at its control rate.
+
+        Parameters
+        ----------
+        q0 : array-like of shape (n,)
+            Present actuator vector, in the unit of q.
+        tol : float, default=1e-4
+            Error that counts as reached [m].
+
+        Returns
+        -------
+        Controller
+            Its `step` takes a target, and the measured tip if there is one, and gives the next
+            command, some fifty times faster than `step` here. It steers tip positions; `tracker`
+            follows every task.
+        """
+        return Controller(self, q0, tol=tol)
+
+    def _tracker(
+        self, target: Tensor, q0: Any, feedback: str | None, tol: Any, as_numpy: bool
+    ) -> Tracker:
+        if feedback not in FEEDBACKS:
+            raise ValueError(f'`feedback` must be "model", "measured" or None, got {feedback!r}.')
+        if q0 is None:
+            q = as_tensor(self.solve(target, tol=tol).q, "q0")
+        else:
+            q = self._configurations(q0, "q0", target)
+            if q.ndim != 1:
+                raise ValueError(f"`q0` must have shape (n,), got {tuple(q.shape)}.")
+        target = target.to(q.dtype)
+        return Tracker(self._law, self._rates, q[None], target[None], feedback, as_numpy)
+
+    @property
+    def _law(self) -> Law:
+        return Law(
+            *(self.task, self.q_min, self.q_max, self.dq_max),
+            self.q_pref if self.beta > 0.0 else None,
+            *(self.weights, self.damping, self.limits, self.mode),
         )
 
-    def _resolve(
-        self,
-        J: Tensor,
-        v: Tensor,
-        posture: Tensor | None,
-        lower: Tensor,
-        upper: Tensor,
-        extra_sq: Tensor | float = 0.0,
-    ) -> _Move:
-        """Return the step for the task v and the posture step, within the bounds."""
-        gram = row_gram(J)
-        if self.damping == "adaptive":
-            damping_sq = adaptive_damping(gram, _HEALTHY) + extra_sq * gram.sigma_max.square()
-        else:
-            damping_sq = (float(self.damping) ** 2 + extra_sq) * gram.sigma_max.square()
-        dq = apply_columns(J, damped_solve(gram, v, damping_sq))
-        z = torch.zeros_like(dq)
-        if posture is not None:
-            z = null_projection(J, gram, posture)
-            dq = dq + z
-        if self.limits != "off":
-            clipped = torch.clamp(dq, lower, upper)
-            over = (clipped != dq).any(-1).nonzero()[:, 0]
-            if self.limits == "saturate" and over.numel() > 0:
-                problem = (a[over] for a in (J, v, z, lower, upper, damping_sq))
-                clipped[over] = strict_box_step(*problem)
-            dq = clipped
-        saturated = (dq <= lower) | (dq >= upper)
-        return _Move(dq, gram.sigma_min, damping_sq.sqrt(), saturated)
-
-    def _search(self, q: Tensor, target: Tensor, tol: float, max_iter: int) -> _Found:
-        """Lower the tip error from one start until it is within tol or cannot be lowered."""
-        found = _Found.at(q, *self._evaluate(q), target)
-        rows = torch.arange(len(q), device=q.device)
-        nu = q.new_full((len(q),), _FIRST_DAMPING)  # lambda^2 / sigma_max^2 of the whole error
-        start = [a.clone() for a in (q, found.x, found.J, found.error, target, found.error)]
-        live = [*start, nu, torch.full_like(nu, 2.0), torch.zeros_like(nu)]
-        held = found.held.clone()
-        for iteration in range(max_iter + 1):
-            q, x, J, error, aim, first, nu, growth, slow = live
-            still = self._blocked(q, J, aim - x) | (nu > _LAST_DAMPING) | (slow >= _SLOW_STEPS)
-            found.put(rows, q, x, J, error, still, held)
-            found.n_iter[rows] = iteration
-            going = ((error > tol) & ~still).nonzero()[:, 0]
-            if going.numel() == 0 or iteration == max_iter:
-                break
-            rows, live = rows[going], [a[going] for a in live]
-            q, x, J, error, aim, first, nu, growth, slow = live
-            bounds = self._step_bounds(q, None)
-            e = aim - x
-            # Error-proportional, so that the last iterations are Gauss-Newton's.
-            move = self._resolve(J, e, None, *bounds, nu * (error / first))
-            new = q + move.dq
-            x_new, J_new = self._evaluate(new)
-            error_new = (aim - x_new).norm(dim=-1)
-            predicted = (e - apply_rows(J, move.dq)).norm(dim=-1)
-            gained = error.square() - error_new.square()
-            quality = gained / (error.square() - predicted.square()).clamp_min(1e-30)
-            better = error_new < error
-            held = move.saturated.any(-1)
-            nu = torch.where(
-                better, nu * (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0), nu * growth
-            )
-            growth = torch.where(better, 2.0, 2.0 * growth)
-            slow = torch.where(better & (error - error_new < 0.01 * tol), slow + 1.0, 0.0)
-            pick = better[:, None]
-            live = [
-                *(torch.where(pick, new, q), torch.where(pick, x_new, x)),
-                *(torch.where(pick[..., None], J_new, J), torch.where(better, error_new, error)),
-                *(aim, first, nu, growth, slow),
-            ]
-        return found
-
-    def _try_again(
-        self, found: _Found, rows: Tensor, q: Tensor, target: Tensor, tol: float, max_iter: int
-    ) -> None:
-        """Search some rows from another start, and keep what came nearer."""
-        rows = rows.nonzero()[:, 0]
-        if rows.numel() == 0:
-            return
-        again = self._search(self._inside(q[rows]), target[rows], tol, max_iter)
-        found.n_iter[rows] += again.n_iter
-        better = again.error < found.error[rows]
-        found.put(rows[better], *(part[better] for part in again.parts()))
-
-    def _nudged(self, found: _Found) -> Tensor:
-        """Return starts beside singular points, where the first-order motion is blind.
-
-        A straight backbone asked to shorten, or a stretched arm: the error is stationary without
-        being smallest. The way out is of second order, hence not short where the error is small:
-        5 % of the limits, or what moves a healthy tip by a tenth of the error.
-        """
-        n = found.q.shape[-1]
-        size = found.J.flatten(1).norm(dim=-1, keepdim=True)
-        size = torch.where(size > 0.0, 0.1 * found.error[:, None] / size, 0.0).expand_as(found.q)
-        span = 0.05 * (self.q_max - self.q_min).to(found.q)
-        size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)
-        # Unequal shares, because equal ones may cancel in a symmetric robot.
-        return found.q + size * torch.cos(torch.arange(1.0, n + 1.0).to(found.q))
+    def _statuses(
+        self, q: Tensor, error: Tensor, reached: Tensor, held: Tensor, singular: Tensor
+    ) -> Tensor:
+        status = torch.full(error.shape, IKStatus.MAX_ITER.value, device=error.device)
+        status[singular] = IKStatus.SINGULAR
+        status[held] = IKStatus.AT_LIMITS
+        status[reached] = IKStatus.CONVERGED
+        inside = self.task.in_domain(q) if len(q) > 0 else None
+        if inside is not None:
+            status[reached & ~inside] = IKStatus.OUT_OF_DOMAIN
+        status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
+        return status
 
     def _restarts(
         self, q: Tensor, restarts: int, random_state: Any, from_preferred: bool
@@ -517,108 +503,22 @@ class InverseKinematics:
         shares = np.random.default_rng(random_state).random((draws, n))
         return points + list((low + span * torch.as_tensor(shares)).to(q))
 
-    def _settle(self, found: _Found, target: Tensor, tol: float) -> None:
-        """Slide converged rows along their null space towards q_pref, then polish the tip.
-
-        On the way the error may exceed tol by a share of the motion, for the next step takes it
-        back; only what has converged is recorded.
-        """
-        rows = (found.error <= tol).nonzero()[:, 0]
-        if self.q_pref is None or self.beta == 0.0 or rows.numel() == 0:
-            return
-        all_rows, nearest = rows, (self._preferred(found.q) - found.q).norm(dim=-1)
-        live = [a[rows] for a in (found.q, found.x, found.J, target, nearest)]
-        share = torch.ones_like(live[-1])
-        for iteration in range(_POSTURE_STEPS):
-            q, x, J, aim, gap = live
-            task_only = iteration == _POSTURE_STEPS - 1
-            posture = None if task_only else share[:, None] * (self._preferred(q) - q)
-            move, new, x_new, J_new, error_new = self._try_step(q, x, J, aim, posture)
-            gap_new = (self._preferred(new) - new).norm(dim=-1)
-            loose = _POSTURE_SLIP * J.flatten(1).norm(dim=-1) * move.dq.norm(dim=-1)
-            ok = (error_new <= loose.clamp_min(tol)) & (gap_new < gap) | task_only
-            error = (aim - x).norm(dim=-1)
-            ok |= (error > tol) & (error_new < 0.5 * error)
-            record = ok & (error_new <= tol) & (gap_new < nearest[rows])
-            nearest[rows[record]] = gap_new[record]
-            found.put(rows[record], *(a[record] for a in (new, x_new, J_new, error_new)))
-            found.n_iter[rows] += 1
-            going = torch.where(
-                ok, (gap - gap_new > 1e-3 * gap) | (error_new > tol) | (error > tol), share > 0.01
+    def _tolerance(self, tol: Any) -> float | tuple[float, ...]:
+        given = np.atleast_1d(np.asarray(tol, dtype=float))
+        if not (given > 0.0).all():
+            raise ValueError(f"`tol` must be positive [m], got {tol!r}.")
+        if np.ndim(tol) == 0:
+            return float(given[0])
+        if given.shape != (len(self.task.parts),):
+            raise ValueError(
+                f"`tol` must be one number [m] or {len(self.task.parts)}, one for every part of "
+                f"the task, got {tol!r}."
             )
-            share = torch.where(ok, (2.0 * share).clamp_max(1.0), 0.25 * share)[going]
-            new, x_new, J_new, gap_new = (
-                torch.where(ok.view(-1, *[1] * (b.ndim - 1)), b, a)
-                for a, b in ((q, new), (x, x_new), (J, J_new), (gap, gap_new))
-            )
-            rows, live = rows[going], [a[going] for a in (new, x_new, J_new, aim, gap_new)]
-            if rows.numel() == 0:
-                break
-        q, x, J, aim = (a[all_rows] for a in (found.q, found.x, found.J, target))
-        _, *ended, error_new = self._try_step(q, x, J, aim, None)
-        better = error_new < found.error[all_rows]
-        found.put(all_rows[better], *(a[better] for a in (*ended, error_new)))
+        return tuple(given.tolist())
 
-    def _try_step(
-        self, q: Tensor, x: Tensor, J: Tensor, target: Tensor, posture: Tensor | None
-    ) -> tuple[_Move, Tensor, Tensor, Tensor, Tensor]:
-        """Return a step, and q, x, J and the error after it."""
-        move = self._resolve(J, target - x, posture, *self._step_bounds(q, None))
-        new = q + move.dq
-        x_new, J_new = self._evaluate(new)
-        return move, new, x_new, J_new, (target - x_new).norm(dim=-1)
-
-    def _statuses(
-        self, q: Tensor, error: Tensor, tol: float, held: Tensor, singular: Tensor
-    ) -> Tensor:
-        status = torch.full(error.shape, IKStatus.MAX_ITER.value, device=error.device)
-        status[singular] = IKStatus.SINGULAR
-        status[held] = IKStatus.AT_LIMITS
-        status[error <= tol] = IKStatus.CONVERGED
-        in_domain = getattr(self._module, "in_domain", None)
-        if in_domain is not None and len(q) > 0:
-            inside = torch.as_tensor(in_domain(q), device=q.device)
-            status[(error <= tol) & ~inside] = IKStatus.OUT_OF_DOMAIN
-        status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
-        return status
-
-    def _blocked(self, q: Tensor, J: Tensor, e: Tensor) -> Tensor:
-        """Return where no motion within the limits lowers the error to first order."""
-        lower, upper = self._box(q)
-        pull = apply_columns(J, e)
-        out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
-        left = torch.where(out, 0.0, pull).norm(dim=-1)
-        return left <= _STATIONARY * J.flatten(1).norm(dim=-1) * e.norm(dim=-1)
-
-    def _box(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        if self.limits == "off":
-            return q.new_tensor(-math.inf), q.new_tensor(math.inf)
-        return self.q_min.to(q), self.q_max.to(q)
-
-    def _inside(self, q: Tensor) -> Tensor:
-        return torch.clamp(q, *self._box(q))
-
-    def _step_bounds(self, q: Tensor, largest: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the bounds of dq: position and speed intersected, never empty.
-
-        From outside the limits both bounds meet at the way back, at most the largest step. The
-        nextafter makes q + upper <= q_max hold after rounding, and with it q + dq for every dq.
-        """
-        q_min, q_max = self._box(q)
-        lower, upper = q_min - q, q_max - q
-        up, down = torch.full_like(q, math.inf), torch.full_like(q, -math.inf)
-        upper = torch.where(q + upper > q_max, torch.nextafter(upper, down), upper)
-        lower = torch.where(q + lower < q_min, torch.nextafter(lower, up), lower)
-        if self.limits != "off" and largest is not None:
-            lower = torch.clamp(lower, -largest, largest)
-            upper = torch.clamp(upper, -largest, largest)
-        return lower, upper
-
-    def _margin(self, q: Tensor) -> Tensor:
-        return torch.minimum(q - self.q_min.to(q), self.q_max.to(q) - q).amin(-1)
-
-    def _rates(self, period: float) -> tuple[float, float]:
-        """Return gain dt and beta dt, both at most 1."""
+    def _rates(self, period: float | None) -> tuple[float, float, float]:
+        """Return gain dt and beta dt, both at most 1, and dt."""
+        period = self.dt if period is None else float(period)
         gain = 1.0 if self.gain is None else self.gain * period
         if not 0.0 < gain <= 1.0 + 1e-9:
             raise ValueError(
@@ -631,21 +531,7 @@ class InverseKinematics:
                 f"`beta` times the period must lie in [0, 1], got {self.beta} 1/s x {period:.6g} "
                 f"s = {beta:.4g}; take a beta up to {1.0 / period:.4g} 1/s or a shorter period."
             )
-        return min(gain, 1.0), min(beta, 1.0)
-
-    def _evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        x, J = forward_and_jacobian(self._module, q)
-        if x.shape != (*q.shape[:-1], 3):
-            raise ValueError(
-                f"`model` must map q of shape {tuple(q.shape)} to tips of shape "
-                f"{(*q.shape[:-1], 3)}, got {tuple(x.shape)}."
-            )
-        return x.to(q), J.to(q)
-
-    def _preferred(self, q: Tensor) -> Tensor:
-        """Return the preferred configurations, of shape (n,) or that of q."""
-        wanted: Any = self.q_pref(q) if callable(self.q_pref) else self.q_pref
-        return wanted.to(q)
+        return min(gain, 1.0), min(beta, 1.0), period
 
     def _start(self, target: Tensor) -> Tensor:
         start = self._middle if callable(self.q_pref) else self.q_pref
@@ -660,10 +546,10 @@ class InverseKinematics:
                 "`q0`, or `q_pref` of shape (n,)."
             )
         start = start.to(target).expand(n)
-        return self._preferred(start) if callable(self.q_pref) else start
+        return self._law.preferred(start) if callable(self.q_pref) else start
 
     def _configurations(self, value: Any, name: str, like: Tensor | None = None) -> Tensor:
-        q = _tensor(value, name, self._device() if like is None else like.device)
+        q = as_tensor(value, name, device_of(self.task) if like is None else like.device)
         if q.ndim == 0 or self._size not in (None, q.shape[-1]):
             n = "n" if self._size is None else self._size
             raise ValueError(
@@ -672,20 +558,28 @@ class InverseKinematics:
             )
         return q if like is None else q.to(torch.promote_types(q.dtype, like.dtype))
 
-    def _points(self, value: Any, name: str, like: Tensor | None) -> Tensor:
-        x = _tensor(value, name, self._device())
-        if x.ndim == 0 or x.shape[-1] != 3:
+    def _points(
+        self, value: Any, name: str, like: Tensor | None, shape: tuple[int, ...] | None = None
+    ) -> Tensor:
+        x, kind = as_tensor(value, name, device_of(self.task)), shape or self.task.shape
+        if tuple(x.shape[max(x.ndim - len(kind), 0) :]) != kind:
             raise ValueError(
-                f"`{name}` must have shape (..., 3) [m], got {tuple(x.shape)}; one tip per row."
+                f"`{name}` must have shape {self._shape('...', kind)} [m], got {tuple(x.shape)}; "
+                "one target per row."
             )
+        if shape is None:
+            self.task.check(x, name)
         return x if like is None else x.to(like)
+
+    def _shape(self, lead: str, kind: tuple[int, ...] | None = None) -> str:
+        return f"({', '.join([lead, *(str(size) for size in kind or self.task.shape)])})"
 
     def _times(self, t: Any, target: Tensor) -> tuple[Tensor, list[float]]:
         n = len(target)
         if t is None:
             steps = torch.arange(n, dtype=target.dtype, device=target.device)
             return self.dt * steps, [self.dt] * (n - 1)
-        times = _tensor(t, "t", target.device)
+        times = as_tensor(t, "t", target.device)
         if times.shape != (n,):
             raise ValueError(
                 f"`t` must have shape ({n},), one time per point of `path`, got "
@@ -697,109 +591,3 @@ class InverseKinematics:
         if n > 1:
             self._rates(float(periods.max()))
         return times, periods.tolist()
-
-    def _device(self) -> torch.device:
-        if isinstance(self._module, nn.Module):
-            for tensor in (*self._module.parameters(), *self._module.buffers()):
-                return tensor.device
-        return torch.device("cpu")
-
-
-class _Move(NamedTuple):
-    dq: Tensor
-    sigma_min: Tensor
-    damping: Tensor
-    saturated: Tensor
-
-
-class _Point(NamedTuple):
-    q: Tensor
-    x: Tensor
-    measured: Tensor
-    sigma_min: Tensor
-    held: Tensor
-    damped: Tensor
-
-
-@dataclass
-class _Found:
-    """The best points so far of every row, owned by `solve` and updated in place."""
-
-    q: Tensor
-    x: Tensor
-    J: Tensor
-    error: Tensor
-    stationary: Tensor
-    held: Tensor
-    n_iter: Tensor
-
-    @classmethod
-    def at(cls, q: Tensor, x: Tensor, J: Tensor, target: Tensor) -> _Found:
-        no = torch.zeros(len(q), dtype=torch.bool, device=q.device)
-        error = (target - x).norm(dim=-1)
-        return cls(q.clone(), x.clone(), J.clone(), error, no, no.clone(), no.long().clone())
-
-    def put(self, rows: Tensor, *parts: Tensor) -> None:
-        """Overwrite rows of the leading fields."""
-        for whole, part in zip(self.parts(), parts, strict=False):
-            whole[rows] = part
-
-    def parts(self) -> tuple[Tensor, ...]:
-        return self.q, self.x, self.J, self.error, self.stationary, self.held
-
-
-def _measure(plant: Callable[[Any], Any], q: Tensor, i: int, as_numpy: bool) -> Tensor:
-    """Return the plant's tip (1, 3), NaN where it fails: what was done must not be lost."""
-    try:
-        tip = _tensor(plant(as_array(q[0]).copy() if as_numpy else q[0].clone()), "tip", q.device)
-        if tip.shape != (3,):
-            raise ValueError(f"the measured tip must have shape (3,), got {tuple(tip.shape)}")
-    except Exception as error:
-        warnings.warn(f"`plant` failed at point {i}: {error!r}; it counts as NaN.", stacklevel=4)
-        return q.new_full((1, 3), math.nan)
-    return tip.to(q)[None]
-
-
-def _bound(value: Any, name: str, default: float) -> Tensor:
-    """Return a limit or posture as a float64 tensor of shape () or (n,)."""
-    bound = _tensor(default if value is None else value, name).cpu().double()
-    if bound.ndim > 1 or bound.numel() == 0 or torch.isnan(bound).any():
-        raise ValueError(
-            f"`{name}` must be a number or of shape (n,), without NaN, got {bound.tolist()}."
-        )
-    return bound
-
-
-def _tensor(value: Any, name: str, device: Any = None) -> Tensor:
-    """Return a floating tensor that shares no memory with a caller's array."""
-    if not isinstance(value, Tensor):
-        try:
-            value = torch.tensor(np.asarray(value), device=device)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
-    value = value.detach()
-    return value if value.is_floating_point() else value.double()
-
-
-def _known(v: Tensor) -> Tensor:
-    """Return v, or zero where the target or the measured tip is not known."""
-    return torch.where(torch.isfinite(v).all(-1, keepdim=True), v, 0.0)
-
-
-def _lead(tensors: list[Tensor]) -> tuple[int, ...]:
-    shapes = [tuple(a.shape[:-1]) for a in tensors]
-    try:
-        return tuple(torch.broadcast_shapes(*shapes))
-    except RuntimeError as error:
-        raise ValueError(
-            f"configurations and targets must agree in their batch shapes, got {shapes}."
-        ) from error
-
-
-def _flat(a: Tensor, lead: tuple[int, ...]) -> Tensor:
-    return a.expand(*lead, a.shape[-1]).reshape(math.prod(lead), a.shape[-1])
-
-
-def _give_back(results: Any, lead: tuple[int, ...], as_numpy: bool) -> list[Any]:
-    shaped = [a.reshape((*lead, *a.shape[1:])) for a in results]
-    return [as_array(a) for a in shaped] if as_numpy else shaped

@@ -9,15 +9,14 @@ from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain
+from hybridkin._box import box_limited_step, strict_box_step
 from hybridkin._solvers import (
     adaptive_damping,
     apply_columns,
     apply_rows,
-    box_limited_step,
     damped_solve,
     null_projection,
     row_gram,
-    strict_box_step,
 )
 from hybridkin.ik import IKStatus, InverseKinematics
 from hybridkin.trajectories import figure_eight
@@ -126,12 +125,12 @@ def reference_qp(J, v, z, lower, upper, damping_sq):
     return x
 
 
-@pytest.mark.parametrize("relative", [1e-6, 1e-3, 1.0])
-def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative):
-    N, n = 300, 9
-    J = randn(rng, N, 3, n)
-    J[::9, 2] = 1e-4 * J[::9, 2] + J[::9, 0]
-    v = randn(rng, N, 3) * 10.0 ** uniform(rng, -2.0, 1.5, N, 1)  # the far ones are infeasible
+@pytest.mark.parametrize(("relative", "m"), [(1e-6, 3), (1e-3, 3), (1.0, 3), (1e-6, 6)])
+def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
+    N, n = 350, 9
+    J = randn(rng, N, m, n)
+    J[::9, -1] = 1e-4 * J[::9, -1] + J[::9, 0]
+    v = randn(rng, N, m) * 10.0 ** uniform(rng, -2.0, 1.5, N, 1)  # the far ones are infeasible
     z = null_projection(J, row_gram(J), randn(rng, N, n))
     a, b = randn(rng, N, n), randn(rng, N, n)
     lower, upper = torch.minimum(a, b), torch.maximum(a, b)
@@ -305,16 +304,26 @@ def test_singular_configuration_is_damped_and_finite():
 # ---------------------------------------------------------------- solve
 
 
-def test_reachable_targets_converge_from_a_cold_start(rng):
-    target = CHAIN(uniform(rng, 0.1, 0.4, 2000, 9))
-    solution = bha().solve(target)
+def coupled_tendons():
+    """A thin robot whose distal tendons run through all segments, and that starts straight."""
+    return ConstantCurvatureChain([0.02] * 3, lengths=[0.1] * 3, routing="base")
+
+
+@pytest.mark.parametrize(
+    ("chain", "low", "high"),
+    [(CHAIN, 0.1, 0.4), (coupled_tendons(), -0.02, 0.02)],
+    ids=["trunk", "coupled tendons"],
+)
+def test_reachable_targets_converge_from_a_cold_start(rng, chain, low, high):
+    target = chain(uniform(rng, low, high, 10_000, 9))
+    solution = InverseKinematics(chain, q_min=low, q_max=high).solve(target)
     assert solution.converged.double().mean() >= 0.999
-    good = solution.converged
-    assert_close((CHAIN(solution.q) - target).norm(dim=-1), solution.error, rtol=0.0, atol=1e-12)
+    good, q = solution.converged, solution.q
+    assert_close((chain(q) - target).norm(dim=-1), solution.error, rtol=0.0, atol=1e-12)
     assert solution.error[good].max() <= 1e-4
-    assert_close(CHAIN(solution.q), solution.x, rtol=0.0, atol=1e-12)
-    margin = torch.minimum(solution.q - 0.1, 0.4 - solution.q).amin(-1)
-    assert_close(solution.limit_margin, margin)
+    assert_close(chain(q), solution.x, rtol=0.0, atol=1e-12)
+    assert ((q >= low) & (q <= high)).all()
+    assert_close(solution.limit_margin, torch.minimum(q - low, high - q).amin(-1))
 
 
 @pytest.mark.parametrize("d", [0.001, 0.1, 3.0])
@@ -357,11 +366,6 @@ def test_posture_after_convergence_is_the_nearest_solution(rng, A):
     pinv = torch.linalg.pinv(A)
     expected = q_pref + apply_rows(pinv, target - A @ q_pref)
     assert_close(solution.q, expected, rtol=0.0, atol=1e-9)
-    # A bent robot: no start matters much, once the posture has settled.
-    target = CHAIN(uniform(rng, 0.2, 0.3, 50, 9))
-    cold = bha().solve(target).q
-    warm = bha().solve(target, uniform(rng, 0.2, 0.3, 50, 9)).q
-    assert (cold - warm).norm(dim=-1).median() < 1e-3
 
 
 def test_warm_start_restarts_and_the_seed(rng):
@@ -395,21 +399,16 @@ def solve_whole_and_in_parts(ik, target):
 
 
 def test_batch_equals_loop_and_any_split(rng):
-    target = CHAIN(uniform(rng, 0.2, 0.3, 30, 9))
-    free = bha(q_min=-0.5, q_max=1.0)
-    whole, _, others = solve_whole_and_in_parts(free, target)
-    for other in others:
-        # The tip is pinned to rounding; the posture passes some ten curved steps, each of which
-        # multiplies what the model's own batches differ by.
-        assert_close(whole.x, CHAIN(other), rtol=0.0, atol=1e-12)
-        assert_close(whole.q, other, rtol=0.0, atol=1e-10)
-    target = torch.cat([CHAIN(uniform(rng, 0.1, 0.4, 30, 9)), randn(rng, 30, 3)])
     ik = bha()
-    whole, single, others = solve_whole_and_in_parts(ik, target)
+    whole, single, others = solve_whole_and_in_parts(ik, CHAIN(uniform(rng, 0.1, 0.4, 60, 9)))
     for other in others:
-        # At limits, rounding grows by the 1e6 of the box-limited step's smallest damping, and
-        # on the way to a nearest point it is not contracted as it is by Gauss-Newton.
-        assert_close(whole.q, other, rtol=0.0, atol=1e-8)
+        assert_close(whole.q, other, rtol=0.0, atol=1e-12)
+        assert_close(whole.x, CHAIN(other), rtol=0.0, atol=1e-12)
+    assert whole.status.tolist() == [int(s.status) for s in single]
+    whole, single, others = solve_whole_and_in_parts(ik, randn(rng, 30, 3))
+    for other in others:
+        # On the way to a nearest point rounding is not contracted as it is by Gauss-Newton.
+        assert_close(whole.q, other, rtol=0.0, atol=1e-9)
     assert whole.status.tolist() == [int(s.status) for s in single]
     q = uniform(rng, 0.2, 0.3, 4, 15, 9)
     target = CHAIN(q) + 0.01 * randn(rng, 4, 15, 3)
@@ -489,12 +488,14 @@ def test_posture_makes_a_closed_path_cyclic():
     for rate in (0.0, beta):
         track = bha(dt=period / n, beta=rate).track(closed_path(n, laps), q0=q0)
         marks = track.q[::n]
-        gaps[rate] = np.linalg.norm(np.diff(marks, axis=0), axis=1)
-    decay = gaps[beta][1:] / gaps[beta][:-1]
+        gaps[rate] = track.lap_gap
+        assert track.n_laps == laps
+        np.testing.assert_array_equal(track.lap_gap, np.linalg.norm(np.diff(marks, axis=0), axis=1))
+    decay = {rate: gap[1:] / gap[:-1] for rate, gap in gaps.items()}
     # (1 - beta dt)^n is what the discrete law gives for exp(-beta T).
-    np.testing.assert_allclose(decay[:2], (1.0 - beta * period / n) ** n, rtol=0.35)
-    assert gaps[beta][-1] < 0.01 * gaps[beta][0]
-    assert gaps[0.0][-1] > 0.3 * gaps[0.0][0] > 0.0
+    np.testing.assert_allclose(decay[beta], (1.0 - beta * period / n) ** n, rtol=0.01)
+    # Without posture the gap stays, up to what the drift itself changes.
+    assert ((decay[0.0] > 0.9) & (decay[0.0] < 1.0)).all()
 
 
 def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
@@ -560,6 +561,44 @@ def test_track_takes_a_trajectory_uneven_times_and_gaps_in_the_path():
     track = ik.track(spoilt, path.t)
     assert (track.status == IKStatus.INVALID_INPUT).nonzero()[0].tolist() == [40, 41, 42, 43, 44]
     assert track.error[47:].max() < 1e-3  # one jump to the path, one step to settle
+
+
+def test_a_path_may_be_a_function_of_time_and_open_ones_have_no_laps():
+    def path(t):
+        return np.array([0.1 * np.sin(t), 0.0, 0.75])
+
+    t = np.linspace(0.0, 1.0, 51)
+    track = bha(dt=0.02).track(path, t)
+    given = bha(dt=0.02).track(np.stack([path(time) for time in t]), t)
+    np.testing.assert_array_equal(track.q, given.q)
+    assert track.n_laps == 0
+    assert track.lap_gap.shape == (0,)
+    with pytest.raises(ValueError, match="`t` must be given"):
+        bha().track(path)
+
+
+@pytest.mark.parametrize("feedback", ["model", "measured", None])
+def test_ticks_follow_a_path_as_track_does(feedback):
+    def plant(q):
+        return CHAIN(torch.from_numpy(1.02 * q)).numpy()
+
+    path, ik = closed_path(50), bha(dt=0.02)
+    track = ik.track(path, plant=plant, feedback=feedback)
+    tracker = ik.tracker(path[0], feedback=feedback)
+    for i, point in enumerate(path[1:]):
+        np.testing.assert_array_equal(tracker.q, track.q[i])
+        step = tracker.tick(point, plant(tracker.q))
+        np.testing.assert_array_equal(step.x, track.x[i])
+        np.testing.assert_array_equal(track.q[i] + step.dq, tracker.q)
+    if feedback == "measured":
+        assert step.error == track.error[-2]
+        with pytest.raises(ValueError, match="`x_measured` must be given"):
+            tracker.tick(point)
+        before = tracker.q
+        tracker.tick(path[-1], np.full(3, np.nan))  # no reading: feed-forward alone, and at rest
+        assert np.abs(tracker.q - before).max() < 1e-3
+    with pytest.raises(ValueError, match=r"`x_next` must have shape \(3,\)"):
+        tracker.tick(path, path[0])
 
 
 def test_a_path_out_of_reach_is_followed_at_the_limits():
@@ -652,6 +691,8 @@ def test_hostile_targets_never_raise(values):
         ({"limits": "hard"}, "`limits` must be"),
         ({"damping": "some"}, "`damping` must be"),
         ({"damping": -1.0}, "`damping` must be"),
+        ({"mode": "ray"}, "`mode` must be"),
+        ({"weights": -1.0}, "`weights` must be positive"),
     ],
 )
 def test_bad_settings_say_what_was_needed(settings, message):
@@ -667,6 +708,8 @@ def test_bad_settings_say_what_was_needed(settings, message):
         (lambda ik: ik.step(np.zeros((2, 9)), np.zeros((3, 3))), "agree in their batch shapes"),
         (lambda ik: ik.step(["a"] * 9, np.zeros(3)), "`q` must be numeric"),
         (lambda ik: ik.solve(np.zeros(3), tol=0.0), "`tol` must be positive"),
+        (lambda ik: ik.solve(np.zeros(3), tol=(1e-3, 1e-2)), "`tol` must be one number"),
+        (lambda ik: ik.tracker(np.zeros((2, 3))), r"`x_target` must have shape \(3,\)"),
         (lambda ik: ik.solve(np.zeros(3), max_iter=0), "`max_iter` must be at least 1"),
         (lambda ik: ik.track(np.zeros(3)), r"`path` must have shape \(T, 3\)"),
         (lambda ik: ik.track(np.zeros((3, 3)), [0.0, 1.0]), r"`t` must have shape \(3,\)"),

@@ -1,0 +1,67 @@
+"""Arrays of a caller, NumPy or torch, as rows of tensors and back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def as_tensor(value: Any, name: str, device: Any = None) -> Tensor:
+    """Return a floating tensor that shares no memory with a caller's array."""
+    if not isinstance(value, Tensor):
+        if hasattr(value, "get_matrix"):  # a pytorch_kinematics Transform3d
+            return value.get_matrix().detach()
+        try:
+            value = torch.tensor(np.asarray(value), device=device)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
+    value = value.detach()
+    return value if value.is_floating_point() else value.double()
+
+
+def as_array(a: Any) -> np.ndarray:
+    """Return a tensor or array as a NumPy array."""
+    return a.cpu().numpy() if isinstance(a, Tensor) else np.asarray(a)
+
+
+def is_numpy(value: Any) -> bool:
+    """Return whether results for this argument go back as NumPy arrays."""
+    return not (isinstance(value, Tensor) or hasattr(value, "get_matrix"))
+
+
+def bound(value: Any, name: str, default: float) -> Tensor:
+    """Return a limit or posture as a float64 tensor of shape () or (n,)."""
+    bound = as_tensor(default if value is None else value, name).cpu().double()
+    if bound.ndim > 1 or bound.numel() == 0 or torch.isnan(bound).any():
+        raise ValueError(
+            f"`{name}` must be a number or of shape (n,), without NaN, got {bound.tolist()}."
+        )
+    return bound
+
+
+def leading(pairs: Sequence[tuple[Tensor, int]]) -> tuple[int, ...]:
+    """Return the common batch shape of tensors, each with its number of trailing axes."""
+    shapes = [tuple(a.shape[: a.ndim - trailing]) for a, trailing in pairs]
+    try:
+        return tuple(torch.broadcast_shapes(*shapes))
+    except RuntimeError as error:
+        raise ValueError(
+            f"configurations and targets must agree in their batch shapes, got {shapes}."
+        ) from error
+
+
+def rows_of(a: Tensor, lead: tuple[int, ...], trailing: int = 1) -> Tensor:
+    """Return a tensor broadcast to the batch shape, as rows (N, ...)."""
+    shape = a.shape[a.ndim - trailing :]
+    return a.expand(*lead, *shape).reshape(math.prod(lead), *shape)
+
+
+def give_back(results: Iterable[Tensor], lead: tuple[int, ...], as_numpy: bool) -> list[Any]:
+    """Return rows (N, ...) in the caller's batch shape and kind."""
+    shaped = [a.reshape((*lead, *a.shape[1:])) for a in results]
+    return [as_array(a) for a in shaped] if as_numpy else shaped
