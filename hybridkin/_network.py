@@ -132,7 +132,7 @@ class ELM(PortableModule):
         return x, J
 
     def forward_jacobian_and(self, q, function):
-        """Return ``forward(q), jacobian(q), function(features(q))``, the last (..., k) for any k."""
+        """Return ``forward(q), jacobian(q), function(features(q))``, the last of shape (..., k)."""
 
         def rows(q):
             u, a, s = self._hidden(q)
