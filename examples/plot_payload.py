@@ -59,8 +59,8 @@ def run(learn):
 
 
 # %%
-# The payload takes the error of the fitted model from 2 to 6.5 mm; the one that learns stays at 4 mm,
-# with a second lag wherever the path goes on to where it has not yet been measured.
+# The payload takes the error of the fitted model from 2 to 6.5 mm; the one that learns comes to
+# 4 mm, with a new lag wherever the path goes on to where nothing has been measured yet.
 
 if importlib.util.find_spec("mujoco") is None:
     print('Skipped: this example needs MuJoCo; pip install "hybridkin[sim]".')
