@@ -15,8 +15,9 @@ from hybridkin import (
     robots,
 )
 from hybridkin.__main__ import main
+from hybridkin.experiments._identifiability import ASKED, TELLABLE, identifiability
 from hybridkin.experiments._report import geometry_entries
-from hybridkin.experiments.paper import ASKED, TELLABLE, identifiability, summary
+from hybridkin.experiments.paper import summary
 
 ROBOT = """
 calibrate = ["radii", "base"]
@@ -82,6 +83,12 @@ def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
     report = (out / "report.md").read_text()
     assert record["tracking_mechanical_over_hybrid"]["nominal"] > 2.0
     assert len(record["table1"]) == 11
+    closed = record["closed_loop"]
+    assert len(closed) == 5
+    for runs in closed.values():
+        assert runs["closed loop"]["mean"] < 0.02
+        assert max(run["largest_step"] for run in runs.values()) < 0.06  # at 25 points
+    assert closed["serial on calibrated"]["feed-forward"]["mean"] < 0.006
     told = record["identifiability"]
     assert (
         "What 1500 rows of one segment and 400 random rows of the simulated trunk tell" in printed

@@ -14,15 +14,12 @@ from threadpoolctl import threadpool_limits
 from hybridkin import datasets, plots, robots, trajectories
 from hybridkin.calibration import calibrate
 from hybridkin.elm import ELMRegressor
+from hybridkin.experiments._identifiability import identifiability, write_identifiability
 from hybridkin.experiments._report import (
-    GEOMETRY_HEADER,
-    TOLD,
     Progress,
     Report,
     check_out,
     distance,
-    geometry_entries,
-    geometry_rows,
     linear,
     quadratic,
     quiet,
@@ -55,13 +52,8 @@ TRACKED = (
     "hybrid on nominal",
     "hybrid on calibrated",
 )
+SERIAL = "serial on calibrated"
 _MEASURED_SEED = 7
-
-ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
-"""The geometry that `identifiability` asks for at once."""
-
-TELLABLE = ("radii", "rest_bends", "tool", "base")
-"""What remains of it where each thing that the samples cannot tell apart is asked for once."""
 
 
 def table1(
@@ -142,10 +134,11 @@ def tracking(
     paths: dict[str, Any],
     plant_parameters: dict[str, Any],
     *,
+    feedback: str | None = "model",
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> dict[str, dict[str, Any]]:
-    """Return, by path and model, how the plant follows commands computed on each model alone.
+    """Return, by path and model, how the plant follows commands computed on each model.
 
     Parameters
     ----------
@@ -155,6 +148,9 @@ def tracking(
         Target paths [m].
     plant_parameters : dict
         Arguments of `simulation.TrunkPlant`.
+    feedback : {"model", "measured"} or None, default="model"
+        "model": feed-forward, the commands are computed on the model alone; "measured": the loop is
+        closed over the measured tips.
     n_jobs, progress
         As in `table1`.
 
@@ -168,57 +164,13 @@ def tracking(
     Reinhart & Steil (2016), section 4, Figs. 3 and 4.
     """
     pairs = [(path, model) for path in paths for model in models]
-    jobs = (delayed(_one_track)(models[m], paths[p], plant_parameters) for p, m in pairs)
+    jobs = (delayed(_one_track)(models[m], paths[p], plant_parameters, feedback) for p, m in pairs)
     result: dict[str, dict[str, Any]] = {path: {} for path in paths}
     runs = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
     for i, ((path, model), track) in enumerate(zip(pairs, runs, strict=True)):
         result[path][model] = track
         progress("tracking on the simulated trunk", i + 1, len(pairs))
     return result
-
-
-def identifiability(data: Any, split: int = 0) -> dict[str, Any]:
-    """Return what the training rows of the paper's protocol tell about the trunk's geometry.
-
-    Parameters
-    ----------
-    data : Bunch
-        As for `table1`.
-    split : int, default=0
-        Which of the fully random rows are kept for the test.
-
-    Returns
-    -------
-    dict
-        "n_train", "n_single" (rows in which one segment moves) and "n_random"; then by "asked",
-        "tellable" and "default" (radii and base) a dict of "parameters", "entries" (one for each
-        free parameter, see `geometry_entries`), "unidentified" (a sentence for each direction
-        left open), and "rmse", "test" and "test_max", tip errors on the training rows and on the
-        test rows [m].
-    """
-    train, test = datasets.paper_split(data, split)
-    chain = robots.bionic_handling_assistant()
-    n_random = int((data.part[train] == 3).sum())
-    found: dict[str, Any] = {"n_train": len(train), "n_random": n_random}
-    found["n_single"] = len(train) - n_random
-    for label, names in (
-        ("asked", ASKED),
-        ("tellable", TELLABLE),
-        ("default", chain.default_parameters),
-    ):
-        result = calibrate(chain, data.q[train], data.x[train], names)
-        with torch.no_grad():
-            tips = result.chain(torch.from_numpy(data.q[test])).numpy()
-        errors = distance(tips, data.x[test])
-        found[label] = {
-            "parameters": names,
-            "entries": geometry_entries(chain, result),
-            "unidentified": result.unidentified,
-            "rmse": result.rmse,
-            "test": errors.mean(),
-            "test_max": errors.max(),
-        }
-    return found
 
 
 def paper_paths(n_points: int = 151) -> dict[str, trajectories.Trajectory]:
@@ -268,17 +220,21 @@ def _tracked_models(q: NDArray, x: NDArray) -> dict[str, HybridForwardModel]:
         elm = ELMRegressor(**PAPER_ELM, random_state=0)
         models[f"mechanical, {name}"] = HybridForwardModel(chain, "drop").fit(q, x)
         models[f"hybrid on {name}"] = HybridForwardModel(chain, elm).fit(q, x)
-    return {name: models[name] for name in TRACKED}
+        if name == "calibrated":
+            models[SERIAL] = HybridForwardModel(chain, coupling="serial").fit(q, x)
+    return {name: models[name] for name in (*TRACKED, SERIAL)}
 
 
 @threadpool_limits.wrap(limits=1)
-def _one_track(model: Any, path: Any, plant_parameters: dict[str, Any]) -> Any:
+def _one_track(
+    model: Any, path: Any, plant_parameters: dict[str, Any], feedback: str | None
+) -> Any:
     low, high = robots.BHA_LENGTH_LIMITS
     ik = InverseKinematics(
         model, q_min=low, q_max=high, q_pref=PREFERRED, dt=float(path.t[1] - path.t[0])
     )
     plant = TrunkPlant(**plant_parameters, random_state=_MEASURED_SEED)
-    return ik.track(path, plant=plant, feedback="model")
+    return ik.track(path, plant=plant, feedback=feedback)
 
 
 def run_paper(
@@ -316,7 +272,11 @@ def run_paper(
     models = _tracked_models(data.q[train], data.x[train])
     modules = {name: model.module_ for name, model in models.items()}
     paths = paper_paths(n_points)
-    tracks = tracking(modules, paths, data.parameters["plant"], n_jobs=n_jobs, progress=progress)
+    plant = data.parameters["plant"]
+    tracks, closed = (
+        tracking(modules, paths, plant, feedback=feedback, n_jobs=n_jobs, progress=progress)
+        for feedback in ("model", "measured")
+    )
     report = Report("The paper's result on a simulated trunk")
     report.record.update(n_splits=n_splits, n_seeds=n_seeds, n_points=n_points)
     report.text(
@@ -330,7 +290,8 @@ def run_paper(
     _write_table1(report, table)
     _write_errors(report, data, models)
     _write_tracking(report, paths, tracks)
-    _write_identifiability(report, data, identifiability(data))
+    _write_closed_loop(report, tracks, closed)
+    write_identifiability(report, data, identifiability(data))
     return report, report.write(out)
 
 
@@ -406,7 +367,10 @@ def _write_tracking(
 ) -> None:
     paper = {name: f"{value:.2f}" for name, value in PAPER_TRACKING.items()}
     rows, record = [], {}
-    overall = {name: np.concatenate([t[name].error for t in tracks.values()]) for name in TRACKED}
+    overall = {
+        name: np.concatenate([t[name].error for t in tracks.values()])
+        for name in (*TRACKED, SERIAL)
+    }
     for label, errors in [
         *((p, {n: t.error for n, t in runs.items()}) for p, runs in tracks.items()),
         ("both", overall),
@@ -462,49 +426,40 @@ def _write_tracking(
     report.figure(
         "configurations", figure, "Chamber lengths along the figure eight (Fig. 4, right)."
     )
-    steps = {name: max(t[name].largest_step for t in tracks.values()) for name in TRACKED}
-    report.record["largest_step"] = steps
-    listed = ", ".join(f"{name} {1000 * step:.1f} mm" for name, step in steps.items())
-    report.text(f"Largest change of a chamber between two time steps: {listed}.")
 
 
-def _write_identifiability(report: Report, data: Any, found: dict[str, Any]) -> None:
-    report.record["identifiability"] = found
-    asked, tellable, default = (found[label] for label in ("asked", "tellable", "default"))
-    told = sum(entry["told"] for entry in asked["entries"])
+def _write_closed_loop(
+    report: Report, feed_forward: dict[str, dict[str, Any]], closed: dict[str, dict[str, Any]]
+) -> None:
+    rows, record = [], {}
+    for name in (*TRACKED, SERIAL):
+        cells, record[name] = [], {}
+        for label, tracks in (("feed-forward", feed_forward), ("closed loop", closed)):
+            error = np.concatenate([runs[name].error for runs in tracks.values()])
+            stats = {
+                "mean": np.nanmean(error),
+                "std": np.nanstd(error),
+                "p95": np.nanpercentile(error, 95),
+                "max": np.nanmax(error),
+                "largest_step": max(runs[name].largest_step for runs in tracks.values()),
+            }
+            record[name][label] = stats
+            cells += [
+                _cell(stats),
+                f"{100 * stats['p95']:.2f}",
+                f"{1e3 * stats['largest_step']:.1f}",
+            ]
+        rows.append([name, *cells])
+    report.record["closed_loop"] = record
     report.text(
-        "## What the samples tell about the geometry",
-        f"Everything asked at once ({', '.join(ASKED)}) of the {found['n_train']} training rows of "
-        f"one split of the **simulated** data: {found['n_single']} rows of one segment moving "
-        f"alone and {found['n_random']} fully random ones. A parameter is told where the rows "
-        f"narrow its prior at least {TOLD:.0f} times; other values are assumptions, near the "
-        f"published geometry. Told: {told} of {len(asked['entries'])} parameters. The base by its "
-        "turn from the start and its position.",
+        "## With the measured tip fed back",
+        "Both paths, in cm: mean ± standard deviation (maximum), 95 %; and the largest change of "
+        "a chamber from one time step to the next, in mm. In the closed loop every step takes the "
+        "tip measured after the last one, noise included. The serial model has its error inside "
+        "the robot; it is not in the paper.",
     )
-    report.table(GEOMETRY_HEADER, geometry_rows(asked["entries"]))
-    report.text("What the samples leave open, and what settles it:")
-    report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
-    report.text(
-        f"Without turns and actuator zeros ({', '.join(TELLABLE)}) all is told:"
-        if all(entry["told"] for entry in tellable["entries"])
-        else f"Without turns and actuator zeros ({', '.join(TELLABLE)}):"
-    )
-    report.table(GEOMETRY_HEADER, geometry_rows(tellable["entries"]))
-    base = {entry["name"]: entry for entry in tellable["entries"]}
-    true = dict(zip("xyz", 1e3 * np.array(data.parameters["plant"]["base_error"][:3]), strict=True))
-    away = {axis: base[f"base[{axis}]"]["value"] - true[axis] for axis in true}
-    far = max(abs(away[axis]) / base[f"base[{axis}]"]["std_error"] for axis in away)
-    found["base_position_error"] = list(away.values())
-    report.text(
-        "The tip hardly cares: mean error on the 100 test rows "
-        f"{100 * asked['test']:.2f} cm with everything fitted, {100 * tellable['test']:.2f} cm "
-        f"without turns and actuator zeros, {100 * default['test']:.2f} cm with radii and base "
-        "alone. Standard errors say how far noise moves a value, not how far a wrong model does: "
-        f"the simulated trunk sags and is no chain of arcs ({100 * tellable['rmse']:.2f} cm rms "
-        "remain), and its base, known in the simulation, is missed by "
-        f"{', '.join(f'{value:+.1f}' for value in away.values())} mm, up to {far:.0f} standard "
-        "errors."
-    )
+    header = ["model", "feed-forward", "95 %", "step", "closed loop", "95 %", "step"]
+    report.table(header, rows)
 
 
 def _cell(stats: dict[str, Any]) -> str:
