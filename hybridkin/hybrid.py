@@ -23,6 +23,7 @@ from hybridkin._couplings import COUPLINGS, READOUTS, Readout, fit_coupled
 from hybridkin._drift import Drift
 from hybridkin._error_modules import error_module
 from hybridkin._hybrid_modules import HybridModule
+from hybridkin._pose_hybrid import PoseHybridModule, check_pose_settings, pose_errors
 from hybridkin._radius import Radius, conformal_radius
 from hybridkin._realtime import NumpyFunction
 from hybridkin.calibration import CalibrationResult, calibrate
@@ -40,8 +41,8 @@ _NAMED = (str, Readout)
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Forward kinematics f_hyb(q) = f_mech(q) + eps(q), with eps learned on the model's errors.
 
-    A scikit-learn regressor from actuator vectors to tip positions. The fitted `module_` is a
-    torch module with a closed-form Jacobian, ready for `InverseKinematics`.
+    A scikit-learn regressor from actuator vectors to tip positions, or poses. The fitted `module_`
+    is a torch module with a closed-form Jacobian, ready for `InverseKinematics`.
 
     Parameters
     ----------
@@ -73,13 +74,19 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Share of tips, 0.9 for example, that shall lie within the radius of
         ``predict(Q, return_radius=True)``. It costs five more fits, each with a fifth of the
         groups held out. Default: no radius.
+    output : {"position", "pose"}, default="position"
+        What y holds. "pose": rows of tip position [m] and rotation vector [rad] of the tip's frame
+        in the measuring frame. The errors of both are learned as six numbers [m], a radian as the
+        reach of the chain, and set p = p_mech + eps_p and R = exp(eps_r / reach) R_mech. For chains
+        and regressors, parallel, without `coverage`; a calibration looks at the positions.
     random_state : int, RandomState or None, default=None
         Seed of the default error model; one that is given brings its own.
 
     Attributes
     ----------
     module_ : nn.Module
-        q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``.
+        q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``; of poses q
+        -> tip position, with ``pose``, ``pose_jacobian`` and ``tip_transform`` as well.
     mechanical_model_ : nn.Module or None
         The mechanical part, calibrated when asked.
     error_model_ : estimator, SerialFit or None
@@ -124,6 +131,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         calibrate: Sequence[str] | str = (),
         guard: str | None = "leverage",
         coverage: float | None = None,
+        output: str = "position",
         random_state: int | np.random.RandomState | None = None,
     ) -> None:
         self.mechanical_model = mechanical_model
@@ -132,6 +140,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.calibrate = calibrate
         self.guard = guard
         self.coverage = coverage
+        self.output = output
         self.random_state = random_state
 
     def set_params(self, **params: Any) -> HybridForwardModel:
@@ -155,7 +164,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X : array-like of shape (N, n)
             Actuator vectors q [m], of revolute joints [rad].
         y : array-like of shape (N, m) or (N,)
-            Measured tip positions x [m].
+            Measured tip positions x [m]; of poses (N, 6), see `output`.
         sample_weight : array-like of shape (N,), optional
             How many times each row counts.
         groups : array-like of shape (N,), optional
@@ -192,18 +201,20 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if hasattr(mechanical, "check_actuators"):
             mechanical.check_actuators(q, "X")
         self.calibration_: CalibrationResult | None = None
+        build = PoseHybridModule if self.output == "pose" else HybridModule
         names = self.calibrate
         if isinstance(names, str) and names == "default":
             names = getattr(mechanical, "default_parameters", ())
         if mechanical is not None and len(names):
+            tips = y.reshape(len(y), -1)[:, :3] if self.output == "pose" else y
             self.calibration_ = calibrate(
-                mechanical, q, torch.from_numpy(y), names, groups=groups, sample_weight=weights
+                mechanical, q, torch.from_numpy(tips), names, groups=groups, sample_weight=weights
             )
             mechanical = self.calibration_.chain
         else:
             _warn_contradictory(mechanical, q)
         self.mechanical_model_ = mechanical
-        error = y - _mechanical_tips(mechanical, q, y)
+        error = self._errors(q, y)
         coupling, model = self.coupling, self.error_model
         if model is None:
             model = self._default_error_model()
@@ -211,7 +222,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if isinstance(model, str) and model == "auto":
             coupling, model, self.cv_results_ = choose(self, mechanical, X, y, weights, groups)
         if isinstance(model, str) and model == "drop":
-            self.error_model_, self.module_ = None, HybridModule(mechanical, None)
+            self.error_model_, self.module_ = None, build(mechanical, None)
         elif mechanical is not None and (coupling == "serial" or isinstance(model, _NAMED)):
             tips = torch.from_numpy(y.reshape(len(y), -1))
             self.error_model_, self.module_ = fit_coupled(
@@ -224,7 +235,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             guard = None  # without a mechanical model there is nothing to fall back on
             if mechanical is not None:
                 guard = fit_guard(self.guard, error_part, kept)
-            self.module_ = HybridModule(mechanical, error_part, guard)
+            self.module_ = build(mechanical, error_part, guard)
         self._single_output = y.ndim == 1
         n_outputs = 1 if y.ndim == 1 else y.shape[1]
         self._drift = Drift.of_range(q.amin(0).numpy(), q.amax(0).numpy(), n_outputs)
@@ -279,7 +290,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         module = copy.copy(self.module_)  # what was handed out before stays as it was
         module._modules = {**self.module_._modules, "drift": None}
         with torch.no_grad():
-            residual = y.reshape(len(y), -1) - module(q).numpy()
+            error = self._errors(q, y).reshape(len(y), -1)
+            residual = error - module.error_part(q).numpy()
         self._drift = self._drift.learned(q.numpy(), residual, weights, decay)
         module.drift = self._drift.correction(alpha)
         self.module_ = module
@@ -298,7 +310,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         x : ndarray of shape (N, m), or (N,) as in `fit`
-            Tips [m].
+            Tips [m]; of poses rotation vectors up to pi long, too [rad].
         radius : ndarray of shape (N,)
             Only if `return_radius`: a share `coverage` of the tips lies within [m], of motions like
             those of the fit; wider where the error model is not trusted.
@@ -319,11 +331,14 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._by_blocks(lambda module, q: (module.mechanical_part(q),), X)[0]
 
     def predict_error(self, X: Any) -> NDArray:
-        """Return the learned part w(q) eps(q), shaped like `predict` [m]."""
+        """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
         return self._by_blocks(lambda module, q: (module.error_part(q),), X, mechanical=False)[0]
 
     def jacobian(self, X: Any) -> NDArray:
-        """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n)."""
+        """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
+
+        Of poses the last three rows give the angular velocity in the measuring frame.
+        """
         return self._by_blocks(lambda module, q: (module.jacobian(q),), X)[0]
 
     def predict_and_jacobian(self, X: Any) -> tuple[NDArray, NDArray]:
@@ -340,8 +355,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Maps q of shape (n,) to `predict` (m,) [m] and its Jacobian (m, n), in float64 and some
             ten times faster. It is not told by a later `fit`.
         """
-        check_is_fitted(self)
-        return self.module_.numpy_function()
+        return self._rows().numpy_function()
 
     def in_domain(self, X: Any) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
@@ -351,13 +365,34 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         return self._by_blocks(lambda module, q: (module.error_weight(q),), X, mechanical=False)[0]
 
+    def _errors(self, q: Tensor, y: NDArray) -> NDArray:
+        """Return what the mechanical model lacks to y, in the rows that an error model learns."""
+        mechanical = self.mechanical_model_
+        if mechanical is None:
+            return y
+        if self.output == "pose":
+            return pose_errors(mechanical, q, y)
+        with torch.no_grad():
+            tips = mechanical(q).numpy()
+        if tips.shape != (y.shape if y.ndim == 2 else (len(y), 1)):
+            raise ValueError(
+                f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
+                f"shape {y.shape}."
+            )
+        return y - tips.reshape(y.shape)
+
+    def _rows(self) -> Any:
+        """Return the fitted module whose outputs are the columns of y."""
+        check_is_fitted(self)
+        return getattr(self.module_, "rows", self.module_)
+
     def _by_blocks(
         self,
-        function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]],
+        function: Callable[[Any, Tensor], tuple[Tensor, ...]],
         X: Any,
         mechanical: bool = True,
     ) -> list[NDArray]:
-        check_is_fitted(self)
+        module = self._rows()
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
         if mechanical:
             _warn_contradictory(self.mechanical_model_, torch.from_numpy(X.astype(np.float64)))
@@ -365,7 +400,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         with torch.no_grad():
             for start in range(0, len(X), _BLOCK):
                 q = torch.from_numpy(X[start : start + _BLOCK].astype(np.float64))
-                blocks.append(function(self.module_, q))
+                blocks.append(function(module, q))
         results = []
         for parts in zip(*blocks, strict=True):
             array = torch.cat(parts).numpy()
@@ -384,6 +419,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise ValueError(f"`coupling` must be one of {[*COUPLINGS]}, got {self.coupling!r}.")
         if self.coverage is not None and not 0.0 < self.coverage < 1.0:
             raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {self.coverage!r}.")
+        if self.output not in ("position", "pose"):
+            raise ValueError(f"`output` must be 'position' or 'pose', got {self.output!r}.")
+        if self.output == "pose":
+            check_pose_settings(self)
         if self.guard not in GUARDS:
             raise ValueError(f"`guard` must be one of {GUARDS}, got {self.guard!r}.")
         named, names = isinstance(self.error_model, _NAMED), ("auto", "drop", *READOUTS)
@@ -427,17 +466,3 @@ def _fit_regressor(
 def _warn_contradictory(mechanical: Any, q: Tensor) -> None:
     if hasattr(mechanical, "warn_contradictory"):
         mechanical.warn_contradictory(q, "X", stacklevel=5)
-
-
-def _mechanical_tips(mechanical: nn.Module | None, q: Tensor, y: NDArray) -> NDArray | float:
-    if mechanical is None:
-        return 0.0
-    with torch.no_grad():
-        tips = mechanical(q).numpy()
-    wanted = y.shape if y.ndim == 2 else (len(y), 1)
-    if tips.shape != wanted:
-        raise ValueError(
-            f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
-            f"shape {y.shape}."
-        )
-    return tips.reshape(y.shape)

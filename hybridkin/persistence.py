@@ -22,6 +22,7 @@ from hybridkin._error_modules import AffineModule
 from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
 from hybridkin._hybrid_modules import HybridModule, SerialHybridModule
 from hybridkin._pose_features import PoseFeatures
+from hybridkin._pose_hybrid import PoseHybridModule
 from hybridkin._radius import Radius
 from hybridkin._readout import Statistics
 from hybridkin._serial import SerialModule
@@ -227,6 +228,7 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
         "calibrate": model.calibrate if isinstance(model.calibrate, str) else [*model.calibrate],
         "guard": model.guard,
         "coverage": model.coverage,
+        "output": model.output,
         "radius": None if model.radius_ is None else model.radius_._asdict(),
         "n_features_in": model.n_features_in_,
         "feature_names_in": [str(name) for name in getattr(model, "feature_names_in_", [])],
@@ -273,6 +275,7 @@ def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardMod
         calibrate=names if isinstance(names, str) else tuple(names),
         guard=header["guard"],
         coverage=header.get("coverage"),
+        output=header.get("output", "position"),
     )
     radius = header.get("radius")
     model.radius_ = None if radius is None else Radius(**radius)
@@ -291,9 +294,11 @@ def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardMod
     if isinstance(error_module, SerialModule):
         model.module_ = SerialHybridModule(error_module, guard, drift)
     else:
-        model.module_ = HybridModule(mechanical, error_module, guard, drift)
+        build = PoseHybridModule if model.output == "pose" else HybridModule
+        model.module_ = build(mechanical, error_module, guard, drift)
     with torch.no_grad():  # a file whose arrays do not fit together fails here, not in use
-        model.module_.forward_and_jacobian(torch.ones(1, model.n_features_in_, dtype=torch.float64))
+        one_row = torch.ones(1, model.n_features_in_, dtype=torch.float64)
+        model._rows().forward_and_jacobian(one_row)
     return model
 
 

@@ -17,6 +17,7 @@ ORDER = [
     "hybrid",
     "_auto",
     "_couplings",
+    "_pose_hybrid",
     "_hybrid_modules",
     "_drift",
     "_error_modules",
