@@ -425,11 +425,19 @@ class RigidChain(PortableModule):
         The first three rows are `jacobian(q)`, the others give the angular velocity in the
         measuring frame: [-] for revolute joints, zero for prismatic ones.
         """
-        _, linear, axes = self._columns(q)
+        return self.pose_and_jacobian(q)[1]
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip's pose (..., 4, 4) in the measuring frame, and `pose_jacobian(q)`."""
+        tip, linear, axes, frame = self._columns(q)
         slides = self.slides.to(q.device)[:, None, None]
         angular = torch.where(slides, torch.zeros_like(axes), axes)
         columns = [self._in_measuring_frame(part, q) for part in (linear, angular)]
-        return torch.cat(columns, dim=-2)
+        turned = (self.tip.to(q)[:, :3].T @ frame.flatten(1)).unflatten(1, (3, -1))
+        local = torch.cat([turned, tip[None]]).permute(2, 1, 0)  # (N, 3, 4): axes and tip
+        last = torch.eye(4).to(q)[3].expand(len(local), 1, 4)
+        pose = (self.base.to(q) @ torch.cat([local, last], 1)).reshape(*q.shape[:-1], 4, 4)
+        return pose, torch.cat(columns, dim=-2)
 
     def poses(self, q: Tensor) -> Tensor:
         """Return the pose of the base and of the link that every joint moves.
@@ -532,23 +540,28 @@ class RigidChain(PortableModule):
         return ((base[:3] @ p).T.reshape(*q.shape[:-1], 3),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        tip, linear, _ = self._columns(q)
+        tip, linear, _, _ = self._columns(q)
         base = self.base.to(q)
         x = (base[:3, :3] @ tip + base[:3, 3:]).T
         return x.reshape(*q.shape[:-1], 3), self._in_measuring_frame(linear, q)
 
-    def _columns(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return tip (3, N), its derivatives and the joint axes (n, 3, N) in the base frame."""
+    def _columns(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return tip (3, N), its derivatives and the joint axes (n, 3, N), and the last frame.
+
+        All are in the base frame; of the last joint's moving frame (4, 3, N) these are the three
+        axes and the origin.
+        """
         few = q.shape[:-1].numel() <= _FEW_ROWS
-        tip, axes, points = self._by_frames(q) if few else self._by_columns(q)
+        frame, axes, points = self._by_frames(q) if few else self._by_columns(q)
+        tip = (self._end(q) @ frame.flatten(1)).unflatten(0, (3, -1))
         columns = torch.linalg.cross(axes, tip - points, dim=1)
         if "prismatic" in self.kinds:
             slides = self.slides.to(q.device)[:, None, None]
             columns = torch.where(slides, axes, columns)
-        return tip, columns, axes
+        return tip, columns, axes, frame
 
     def _by_columns(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return tip (3, N), joint axes and joint positions (n, 3, N) in the base frame."""
+        """Return the last frame (4, 3, N), joint axes and joint positions (n, 3, N)."""
         parts = self._parts(q)
         n_rows = len(parts[0])
         # Three coordinates of every row side by side, so that a joint costs one small product.
@@ -560,16 +573,16 @@ class RigidChain(PortableModule):
             frame = torch.addcmul(torch.addcmul(still, u1[k], by_u1), u2[k], by_u2)
             axes.append(axis)
             points.append(frame[3:])
-        tip = (self._end(q) @ frame).unflatten(0, (3, n_rows))
         shape = (self.n_actuators, 3, n_rows)
-        return tip, torch.cat(axes).reshape(shape), torch.cat(points).reshape(shape)
+        axes, points = (torch.cat(part).reshape(shape) for part in (axes, points))
+        return frame.unflatten(1, (3, n_rows)), axes, points
 
     def _by_frames(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the same as `_by_columns`; fewer calls, more work in each row."""
         frames = self._frames(q.reshape(-1, self.n_actuators))[..., :3, :]
         axes = (frames[..., :3] @ self.axes.to(q)[..., None])[..., 0]
-        tip = frames[:, -1] @ self._end(q)
-        return tip.T, axes.permute(1, 2, 0), frames[..., 3].permute(1, 2, 0)
+        points = frames[..., 3].permute(1, 2, 0)
+        return frames[:, -1].permute(2, 1, 0), axes.permute(1, 2, 0), points
 
     def _in_measuring_frame(self, columns: Tensor, q: Tensor) -> Tensor:
         """Return columns (n, 3, N) of the base frame as a Jacobian (..., 3, n)."""

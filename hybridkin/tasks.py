@@ -161,8 +161,8 @@ class PoseTask(Task):
     radian : float, default=0.1
         Metres that a radian counts as.
     orientation : nn.Module, optional
-        The chain that tells the orientation, where `model` does not: a hybrid model learns the
-        position only, and its chain turns the tip. Default: `model`.
+        The chain that tells the orientation, where `model` does not: a hybrid model of positions
+        learns nothing else, and its chain turns the tip. Default: `model`.
 
     Examples
     --------
@@ -196,7 +196,7 @@ class PoseTask(Task):
 
     def _evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         turning = self.models[-1]
-        T, J = _tip_pose(turning, q), turning.pose_jacobian(q)
+        T, J = _pose_and_jacobian(turning, q)
         if turning is not self.models[0]:
             x, linear = forward_and_jacobian(self.models[0], q)
             moved = torch.cat([T[:, :3, :3], x.to(T)[..., None]], dim=-1)
@@ -456,8 +456,10 @@ def rotation_vector(R: Tensor) -> Tensor:
     return ratio * axis
 
 
-def _tip_pose(chain: Any, q: Tensor) -> Tensor:
-    return chain.tip_transform(q).get_matrix()
+def _pose_and_jacobian(chain: Any, q: Tensor) -> tuple[Tensor, Tensor]:
+    if hasattr(chain, "pose_and_jacobian"):
+        return chain.pose_and_jacobian(q)
+    return chain.tip_transform(q).get_matrix(), chain.pose_jacobian(q)
 
 
 class _FunctionPair:

@@ -262,6 +262,16 @@ def test_angular_jacobian_turns_the_tip_frame(rng):
     assert_close(angular, expected, rtol=0, atol=4e-15)
 
 
+@pytest.mark.parametrize("n", [1, 5, 300])
+def test_pose_and_jacobian_is_the_last_pose(rng, n):
+    chain = RigidChain.from_urdf(URDF, "camera")
+    q = 0.3 * torch.rand(n, chain.n_actuators, generator=rng, dtype=torch.float64)
+    pose, J = chain.pose_and_jacobian(q)
+    assert_close(pose, chain.poses(q)[:, -1], rtol=0, atol=1e-13)
+    assert_close(J, chain.pose_jacobian(q), rtol=0, atol=0)
+    assert_close(chain.pose_and_jacobian(q[0])[0], pose[0])
+
+
 def test_poses_and_backbone_agree(rng):
     chain, q = arm(tool=[0.1, 0.02, 0.2], base=random_pose(rng)), random_q(rng, 4)
     poses, points = chain.poses(q), chain.backbone(q, n_points=3)
