@@ -10,7 +10,6 @@ from hybridkin._error_modules import AffineModule
 from hybridkin._network import ELM
 from hybridkin._numerics import (
     forward_and_jacobian,
-    forward_and_reverse_jacobian,
     in_blocks,
 )
 from hybridkin._realtime import NumpyFunction, by_torch, numpy_function
@@ -90,8 +89,8 @@ class HybridModule(nn.Module):
         fading = None
         if self.error is not None:
             x, J, outside = self._error_and_outside(q)
-            if outside is not None and len(outside):
-                fading = outside, *forward_and_reverse_jacobian(self.guard, q[outside])
+            if self.guard is not None and outside is not None and len(outside):
+                fading = outside, *self.guard.weight_and_jacobian(q[outside])
                 x, J = _faded(x, J, *fading)
             if self.guard is not None:
                 x, J = self.guard.shortened_with_jacobian(x, J)
@@ -112,7 +111,8 @@ class HybridModule(nn.Module):
                 x, J, inside = self.error.forward_jacobian_and(
                     q, lambda features: guard.is_inside(features)[..., None]
                 )
-                return x, J, (~inside[:, 0]).nonzero()[:, 0]
+                unsure = (~inside[:, 0]).nonzero()[:, 0]
+                return x, J, unsure[~self.in_domain(q[unsure])] if len(unsure) else unsure
         outside = None if guard is None else (~self.in_domain(q)).nonzero()[:, 0]
         return *forward_and_jacobian(self.error, q), outside
 
@@ -188,7 +188,7 @@ class SerialHybridModule(HybridModule):
             long = self.guard.is_long(x - self.mechanical(q))
             rows = (long | ~self.in_domain(q)).nonzero()[:, 0]
             if len(rows):
-                fading = forward_and_reverse_jacobian(self.guard, q[rows])
+                fading = self.guard.weight_and_jacobian(q[rows])
                 x_mech, J_mech = forward_and_jacobian(self.mechanical, q[rows])
                 own, J_own = _weighed(x[rows] - x_mech, J[rows] - J_mech, *fading)
                 own, J_own = self.guard.shortened_with_jacobian(own, J_own)

@@ -145,15 +145,29 @@ class ELM(PortableModule):
         r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
         return (r * r).sum(-1) + self.leverage_offset.to(q)
 
+    def leverage_and_gradient(self, q):
+        """Return the leverage (...) and its derivative by `q` (..., n_inputs) in closed form."""
+        u, a, s = self._hidden(q)
+        factor = self.leverage_factor.to(q)
+        r = (self._features(u, s) - self.leverage_center.to(q)) @ factor
+        by_features = 2 * r @ factor.T
+        n_hidden = s.shape[-1]
+        by_a = by_features[..., :n_hidden] * ACTIVATIONS[self.activation][1](a, s)
+        gradient = by_a @ self.input_weights.to(q)
+        if by_features.shape[-1] > n_hidden:
+            gradient = gradient + by_features[..., n_hidden:]
+        return (r * r).sum(-1) + self.leverage_offset.to(q), gradient / self.input_scale.to(q)
+
     def leverage_is_below(self, limit, features):
         """Return where the leverage is certainly below `limit`, shape (...), bool.
 
         In single precision, at half the price; what is close to the limit is left out.
         """
         center, factor = self.leverage_center.float(), self.leverage_factor.float()
-        deviation = features.float() - center
+        single = features.float()
+        half = torch.addmm(-center @ factor, single, factor)
         rounding = 8 * len(center) ** 0.5 * torch.finfo(torch.float32).eps * factor.norm()
-        bound = (deviation @ factor).norm(dim=-1) + rounding * deviation.norm(dim=-1)
+        bound = half.norm(dim=-1) + rounding * (single.norm(dim=-1) + center.norm())
         return bound < (limit - self.leverage_offset).clamp(min=0.0).sqrt()
 
     def numpy_function(self, limit=None):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 from torch import Tensor, nn
 
-from hybridkin._numerics import PortableModule
+from hybridkin._numerics import PortableModule, forward_and_reverse_jacobian
 from hybridkin._realtime import NumpyFunction, numpy_function
 
 __all__ = ["GUARDS", "BoxGuard", "Guard", "LeverageGuard", "QuadraticReadout", "fit_guard"]
@@ -50,6 +50,20 @@ class Guard(PortableModule):
         """Return w(q), shape (..., 1)."""
         beyond = (self.strangeness(q) - 1.0).clamp(min=0.0)
         return self._weight(beyond)[..., None]
+
+    def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return w(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
+        strangeness, gradient = self._strangeness_and_gradient(q)
+        beyond = (strangeness - 1.0).clamp(min=0.0)
+        weight = self._weight(beyond)
+        slope = -3.0 * (beyond * weight) ** 2
+        return weight[:, None], (slope[:, None] * gradient)[:, None]
+
+    def _strangeness_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        strangeness, gradient = forward_and_reverse_jacobian(
+            lambda rows: self.strangeness(rows)[..., None], q
+        )
+        return strangeness[:, 0], gradient[:, 0]
 
     def numpy_function(self) -> NumpyStrangeness:
         """Return a NumPy function q (n,) -> strangeness, and its gradient (n,) where above 1."""
@@ -156,6 +170,13 @@ class LeverageGuard(Guard):
     def is_inside(self, features: Tensor) -> Tensor:
         """Return where the strangeness is certainly below 1, from the readout's features."""
         return self.readout.leverage_is_below(self.limit, features)  # pyright: ignore
+
+    def _strangeness_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        if not hasattr(self.readout, "leverage_and_gradient"):
+            return super()._strangeness_and_gradient(q)
+        leverage, gradient = self.readout.leverage_and_gradient(q)  # pyright: ignore
+        limit = self.limit.to(q)
+        return leverage / limit, gradient / limit
 
     def strangeness(self, q: Tensor) -> Tensor:
         """Return the leverage of q over the limit, shape (...)."""

@@ -391,3 +391,25 @@ def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
     assert_close(module.forward_and_jacobian(at)[0], module(at), rtol=0, atol=1e-9)
     reverse = torch.func.vmap(torch.func.jacrev(module))(at)
     assert_close(module.jacobian(at), reverse, rtol=1e-6, atol=1e-6 * float(reverse.abs().max()))
+
+
+@pytest.mark.parametrize("kind", ["leverage", "box"])
+@pytest.mark.parametrize(
+    "error_model",
+    [
+        ELMRegressor(random_state=0),
+        ELMRegressor(alpha=1e-4, direct_link=True, activation="tanh", random_state=0),
+        LinearRegression(),
+    ],
+    ids=["elm", "linked", "linear"],
+)
+def test_weight_and_its_derivative(kind, error_model):
+    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
+    guard = HybridForwardModel(chain, error_model, guard=kind).fit(data.q, data.x).module_.guard
+    rng = np.random.default_rng(0)
+    away = rng.uniform(-0.2, 0.2, (40, 9)) * np.linspace(0, 1, 40)[:, None]
+    q = torch.from_numpy(data.q[:40] + away)
+    weight, slope = guard.weight_and_jacobian(q)
+    assert_close(weight, guard(q))
+    assert ((weight > 0.01) & (weight < 0.99)).any()
+    assert_close(slope, torch.func.vmap(torch.func.jacrev(guard))(q), rtol=1e-9, atol=1e-9)
