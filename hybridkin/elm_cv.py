@@ -366,7 +366,7 @@ def _splits(cv, y_shape, groups, kept):
             cv = GroupKFold(int(cv))
     rows = np.zeros(y_shape[0])
     splits = []
-    splitter: Any = check_cv(cv)
+    splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
     for train, test in splitter.split(rows, rows, groups):
         used, asked = rows.astype(bool), rows.astype(bool)
         used[train], asked[test] = True, True
