@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import time
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
+from sklearn.kernel_ridge import KernelRidge
 from sklearn.model_selection import GroupKFold, KFold
 
 from hybridkin._arc_chain import ArcChain
@@ -19,6 +21,9 @@ from hybridkin.elm import ELMRegressor
 from hybridkin.elm_cv import ELMRegressorCV
 
 _FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
+_ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
+_MOST = 2000  # rows for kernel ridge, whose cost grows with their cube
+_GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # over the mean variance of the inputs
 
 
 class Choice(NamedTuple):
@@ -57,11 +62,17 @@ def choose(
     by_motion = None if groups is None else fold_of
     seed = copy.deepcopy(model.random_state)
     candidates = _candidates(mechanical, seed)
+    if len(X) > _MOST:
+        del candidates["parallel kernel"]
     settled, seconds = [], []
+    error = y - _fit(model, mechanical, "parallel", "drop", X, y, weights, None).predict(X)
     for coupling, error_model in candidates.values():
         start = time.process_time()
-        fitted = _fit(model, mechanical, coupling, error_model, X, y, weights, by_motion)
-        settled.append((coupling, _settled(error_model, fitted.error_model_)))
+        if isinstance(error_model, KernelRidge):
+            settled.append((coupling, _tuned(X, error, weights, folds)))
+        else:
+            fitted = _fit(model, mechanical, coupling, error_model, X, y, weights, by_motion)
+            settled.append((coupling, _settled(error_model, fitted.error_model_)))
         seconds.append(time.process_time() - start)
     distances = np.empty((len(candidates), len(X)))
     for train, test in folds:
@@ -107,7 +118,37 @@ def _candidates(mechanical: Any, seed: Any) -> dict[str, tuple[str, Any]]:
     candidates |= {f"serial {kind}": ("serial", Readout(kind)) for kind in inside}
     candidates["parallel quadratic"] = ("parallel", Readout("quadratic"))
     candidates["parallel ELM"] = ("parallel", network)
+    candidates["parallel kernel"] = ("parallel", KernelRidge(kernel="rbf"))
     return candidates
+
+
+def _tuned(X: NDArray, error: NDArray, weights: NDArray, folds: list[Any]) -> KernelRidge:
+    """Return kernel ridge with the width and the penalty that err least on the folds."""
+    spread = X.var(axis=0).mean() or 1.0
+    missed: dict[tuple[int, int], float] = {}
+
+    def ridge(place: tuple[int, int]) -> Any:
+        gamma = _GAMMAS[place[0]] / spread
+        return KernelRidge(kernel="rbf", gamma=gamma).set_params(alpha=_ALPHAS[place[1]])
+
+    def error_left_out(place: tuple[int, int]) -> float:
+        if place not in missed:
+            missed[place] = 0.0
+            for train, test in folds:
+                part = ridge(place).fit(X[train], error[train], sample_weight=weights[train])
+                left = (error[test] - part.predict(X[test])).reshape(len(test), -1)
+                missed[place] += weights[test] @ np.linalg.norm(left, axis=1)
+        return missed[place]
+
+    widths, penalties = range(len(_GAMMAS)), range(len(_ALPHAS))
+    best = min(product(widths[::2], penalties[1::2]), key=error_left_out)
+    previous = None
+    while best != previous:
+        width, penalty = best
+        near = product(range(width - 1, width + 2), range(penalty - 1, penalty + 2))
+        inside = (place for place in near if place[0] in widths and place[1] in penalties)
+        previous, best = best, min(inside, key=error_left_out)
+    return ridge(best)
 
 
 def _settled(error_model: Any, fitted: Any) -> Any:

@@ -54,8 +54,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         features of all actuators, or "pose", features of a chain's shape that loads act by, linear
         and other parts penalised apart by errors on rows, or groups, left out, down to no
         correction at all; "drop" is the mechanical model alone. None is
-        ``ELMRegressor()``, with serial coupling "quadratic". "auto" tries these and an
-        `ELMRegressorCV`, in both couplings, and takes what errs least on groups, or rows, left out.
+        ``ELMRegressor()``, with serial coupling "quadratic". "auto" tries these in
+        both couplings, an `ELMRegressorCV` and, up to 2000 rows, kernel ridge, and takes what errs
+        least on groups, or rows, left out. Let the groups be what will be new at work.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
         the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q

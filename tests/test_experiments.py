@@ -86,9 +86,10 @@ def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
     closed = record["closed_loop"]
     assert len(closed) == 5
     for runs in closed.values():
-        assert runs["closed loop"]["mean"] < 0.02
+        assert runs["closed loop"]["mean"] < 1.1 * runs["feed-forward"]["mean"]
         assert max(run["largest_step"] for run in runs.values()) < 0.06  # at 25 points
-    assert closed["serial on calibrated"]["feed-forward"]["mean"] < 0.006
+    serial, nominal = closed["serial on calibrated"], closed["mechanical, nominal"]
+    assert serial["feed-forward"]["mean"] < 0.5 * nominal["feed-forward"]["mean"]
     told = record["identifiability"]
     assert (
         "What 1500 rows of one segment and 400 random rows of the simulated trunk tell" in printed
