@@ -13,12 +13,14 @@ import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
+from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
 from hybridkin._drift import Drift
 from hybridkin._error_modules import AffineModule
+from hybridkin._error_modules import error_module as make_error_module
 from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
 from hybridkin._hybrid_modules import HybridModule, SerialHybridModule
 from hybridkin._pose_features import PoseFeatures
@@ -96,8 +98,9 @@ def save_model(model: Any, path: str | Path) -> None:
     ----------
     model : a chain, a fitted HybridForwardModel, ELMRegressor or ELMRegressorCV
         A chain is a ConstantCurvatureChain, ElasticTendonChain or RigidChain. The hybrid's
-        mechanical model must be one of these or None, its error model an ELM, a LinearRegression,
-        or "drop". Of an ELMRegressorCV the chosen ELMRegressor is stored.
+        mechanical model must be one of these or None, its error model an ELM, a LinearRegression, a
+        KernelRidge with the kernel "rbf", or a name. Of an ELMRegressorCV the chosen ELMRegressor
+        is stored.
     path : str or Path
         File to write, usually ``*.safetensors``. It is replaced only once all is written.
 
@@ -367,13 +370,18 @@ def _store_error(regressor: Any, arrays: Arrays) -> dict[str, Any] | None:
         return _store_elm(regressor, arrays, "error.")
     if isinstance(regressor, SerialFit):
         return _store_readout(regressor, arrays)
+    if type(regressor) is KernelRidge and regressor.kernel == "rbf":
+        fitted: Any = regressor
+        arrays["error.rows"], arrays["error.dual"] = fitted.X_fit_, fitted.dual_coef_
+        return {"kind": "kernel", "gamma": _plain(fitted.gamma), "alpha": _plain(fitted.alpha)}
     if isinstance(regressor, LinearRegression):
         arrays["error.coef"] = np.asarray(regressor.coef_)
         arrays["error.intercept"] = np.asarray(regressor.intercept_)
         return {"kind": "linear"}
     raise TypeError(
-        "`model` must have an ELM, a LinearRegression or a name as `error_model` to be "
-        f"saved, got {type(regressor).__name__}, which could only be stored as code."
+        "`model` must have an ELM, a LinearRegression, a KernelRidge with the kernel 'rbf' or a "
+        f"name as `error_model` to be saved, got {type(regressor).__name__}, which could only be "
+        "stored as code."
     )
 
 
@@ -383,6 +391,11 @@ def _restored_error(header: Any, arrays: Arrays) -> tuple[Any, nn.Module | None]
     if header["kind"] == "elm":
         elm = _restored_elm(header, arrays, "error.")
         return elm, elm.module_
+    if header["kind"] == "kernel":
+        ridge: Any = KernelRidge(kernel="rbf", gamma=header["gamma"], alpha=header["alpha"])
+        ridge.X_fit_, ridge.dual_coef_ = arrays["error.rows"], arrays["error.dual"]
+        ridge.n_features_in_ = ridge.X_fit_.shape[1]
+        return ridge, make_error_module(ridge, torch.from_numpy(ridge.X_fit_))
     if header["kind"] == "linear":
         linear = LinearRegression()
         linear.coef_, linear.intercept_ = arrays["error.coef"], arrays["error.intercept"]

@@ -189,7 +189,9 @@ def test_hybrid_of_an_elastic_chain_comes_back(tmp_path):
 
 
 @pytest.mark.parametrize("guard", ["leverage", "box", None])
-@pytest.mark.parametrize("error_model", [None, "drop", LinearRegression()])
+@pytest.mark.parametrize(
+    "error_model", [None, "drop", LinearRegression(), KernelRidge(0.1, kernel="rbf", gamma=20.0)]
+)
 def test_hybrid_comes_back_in_another_process(tmp_path, log, error_model, guard):
     q, x = log
     model = HybridForwardModel(
