@@ -8,7 +8,6 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
@@ -16,7 +15,6 @@ from sklearn.model_selection import GroupKFold, KFold
 
 from hybridkin._arc_chain import ArcChain
 from hybridkin._couplings import Readout
-from hybridkin.calibration import calibrate
 from hybridkin.elm import ELMRegressor
 from hybridkin.elm_cv import ELMRegressorCV
 
@@ -76,7 +74,10 @@ def choose(
         seconds.append(time.process_time() - start)
     distances = np.empty((len(candidates), len(X)))
     for train, test in folds:
-        chain = _calibrated(model, mechanical, X[train], y[train], weights[train])
+        alone: Any = clone(model).set_params(  # pyright: ignore[reportAttributeAccessIssue]
+            error_model="drop", coverage=None
+        )
+        chain = alone.fit(X[train], y[train], sample_weight=weights[train]).mechanical_model_
         for i, (coupling, error_model) in enumerate(settled):
             start = time.process_time()
             part = _fit(
@@ -179,16 +180,6 @@ def _fit(
         coverage=None,
     )
     return part.fit(X, y, sample_weight=weights, groups=groups)
-
-
-def _calibrated(model: Any, mechanical: Any, X: NDArray, y: NDArray, weights: NDArray) -> Any:
-    names = model.calibrate
-    if isinstance(names, str) and names == "default":
-        names = getattr(mechanical, "default_parameters", ())
-    if not len(names):
-        return mechanical
-    q, x = (torch.from_numpy(np.asarray(array, dtype=np.float64)) for array in (X, y))
-    return calibrate(model.mechanical_model, q, x, names, sample_weight=weights).chain
 
 
 def _folds(X: NDArray, groups: Any) -> list[tuple[NDArray, NDArray]]:

@@ -5,7 +5,6 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
 from sklearn.model_selection import GroupKFold, LeaveOneGroupOut, check_cv
 from sklearn.utils import check_random_state, gen_batches
@@ -13,7 +12,6 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from hybridkin._left_out import LeftOut
-from hybridkin._network import ACTIVATIONS
 from hybridkin.elm import DTYPES, ELMRegressor, check_rows, device_named, draw_layer, gather
 
 __all__ = ["ELMRegressorCV"]
@@ -113,13 +111,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "alpha_per_target": ["boolean"],
         "relevance_rounds": [Interval(Integral, 0, None, closed="left")],
         "max_hidden": [Interval(Integral, 0, None, closed="left")],
-        "activation": [StrOptions(set(ACTIVATIONS))],
-        "input_scaling": [StrOptions({"minmax", "standard"}), None, "array-like"],
-        "fit_intercept": ["boolean"],
-        "direct_link": ["boolean"],
-        "block_size": [Interval(Integral, 1, None, closed="left"), None],
-        "device": [str, torch.device, None],
-        "random_state": ["random_state"],
+        **{name: ELMRegressor._parameter_constraints[name] for name in (*_SHARED, "random_state")},
     }
 
     def __init__(

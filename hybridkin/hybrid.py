@@ -280,6 +280,11 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
+        if not hasattr(self, "_drift"):
+            raise ValueError(
+                "`partial_fit` needs the range of the fit, which this model was saved without by "
+                "an earlier version; call `fit` first."
+            )
         for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
             if not 0.0 < value <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
