@@ -1,8 +1,43 @@
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import torch
+from matplotlib import animation
 from matplotlib.figure import Figure
+from PIL import Image
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.linear_model import Ridge
 
-from hybridkin import plots
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    ELMRegressor,
+    HybridForwardModel,
+    InverseKinematics,
+    RigidChain,
+    datasets,
+    plots,
+    robots,
+    trajectories,
+)
+
+SPACE = {"projection": "3d"}
+SHIFT = np.array([0.0, 0.01, -0.02])
+BENT = np.array([0.25, 0.3, 0.27, 0.25, 0.21, 0.3, 0.2, 0.25, 0.22])
+
+
+@pytest.fixture(autouse=True)
+def no_figure_left_open():
+    yield
+    left = plt.get_fignums()
+    plt.close("all")
+    assert not left
 
 
 @pytest.fixture
@@ -10,9 +45,37 @@ def x():
     return np.random.default_rng(0).normal(0.0, 0.2, (50, 3))
 
 
+@pytest.fixture(scope="module")
+def data():
+    return datasets.load_trunk()
+
+
+@pytest.fixture(scope="module")
+def hybrid(data):
+    return HybridForwardModel(robots.bionic_handling_assistant(), "linear").fit(data.q, data.x)
+
+
+@pytest.fixture(scope="module")
+def track():
+    path = trajectories.figure_eight([0.0, 0.0, 0.72], (0.2, 0.1), duration=2.0, dt=0.05)
+    ik = InverseKinematics(robots.bionic_handling_assistant(), q_min=0.1, q_max=0.4, dt=0.05)
+    return ik.track(path.x, path.t, plant=lambda q: ik.step(q, path.x[0]).x + SHIFT)
+
+
 def drawn(figure, tmp_path):
     figure.savefig(tmp_path / "figure.png")
     return (tmp_path / "figure.png").stat().st_size > 2000
+
+
+def distances(a, b):
+    return np.linalg.norm(a - b, axis=1)
+
+
+def path_lengths(points):
+    return np.linalg.norm(np.diff(points, axis=-2), axis=-1).sum(axis=-1)
+
+
+# Errors
 
 
 def test_error_histogram_counts_every_row_in_the_unit_shown(x, tmp_path):
@@ -21,9 +84,56 @@ def test_error_histogram_counts_every_row_in_the_unit_shown(x, tmp_path):
     np.testing.assert_allclose(display.errors["a"], 0.05)
     figure, ax = plots.new_figure(4, 3)
     assert display.plot(ax, unit="mm", bins=10) is display
+    assert (display.ax_, display.figure_) == (ax, figure)
     assert ax.get_xlabel() == "tip error [mm]"
+    assert ax.get_xlim() == pytest.approx((0.0, 50.0))
+    # Outlines of "a" then "b": all of "b" lies in the first bin, all of "a" in the last.
+    outlines = [patch.get_xy() for patch in ax.patches]
+    assert [outline[:, 1].max() for outline in outlines] == [50] * 4
+    assert outlines[0][outlines[0][:, 1] == 50, 0].min() == pytest.approx(45.0)
     assert "a: mean 50.00, max 50.0 mm" in [t.get_text() for t in ax.get_legend().get_texts()]
     assert drawn(figure, tmp_path)
+
+
+def test_rows_that_are_not_known_are_left_out_of_errors():
+    _, axes = plots.new_figure(6, 3, 1, 2)
+    errors = {"a": [0.01, np.nan, 0.03]}
+    plots.ErrorHistogramDisplay(errors).plot(axes[0])
+    plots.ErrorBoxDisplay(errors).plot(axes[1])
+    assert axes[0].get_legend().get_texts()[0].get_text() == "a: mean 2.00, max 3.0 cm"
+    dots = {line.get_label(): line.get_xdata() for line in axes[1].lines}
+    np.testing.assert_allclose([*dots["mean"], *dots["maximum"]], [2.0, 3.0])
+
+
+def test_a_hybrid_model_shows_both_its_parts(data, hybrid):
+    q, x = data.q[::10], data.x[::10]
+    display = plots.ErrorHistogramDisplay.from_estimator(hybrid, q, x)
+    parts = {"mechanical": hybrid.predict_mechanical(q), "hybrid": hybrid.predict(q)}
+    expected = plots.ErrorHistogramDisplay.from_predictions(x, parts)
+    assert [*display.errors] == ["mechanical", "hybrid"]
+    for name, errors in expected.errors.items():
+        np.testing.assert_array_equal(display.errors[name], errors)
+    assert display.errors["hybrid"].mean() < display.errors["mechanical"].mean()
+
+
+def test_models_by_name_may_be_estimators_or_chains(data):
+    q, x = data.q[::10], data.x[::10]
+    chain, ridge = robots.bionic_handling_assistant(), Ridge(1e-3).fit(q, x)
+    display = plots.ErrorBoxDisplay.from_estimator({"chain": chain, "ridge": ridge}, q, x)
+    tips = chain(torch.from_numpy(q)).numpy()
+    np.testing.assert_allclose(display.errors["chain"], distances(tips, x))
+    np.testing.assert_allclose(display.errors["ridge"], distances(ridge.predict(q), x))
+    single = plots.PredictionErrorDisplay.from_estimator(ridge, q, x)
+    assert [*single.predictions] == ["Ridge"]
+
+
+def test_of_poses_the_position_is_compared(data):
+    chain, q = robots.bionic_handling_assistant(), data.q[:100]
+    poses = np.concatenate([data.x[:100], np.zeros((100, 3))], axis=1)
+    model = HybridForwardModel(chain, ELMRegressor(random_state=0), output="pose").fit(q, poses)
+    display = plots.ErrorHistogramDisplay.from_estimator(model, q, poses)
+    expected = distances(model.predict(q)[:, :3], data.x[:100])
+    np.testing.assert_allclose(display.errors["hybrid"], expected)
 
 
 def test_boxes_and_bars_name_every_model(tmp_path):
@@ -35,6 +145,211 @@ def test_boxes_and_bars_name_every_model(tmp_path):
     assert drawn(figure, tmp_path)
 
 
+def test_prediction_errors_by_coordinate(x, tmp_path):
+    p = x + SHIFT
+    p[3] = np.nan
+    display = plots.PredictionErrorDisplay.from_predictions(x, {"a": p})
+    figure, axes = plots.new_figure(9, 6, 2, 3)
+    display.plot(axes[0], unit="mm")
+    display.plot(axes[1], kind="predicted_vs_measured")
+    for k, letter in enumerate("xyz"):
+        residual = np.stack([p[:, k], (x - p)[:, k]], axis=1)
+        np.testing.assert_allclose(axes[0, k].lines[0].get_xydata(), 1e3 * residual)
+        both = np.stack([x[:, k], p[:, k]], axis=1)
+        np.testing.assert_allclose(axes[1, k].lines[0].get_xydata(), 1e2 * both)
+        assert axes[0, k].get_xlabel() == f"predicted {letter} [mm]"
+        assert axes[1, k].get_xlabel() == f"measured {letter} [cm]"
+    assert axes[0, 2].get_title() == "a: 20.00 ± 0.00 mm"
+    assert drawn(figure, tmp_path)
+
+
+# Learning curves
+
+
+class Watcher(RegressorMixin, BaseEstimator):
+    """Predicts zero, and keeps what it was fitted on."""
+
+    seen = []  # noqa: RUF012
+
+    def fit(self, X, y, groups=None):
+        self.seen.append((X[:, 0].astype(int), groups))
+        self.shape_ = y.shape[1:]
+        return self
+
+    def predict(self, X):
+        return np.zeros((len(X), *self.shape_))
+
+
+def test_learning_curve_holds_out_and_adds_whole_motions(x):
+    Watcher.seen.clear()
+    q = np.arange(50.0)[:, None]  # the row itself
+    groups = np.repeat([*"abcde"], 10)[np.random.default_rng(1).permutation(50)]
+    display = plots.LearningCurveDisplay.from_estimator(
+        Watcher(), q, x, groups=groups, sizes=[15, 40], random_state=0
+    )
+    assert display.errors["Watcher"].shape == (2, 5)
+    assert sorted(len(rows) for rows, _ in Watcher.seen) == [15] * 5 + [40] * 5
+    for rows, given in Watcher.seen:
+        np.testing.assert_array_equal(given, groups[rows])
+        sizes = sorted(np.unique(given, return_counts=True)[1])
+        assert sizes == ([5, 10] if len(rows) == 15 else [10] * 4)
+    # Every motion is held out once, so that the errors with all rows average to that of all rows.
+    expected = np.linalg.norm(x, axis=1).mean()
+    np.testing.assert_allclose(display.errors["Watcher"].mean(axis=1), expected)
+
+
+def test_learning_curve_is_the_mean_distance_of_a_refitted_model(data):
+    q, x = data.q[:200], data.x[:200]
+    train, test = np.arange(150), np.arange(150, 200)
+    calls = []
+    display = plots.LearningCurveDisplay.from_estimator(
+        {"ridge": Ridge(1e-3)},
+        q,
+        x,
+        sizes=[150],
+        cv=[(train, test)],
+        progress=lambda *call: calls.append(call),
+    )
+    expected = distances(Ridge(1e-3).fit(q[train], x[train]).predict(q[test]), x[test]).mean()
+    np.testing.assert_allclose(display.errors["ridge"], [[expected]], rtol=1e-9)
+    assert calls == [(0, 1), (1, 1)]
+
+
+def test_learning_curve_draws_mean_and_band(tmp_path):
+    figure, ax = plots.new_figure(4, 3)
+    curves = {"a": [[0.02, 0.04], [0.01, 0.02], [np.nan, np.nan]], "b": [0.03, 0.02, 0.01]}
+    display = plots.LearningCurveDisplay([25, 50, 100], curves)
+    display.plot(ax, unit="mm", styles={"b": ("black", "--")})
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), [[25, 30], [50, 15]])
+    np.testing.assert_allclose(ax.lines[1].get_ydata(), [30, 20, 10])
+    assert (ax.lines[1].get_color(), ax.lines[1].get_linestyle()) == ("black", "--")
+    (band,) = ax.collections
+    corners = band.get_paths()[0].vertices
+    assert {(25.0, 20.0), (25.0, 40.0), (50.0, 10.0), (50.0, 20.0)} <= set(map(tuple, corners))
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert ax.get_ylabel() == "mean tip error [mm]"
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["25", "50", "100"]
+    assert drawn(figure, tmp_path)
+
+
+# Space
+
+
+def test_workspace_colours_are_the_errors(data, hybrid, tmp_path):
+    q, x = data.q[:100], data.x[:100].copy()
+    x[7] = np.nan
+    figure, ax = plots.new_figure(5, 4, subplot_kw=SPACE)
+    display = plots.WorkspaceDisplay.from_estimator(hybrid, q, x).plot(ax, unit="mm")
+    np.testing.assert_array_equal(display.predicted, hybrid.predict(q))
+    errors = distances(display.predicted, x)
+    known = np.sort(errors[np.isfinite(errors)])
+    np.testing.assert_allclose(ax.collections[0].get_array(), 1e3 * known)
+    assert errors[display.row] == known[int(0.95 * 99)]
+    chain, row = hybrid.mechanical_model_, torch.from_numpy(q[display.row])
+    np.testing.assert_allclose(display.backbone, chain.backbone(row, 12))
+    assert ax.get_zlabel() == "z [mm]"
+    assert "tip error [mm]" in [a.get_ylabel() for a in figure.axes]
+    assert drawn(figure, tmp_path)
+
+
+def test_workspace_of_an_estimator_without_body(data):
+    ridge = Ridge(1e-3).fit(data.q, data.x)
+    display = plots.WorkspaceDisplay.from_estimator(ridge, data.q[:50], data.x[:50], row=3)
+    assert display.backbone is None
+    assert display.row == 3
+
+
+def turned():
+    base = np.eye(4)
+    base[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    base[:3, 3] = [0.3, -0.2, 0.1]
+    return base
+
+
+def test_chambers_drawn_are_as_long_as_commanded():
+    chain = ConstantCurvatureChain([0.1, 0.09, 0.08], offsets=[0.01, 0.0, 0.05], base=turned())
+    display = plots.BackboneDisplay.from_estimator(chain, BENT, n_points=400)
+    assert len(display.actuators) == 9
+    assert display.segments == (0, 0, 0, 1, 1, 1, 2, 2, 2)
+    lengths = [path_lengths(path)[0] for path in display.actuators]
+    np.testing.assert_allclose(lengths, BENT, rtol=1e-5)
+
+
+def test_tendons_drawn_from_the_base_change_their_length_as_commanded():
+    lengths = [0.1, 0.08]
+    chain = ConstantCurvatureChain(
+        [0.01, 0.008], n_actuators=(3, 4), lengths=lengths, routing="base"
+    )
+    q = np.array([-0.004, 0.002, 0.002, -0.006, -0.001, 0.006, 0.001])
+    display = plots.BackboneDisplay.from_estimator(chain, q[None], n_points=400)
+    straight = np.array([0.1] * 3 + [0.18] * 4)
+    found = np.array([path_lengths(path)[0] for path in display.actuators])
+    np.testing.assert_allclose(found - straight, q, atol=2e-6)
+
+
+def test_disks_and_frames_stand_on_the_backbone():
+    chain = ElasticTendonChain([0.01, 0.008], [0.1, 0.08], offsets=[0.0, 0.02], base=turned())
+    q = np.array([[-0.004, 0.002, 0.002, 0.003, -0.006, 0.003]])
+    display = plots.BackboneDisplay.from_estimator(chain, q)
+    poses = chain.poses(torch.from_numpy(q)).numpy()
+    np.testing.assert_allclose(display.frames, poses)
+    np.testing.assert_allclose(display.points[:, -1], poses[:, -1, :3, 3])
+    centres = poses[:, :, :3, 3].copy()
+    centres[:, 2] -= 0.02 * poses[:, 2, :3, 2]  # before the tool
+    rims = display.disks - centres[:, :, None]
+    normals = poses[:, :, :3, 2]
+    assert np.abs(np.einsum("kdci,kdi->kdc", rims, normals)).max() < 1e-12
+    radii = np.linalg.norm(rims, axis=-1)
+    assert (radii.min(axis=-1) > [0.01, 0.01, 0.008]).all()
+    first = display.actuators[0][0]  # at angle 0: on the x-axes of base and first segment's end
+    np.testing.assert_allclose(first[0], poses[0, 0, :3, 3] + 0.01 * poses[0, 0, :3, 0])
+    np.testing.assert_allclose(first[-1], poses[0, 1, :3, 3] + 0.01 * poses[0, 1, :3, 0])
+
+
+def test_a_rigid_arm_shows_its_links():
+    origins = np.stack([np.eye(4)] * 3)
+    origins[1:, 2, 3] = 0.3
+    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], tool=[0.0, 0.0, 0.2])
+    q = np.array([0.3, 0.5, -0.8])
+    display = plots.BackboneDisplay.from_estimator(arm, q)
+    np.testing.assert_allclose(display.points[0], arm.backbone(torch.from_numpy(q)))
+    _, ax = plots.new_figure(4, 4, subplot_kw=SPACE)
+    display.plot(ax)
+    np.testing.assert_allclose(np.array(ax.lines[0].get_data_3d()).T, 100 * display.points[0])
+    assert "links and joints" in ax.get_legend_handles_labels()[1]
+
+
+def test_a_fitted_hybrid_shows_its_correction(hybrid, data, tmp_path):
+    display = plots.BackboneDisplay.from_estimator(hybrid, data.q[3])
+    np.testing.assert_allclose(display.predicted[0], hybrid.predict(data.q[3:4])[0])
+    np.testing.assert_allclose(display.tips[0], hybrid.predict_mechanical(data.q[3:4])[0])
+    figure, ax = plots.new_figure(4, 4, subplot_kw=SPACE)
+    display.plot(ax, unit="mm")
+    shown = {line.get_label(): np.array(line.get_data_3d()).T for line in ax.lines}
+    ends = [display.tips[0], display.predicted[0]]
+    np.testing.assert_allclose(shown["learned correction"], 1e3 * np.stack(ends))
+    backbone = hybrid.mechanical_model_.backbone(torch.from_numpy(data.q[3]), 12)
+    np.testing.assert_allclose(shown["backbone"], 1e3 * backbone)
+    assert len([name for name in shown if name.startswith("actuators of segment")]) == 3
+    assert drawn(figure, tmp_path)
+
+
+def test_several_bodies_and_rows_without_one(data):
+    q = data.q[:3].copy()
+    q[1, 4] = np.nan
+    display = plots.BackboneDisplay.from_estimator(robots.bionic_handling_assistant(), q)
+    assert np.isfinite(display.points).all(axis=(1, 2)).tolist() == [True, False, True]
+    figure, axes = plots.new_figure(8, 4, 1, 2, subplot_kw=SPACE)
+    display.plot(axes[0], actuators=False, disks=False)
+    assert len(axes[0].lines) == 4  # two backbones, two tips
+    plots.BackboneDisplay(data.x[:10]).plot(axes[1], unit="mm")
+    assert axes[1].get_zlabel() == "z [mm]"
+    figure.draw_without_rendering()
+
+
+# Tracks
+
+
 def test_tracking_draws_target_and_tracks(x, tmp_path):
     figure, axes = plots.new_figure(6, 3, 1, 2)
     display = plots.TrackingDisplay(x, {"one": x + 0.01, "two": x})
@@ -43,27 +358,342 @@ def test_tracking_draws_target_and_tracks(x, tmp_path):
     np.testing.assert_allclose(axes[0].lines[0].get_xydata(), 100 * (x + 0.01)[:, [0, 2]])
     np.testing.assert_allclose(axes[0].lines[2].get_xydata(), 100 * x[:, [0, 2]])
     assert len(axes[1].lines) == 9
+    assert axes[1].get_xlabel() == "time step"
     assert drawn(figure, tmp_path)
 
 
-def test_actuators_share_out_over_segments(tmp_path):
+def test_tracks_show_what_was_measured(track, tmp_path):
+    display = plots.TrackingDisplay.from_tracks({"a": track, "b": track})
+    np.testing.assert_array_equal(display.tracks["a"], track.x_measured)
+    figure = Figure(layout="constrained")
+    ax, space = figure.add_subplot(121), figure.add_subplot(122, projection="3d")
+    assert display.plot_error(ax, unit="mm").plot_space(space).ax_ is space
+    error = np.stack([track.t, 1e3 * track.error], axis=1)
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), error)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "tip error [mm]")
+    path = np.array(space.lines[0].get_data_3d()).T
+    np.testing.assert_allclose(path, 100 * track.x_measured)
+    assert drawn(figure, tmp_path)
+    free = InverseKinematics(robots.bionic_handling_assistant(), q_pref=0.25, dt=0.05)
+    free = free.track(torch.from_numpy(track.target[:5]), torch.from_numpy(track.t[:5]))
+    single = plots.TrackingDisplay.from_tracks(free)
+    np.testing.assert_array_equal(single.tracks["track"], free.x)
+    with pytest.raises(ValueError, match="one path"):
+        plots.TrackingDisplay.from_tracks({"a": track, "b": free})
+
+
+def test_unknown_tips_leave_gaps(x, tmp_path):
+    reached = x + 1.5 * SHIFT
+    reached[10:20] = np.nan
+    display = plots.TrackingDisplay(x, {"a": reached, "lost": np.full_like(x, np.nan)})
+    figure = Figure(layout="constrained")
+    display.plot(figure.add_subplot(221)).plot_time(figure.add_subplot(222))
+    display.plot_error(figure.add_subplot(223))
+    labels = [t.get_text() for t in display.ax_.get_legend().get_texts()]
+    assert labels == ["a: mean error 3.35 cm", "lost: mean error nan cm"]
+    display.plot_space(figure.add_subplot(224, projection="3d"))
+    assert drawn(figure, tmp_path)
+
+
+def test_actuators_share_out_over_segments(track, tmp_path):
     figure, axes = plots.new_figure(4, 4, 2, 1)
     q = np.arange(21.0).reshape(3, 7)
-    plots.ActuatorDisplay({"a": q}, (3, 4)).plot(axes, unit="m")
+    plots.ActuatorDisplay({"a": q}, (3, 4)).plot(axes, unit="deg")
     assert [len(ax.lines) for ax in axes] == [3, 4]
-    np.testing.assert_allclose(axes[1].lines[0].get_ydata(), q[:, 3])
+    np.testing.assert_allclose(axes[1].lines[0].get_ydata(), np.degrees(q[:, 3]))
+    assert axes[1].get_ylabel() == "segment 2 [deg]"
     assert drawn(figure, tmp_path)
+    display = plots.ActuatorDisplay.from_tracks(track, (3, 3, 3))
+    np.testing.assert_array_equal(display.paths["track"], track.q)
+    np.testing.assert_array_equal(display.t, track.t)
 
 
-def test_space(x, tmp_path):
-    figure, axes = plots.new_figure(8, 4, 1, 2, subplot_kw={"projection": "3d"})
-    plots.WorkspaceDisplay(x, x + 0.01, backbone=x[:5], row=3).plot(axes[0])
-    plots.BackboneDisplay(x[:10]).plot(axes[1], unit="mm")
-    assert axes[1].get_zlabel() == "z [mm]"
-    assert drawn(figure, tmp_path)
+# Films and pages
+
+
+@pytest.fixture(scope="module")
+def film(track):
+    return plots.TrackAnimation.from_track(robots.bionic_handling_assistant(), track, n_frames=5)
+
+
+def test_frames_lie_evenly_in_time(track, film):
+    assert film.rows.tolist() == [0, 10, 20, 30, 40]
+    assert film.fps == pytest.approx(2.0)  # 2 s in four steps
+    np.testing.assert_allclose(film.error, track.error)
+    t = np.array([0.0, 0.1, 0.2, 0.3, 2.0, 3.0])
+    uneven = plots.TrackAnimation.from_estimator(
+        robots.bionic_handling_assistant(), track.q[:6], t=t, n_frames=4
+    )
+    assert uneven.rows.tolist() == [0, 3, 4, 5]
+    np.testing.assert_allclose(uneven.x, track.x[:6])
+    assert uneven.error is None
+
+
+def test_a_frame_shows_body_tip_and_target(track, film):
+    figure, ax = plots.new_figure(4, 4, subplot_kw=SPACE)
+    film.plot(ax, unit="mm", frame=2)
+    shown = {line.get_label(): np.array(line.get_data_3d()).T for line in ax.lines}
+    np.testing.assert_allclose(shown["tip (measured)"], 1e3 * track.x_measured[[20]])
+    np.testing.assert_allclose(shown["target"], 1e3 * track.target)
+    backbone = robots.bionic_handling_assistant().backbone(torch.from_numpy(track.q[20]), 12)
+    np.testing.assert_allclose(shown["backbone"], 1e3 * backbone)
+    ends = np.stack([track.target[20], track.x_measured[20]])
+    np.testing.assert_allclose(shown["tip error"], 1e3 * ends)
+    assert ax.get_title() == f"t = 1.00 s, error {1e3 * track.error[20]:.2f} mm"
+    figure.draw_without_rendering()
+
+
+def test_gif_has_every_frame_and_reports_progress(film, tmp_path):
+    calls = []
+    path = film.save(
+        tmp_path / "a.gif", dpi=50, speed=2.0, progress=lambda *call: calls.append(call)
+    )
+    assert calls == [(k, 5) for k in range(1, 6)]
+    with Image.open(path) as image:
+        assert (image.n_frames, image.size) == (5, (450, 225))
+        assert image.info["duration"] == 250  # [ms], at twice the speed
+        first = np.array(image.convert("RGB"), dtype=int)
+        image.seek(2)
+        assert np.abs(np.array(image.convert("RGB"), dtype=int) - first).max() > 100
+
+
+def test_film_is_seen_from_where_asked(film, tmp_path):
+    pictures = []
+    for view in ((30.0, -60.0), (90.0, -90.0)):
+        with Image.open(film.save(tmp_path / "a.gif", dpi=50, view=view)) as image:
+            pictures.append(np.array(image.convert("RGB"), dtype=int))
+    scene, error = np.split(np.abs(pictures[1] - pictures[0]).max(axis=-1), [270], axis=1)
+    assert (scene > 100).sum() > 500
+    assert (error > 100).sum() < 50
+
+
+def test_mp4_plays_as_long_as_the_motion(film, tmp_path):
+    if shutil.which("ffmpeg") is None or shutil.which("ffprobe") is None:
+        pytest.skip("needs ffmpeg")
+    path = film.save(tmp_path / "a.mp4", dpi=50)
+    show = "stream=nb_frames,pix_fmt,r_frame_rate"
+    command = ["ffprobe", "-v", "error", "-show_entries", show, "-of", "json", str(path)]
+    done = subprocess.run(command, check=True, capture_output=True)
+    (stream,) = json.loads(done.stdout)["streams"]
+    assert stream == {"pix_fmt": "yuv420p", "r_frame_rate": "2/1", "nb_frames": "5"}
+
+
+def test_film_of_rows_that_are_not_known(tmp_path):
+    q = np.tile(BENT, (4, 1))
+    q[1], target = np.nan, np.full((4, 3), 0.5)
+    target[2] = np.nan
+    film = plots.TrackAnimation.from_estimator(robots.bionic_handling_assistant(), q, target=target)
+    assert film.caption(1, "cm") == "step 1, error not known"
+    with Image.open(film.save(tmp_path / "a.gif", dpi=40)) as image:
+        assert image.n_frames == 4
+    pytest.importorskip("plotly")
+    frames = frames_of(film.save(tmp_path / "a.html").read_text(encoding="utf-8"))
+    assert set(frames[1]["data"][0]["x"]) == {None}
+    assert None not in frames[0]["data"][0]["x"]
+
+
+def test_what_is_missing_is_named(film, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match=r"must end in one of .*got 'a\.avi'"):
+        film.save(tmp_path / "a.avi")
+    with pytest.raises(ValueError, match="`speed`"):
+        film.save(tmp_path / "a.gif", speed=0.0)
+    monkeypatch.setattr(animation.writers, "is_available", lambda name: False)
+    with pytest.raises(RuntimeError, match=r"install it .*or save as \.gif"):
+        film.save(tmp_path / "a.mp4")
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    with pytest.raises(ImportError, match=r'pip install "hybridkin\[interactive\]"'):
+        film.save(tmp_path / "a.html")
+    assert [*tmp_path.iterdir()] == []
+
+
+def frames_of(html):
+    start = re.search(r"Plotly\.addFrames\(\s*'[^']*',\s*", html).end()
+    return json.JSONDecoder().raw_decode(html[start:])[0]
+
+
+def test_page_holds_every_frame_and_needs_no_network(film, track, tmp_path):
+    pytest.importorskip("plotly")
+    path = film.save(tmp_path / "a.html", unit="mm")
+    html = path.read_text(encoding="utf-8")
+    assert len(html) < 6e6
+    tags = re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", html)
+    assert not [tag for tag in tags if "src=" in tag or "href=" in tag]
+    frames = frames_of(html)
+    assert [frame["name"] for frame in frames] == [*"01234"]
+    backbone = np.array([frames[2]["data"][0][letter] for letter in "xyz"]).T
+    expected = robots.bionic_handling_assistant().backbone(torch.from_numpy(track.q[20]), 12)
+    np.testing.assert_allclose(backbone, 1e3 * expected, atol=0.06)
+    dot = frames[2]["data"][-1]
+    np.testing.assert_allclose([*dot["x"], *dot["y"]], [1.0, 1e3 * track.error[20]], atol=0.06)
+
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),
+    None,
+)
+
+# A page that is not shown gets no animation frames: a timer stands in.
+TIMER = """<head><script>
+window.requestAnimationFrame = (step) => setTimeout(() => step(performance.now()), 16);
+window.cancelAnimationFrame = clearTimeout;
+</script>"""
+
+# Turn the view, jump to the last frame, play, and tell what the page then is.
+PROBE = """<pre id="probe"></pre><script>
+const look = async () => {
+  const plot = document.querySelector(".plotly-graph-div");
+  const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
+  const jump = {mode: "immediate", transition: {duration: 0}, frame: {duration: 0, redraw: true}};
+  await sleep(1000);  // the frames are there
+  const start = plot._fullLayout.scene._scene.getCamera().eye;
+  await Plotly.relayout(plot, {"scene.camera.eye": {x: 2.0, y: 0.1, z: 0.2}});
+  await Plotly.animate(plot, ["4"], jump);
+  await sleep(100);
+  const found = {
+    start,
+    caption: plot.querySelector(".slider-label").textContent,
+    eye: plot._fullLayout.scene._scene.getCamera().eye,
+    tip: [..."xyz"].map((k) => plot.data.find((one) => one.name === "tip (measured)")[k][0]),
+    canvas: plot.querySelectorAll("canvas").length,
+    traces: plot.data.length,
+  };
+  await Plotly.animate(plot, ["0"], jump);
+  const press = (k) => plot.querySelectorAll(".updatemenu-button")[k].dispatchEvent(
+    new MouseEvent("click", {bubbles: true}));
+  press(0);
+  await sleep(1200);
+  press(1);
+  await sleep(100);
+  found.played = plot._fullLayout.sliders[0].active;
+  found.requests = performance.getEntriesByType("resource").map((entry) => entry.name);
+  return found;
+};
+const tell = (found) => document.getElementById("probe").textContent = JSON.stringify(found);
+window.addEventListener("load", () => look().then(tell, (error) => tell(String(error.stack))));
+</script></body>"""
+
+
+def chromium(folder, page, *options):
+    command = [
+        CHROMIUM,
+        *("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"),
+        *("--hide-scrollbars", "--window-size=1200,700", "--virtual-time-budget=30000"),
+        "--host-resolver-rules=MAP * ~NOTFOUND",  # there is no network
+        f"--user-data-dir={folder / 'profile'}",
+        *options,
+        page.as_uri(),
+    ]
+    done = subprocess.run(command, check=True, capture_output=True, timeout=180)
+    return done.stdout.decode("utf-8")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium or Chrome to open the page in")
+def test_page_in_a_browser(film, track, tmp_path):
+    pytest.importorskip("plotly")
+    page = film.save(tmp_path / "a.html", view=(0.0, 90.0))
+    chromium(tmp_path, page, f"--screenshot={tmp_path / 'a.png'}")
+    with Image.open(tmp_path / "a.png") as image:
+        pixels = np.array(image.convert("RGB"), dtype=int)
+    scene = pixels[40:480, 220:760]  # beside the legend
+    assert len(np.unique(scene.reshape(-1, 3), axis=0)) > 100
+    for color in ((0xD5, 0x5E, 0x00), (0x40, 0x40, 0x40), (0x00, 0x72, 0xB2), (0x00, 0x9E, 0x73)):
+        assert (np.abs(scene - color).max(axis=-1) < 40).sum() > 15, color
+    probed = tmp_path / "probed.html"
+    html = page.read_text(encoding="utf-8")
+    html = html.replace("<head>", TIMER, 1).replace("</body>", PROBE)
+    probed.write_text(html, encoding="utf-8")
+    dom = chromium(tmp_path, probed, "--dump-dom")
+    found = json.loads(re.search(r'<pre id="probe">(.*?)</pre>', dom).group(1))
+    assert found["requests"] == []
+    assert found["canvas"] > 0
+    assert found["caption"] == film.caption(4, "cm")
+    np.testing.assert_allclose(found["tip"], 100 * track.x_measured[40], atol=0.006)
+    start = found["start"]
+    assert [start["x"], start["z"]] == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert start["y"] > 1.0
+    assert found["eye"]["x"] == pytest.approx(2.0, abs=1e-6)  # the view stays as it was turned
+    assert 0 < found["played"] < 4
+
+
+# All of them
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: plots.ErrorHistogramDisplay({}), "`errors` must be a mapping"),
+        (lambda: plots.ErrorHistogramDisplay({"a": [[1.0]]}), r"\(N,\).*\(1, 1\) for 'a'"),
+        (lambda: plots.ErrorBoxDisplay({"a": [np.nan]}), "with a number in them"),
+        (lambda: plots.BarDisplay(["a"], [1.0, 2.0], [1.0]), r"`values` must have shape \(1,\)"),
+        (lambda: plots.PredictionErrorDisplay(np.zeros((4, 3)), {"a": np.zeros((5, 3))}), "5, 3"),
+        (lambda: plots.LearningCurveDisplay([50, 25], {"a": [1, 2]}), "`sizes` must .* increase"),
+        (lambda: plots.LearningCurveDisplay([25, 50], {"a": [1, 2, 3]}), r"\(2,\) or"),
+        (lambda: plots.WorkspaceDisplay(np.zeros((4, 2)), np.zeros((4, 2))), r"\(N, 3\)"),
+        (lambda: plots.WorkspaceDisplay(np.zeros((4, 3)), np.zeros((4, 3)), row=4), "4 rows"),
+        (lambda: plots.BackboneDisplay(np.zeros((4, 2))), r"\(K, P, 3\)"),
+        (lambda: plots.BackboneDisplay(np.zeros((4, 3)), tips=np.zeros((2, 3))), r"\(1, 3\)"),
+        (lambda: plots.TrackingDisplay(np.zeros((4, 3)), {"a": np.zeros((5, 3))}), r"\(4, 3\)"),
+        (lambda: plots.TrackingDisplay(np.zeros((2, 3)), {"a": np.zeros((2, 3))}, [1, 0]), "`t`"),
+        (lambda: plots.ActuatorDisplay({"a": np.zeros((5, 6))}, (3, 4)), r"\(T, 7\)"),
+        (lambda: plots.TrackAnimation(np.zeros((4, 3)), rows=[0, 4]), "4 rows"),
+        (
+            lambda: plots.TrackAnimation(
+                np.zeros((4, 3)), body=plots.BackboneDisplay(np.zeros((5, 3)))
+            ),
+            "4 configurations",
+        ),
+        (lambda: plots.TrackAnimation(np.full((4, 3), np.nan)).limits(), "all rows are NaN"),
+    ],
+)
+def test_wrong_arrays_are_named(make, match):
+    with pytest.raises(ValueError, match=match):
+        make()
+
+
+def test_wrong_choices_are_named(x, data):
+    _, ax = plots.new_figure(3, 3)
+    chain = robots.bionic_handling_assistant()
+    with pytest.raises(ValueError, match=r"`unit` must be one of \['m', 'cm', 'mm'\]"):
+        plots.ErrorHistogramDisplay({"a": [1.0]}).plot(ax, unit="inch")
+    with pytest.raises(ValueError, match="`plane`"):
+        plots.TrackingDisplay(x, {"a": x}).plot(ax, plane="xx")
+    with pytest.raises(ValueError, match="`kind`"):
+        plots.PredictionErrorDisplay(x, {"a": x}).plot([ax] * 3, kind="both")
+    with pytest.raises(ValueError, match="3 axes, got 1"):
+        plots.PredictionErrorDisplay(x, {"a": x}).plot([ax])
+    with pytest.raises(TypeError, match="3-D axes"):
+        plots.BackboneDisplay(x).plot(ax)
+    with pytest.raises(TypeError, match="whose backbone can be drawn; got Ridge"):
+        plots.BackboneDisplay.from_estimator(Ridge().fit(data.q, data.x), data.q[0])
+    with pytest.raises(ValueError, match=r"`q` must have shape \(K, 9\)"):
+        plots.BackboneDisplay.from_estimator(chain, data.q[0, :6])
+    with pytest.raises(ValueError, match="at least 2 motions"):
+        plots.LearningCurveDisplay.from_estimator(
+            Ridge(), data.q[:20], data.x[:20], groups=np.zeros(20)
+        )
+    with pytest.raises(ValueError, match="1 to 16"):
+        plots.LearningCurveDisplay.from_estimator(Ridge(), data.q[:20], data.x[:20], sizes=[17])
+    with pytest.raises(TypeError, match="fitted estimator or a chain, got builtin"):
+        plots.ErrorHistogramDisplay.from_estimator({"f": len}.get, data.q[:5], data.x[:5])
+
+
+def test_inputs_are_copied(x):
+    display = plots.TrackingDisplay(x, {"a": x})
+    before = display.target.copy()
+    x += 1.0
+    np.testing.assert_array_equal(display.target, before)
 
 
 def test_own_axes_when_none_are_given(x):
-    display = plots.ErrorHistogramDisplay({"a": [0.01, 0.02]}).plot()
-    assert isinstance(display.ax_.figure, Figure)
-    plots.plt.close(display.ax_.figure)
+    displays = [
+        plots.ErrorHistogramDisplay({"a": [0.01, 0.02]}),
+        plots.BackboneDisplay(x),
+        plots.PredictionErrorDisplay(x, {"a": x}),
+        plots.ActuatorDisplay({"a": x}, (3,)),
+    ]
+    for display in displays:
+        figure = display.plot().figure_
+        assert isinstance(figure, Figure)
+        assert plt.gcf() is figure
+        plt.close(figure)

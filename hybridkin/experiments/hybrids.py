@@ -251,16 +251,10 @@ def _curves_figure(curves: list[dict[str, Any]]) -> Any:
     for ax, (case, test) in zip(axes[0], cases, strict=True):
         means = _means(curves, case, test, by_size=True)
         sizes = sorted({n for _, n in means})
-        for model, (color, style) in _LOOKS.items():
-            if (model, sizes[0]) in means:
-                errors = [1e3 * means[model, n][0] for n in sizes]
-                ax.plot(sizes, errors, style, color=color, markersize=4, label=model)
-        ax.set(xscale="log", yscale="log", xlabel="training rows", title=f"{case}, {test}")
-        ax.set_xticks(sizes, [str(n) for n in sizes], fontsize="small")
-        ax.minorticks_off()
-        _plain_ticks(ax.yaxis)
-        ax.grid(alpha=0.3)
-    axes[0, 0].set(ylabel="mean tip error [mm]")
+        errors = {m: [means[m, n][0] for n in sizes] for m in _LOOKS if (m, sizes[0]) in means}
+        plots.LearningCurveDisplay(sizes, errors).plot(ax, unit="mm", styles=_LOOKS)
+        ax.get_legend().remove()
+        ax.set(title=f"{case}, {test}", ylabel="mean tip error [mm]" if ax is axes[0, 0] else "")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
     return figure

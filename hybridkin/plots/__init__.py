@@ -1,0 +1,33 @@
+"""Pictures: Display classes that hold plain arrays and draw them (the only user of matplotlib).
+
+A display is made from arrays, or by ``from_estimator``, ``from_predictions`` and ``from_tracks``;
+``plot`` draws it and returns it, with the axes as ``ax_`` and the figure as ``figure_``. Arrays
+are in metres; ``unit`` is that of the axes. Colours are those of Okabe & Ito and cividis, which
+colour-blind readers tell apart, and lines differ in style too.
+"""
+
+from hybridkin.plots._canvas import new_figure
+from hybridkin.plots.animation import TrackAnimation
+from hybridkin.plots.errors import (
+    BarDisplay,
+    ErrorBoxDisplay,
+    ErrorHistogramDisplay,
+    PredictionErrorDisplay,
+)
+from hybridkin.plots.learning import LearningCurveDisplay
+from hybridkin.plots.space import BackboneDisplay, WorkspaceDisplay
+from hybridkin.plots.tracking import ActuatorDisplay, TrackingDisplay
+
+__all__ = [
+    "ActuatorDisplay",
+    "BackboneDisplay",
+    "BarDisplay",
+    "ErrorBoxDisplay",
+    "ErrorHistogramDisplay",
+    "LearningCurveDisplay",
+    "PredictionErrorDisplay",
+    "TrackAnimation",
+    "TrackingDisplay",
+    "WorkspaceDisplay",
+    "new_figure",
+]

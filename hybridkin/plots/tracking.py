@@ -1,0 +1,281 @@
+"""Paths followed: target and tracks in a plane, in space and over time, errors and actuators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridkin.plots._canvas import (
+    COLORS,
+    LENGTHS,
+    STYLES,
+    axes_or_new,
+    distance,
+    label_space,
+    named,
+    plain,
+    scale_of,
+    several_axes,
+    times,
+    tips,
+)
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["ActuatorDisplay", "TrackingDisplay"]
+
+_ACTUATOR_UNITS = {**LENGTHS, "rad": 1.0, "deg": 180.0 / np.pi}
+_PLANES = ("xy", "xz", "yx", "yz", "zx", "zy")
+
+
+class TrackingDisplay:
+    """A target path and how each model followed it (Fig. 3).
+
+    Parameters
+    ----------
+    target : array-like of shape (T, 3)
+        Path to follow [m].
+    tracks : mapping of str to array-like of shape (T, 3)
+        Tip positions reached with each model [m], NaN where they are not known.
+    t : array-like of shape (T,), optional
+        Times [s]. Default: time steps.
+
+    Attributes
+    ----------
+    target : ndarray of shape (T, 3)
+        The path [m].
+    tracks : dict of str to ndarray of shape (T, 3)
+        Tips [m].
+    ax_, figure_ : matplotlib Axes and Figure
+        Where it was drawn last.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin import InverseKinematics, plots, robots, trajectories
+    >>> path = trajectories.figure_eight([0.0, 0.0, 0.75], (0.2, 0.1), duration=2.0, dt=0.05)
+    >>> ik = InverseKinematics(robots.bionic_handling_assistant(), q_min=0.1, q_max=0.4, dt=0.05)
+    >>> track = ik.track(path.x, path.t)
+    >>> figure, axes = plots.new_figure(8.0, 3.0, 1, 2)
+    >>> display = plots.TrackingDisplay.from_tracks({"mechanical model": track})
+    >>> display.plot(axes[0]).plot_error(axes[1], unit="mm").ax_.get_ylabel()
+    'tip error [mm]'
+    """
+
+    def __init__(
+        self, target: ArrayLike, tracks: Mapping[str, ArrayLike], t: ArrayLike | None = None
+    ) -> None:
+        self.target = tips(target, "target")
+        T = len(self.target)
+        self.tracks = {
+            name: tips(x, f"tracks[{name!r}]", T) for name, x in named(tracks, "tracks").items()
+        }
+        self.t = times(t, T)
+
+    @classmethod
+    def from_tracks(cls, tracks: Any) -> Self:
+        """Return the display of one or more results of `InverseKinematics.track`.
+
+        Parameters
+        ----------
+        tracks : Track, or mapping of str to Track
+            Of the same path. The measured tips are shown where a plant was there, else those of
+            the model.
+
+        Returns
+        -------
+        TrackingDisplay
+            Not drawn yet.
+        """
+        tracks = named(tracks if isinstance(tracks, Mapping) else {"track": tracks}, "tracks")
+        first, *others = tracks.values()
+        target = tips(first.target, "target")
+        for other in others:
+            if not np.array_equal(plain(other.target), target, equal_nan=True):
+                raise ValueError("`tracks` must follow one path, got different targets.")
+        return cls(target, {name: reached(track) for name, track in tracks.items()}, first.t)
+
+    def plot(self, ax: Any = None, *, unit: str = "cm", plane: str = "xy") -> Self:
+        """Draw the paths in one plane of the task space and return self.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            Default: those of a new figure of pyplot.
+        unit : {"m", "cm", "mm"}, default="cm"
+            Of the axes.
+        plane : {"xy", "xz", "yz", "yx", "zx", "zy"}, default="xy"
+            Across, then up.
+
+        Returns
+        -------
+        TrackingDisplay
+            Itself, drawn.
+        """
+        if plane not in _PLANES:
+            raise ValueError(f"`plane` must be one of {_PLANES}, got {plane!r}.")
+        scale, ax = scale_of(unit), axes_or_new(ax)
+        i, j = ("xyz".index(letter) for letter in plane)
+        for name, x, look in self._styled():
+            label = self._summary(name, scale, unit)
+            ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look)
+        target = scale * self.target
+        ax.plot(target[:, i], target[:, j], color="black", linewidth=1.0, label="target")
+        ax.set(xlabel=f"{plane[0]} [{unit}]", ylabel=f"{plane[1]} [{unit}]")
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16))
+        return self._drawn(ax)
+
+    def plot_space(self, ax: Any = None, *, unit: str = "cm") -> Self:
+        """Draw the paths into a 3-D axes and return self; parameters as of `plot`."""
+        scale, ax = scale_of(unit), axes_or_new(ax, projection="3d")
+        for name, x, look in self._styled():
+            ax.plot(*(scale * x.T), label=self._summary(name, scale, unit), **look)
+        ax.plot(*(scale * self.target.T), color="black", linewidth=1.0, label="target")
+        label_space(ax, unit)
+        ax.legend(frameon=False, fontsize="small", loc="upper left")
+        return self._drawn(ax)
+
+    def plot_time(self, ax: Any = None, *, unit: str = "cm") -> Self:
+        """Draw the three coordinates over time and return self; parameters as of `plot`."""
+        scale, ax = scale_of(unit), axes_or_new(ax)
+        steps = self._steps(ax)
+        for name, x, look in self._styled():
+            lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
+            lines[0].set_label(name)
+        ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
+        for letter, values in zip("xyz", scale * self.target.T, strict=True):
+            if np.isfinite(values).any():
+                top = int(np.nanargmax(values))
+                ax.annotate(letter, (steps[top], values[top]), (0, 3), textcoords="offset points")
+        ax.margins(y=0.08)
+        ax.set(ylabel=f"tip [{unit}]")
+        return self._drawn(ax)
+
+    def plot_error(self, ax: Any = None, *, unit: str = "cm") -> Self:
+        """Draw the distances to the target over time and return self; parameters as of `plot`."""
+        scale, ax = scale_of(unit), axes_or_new(ax)
+        steps = self._steps(ax)
+        for name, x, look in self._styled():
+            error = scale * distance(x, self.target)
+            ax.plot(steps, error, label=self._summary(name, scale, unit), **look)
+        ax.set(ylabel=f"tip error [{unit}]", xlim=(steps[0], steps[-1]) if len(steps) > 1 else None)
+        ax.set_ylim(bottom=0.0)
+        ax.legend(frameon=False, fontsize="small")
+        return self._drawn(ax)
+
+    def _styled(self) -> list[tuple[str, NDArray, dict[str, Any]]]:
+        return [
+            (name, x, {"color": COLORS[k % 8], "linestyle": STYLES[k % 4], "linewidth": 1.5})
+            for k, (name, x) in enumerate(self.tracks.items())
+        ]
+
+    def _summary(self, name: str, scale: float, unit: str) -> str:
+        error = scale * distance(self.tracks[name], self.target)
+        mean = error[np.isfinite(error)].mean() if np.isfinite(error).any() else np.nan
+        return f"{name}: mean error {mean:.2f} {unit}"
+
+    def _steps(self, ax: Any) -> NDArray:
+        ax.set(xlabel="time step" if self.t is None else "time [s]")
+        return np.arange(len(self.target)) if self.t is None else self.t
+
+    def _drawn(self, ax: Any) -> Self:
+        self.ax_, self.figure_ = ax, ax.figure
+        return self
+
+
+class ActuatorDisplay:
+    """Actuator lengths over time, one panel per segment (Fig. 4, right).
+
+    Parameters
+    ----------
+    paths : mapping of str to array-like of shape (T, n)
+        Commanded actuator vectors of each model [m], of revolute joints [rad].
+    actuators_per_segment : sequence of int
+        How the n actuators share out over the segments.
+    t : array-like of shape (T,), optional
+        Times [s]. Default: time steps.
+
+    Attributes
+    ----------
+    paths : dict of str to ndarray of shape (T, n)
+        As given.
+    axes_, figure_ : ndarray of shape (S,) of Axes, and Figure
+        Where it was drawn.
+    """
+
+    def __init__(
+        self,
+        paths: Mapping[str, ArrayLike],
+        actuators_per_segment: Sequence[int],
+        t: ArrayLike | None = None,
+    ) -> None:
+        self.actuators_per_segment = tuple(actuators_per_segment)
+        n = sum(self.actuators_per_segment)
+        self.paths = {name: plain(q, "paths") for name, q in named(paths, "paths").items()}
+        for name, q in self.paths.items():
+            if q.ndim != 2 or q.shape[1] != n:
+                raise ValueError(
+                    f"`paths` must hold arrays of shape (T, {n}), as `actuators_per_segment` says, "
+                    f"got {q.shape} for {name!r}."
+                )
+        self.t = times(t, len(next(iter(self.paths.values()))))
+
+    @classmethod
+    def from_tracks(cls, tracks: Any, actuators_per_segment: Sequence[int]) -> Self:
+        """Return the display of one or more results of `InverseKinematics.track`.
+
+        Parameters
+        ----------
+        tracks : Track, or mapping of str to Track
+            With the same times.
+        actuators_per_segment : sequence of int
+            As ``chain.actuators_per_segment``.
+
+        Returns
+        -------
+        ActuatorDisplay
+            Not drawn yet.
+        """
+        tracks = named(tracks if isinstance(tracks, Mapping) else {"track": tracks}, "tracks")
+        t = next(iter(tracks.values())).t
+        return cls({name: track.q for name, track in tracks.items()}, actuators_per_segment, t)
+
+    def plot(self, axes: Any = None, *, unit: str = "cm") -> Self:
+        """Draw one axes per segment, sharing time, and return self.
+
+        Parameters
+        ----------
+        axes : sequence of S matplotlib Axes, optional
+            Default: those of a new figure of pyplot.
+        unit : {"m", "cm", "mm", "rad", "deg"}, default="cm"
+            Of the actuators.
+
+        Returns
+        -------
+        ActuatorDisplay
+            Itself, drawn.
+        """
+        scale, n = scale_of(unit, _ACTUATOR_UNITS), len(self.actuators_per_segment)
+        axes = several_axes(axes, n, 6.0, 1.0 + 1.6 * n, rows=True)
+        ends = np.cumsum(self.actuators_per_segment)
+        for k, ax in enumerate(axes):
+            for i, (name, q) in enumerate(self.paths.items()):
+                steps = np.arange(len(q)) if self.t is None else self.t
+                part = scale * q[:, ends[k] - self.actuators_per_segment[k] : ends[k]]
+                lines = ax.plot(steps, part, STYLES[i % 4], color=COLORS[i % 8], linewidth=1.2)
+                lines[0].set_label(name)
+            ax.set(ylabel=f"segment {k + 1} [{unit}]")
+        axes[0].legend(frameon=False, fontsize="small", ncols=len(self.paths))
+        axes[-1].set(xlabel="time step" if self.t is None else "time [s]")
+        self.axes_, self.figure_ = axes, axes[0].figure
+        return self
+
+
+def reached(track: Any) -> Any:
+    """Return the tips of a track: measured where there was a plant, else those of the model."""
+    return track.x if track.x_measured is None else track.x_measured
