@@ -201,7 +201,7 @@ def relaxed(rows: Tensor, shape: Tensor, width: float, elasticity: Elasticity) -
     """
     fixed = Elasticity(*(part.detach() for part in elasticity))
     given, shape = rows.detach(), shape.detach()
-    shares = shape.new_tensor(_SHARES)[:, None, None]
+    shares = torch.tensor(_SHARES, dtype=shape.dtype, device=shape.device)[:, None, None]
     for _ in range(_NEWTON_STEPS):
         tries = shape - shares * _newton(given, shape, width, fixed)[0]
         best = _energy(given, tries, width, fixed).argmin(0)

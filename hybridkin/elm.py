@@ -153,8 +153,8 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ``u = (x - input_center_) / input_scale_`` [unit of X].
     output_weights_, intercept_ : ndarray of shape (n_features, n_outputs) and (n_outputs,)
         Readout [unit of y]; `n_features` is `n_hidden`, plus `n_inputs` with a direct link.
-    leverage_center_, leverage_factor_, leverage_offset_ : ndarray
-        See :class:`ELM`; of the smallest `alpha`, if each output has its own.
+    leverage_center_, leverage_factor_, leverage_offset_ : ndarray of the shapes in `module_`
+        As of `module_`; of the smallest `alpha`, if each output has its own.
     noise_variance_ : ndarray of shape (n_outputs,)
         Residual sum of squares over ``n - tr(G (G + alpha 1)^-1) - fit_intercept`` [unit of y^2]; G
         the features' Gram matrix, n the sum of the sample weights. NaN if that leaves nothing.
@@ -162,7 +162,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Sum of the sample weights so far.
     solver_ : {"cholesky", "eigh"}
         What solved for the readout: "eigh" if the system was singular.
-    module_ : ELM
+    module_ : nn.Module
         The fitted network as a torch module q -> eps.
     n_features_in_ : int
         Number of inputs.
@@ -261,7 +261,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Parameters
         ----------
-        X, y, sample_weight : array-like
+        X, y, sample_weight : array-like of the shapes as for `fit`
             The new rows, as for `fit`.
         decay : float, default=1.0
             Factor in (0, 1] on the weights of all earlier rows, to follow a drift.
@@ -361,7 +361,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Returns
         -------
-        y, J : ndarray
+        y, J : ndarray of their shapes
             As from `predict` and `jacobian`.
         """
         return self._map(X, lambda elm, q: elm.forward_and_jacobian(q))

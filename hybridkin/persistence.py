@@ -3,96 +3,60 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
+import platform
+from collections.abc import Mapping
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sklearn
 import torch
-from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
-from sklearn.kernel_ridge import KernelRidge
-from sklearn.linear_model import LinearRegression
 from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
+from hybridkin import __version__
 from hybridkin._drift import Drift
 from hybridkin._error_modules import AffineModule
-from hybridkin._error_modules import error_module as make_error_module
-from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
 from hybridkin._hybrid_modules import HybridModule, SerialHybridModule
-from hybridkin._pose_features import PoseFeatures
+from hybridkin._model_files import Arrays, Part, plain, read, read_header, write
+from hybridkin._model_parts import (
+    CHAIN_KINDS,
+    CHAINS,
+    ELMS,
+    Chain,
+    feature_names,
+    restored_chain,
+    restored_elm,
+    restored_error,
+    restored_guard,
+    restored_setting,
+    store_chain,
+    store_elm,
+    store_error,
+    store_guard,
+    store_setting,
+)
 from hybridkin._pose_hybrid import PoseHybridModule
 from hybridkin._radius import Radius
-from hybridkin._readout import Statistics
 from hybridkin._serial import SerialModule
 from hybridkin._serial_fit import SerialFit
-from hybridkin.chain import ConstantCurvatureChain
-from hybridkin.elm import ELMRegressor
-from hybridkin.elm_cv import ELMRegressorCV
-from hybridkin.guards import BoxGuard, Guard, LeverageGuard, QuadraticReadout
+from hybridkin.elm import ELMRegressor, device_named
+from hybridkin.guards import BoxGuard, LeverageGuard, QuadraticReadout
 from hybridkin.hybrid import HybridForwardModel
 from hybridkin.rigid import RigidChain
-from hybridkin.tendons import ElasticTendonChain
 
-__all__ = ["load_model", "save_model"]
+__all__ = ["load_model", "model_header", "save_model"]
 
-_FORMAT = "hybridkin-model"
-_VERSION = 1
-# Every kind of chain: its arrays, what its header says, and how its constructor calls the counts.
-_CHAINS = {
-    "chain": (
-        ConstantCurvatureChain,
-        ("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),
-        ("actuators_per_segment", "routing", "tip_at"),
-        "n_actuators",
-    ),
-    "elastic_tendon_chain": (
-        ElasticTendonChain,
-        (
-            *("radii", "angles", "lengths", "bending_stiffness", "axial_stiffness"),
-            *("tendon_zeros", "rest_bends", "offsets", "base"),
-        ),
-        ("actuators_per_segment", "routing", "tip_at", "smoothing"),
-        "n_tendons",
-    ),
-    "rigid": (
-        RigidChain,
-        ("origins", "axes", "q_min", "q_max", "tip", "tool", "base"),
-        ("kinds", "names"),
-        "",
-    ),
-}
-_OF_ALL_ARCS = ("actuators_per_segment", "tip_at")
-_DAMAGE = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-_OPTIONAL = {"chain": ("lengths", "rest_bends", "actuator_zeros")}
-_ELM_ARRAYS = (
-    *("input_weights_", "input_bias_", "input_center_", "input_scale_"),
-    *("output_weights_", "intercept_", "noise_variance_"),
-    *("leverage_center_", "leverage_factor_", "leverage_offset_"),
+_DAMAGE = (
+    *(ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError),
+    *(AssertionError, TypeError, ValueError),
 )
-_ELM_SETTINGS = ("solver_", "n_samples_seen_", "n_features_in_", "_activation", "_y_ndim")
-
-_RANGE = ("center", "scale")
-_FEATURES: dict[str, Any] = {
-    "linear": (Features, _RANGE),
-    "quadratic": (QuadraticFeatures, _RANGE),
-    "pose": (PoseFeatures, _RANGE),
-    "hidden": (HiddenFeatures, (*_RANGE, "input_weights", "input_bias")),
-}
-_READOUT_ARRAYS = ("weights", "factor", "noise_variance")
-
-Arrays = dict[str, NDArray]
-Chain = ConstantCurvatureChain | ElasticTendonChain | RigidChain
-_CLASSES = (ConstantCurvatureChain, ElasticTendonChain, RigidChain)
-_ELMS = (ELMRegressor, ELMRegressorCV)
 _NAMES = "a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain"
 
 
-def save_model(model: Any, path: str | Path) -> None:
-    """Write a chain or a fitted hybrid model to one file.
+def save_model(model: Any, path: str | Path, *, training: Mapping[str, Any] | None = None) -> None:
+    """Write a chain or a fitted model to one file.
 
     Parameters
     ----------
@@ -103,11 +67,21 @@ def save_model(model: Any, path: str | Path) -> None:
         is stored.
     path : str or Path
         File to write, usually ``*.safetensors``. It is replaced only once all is written.
+    training : mapping of str to numbers, strings or lists, optional
+        What people shall read about the training besides what the model knows of it, for example
+        ``{"log": "log.csv", "motions": 24, "held_out_rmse": 0.0031}``; see `model_header`.
 
     Raises
     ------
     TypeError
         For other models: their parts could only be stored as code.
+
+    Notes
+    -----
+    Files of every format version that was ever released load. Of a file written by a later
+    hybridkin, entries of the header that are not known are ignored, unless the file says that it
+    ``requires`` them; then, and for a later format version, `load_model` refuses it and names the
+    hybridkin that wrote it.
 
     Examples
     --------
@@ -119,44 +93,39 @@ def save_model(model: Any, path: str | Path) -> None:
     ConstantCurvatureChain(extensible, 3 segments, 9 actuators, routing 'segment')
     """
     arrays: Arrays = {}
-    if isinstance(model, _CLASSES):
-        header = _store_chain(model, arrays, "")
+    if isinstance(model, CHAINS):
+        header = {**store_chain(model, arrays, ""), "units": _units(model)}
     elif isinstance(model, HybridForwardModel):
         header = _store_hybrid(model, arrays)
-    elif isinstance(model, _ELMS):
+    elif isinstance(model, ELMS):
         check_is_fitted(model)
-        header = _store_elm(model, arrays, "")
+        header = store_elm(model, arrays, "")
+        header["training"] = {"rows": header["settings"]["n_samples_seen_"]}
     else:
         raise TypeError(
             f"`model` must be {_NAMES}, a fitted HybridForwardModel or a fitted ELM, got "
             f"{type(model).__name__}."
         )
-    header = {"format": _FORMAT, "version": _VERSION, **header}
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"`path` must lie in a folder that exists, got {path}.")
-    handle, staging = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    os.close(handle)
-    try:
-        whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        save_file(whole, staging, metadata={"hybridkin": json.dumps(header)})
-        os.replace(staging, path)
-    finally:
-        Path(staging).unlink(missing_ok=True)
+    header["training"] = {**header.get("training", {}), **_checked(training)}
+    write(Path(path), {"requires": [], **_origin(), **header}, arrays)
 
 
-def load_model(path: str | Path) -> Any:
+def load_model(path: str | Path, *, device: str | torch.device | None = None) -> Any:
     """Return the model that `save_model` wrote; nothing in the file is ever run as code.
 
     Parameters
     ----------
     path : str or Path
-        File to read.
+        File to read, from any machine.
+    device : str or torch.device, optional
+        Where the model's tensors shall be, ``"cuda"`` for example, whatever device it was saved
+        from. Default: the CPU. Dtypes are those that were saved.
 
     Returns
     -------
     ConstantCurvatureChain, ElasticTendonChain, RigidChain, HybridForwardModel or ELMRegressor
-        On the CPU, ready to predict.
+        Ready to predict, and with the settings of the saved one to fit again; random states that
+        are not numbers come back as None.
 
     Raises
     ------
@@ -164,67 +133,104 @@ def load_model(path: str | Path) -> Any:
         If there is no such file.
     ValueError
         If the file is not such a model, is damaged, or comes from a later version.
+    RuntimeError
+        If there is no such device here.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"`path` must name a saved model, got {path}: no such file.")
+    at = device_named(device)
+    header, arrays = read(path)
     try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {})["hybridkin"])
-            arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not a model saved by hybridkin ({error}).") from error
-    known = isinstance(header, dict) and header.get("format") == _FORMAT
-    if not known or not isinstance(header.get("version"), int):
-        raise ValueError(f"{path} is not a model saved by hybridkin: its header is another one.")
-    if header["version"] > _VERSION:
-        raise ValueError(
-            f"{path} has format version {header['version']}, this hybridkin reads up to "
-            f"{_VERSION}; install a newer one."
-        )
-    try:
-        if header["kind"] in _CHAINS:
-            return _restored_chain(header, arrays, "")
-        if header["kind"] == "hybrid":
-            return _restored_hybrid(header, arrays)
-        if header["kind"] == "elm":
-            elm = _restored_elm(header, arrays, "")
-            elm.module_.forward_and_jacobian(torch.ones(1, elm.n_features_in_).double())
+        part = Part(header, arrays)
+        kind = part.value("kind", str)
+        if kind in CHAIN_KINDS:
+            return restored_chain(part).to(at)
+        if kind == "hybrid":
+            model = _restored_hybrid(part)
+            model.module_ = model.module_.to(at)
+            return model
+        if kind == "elm":
+            elm = restored_elm(part)
+            elm.device = None if device is None else str(at)
+            elm.module_ = elm.module_.to(at)
             return elm
     except _DAMAGE as error:
-        raise ValueError(f"{path} is damaged: {error!r}.") from error
-    raise ValueError(f"{path} holds a model of unknown kind {header['kind']!r}.")
+        raise ValueError(f"{path} is damaged: {error or repr(error)}.") from error
+    raise ValueError(f"{path} holds a model of unknown kind {kind[:60]!r}.")
 
 
-def _store_chain(chain: Chain, arrays: Arrays, prefix: str) -> dict[str, Any]:
-    kind = next(kind for kind, (cls, *_) in _CHAINS.items() if isinstance(chain, cls))
-    _, tensors, settings, _ = _CHAINS[kind]
-    for name in tensors:
-        if getattr(chain, name) is not None:
-            arrays[prefix + name] = getattr(chain, name).detach().cpu().numpy()
-    return {"kind": kind, **{name: getattr(chain, name) for name in settings}}
+def model_header(path: str | Path) -> dict[str, Any]:
+    """Return what the header of a saved model says, without loading the model.
+
+    Parameters
+    ----------
+    path : str or Path
+        File that `save_model` wrote.
+
+    Returns
+    -------
+    dict
+        Of JSON values: ``kind``; ``created`` (date) and ``versions`` of what wrote it; ``units`` of
+        q and x; ``training`` (``rows``, errors [m], of error_model="auto" all candidates, and what
+        `save_model` was told); ``domain`` (``q_low`` and ``q_high`` of the training rows, null for
+        a column that did not vary, and the ``guard``); geometry and settings. Files of format
+        version 1 have the last two alone.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not such a model, or comes from a later version.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> from hybridkin import robots, save_model
+    >>> from hybridkin.persistence import model_header
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "trunk.safetensors"
+    >>> save_model(robots.bionic_handling_assistant(), path)
+    >>> model_header(path)["units"]
+    {'q': 'm', 'x': 'm'}
+    """
+    return read_header(Path(path))
 
 
-def _restored_chain(header: dict[str, Any], arrays: Arrays, prefix: str) -> Chain:
-    cls, tensors, settings, counts_name = _CHAINS[header["kind"]]
-    optional = _OPTIONAL.get(header["kind"], ())
-    needed = [name for name in tensors if name not in optional or prefix + name in arrays]
-    stored: dict[str, Any] = {name: arrays[prefix + name] for name in needed}
-    dtype = torch.from_numpy(stored["base"]).dtype
-    if not dtype.is_floating_point:
-        raise ValueError(f"`base` must be floating, got {dtype}")
-    if cls is RigidChain:
-        return RigidChain(**stored, kinds=header["kinds"], names=header["names"], dtype=dtype)
-    counts = [int(n) for n in header["actuators_per_segment"]]
-    stored["angles"] = np.split(stored["angles"], np.cumsum(counts)[:-1])
-    options = {name: header[name] for name in settings if name not in _OF_ALL_ARCS}
-    chain = cls(**stored, **options, **{counts_name: counts}, dtype=dtype)
-    return chain.with_tip(header.get("tip_at", chain.n_segments))
+def _origin() -> dict[str, Any]:
+    versions = {
+        "hybridkin": __version__,
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "numpy": np.__version__,
+        "scikit-learn": sklearn.__version__,
+    }
+    return {"versions": versions, "created": datetime.now(timezone.utc).date().isoformat()}
+
+
+def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
+    said = plain(dict(training or {}))
+    try:
+        json.dumps(said)
+    except TypeError as error:
+        raise TypeError(
+            f"`training` must hold numbers, strings and lists of them, got {training!r}."
+        ) from error
+    return said
+
+
+def _units(chain: Chain | None, output: str = "position") -> dict[str, Any]:
+    if isinstance(chain, RigidChain):
+        q: Any = ["m" if kind == "prismatic" else "rad" for kind in chain.kinds]
+    else:
+        q = "as in training" if chain is None else "m"
+    if output == "pose":
+        return {"q": q, "x": ["m"] * 3 + ["rad"] * 3}
+    return {"q": q, "x": "as in training" if chain is None else "m"}
 
 
 def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
     if not hasattr(model, "module_"):
         raise TypeError("`model` must be fitted before it is saved; call `fit` first.")
+    seed = model.random_state
     header: dict[str, Any] = {
         "kind": "hybrid",
         "coupling": model.coupling,
@@ -232,214 +238,171 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
         "guard": model.guard,
         "coverage": model.coverage,
         "output": model.output,
-        "radius": None if model.radius_ is None else model.radius_._asdict(),
+        "random_state": int(seed) if isinstance(seed, (int, np.integer)) else None,
+        "error_model": store_setting(model.error_model),
+        "radius": None if model.radius_ is None else plain(model.radius_._asdict()),
         "n_features_in": model.n_features_in_,
         "feature_names_in": [str(name) for name in getattr(model, "feature_names_in_", [])],
         "single_output": model._single_output,
         "mechanical": None,
         "nominal": None,
+        "units": _units(model.mechanical_model_, model.output),
+        "training": _training(model),
     }
     for key, part in (("mechanical", model.mechanical_model_), ("nominal", model.mechanical_model)):
         if part is not None:
-            if not isinstance(part, _CLASSES):
+            if not isinstance(part, CHAINS):
                 raise TypeError(
                     f"`model` must have {_NAMES} or None as `mechanical_model` to be saved, got "
                     f"{type(part).__name__}."
                 )
-            header[key] = _store_chain(part, arrays, f"{key}.")
-    header["error"] = _store_error(model.error_model_, arrays)
-    if isinstance(model.error_model_, SerialFit):
-        name = model.error_model
-        header["error_model"] = name if isinstance(name, str) else None
-    header["fitted_guard"] = _store_guard(model.module_.guard, arrays)
-    arrays |= {f"drift.{name}": array for name, array in model._drift._asdict().items()}
+            header[key] = store_chain(part, arrays, f"{key}.")
+    header["error"] = store_error(model.error_model_, arrays, "error.")
+    header["fitted_guard"] = store_guard(model.module_.guard, arrays, "guard.")
+    header["domain"] = {"guard": header["fitted_guard"]}
+    if hasattr(model, "_drift"):
+        arrays |= {f"drift.{name}": array for name, array in model._drift._asdict().items()}
+        center, scale = model._drift.center, model._drift.scale
+        varied = scale != 1.0  # a column without a range counts as one of [-1, 1]
+        for name, bound in (("q_low", center - scale), ("q_high", center + scale)):
+            header["domain"][name] = plain(np.where(varied, bound, np.nan))
     if model.module_.drift is not None:
         arrays["drift.coef"] = model.module_.drift.coef.cpu().numpy()
         arrays["drift.bias"] = model.module_.drift.bias.cpu().numpy()
     return header
 
 
-def _restored_hybrid(header: dict[str, Any], arrays: Arrays) -> HybridForwardModel:
+def _training(model: HybridForwardModel) -> dict[str, Any]:
+    """Return what a fitted hybrid knows about its training, errors in metres."""
+    said: dict[str, Any] = {}
+    error: Any = model.error_model_
+    if isinstance(error, SerialFit):
+        squares = np.square(error.residual).sum(axis=1)
+        said["rows"] = int(np.isfinite(squares).sum())
+        said["left_out_rmse"] = float(np.sqrt(np.nanmean(squares)))
+    elif isinstance(error, ELMS):
+        network: Any = getattr(error, "best_estimator_", error)
+        said["rows"] = network.n_samples_seen_
+    elif hasattr(error, "X_fit_"):
+        said["rows"] = len(error.X_fit_)
+    elif model.radius_ is not None:
+        said["rows"] = model.radius_.n_rows
+    if model.calibration_ is not None:
+        found = model.calibration_
+        said["calibration"] = {
+            "rmse": found.rmse,
+            "held_out_rmse": found.cv_rmse,
+            "converged": found.converged,
+        }
+    if getattr(model, "cv_results_", None) is not None:
+        said["cv_results"] = model.cv_results_
+    return plain(said)
+
+
+def _restored_hybrid(part: Part) -> HybridForwardModel:
+    n = part.value("n_features_in", int)
     mechanical, nominal = (
-        None if header[key] is None else _restored_chain(header[key], arrays, f"{key}.")
-        for key in ("mechanical", "nominal")
+        None if child is None else restored_chain(child)
+        for child in (part.child("mechanical"), part.child("nominal"))
     )
-    readout = header["error"] is not None and header["error"]["kind"] == "readout"
-    error, error_module = (None, None) if readout else _restored_error(header["error"], arrays)
-    error_model: Any = "drop" if error is None else error
-    if readout:
-        error = _restored_readout(header["error"], arrays, mechanical)
-        error_module, error_model = error.module, header["error_model"]
-    names = header["calibrate"]
+    for chain in (mechanical, nominal):
+        if chain is not None and chain.n_actuators != n:
+            raise ValueError(f"a chain of {chain.n_actuators} actuators cannot take {n}")
+    error, error_module = restored_error(part.child("error"), mechanical, n)
+    names = part.header.get("calibrate")
     model = HybridForwardModel(
         nominal,
-        error_model,
-        coupling=header["coupling"],
-        calibrate=names if isinstance(names, str) else tuple(names),
-        guard=header["guard"],
-        coverage=header.get("coverage"),
-        output=header.get("output", "position"),
+        restored_setting(part, error),
+        coupling=part.value("coupling", str),
+        calibrate=names if isinstance(names, str) else tuple(part.names("calibrate")),
+        guard=part.value("guard", (str, None)),
+        coverage=part.value("coverage", (float, None), None),
+        output=part.value("output", str, "position"),
+        random_state=part.value("random_state", (int, None), None),
     )
-    radius = header.get("radius")
-    model.radius_ = None if radius is None else Radius(**radius)
+    model._check_settings()
     model.mechanical_model_, model.error_model_ = mechanical, error
-    model.calibration_ = None
-    model.n_features_in_ = int(header["n_features_in"])
-    if header["feature_names_in"]:
-        model.feature_names_in_ = np.array(header["feature_names_in"], dtype=object)
-    model._single_output = bool(header["single_output"])
-    guard = _restored_guard(header["fitted_guard"], arrays, error_module)
-    drift: AffineModule | None = None
-    if "drift.coef" in arrays:
-        drift = AffineModule(arrays["drift.coef"], arrays["drift.bias"])
-    if "drift.gram" in arrays:  # files from before partial_fit have none
-        model._drift = Drift(*(arrays[f"drift.{name}"] for name in Drift._fields))
-    if isinstance(error_module, SerialModule):
-        model.module_ = SerialHybridModule(error_module, guard, drift)
-    else:
-        build = PoseHybridModule if model.output == "pose" else HybridModule
-        model.module_ = build(mechanical, error_module, guard, drift)
+    model.calibration_, model.radius_ = None, _restored_radius(part)
+    model.cv_results_ = _restored_results(part)
+    model.n_features_in_ = n
+    if part.header.get("feature_names_in"):
+        model.feature_names_in_ = feature_names(part, n)
+    model._single_output = part.value("single_output", bool)
+    own = Part(part.header, part.arrays, "guard.")
+    guard = restored_guard(part.value("fitted_guard", (str, None)), own, error_module, n)
+    model.module_ = _module(model, mechanical, error_module, guard, None)
     with torch.no_grad():  # a file whose arrays do not fit together fails here, not in use
-        one_row = torch.ones(1, model.n_features_in_, dtype=torch.float64)
-        model._rows().forward_and_jacobian(one_row)
+        x = model._rows().forward_and_jacobian(torch.ones(1, n, dtype=torch.float64))[0]
+    if model._single_output and x.shape[1] != 1:
+        raise ValueError(f"`single_output` must be false with {x.shape[1]} outputs")
+    drift = _restored_drift(part, model, n, x.shape[1])
+    if drift is not None:
+        model.module_ = _module(model, mechanical, error_module, guard, drift)
     return model
 
 
-def _store_readout(fit: SerialFit, arrays: Arrays) -> dict[str, Any]:
-    features = fit.module.features
-    kind = next(kind for kind, (cls, _) in _FEATURES.items() if type(features) is cls)
-    for name in _FEATURES[kind][1]:
-        arrays[f"error.{name}"] = getattr(features, name).cpu().numpy()
-    for name in _READOUT_ARRAYS:
-        arrays[f"error.{name}"] = getattr(fit.module, name).cpu().numpy()
-    arrays["error.residual"] = fit.residual
-    header = {"kind": "readout", "features": kind, "place": fit.module.place}
-    if isinstance(features, HiddenFeatures):
-        header["activation"] = features.activation
-    return {**header, "alphas": [*map(str, fit.alphas)], "gradient": fit.gradient}
+def _module(
+    model: HybridForwardModel, mechanical: Any, error: nn.Module | None, guard: Any, drift: Any
+) -> Any:
+    if isinstance(error, SerialModule):
+        return SerialHybridModule(error, guard, drift)
+    build = PoseHybridModule if model.output == "pose" else HybridModule
+    return build(mechanical, error, guard, drift)
 
 
-def _restored_readout(header: Any, arrays: Arrays, mechanical: Any) -> SerialFit:
-    cls, names = _FEATURES[header["features"]]
-    tensors: dict[str, Any] = {
-        name: torch.from_numpy(arrays[f"error.{name}"]) for name in (*names, *_READOUT_ARRAYS)
-    }
-    options: dict[str, Any] = {"chain": mechanical} if cls is PoseFeatures else {}
-    if "activation" in header:
-        options["activation"] = header["activation"]
-    features = cls(**{name: tensors.pop(name) for name in names}, **options)
-    module = SerialModule(mechanical, features, place=header["place"], **tensors)
-    first, second = map(float, header["alphas"])
-    residual = arrays["error.residual"]
-    return SerialFit(module, (first, second), residual, {}, float(header["gradient"]))
-
-
-def _store_elm(regressor: Any, arrays: Arrays, prefix: str) -> dict[str, Any]:
-    elm = getattr(regressor, "best_estimator_", regressor)
-    for name in _ELM_ARRAYS:
-        arrays[prefix + name] = np.asarray(getattr(elm, name))
-    arrays[prefix + "mean"], arrays[prefix + "scatter"] = elm._stats.mean, elm._stats.scatter
-    params = elm.get_params()
-    params["device"] = None
-    if not isinstance(params["random_state"], (int, np.integer)):
-        params["random_state"] = None
-    return {
-        "kind": "elm",
-        "params": {name: _plain(value) for name, value in params.items()},
-        "settings": {name: _plain(getattr(elm, name)) for name in _ELM_SETTINGS},
-        "feature_names_in": [str(name) for name in getattr(regressor, "feature_names_in_", [])],
-    }
-
-
-def _restored_elm(header: Any, arrays: Arrays, prefix: str) -> ELMRegressor:
-    elm = ELMRegressor(**header["params"])
-    settings = {name: header["settings"][name] for name in _ELM_SETTINGS}
-    stored = {name: arrays[prefix + name] for name in _ELM_ARRAYS}
-    mean, scatter = arrays[prefix + "mean"], arrays[prefix + "scatter"]
-    statistics = Statistics(float(settings["n_samples_seen_"]), mean, scatter)
-    elm.__setstate__({**elm.get_params(), **stored, **settings, "_stats": statistics})
-    if header.get("feature_names_in"):
-        elm.feature_names_in_ = np.array(header["feature_names_in"], dtype=object)
-    return elm
-
-
-def _store_error(regressor: Any, arrays: Arrays) -> dict[str, Any] | None:
-    if regressor is None:
+def _restored_drift(part: Part, model: HybridForwardModel, n: int, m: int) -> AffineModule | None:
+    """Set the statistics that `partial_fit` goes on from, and return the correction so far."""
+    own = Part(part.header, part.arrays, "drift.")
+    if "gram" in own:
+        shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, m))
+        found = (own.array(name, s) for name, s in zip(Drift._fields, shapes, strict=True))
+        model._drift = Drift(*found)
+    elif part.value("version", int) == 1:  # from before `partial_fit`
+        low, high = _range(model)
+        if low is not None:
+            model._drift = Drift.of_range(low, high, m)
+    if "coef" not in own:
         return None
-    if isinstance(regressor, _ELMS):
-        return _store_elm(regressor, arrays, "error.")
-    if isinstance(regressor, SerialFit):
-        return _store_readout(regressor, arrays)
-    if type(regressor) is KernelRidge and regressor.kernel == "rbf":
-        fitted: Any = regressor
-        arrays["error.rows"], arrays["error.dual"] = fitted.X_fit_, fitted.dual_coef_
-        return {"kind": "kernel", "gamma": _plain(fitted.gamma), "alpha": _plain(fitted.alpha)}
-    if isinstance(regressor, LinearRegression):
-        arrays["error.coef"] = np.asarray(regressor.coef_)
-        arrays["error.intercept"] = np.asarray(regressor.intercept_)
-        return {"kind": "linear"}
-    raise TypeError(
-        "`model` must have an ELM, a LinearRegression, a KernelRidge with the kernel 'rbf' or a "
-        f"name as `error_model` to be saved, got {type(regressor).__name__}, which could only be "
-        "stored as code."
-    )
+    return AffineModule(own.array("coef", (m, n)), own.array("bias", (m,)))
 
 
-def _restored_error(header: Any, arrays: Arrays) -> tuple[Any, nn.Module | None]:
-    if header is None:
-        return None, None
-    if header["kind"] == "elm":
-        elm = _restored_elm(header, arrays, "error.")
-        return elm, elm.module_
-    if header["kind"] == "kernel":
-        ridge: Any = KernelRidge(kernel="rbf", gamma=header["gamma"], alpha=header["alpha"])
-        ridge.X_fit_, ridge.dual_coef_ = arrays["error.rows"], arrays["error.dual"]
-        ridge.n_features_in_ = ridge.X_fit_.shape[1]
-        return ridge, make_error_module(ridge, torch.from_numpy(ridge.X_fit_))
-    if header["kind"] == "linear":
-        linear = LinearRegression()
-        linear.coef_, linear.intercept_ = arrays["error.coef"], arrays["error.intercept"]
-        linear.n_features_in_ = linear.coef_.shape[-1]  # pyright: ignore[reportAttributeAccessIssue]
-        return linear, AffineModule(linear.coef_, linear.intercept_)
-    raise ValueError(f"unknown error model {header['kind']!r}")
-
-
-def _store_guard(guard: Guard | None, arrays: Arrays) -> str | None:
-    if guard is None:
-        return None
-    arrays["guard.largest"] = guard.largest.cpu().numpy()
+def _range(model: HybridForwardModel) -> tuple[Any, Any]:
+    """Return the range of the training rows as far as guard or error model tell it."""
+    guard, error = model.module_.guard, model.error_model_
     if isinstance(guard, BoxGuard):
-        names, kind, module = ("low", "high"), "box", guard
+        return guard.low.numpy(), guard.high.numpy()
+    if isinstance(guard, LeverageGuard) and isinstance(guard.readout, QuadraticReadout):
+        center, scale = guard.readout.center.numpy(), guard.readout.half_width.numpy()
+    elif isinstance(error, ELMRegressor):
+        center, scale = error.input_center_, error.input_scale_
     else:
-        assert isinstance(guard, LeverageGuard)
-        arrays["guard.limit"] = guard.limit.cpu().numpy()
-        if not isinstance(guard.readout, QuadraticReadout):
-            return "leverage of the error model"
-        names, kind, module = ("center", "half_width", "factor"), "leverage", guard.readout
-    for name in names:
-        arrays[f"guard.{name}"] = getattr(module, name).cpu().numpy()
-    return kind
+        return None, None
+    return center - scale, center + scale
 
 
-def _restored_guard(kind: Any, arrays: Arrays, error_module: nn.Module | None) -> Guard | None:
-    tensors = {
-        name.removeprefix("guard."): torch.from_numpy(array)
-        for name, array in arrays.items()
-        if name.startswith("guard.")
-    }
-    if kind is None:
+def _restored_radius(part: Part) -> Radius | None:
+    own = part.child("radius") if part.header.get("radius") is not None else None
+    if own is None:
         return None
-    # Files from before corrections had a largest length: none is too long.
-    largest = tensors.pop("largest", torch.tensor(float("inf"), dtype=torch.float64))
-    if kind == "box":
-        return BoxGuard(tensors["low"], tensors["high"], largest)
-    if kind == "leverage":
-        limit = tensors.pop("limit")
-        return LeverageGuard(QuadraticReadout(**tensors), limit, largest)
-    if kind == "leverage of the error model" and error_module is not None:
-        return LeverageGuard(error_module, tensors["limit"], largest)
-    raise ValueError(f"unknown guard {kind!r}")
+    inside, outside, coverage = (own.value(key, float) for key in Radius._fields[:3])
+    return Radius(inside, outside, coverage, own.value("n_rows", int))
 
 
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+def _restored_results(part: Part) -> dict[str, Any] | None:
+    """Return the scores of error_model="auto", numbers as arrays again."""
+    results = part.value("training", dict, {}).get("cv_results")
+    if not isinstance(results, dict):
+        return None
+    return {key: _numbers(value) for key, value in results.items()}
+
+
+def _numbers(value: Any) -> Any:
+    """Return a list of numbers, or of such lists, as an array; anything else as it is."""
+    if not isinstance(value, list):
+        return value
+    try:
+        array = np.array(value)
+        array = array.astype(np.float64) if array.dtype == object else array  # null is NaN
+    except (OverflowError, TypeError, ValueError):
+        return value
+    return array if array.dtype.kind in "fi" else value

@@ -318,8 +318,8 @@ class RigidChain(PortableModule):
 
         Parameters
         ----------
-        **geometry : Tensor
-            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
+        **geometry : Tensor of the shape that it has
+            Entries of `geometry()`, in the same units. Their values are not checked.
 
         Returns
         -------

@@ -50,21 +50,21 @@ class Task:
     models: tuple[Any, ...]
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x (N, *shape) and how fast the error falls along q (N, m, n), q of shape (N, n).
+        """Return x ``(N, *shape)`` and how fast the error falls along q (N, m, n), q (N, n).
 
         Rows that are angles count `units` metres per radian.
         """
         raise NotImplementedError
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return the error (N, m) of x with respect to targets, both (N, *shape) [m].
+        """Return the error (N, m) of x with respect to targets, both ``(N, *shape)`` [m].
 
         To first order, J dq = difference(x, x_target) leads from x to the target.
         """
         raise NotImplementedError
 
     def check(self, x_target: Tensor, name: str) -> None:
-        """Raise where targets (..., *shape) cannot be meant."""
+        """Raise where targets ``(..., *shape)`` cannot be meant."""
 
     def reached(self, error: Tensor, tol: float | tuple[float, ...]) -> Tensor:
         """Return whether errors (N, m) are within one tolerance [m], or one for every part."""
@@ -266,7 +266,7 @@ class StackedTask(Task):
         )
 
     def join(self, *x: Any) -> Any:
-        """Return one target (..., k) of the targets (..., *shape) of all tasks."""
+        """Return one target (..., k) of the targets ``(..., *shape)`` of all tasks."""
         if len(x) != len(self.tasks):
             raise ValueError(f"`x` must be {len(self.tasks)} targets, one per task, got {len(x)}.")
         tensors = [a if isinstance(a, Tensor) else torch.as_tensor(np.asarray(a)) for a in x]

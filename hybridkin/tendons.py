@@ -238,7 +238,7 @@ class ElasticTendonChain(ArcChain):
         return (self._balance(self._rows(q)).share < 0.5).reshape(q.shape)
 
     def taut_posture(self, minimum: float = 0.0) -> Callable[[Tensor], Tensor]:
-        """Return a posture that keeps tendons taut, for `InverseKinematics(q_pref=...)`.
+        """Return a posture that keeps tendons taut, for ``InverseKinematics(q_pref=...)``.
 
         Parameters
         ----------

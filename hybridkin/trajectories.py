@@ -102,12 +102,12 @@ def min_jerk(s: Any) -> np.ndarray:
 
     Parameters
     ----------
-    s : array-like
+    s : array-like of shape (...)
         Share of the time, clipped to [0, 1].
 
     Returns
     -------
-    ndarray
+    ndarray of shape (...)
         Share of the way.
 
     References

@@ -453,7 +453,7 @@ def test_alpha_zero(fit_intercept):
     model = elm(6, alpha=0, fit_intercept=fit_intercept).fit(X, Y)
     assert model.solver_ == "cholesky"
     phi = np.hstack([features(model, X), np.ones((400, 1))])[:, : 6 + fit_intercept]
-    expected = np.linalg.lstsq(phi, Y)[0]
+    expected = np.linalg.lstsq(phi, Y, rcond=None)[0]
     assert_allclose(model.output_weights_, expected[:6], rtol=1e-9)
     X[:, 1] = X[:, 0]  # the direct link now sees one column twice
     model.set_params(direct_link=True)

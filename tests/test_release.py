@@ -1,0 +1,129 @@
+import ast
+import io
+import re
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import hybridkin
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+MODULES = {"scikit-learn": "sklearn"}  # where the name of a package is not that of its module
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Return the paths of sdist and wheel, built as `python -m build` does."""
+    pytest.importorskip("hatchling")
+    folder = tmp_path_factory.mktemp("dist")
+    code = (
+        "import hatchling.build as h, sys; h.build_sdist(sys.argv[1]); h.build_wheel(sys.argv[1])"
+    )
+    subprocess.run([sys.executable, "-c", code, folder], cwd=ROOT, check=True, capture_output=True)
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return sdist, wheel
+
+
+def name_of(requirement):
+    return re.split(r"[^\w-]", requirement)[0]
+
+
+def modules_of(requirements):
+    """Return the modules that requirements bring."""
+    names = [name_of(requirement) for requirement in requirements]
+    return {MODULES.get(name, name).replace("-", "_") for name in names}
+
+
+def imports_of(tree, everywhere):
+    """Return what a file imports, as it is opened or everywhere."""
+    nodes = ast.walk(tree) if everywhere else ast.iter_child_nodes(tree)
+    found = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module.split(".")[0])
+    found = {"matplotlib" if name == "mpl_toolkits" else name for name in found}
+    return found - {*sys.stdlib_module_names, "hybridkin"}
+
+
+def test_versions_agree():
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {hybridkin.__version__}\n" in citation
+    headings = re.findall(
+        r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert headings[0] == "Unreleased"
+    assert headings[1:2] in ([], [hybridkin.__version__])
+    assert "version" in PROJECT["dynamic"]
+
+
+def test_extras():
+    extras = PROJECT["optional-dependencies"]
+    assert {"sim", "dask", "interactive", "parquet", "docs", "dev", "bench"} <= {*extras}
+    (whole,) = (name for name in extras["dev"] if name.startswith("hybridkin["))
+    assert {"sim", "dask", "interactive", "parquet"} <= {*re.findall(r"\w+", whole)[1:]}
+
+
+def test_what_is_imported_is_declared():
+    needed = modules_of(PROJECT["dependencies"])
+    extras = PROJECT["optional-dependencies"]
+    used = ("sim", "dask", "interactive", "parquet")
+    optional = needed.union(*(modules_of(extras[extra]) for extra in used))
+    for path in (ROOT / "hybridkin").rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        assert imports_of(tree, everywhere=False) <= needed, path
+        assert imports_of(tree, everywhere=True) <= optional, path
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(built):
+    wheel = zipfile.ZipFile(built[1])
+    names = {*wheel.namelist()}
+    assert {"hybridkin/py.typed", "hybridkin/datasets/data/trunk.npz"} <= names
+    sources = {str(p.relative_to(ROOT).as_posix()) for p in (ROOT / "hybridkin").rglob("*.py")}
+    assert sources <= names
+    tops = {name.split("/")[0] for name in names}
+    assert tops == {"hybridkin", f"hybridkin-{hybridkin.__version__}.dist-info"}
+    assert not any("__pycache__" in name or "test" in name for name in names)
+    assert built[1].stat().st_size < 1_000_000
+
+
+def test_the_wheel_says_what_it_needs(built):
+    about = f"hybridkin-{hybridkin.__version__}.dist-info/"
+    wheel = zipfile.ZipFile(built[1])
+    metadata = wheel.read(about + "METADATA").decode()
+    for extra in PROJECT["optional-dependencies"]:
+        assert f"Provides-Extra: {extra}\n" in metadata
+    for requirement in PROJECT["dependencies"]:
+        assert f"Requires-Dist: {name_of(requirement)}" in metadata
+    assert "hybridkin = hybridkin.__main__:main" in wheel.read(about + "entry_points.txt").decode()
+    assert about + "licenses/LICENSE" in wheel.namelist()
+
+
+def test_the_sdist_builds_the_same_and_can_be_tested(built):
+    sdist = tarfile.open(built[0])
+    names = {name.split("/", 1)[1] for name in sdist.getnames()}
+    assert {"pyproject.toml", "LICENSE", "CONTRIBUTING.md", "tests/conftest.py"} <= names
+    stored = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests/models").rglob("*.*")}
+    assert stored <= names
+    assert built[0].stat().st_size < 1_000_000
+    wheel = zipfile.ZipFile(io.BytesIO(built[1].read_bytes()))
+    package = {name for name in wheel.namelist() if name.startswith("hybridkin/")}
+    assert package <= names
+
+
+def test_the_index_would_take_them(built):
+    pytest.importorskip("twine")
+    command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, built)]
+    said = subprocess.run(command, capture_output=True, text=True)
+    assert said.returncode == 0, said.stdout
