@@ -1,76 +1,70 @@
-"""The command line: `python -m hybridkin paper` and `python -m hybridkin fit`."""
+"""The command line: `hybridkin COMMAND`, or `python -m hybridkin COMMAND`."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import re
 import sys
-import textwrap
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from hybridkin import __version__, experiments
-from hybridkin.simulation import NotSettledError
+import hybridkin  # its rooms are opened when used: help comes at once
+from hybridkin import _cli, _cli_text
 
-_USER_ERRORS = (ValueError, TypeError, OSError, ImportError, NotSettledError)
+_LOGS = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_DT = 0.02
 
-_PAPER = """\
-Reproduce the paper on the simulated trunk: Table 1, error histogram, workspace, a figure eight and
-a spiral tracked with the mechanical and with the hybrid model, and what the paper's samples tell
-about the trunk's geometry. Needs the extra `sim` (MuJoCo)."""
 
-_FIT = """\
-Calibrate a robot to a measured log, compare mechanical, data-driven and hybrid models on motions
-that they have not seen, and save the hybrid model with a report."""
-
-_FIT_EXAMPLE = """\
-example:
-  hybridkin fit log.csv --robot robot.toml --groups motion --out model
-
-The robot description names its geometry and the columns and units of its logs:
-
-  [[segment]]
-  radius = 0.0045       # of the tendon circle [m]
-  length = 0.060        # [m]; leave out for extensible segments
-  repeat = 3
-
-  [log]
-  q = ["t1", "t2", "t3", "t4", "t5", "t6", "t7", "t8", "t9"]
-  x = ["tip_x", "tip_y", "tip_z"]
-  q_unit = "mm"
-  x_unit = "mm"
-  q_sign = -1           # the log counts a pulled tendon as positive
-
-All keys: python -c "import hybridkin; help(hybridkin.robots.read_description)"
-"""
+class _Outcome(NamedTuple):
+    record: Any
+    lines: Callable[[Any], Any]
+    paths: Sequence[Path] = ()
+    code: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0, or 2 for an error of input."""
-    arguments = _parser().parse_args(argv)
+    """Run the command line and return its exit code, see `hybridkin --help`."""
+    arguments = _cli.parser().parse_args(argv)
     bars = _Bars()
     try:
         with warnings.catch_warnings():
+            warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = bars.warn
-            report, paths = arguments.run(arguments, bars)
-    except _USER_ERRORS as error:
-        bars.close()
-        print(f"hybridkin: error: {error}", file=sys.stderr)
-        return 2
+            outcome = _RUN[arguments.command](arguments, bars)
     except KeyboardInterrupt:
         bars.close()
         print("hybridkin: interrupted; nothing was written", file=sys.stderr)
         return 130
+    except Exception as error:
+        bars.close()
+        if not _is_of_input(error):
+            raise
+        if hasattr(error, "report"):
+            print(error.report, file=sys.stderr)  # pyright: ignore[reportAttributeAccessIssue]
+        print(f"hybridkin: error: {error}", file=sys.stderr)
+        return 2
     bars.close()
-    arguments.show(report)
-    print("\nWrote")
-    for path in paths:
-        print(f"  {path}")
-    return 0
+    if arguments.json:
+        record = outcome.record
+        if isinstance(record, dict) and outcome.paths:
+            record = {**record, "written": [str(path) for path in outcome.paths]}
+        print(json.dumps(_plain(record), indent=2, allow_nan=False))
+        return outcome.code
+    for line in outcome.lines(outcome.record):
+        print(line)
+    if outcome.paths:
+        print("\nWrote")
+        for path in outcome.paths:
+            print(f"  {path}")
+    return outcome.code
 
 
 class _Bars:
@@ -78,12 +72,15 @@ class _Bars:
 
     def __init__(self) -> None:
         self._bar: Any = None
+        self._what: str | None = None
         self._seen: set[str] = set()
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        if self._bar is None or self._bar.desc != what:
+        if self._what != what:
             self.close()
-            self._bar = tqdm(total=total, desc=what, file=sys.stderr)
+            self._what = what
+            # None: no bars in files and pipes
+            self._bar = tqdm(total=total, desc=what, file=sys.stderr, disable=None)
         self._bar.update(done - self._bar.n)
 
     def warn(self, message: Any, *_: Any) -> None:
@@ -93,62 +90,24 @@ class _Bars:
             self._seen.add(kind)
             tqdm.write(f"hybridkin: warning: {text}", file=sys.stderr)
 
+    def check(self, report: Any) -> None:
+        tqdm.write(f"{report}\n", file=sys.stderr)
+
     def close(self) -> None:
         if self._bar is not None:
             self._bar.close()
-        self._bar = None
+        self._bar = self._what = None
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="hybridkin",
-        description="Hybrid mechanical and data-driven kinematics of soft robots.",
-    )
-    parser.add_argument("--version", action="version", version=f"hybridkin {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    paper = commands.add_parser(
-        "paper", help="reproduce the paper on the simulated trunk", description=_PAPER
-    )
-    paper.add_argument("--out", type=Path, default=Path("results"), help="folder (results)")
-    paper.add_argument("--splits", type=_count, default=20, help="random test sets (20)")
-    paper.add_argument("--points", type=_count, default=151, help="time steps per path (151)")
-    paper.set_defaults(run=_run_paper, show=_show_paper)
-
-    fit = commands.add_parser(
-        "fit",
-        help="fit a hybrid model to a measured log",
-        description=_FIT,
-        epilog=_FIT_EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    fit.add_argument("log", type=Path, metavar="LOG.csv", help="measured log with a header line")
-    fit.add_argument("--robot", type=Path, required=True, metavar="ROBOT.toml")
-    fit.add_argument("--out", type=Path, required=True, help="folder for model and report")
-    fit.add_argument("--groups", metavar="COLUMN", help="column that names the motion of a row")
-    fit.add_argument(
-        "--exclude",
-        action="append",
-        default=[],
-        metavar="PATTERN",
-        help="motions to leave out, such as '*tendon*'; may be repeated",
-    )
-    fit.add_argument(
-        "--loss",
-        default="linear",
-        choices=("linear", "soft_l1", "huber", "cauchy", "arctan"),
-        help="loss of the calibration; all but linear bound outliers (linear)",
-    )
-    fit.add_argument("--drop-invalid", action="store_true", help="leave out rows with gaps or NaN")
-    fit.set_defaults(run=_run_fit, show=_show_fit)
-    for command in (paper, fit):
-        command.add_argument("--seeds", type=_count, default=5, help="random networks (5)")
-        command.add_argument("--jobs", type=int, default=-1, help="processes; -1: all cores (-1)")
-    return parser
+def _is_of_input(error: Exception) -> bool:
+    """Return whether the user can mend it: such errors are told without a traceback."""
+    if isinstance(error, (ValueError, TypeError, OSError, ImportError)):
+        return True
+    return isinstance(error, hybridkin.simulation.NotSettledError)
 
 
-def _run_paper(arguments: argparse.Namespace, bars: _Bars) -> Any:
-    return experiments.run_paper(
+def _run_paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    report, paths = hybridkin.experiments.run_paper(
         arguments.out,
         n_splits=arguments.splits,
         n_seeds=arguments.seeds,
@@ -156,65 +115,202 @@ def _run_paper(arguments: argparse.Namespace, bars: _Bars) -> Any:
         n_jobs=arguments.jobs,
         progress=bars,
     )
+    return _Outcome(report.record, _cli_text.paper, paths)
 
 
-def _run_fit(arguments: argparse.Namespace, bars: _Bars) -> Any:
-    return experiments.fit_log(
+def _run_fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    description = hybridkin.robots.read_description(arguments.robot)
+    report, paths = hybridkin.experiments.fit_log(
         arguments.log,
         arguments.robot,
         arguments.out,
-        groups=arguments.groups,
-        exclude=arguments.exclude,
+        log_format=_log_format(arguments, description.log, arguments.robot),
         loss=arguments.loss,
+        coverage=arguments.coverage,
+        n_folds=arguments.folds,
         n_seeds=arguments.seeds,
-        drop_invalid=arguments.drop_invalid,
+        auto=not arguments.no_auto,
+        max_rows=arguments.max_rows or None,
         n_jobs=arguments.jobs,
         progress=bars,
+        **_reading(arguments, bars),
     )
+    return _Outcome(report.record, _cli_text.fit, paths)
 
 
-def _show_paper(report: Any) -> None:
-    print("\nTest error on the simulated trunk, mean ± std (max) [cm]")
-    for entry in report.record["table1"]:
-        test = {key: 100 * value for key, value in entry["test"].items()}
-        name = f"{entry['model']}, {entry['learner']}".removesuffix(", -")
-        print(f"  {name:34s} {test['mean']:6.2f} ± {test['std']:.2f} ({test['max']:.1f})")
-    print("Tracking error on the simulated trunk, both paths, mean [cm]")
-    for name, stats in report.record["tracking"]["both"].items():
-        print(f"  {name:34s} {100 * stats['mean']:6.2f}")
-    _show_identifiability(report.record["identifiability"])
-
-
-def _show_identifiability(found: dict[str, Any]) -> None:
-    print(
-        f"What {found['n_single']} rows of one segment and {found['n_random']} random rows of the "
-        "simulated trunk tell about its geometry"
+def _run_evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    opened = hybridkin.experiments.open_model(arguments.model, arguments.robot)
+    report, paths = hybridkin.experiments.evaluate_log(
+        opened,
+        arguments.log,
+        arguments.out,
+        log_format=_log_format(arguments, _known_format(opened), arguments.model),
+        **_reading(arguments, bars),
     )
-    print("  parameter                 calibrated  std. error   prior narrowed")
-    for entry in found["asked"]["entries"]:
-        name = f"{entry['name']} [{entry['unit']}]"
-        print(
-            f"  {name:24s} {entry['value']:11.2f} {entry['std_error']:11.2f} "
-            f"{entry['narrowing']:10.3g} x  {'told' if entry['told'] else 'not told'}"
+    limit = arguments.fail_above
+    code = 1 if limit is not None and 1000 * report.record["all"]["mean"] > limit else 0
+    return _Outcome(report.record, _cli_text.evaluate, paths, code)
+
+
+def _run_track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    opened = hybridkin.experiments.open_model(arguments.model, arguments.robot)
+    log_format = opened.log_format()
+    if (arguments.path is None) == (arguments.shape is None):
+        raise ValueError("give either a file of points or --shape, one of the two.")
+    limits = _limits(arguments, log_format)
+    unit = arguments.unit or log_format.x_unit
+    if arguments.path is not None:
+        path = hybridkin.experiments.read_path(arguments.path, unit=unit, dt=arguments.dt)
+    else:
+        path = _shape(arguments, opened, limits, _METRES[unit])
+    report, paths = hybridkin.experiments.track_path(
+        opened, path, arguments.out, tol=1e-3 * arguments.tol, progress=bars, **limits
+    )
+    code = 0 if report.record["reached"] == report.record["n"] else 1
+    return _Outcome(report.record, _cli_text.track, paths, code)
+
+
+def _run_animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    opened = hybridkin.experiments.open_model(arguments.model, arguments.robot)
+    record = hybridkin.experiments.animate_track(
+        opened,
+        arguments.track,
+        arguments.out,
+        unit=arguments.unit,
+        speed=arguments.speed,
+        n_frames=arguments.frames,
+        progress=bars,
+    )
+    return _Outcome(record, _cli_text.animate, [arguments.out])
+
+
+def _run_benchmark(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    experiments = hybridkin.experiments
+    if arguments.model is None:
+        opened = experiments.trunk_model()
+    else:
+        opened = experiments.open_model(arguments.model, arguments.robot)
+    record = experiments.measure_speed(
+        opened, batches=arguments.batches, seconds=arguments.seconds, progress=bars
+    )
+    return _Outcome(record, _cli_text.benchmark)
+
+
+def _run_describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    experiments = hybridkin.experiments
+    if arguments.what.suffix.lower() not in _LOGS:
+        opened = experiments.open_model(arguments.what, arguments.robot)
+        return _Outcome(experiments.describe_model(opened), _cli_text.describe)
+    if arguments.robot is None:
+        raise ValueError(f"{arguments.what} is a log; name its robot: --robot ROBOT.toml.")
+    description = hybridkin.robots.read_description(arguments.robot)
+    given = _reading(arguments, bars)
+    log = experiments.read_log(
+        arguments.what,
+        _log_format(arguments, description.log, arguments.robot),
+        chain=description.chain,
+        base_is_free="base" in description.calibrate,
+        **{name: given[name] for name in given if name not in ("force", "on_check")},
+    )
+    code = 0 if log.report.ok else 1
+    return _Outcome(log.report.to_dict(), lambda _: [str(log.report)], code=code)
+
+
+def _reading(arguments: argparse.Namespace, bars: _Bars) -> dict[str, Any]:
+    names = ("exclude", "drop_invalid", "drop_frozen", "delimiter", "force")
+    return {name: getattr(arguments, name) for name in names} | {"on_check": bars.check}
+
+
+def _log_format(arguments: argparse.Namespace, known: Any, source: Path) -> Any:
+    """Return how the log is written: what is known, with what the options say instead."""
+    names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time")
+    given = {name: getattr(arguments, name) for name in names}
+    given = {name: value for name, value in given.items() if value is not None}
+    if known is not None:
+        return replace(known, **given)
+    if "q" not in given or "x" not in given:
+        raise ValueError(
+            f"{source} does not say how logs are written: it has no [log] table, as in "
+            "help(hybridkin.robots.read_description); or name the columns by --q and --x."
         )
-    print("  They leave open:")
-    for sentence in found["asked"]["unidentified"]:
-        print(textwrap.fill(sentence, 96, initial_indent="  - ", subsequent_indent="    "))
+    return hybridkin.robots.LogFormat(**given)
 
 
-def _show_fit(report: Any) -> None:
-    print("\nTip error on motions held out [mm]          mean    95 %     max")
-    for name, stats in report.record["held_out"].items():
-        columns = " ".join(f"{1000 * stats[key]:7.2f}" for key in ("mean", "p95", "max"))
-        print(f"  {name:36s} {columns}")
+def _known_format(opened: Any) -> Any:
+    return None if opened.description is None else opened.description.log
 
 
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
-    return value
+def _limits(arguments: argparse.Namespace, log_format: Any) -> dict[str, Any]:
+    """Return the limits [m] as the model counts them, from options in the log's unit and sign."""
+    scale = _METRES[log_format.q_unit]
+    found: dict[str, Any] = {}
+    for name in ("q_min", "q_max", "dq_max"):
+        value = getattr(arguments, name)
+        if value is not None:
+            found[name] = [scale * v for v in value]
+            if len(value) == 1:
+                found[name] = found[name][0]
+    if log_format.q_sign < 0:
+        flipped = {"q_min": found.pop("q_max", None), "q_max": found.pop("q_min", None)}
+        for name, value in flipped.items():
+            if value is not None:
+                found[name] = [-v for v in value] if isinstance(value, list) else -value
+    return found
 
+
+def _shape(arguments: argparse.Namespace, opened: Any, limits: dict[str, Any], metre: float) -> Any:
+    """Return the path of a named shape, about the middle of the workspace by default."""
+    shapes, experiments = hybridkin.trajectories, hybridkin.experiments
+    center = arguments.center
+    if center is None:
+        found = experiments.path_limits(opened, **limits)
+        center = experiments.middle_tip(opened, found)
+    else:
+        center = [metre * v for v in center]
+    normal = arguments.normal
+    if normal is None:
+        base = getattr(opened.chain, "base", None)
+        normal = (0.0, 0.0, 1.0) if base is None else base[:3, 2].tolist()
+    n_sizes = 3 if arguments.shape == "line" else 2
+    if arguments.size is None or len(arguments.size) != n_sizes:
+        raise ValueError(f"--size must be {n_sizes} numbers for a {arguments.shape}, as in --help.")
+    size = [metre * v for v in arguments.size]
+    timing = {"duration": arguments.duration, "dt": arguments.dt or _DT}
+    if arguments.shape == "figure-eight":
+        return shapes.figure_eight(center, size, normal=normal, **timing)
+    if arguments.shape == "spiral":
+        rise = metre * arguments.rise
+        return shapes.spiral(
+            center, size, normal=normal, turns=arguments.turns, rise=rise, **timing
+        )
+    start, end = (
+        [c + sign * 0.5 * s for c, s in zip(center, size, strict=True)] for sign in (-1, 1)
+    )
+    return shapes.line(start, end, **timing)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can say it; what is not finite becomes null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+_RUN = {
+    "paper": _run_paper,
+    "fit": _run_fit,
+    "evaluate": _run_evaluate,
+    "track": _run_track,
+    "animate": _run_animate,
+    "benchmark": _run_benchmark,
+    "describe": _run_describe,
+}
 
 if __name__ == "__main__":
     sys.exit(main())

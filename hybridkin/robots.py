@@ -24,6 +24,7 @@ else:
 __all__ = [
     "BHA_LENGTH_LIMITS",
     "BHA_WORKING_BOX",
+    "Limits",
     "LogFormat",
     "RobotDescription",
     "bionic_handling_assistant",
@@ -88,6 +89,8 @@ class LogFormat:
         -1 where the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
         Rows whose motion ends in this belong to the motion named without it.
+    groups, time : str or None
+        Columns of the motion that a row belongs to, and of its time stamp [s].
     """
 
     q: tuple[str, ...]
@@ -96,6 +99,25 @@ class LogFormat:
     x_unit: str = "m"
     q_sign: int = 1
     group_suffix: str = ""
+    groups: str | None = None
+    time: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the actuators can do.
+
+    Attributes
+    ----------
+    q_min, q_max : ndarray of shape (n,) or None
+        Least and largest value of every actuator, as the chain counts them [m].
+    dq_max : ndarray of shape (n,) or None
+        Largest speed [m/s].
+    """
+
+    q_min: np.ndarray | None = None
+    q_max: np.ndarray | None = None
+    dq_max: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -112,12 +134,15 @@ class RobotDescription:
         Geometry that should be fitted to data.
     log : LogFormat or None
         How its logs are written.
+    limits : Limits
+        What its actuators can do, as far as it is known.
     """
 
     name: str
     chain: Chain
     calibrate: tuple[str, ...]
     log: LogFormat | None
+    limits: Limits = Limits()
 
 
 def from_toml(path: str | Path) -> Chain:
@@ -162,7 +187,14 @@ def read_description(path: str | Path) -> RobotDescription:
             q_unit = "mm"
             x_unit = "mm"
             q_sign = -1                     # -1: the log counts a pulled tendon as positive
+            groups = "motion"               # column that names the motion of a row, optional
             group_suffix = "_hold"          # rows of motion "a_hold" belong to motion "a"
+            time = "t"                      # column of the time stamp [s], optional
+
+            [limits]                        # of the actuators, optional; one number or one each
+            q_min = -0.010                  # as the chain counts them: shortening < 0 [m]
+            q_max = 0.010
+            dq_max = 0.020                  # [m/s]
 
     Returns
     -------
@@ -190,7 +222,7 @@ def read_description(path: str | Path) -> RobotDescription:
 
 
 def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
-    top = {"name", "model", "routing", "calibrate", "segment", "base", "log"}
+    top = {"name", "model", "routing", "calibrate", "segment", "base", "log", "limits"}
     _known(content, top, "the file")
     model = content.get("model", _MODELS[0])
     if model not in _MODELS:
@@ -214,7 +246,8 @@ def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
     if not isinstance(calibrate, (list, tuple)):
         raise ValueError(f"`calibrate` must be a list of names, got {calibrate!r}.")
     log = _log_format(content["log"], chain.n_actuators) if "log" in content else None
-    return RobotDescription(str(content.get("name", stem)), chain, tuple(calibrate), log)
+    limits = _limits(content.get("limits", {}), chain.n_actuators)
+    return RobotDescription(str(content.get("name", stem)), chain, tuple(calibrate), log, limits)
 
 
 def _plain_chain(segments: Mapping[str, list[Any]], **options: Any) -> ConstantCurvatureChain:
@@ -297,7 +330,8 @@ def _base(table: Mapping[str, Any]) -> np.ndarray:
 
 
 def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
-    _known(table, {"q", "x", "q_unit", "x_unit", "q_sign", "group_suffix"}, "[log]")
+    keys = {"q", "x", "q_unit", "x_unit", "q_sign", "group_suffix", "groups", "time"}
+    _known(table, keys, "[log]")
     columns = {}
     for key, size in (("q", n_actuators), ("x", 3)):
         value = table.get(key, [])
@@ -309,11 +343,30 @@ def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
             raise ValueError(f"`{key}` in [log] must be one of {[*_UNITS]}, got {table[key]!r}.")
     if table.get("q_sign", 1) not in (1, -1):
         raise ValueError(f"`q_sign` in [log] must be 1 or -1, got {table['q_sign']!r}.")
-    if not isinstance(table.get("group_suffix", ""), str):
-        raise ValueError(f"`group_suffix` in [log] must be text, got {table['group_suffix']!r}.")
-    options = ("q_unit", "x_unit", "q_sign", "group_suffix")
+    for key in ("group_suffix", "groups", "time"):
+        if not isinstance(table.get(key, ""), str):
+            raise ValueError(f"`{key}` in [log] must be text, got {table[key]!r}.")
+    options = ("q_unit", "x_unit", "q_sign", "group_suffix", "groups", "time")
     extra = {key: table[key] for key in options if key in table}
     return LogFormat(**columns, **extra)
+
+
+def _limits(table: Mapping[str, Any], n_actuators: int) -> Limits:
+    _known(table, {"q_min", "q_max", "dq_max"}, "[limits]")
+    found = {}
+    for key, value in table.items():
+        values = [value] * n_actuators if type(value) in (int, float) else value
+        found[key] = _numbers({key: values}, key, "[limits]", n_actuators)
+    limits = Limits(**found)
+    if (
+        limits.q_min is not None
+        and limits.q_max is not None
+        and (limits.q_min > limits.q_max).any()
+    ):
+        raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
+    if limits.dq_max is not None and not (limits.dq_max > 0).all():
+        raise ValueError(f"`dq_max` in [limits] must be positive, got {table['dq_max']!r}.")
+    return limits
 
 
 def _number(table: Mapping[str, Any], key: str, where: str, default: float | None = None) -> Any:

@@ -1,5 +1,6 @@
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -10,15 +11,18 @@ from scipy.optimize import least_squares
 from hybridkin import ConstantCurvatureChain
 from hybridkin.datasets import (
     _trunk,
+    check_log,
     load_armlab,
     load_asl_trunk,
     load_csv,
     load_ftdcr,
+    load_log,
     load_trunk,
     make_trunk,
     paper_protocol,
     paper_split,
 )
+from hybridkin.robots import bionic_handling_assistant
 
 SMALL = {"n_segment": 2, "n_random": 4, "random_state": 5}
 
@@ -385,6 +389,269 @@ def test_csv_missing_file(tmp_path):
 def test_csv_millimetres_in_a_metre_field_warn(log, row):
     with pytest.warns(UserWarning, match="x_unit='mm'"):
         load_csv(log(HEADER + row), **COLUMNS, q_unit="mm")
+
+
+def test_logs_of_every_format_hold_the_same(tmp_path):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    table = np.arange(24.0).reshape(4, 6) + 0.5
+    runs = np.array(["one", "one", "two", "two"])
+    text = "".join(
+        f"{';'.join(map(str, row))};{run}\n" for row, run in zip(table, runs, strict=True)
+    )
+    (tmp_path / "log.csv").write_text("a;b;c;X;Y;Z;run\n" + text)
+    np.savez(tmp_path / "log.npz", pulls=table[:, :3], X=table[:, 3], YZ=table[:, 4:], run=runs)
+    frame = pd.DataFrame(table, columns=[*"abcXYZ"]).assign(run=runs)
+    frame.to_parquet(tmp_path / "log.parquet")
+    options = {"q_unit": "mm", "x_unit": "mm", "q_sign": -1}
+    csv = load_log(tmp_path / "log.csv", [*"abc"], [*"XYZ"], "run", **options)
+    assert_allclose(csv.q, -1e-3 * table[:, :3])
+    parquet = load_log(tmp_path / "log.parquet", [*"abc"], [*"XYZ"], "run", **options)
+    npz = load_log(tmp_path / "log.npz", "pulls", ["X", "YZ"], "run", **options)
+    assert npz.q_names == ["pulls[0]", "pulls[1]", "pulls[2]"]
+    assert npz.x_names == ["X", "YZ[0]", "YZ[1]"]
+    for other in (parquet, npz):
+        assert_array_equal(other.q, csv.q)
+        assert_array_equal(other.x, csv.x)
+        assert other.groups.tolist() == csv.groups.tolist() == runs.tolist()
+        assert other.line.tolist() == [0, 1, 2, 3]
+    swapped = load_log(
+        tmp_path / "log.npz", ["pulls[2]", "pulls[0]"], ["X", "YZ"], q_unit="1", x_unit="mm"
+    )
+    assert_array_equal(swapped.q, table[:, [2, 0]])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"q": np.ones((3, 3)), "x": np.ones((2, 3))}, "must be equally long"),
+        ({"q": np.ones((3, 3)), "x": np.ones((3, 2))}, "`x` must name 3 columns"),
+        ({"q": np.ones((3, 3)), "tip": np.ones((3, 3))}, "There is no column 'x'"),
+        ({"q": np.full((3, 3), "a"), "x": np.ones((3, 3))}, "must hold numbers"),
+        ({"q": np.ones((0, 3)), "x": np.ones((0, 3))}, "has no rows"),
+        ({"q": np.full((3, 3), None), "x": np.ones((3, 3))}, "not an npz file of plain arrays"),
+    ],
+)
+def test_npz_errors(tmp_path, arrays, message):
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(ValueError, match=message):
+        load_log(tmp_path / "log.npz", ["q"], ["x"])
+
+
+def test_files_that_are_none_are_told(tmp_path, monkeypatch):
+    for name in ("log.npz", "log.csv", "log.parquet"):
+        (tmp_path / name).write_bytes(b"\xff\x00PAR1 no log")
+    with pytest.raises(ValueError, match="not an npz file"):
+        load_log(tmp_path / "log.npz", ["q"], ["x"])
+    with pytest.raises(ValueError, match="not a text file in UTF-8"):
+        load_log(tmp_path / "log.csv", ["q"], ["x", "y", "z"])
+    with pytest.raises(FileNotFoundError, match="there is none at"):
+        load_log(tmp_path / "absent.npz", ["q"], ["x"])
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas pyarrow"):
+        load_log(tmp_path / "log.parquet", ["q"], ["x"])
+
+
+# what is wrong with a log
+
+
+def tendon_log(n_motions=8, n=30, **truth):
+    """A simulated log of a robot of two segments, without noise but for the tracker's."""
+    rng = np.random.default_rng(0)
+    chain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], **truth)
+    u = np.stack([np.cos(np.arange(3) * 2 * np.pi / 3), np.sin(np.arange(3) * 2 * np.pi / 3)])
+    q = []
+    for _ in range(n_motions):
+        first, second = (0.003 * (rng.standard_normal((2, 2)) @ u).ravel() for _ in range(2))
+        s = np.linspace(0.0, 4.0, n)[:, None]
+        q.append(np.sin(s) * first + 0.5 * np.sin(2 * s) * second)
+    q = np.concatenate(q)
+    x = chain(torch.from_numpy(q)).numpy() + 1e-5 * rng.standard_normal((len(q), 3))
+    time = np.linspace(0.0, 24.0, len(q))
+    return {"q": q, "x": x, "groups": np.repeat(np.arange(n_motions), n), "time": time}
+
+
+CHAIN = ConstantCurvatureChain([0.0055, 0.0055], lengths=[0.11, 0.09])
+
+
+def found(log, **options):
+    return {(f.kind, f.severity): f for f in check_log(log, **options).findings}
+
+
+def test_a_clean_log_passes():
+    report = check_log(tendon_log(), chain=CHAIN)
+    assert report.findings == ()
+    assert report.ok
+    assert "240 rows, 8 motions, 6 actuators, 24 s" in str(report)
+    assert "nothing to object to" in str(report)
+
+
+def test_frozen_tip():
+    log = tendon_log()
+    log["x"][70:85] = log["x"][70]
+    finding = found(log)["frozen tip", "error"]
+    assert finding.rows.tolist() == [*range(70, 85)]
+    assert "rows 70-84" in finding.message
+    assert "--drop-frozen" in finding.advice
+    # At rest the tip may well be still.
+    log = tendon_log()
+    log["q"][70:85], log["x"][70:85] = log["q"][70], log["x"][70]
+    assert not any(kind == "frozen tip" for kind, _ in found(log))
+
+
+def test_one_frozen_coordinate_and_a_frozen_actuator():
+    log = tendon_log()
+    log["x"][70:85, 1] = log["x"][70, 1]
+    finding = found(log)["frozen tip", "warning"]
+    assert "'x[1]'" in finding.message
+    assert finding.rows.tolist() == [*range(70, 85)]
+    log = tendon_log()
+    log["q"][70:85, 4] = log["q"][70, 4]
+    finding = found(log)["frozen actuator", "warning"]
+    assert "'q[4]'" in finding.message
+    assert finding.rows.tolist() == [*range(70, 85)]
+
+
+def test_actuators_that_rest_by_command_are_not_frozen():
+    log = tendon_log()
+    log["q"][60:120, 3:] = 0.0
+    log["q"][180:240, :3] = 0.0
+    assert not any(kind == "frozen actuator" for kind, _ in found(log))
+
+
+def test_invalid_rows():
+    log = tendon_log()
+    log["x"][[3, 4, 90], 2] = np.nan
+    log["q"][10, 0] = np.inf
+    finding = found(log)["invalid", "error"]
+    assert "4 of 240 rows" in finding.message
+    assert "rows 3-4, 10, 90" in finding.message
+    assert finding.rows.tolist() == [3, 4, 10, 90]
+
+
+def test_columns_that_never_change():
+    log = tendon_log()
+    log["q"][:, 2] = 0.001
+    log["x"][:, 0] = 0.0
+    report = check_log(log)
+    messages = [f.message for f in report.warnings if f.kind == "constant"]
+    assert [("never move: 'q[2]'" in messages[0]), ("never change: 'x[0]'" in messages[1])]
+    log["x"][:] = 0.0
+    assert ("constant", "error") in found(log)
+
+
+def test_duplicates_and_repeats():
+    log = tendon_log()
+    for name in ("q", "x"):
+        log[name][200:203] = log[name][20:23]
+    finding = found(log)["duplicates", "warning"]
+    assert finding.rows.tolist() == [200, 201, 202]
+    assert "3 of them in another motion" in finding.message
+    log = tendon_log()
+    log["q"][120:], log["x"][120:] = log["q"][:120], log["x"][:120] + np.array([3e-4, 0, 0])
+    finding = found(log)["repeats", "note"]
+    assert "scatters by 0.21 mm rms" in finding.message  # 0.3 / sqrt(2), and all start at 0
+
+
+def test_jumps():
+    log = tendon_log()
+    log["x"][100] += [0.15, 0.0, 0.0]
+    finding = found(log)["jumps", "warning"]
+    assert finding.rows.tolist() == [100, 101]
+    assert "soft_l1" in finding.advice
+
+
+def test_times():
+    log = tendon_log()
+    log["time"][100:] += 5.0
+    log["time"][[40, 41]] = log["time"][[41, 40]]
+    messages = [f.message for f in check_log(log).warnings]
+    assert "do not increase at 1 rows (row 41)" in messages[0]
+    assert "1 gaps in time within a motion, up to 5.1 s" in messages[1]
+    assert "(row 100)" in messages[1]
+
+
+def test_motions():
+    log = tendon_log()
+    assert "--groups" in found({**log, "groups": None})["motions", "warning"].advice
+    few = found({**log, "groups": np.arange(240) // 100})["motions", "warning"]
+    assert "3 motions are few" in few.message
+    alone = found({**log, "groups": np.arange(240)})["motions", "warning"]
+    assert "random split" in alone.message
+    assert ("rows", "warning") in found({name: value[:20] for name, value in log.items()})
+
+
+@pytest.mark.parametrize(
+    ("q", "x", "units", "advice"),
+    [
+        (1e3, 1e3, {"q": "m", "x": "m"}, ['q_unit = "mm"', 'x_unit = "mm"']),
+        (1e2, 1.0, {"q": "m", "x": "mm"}, ['q_unit = "cm"']),
+        (1.0, 1e3, {"q": "mm", "x": "m"}, ['x_unit = "mm"']),
+        (1e-3, 1e-3, {"q": "mm", "x": "mm"}, ['q_unit = "m"', 'x_unit = "m"']),
+        (1.0, 1e-2, {"q": "mm", "x": "mm"}, ["`x_unit`"]),
+    ],
+)
+def test_units_that_cannot_be(q, x, units, advice):
+    log = tendon_log()
+    log |= {"q": q * log["q"], "x": x * log["x"], "file_units": units}
+    report = check_log(log, chain=CHAIN)
+    assert [f.kind for f in report.errors] == ["units"] * len(advice)
+    for finding, wanted in zip(report.errors, advice, strict=True):
+        assert wanted in finding.advice
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm"])
+def test_units_of_chambers(unit):
+    data, scale = load_trunk(), {"mm": 1e3, "cm": 1e2}[unit]
+    log = {"q": scale * data.q, "x": scale * data.x}
+    report = check_log(log, chain=bionic_handling_assistant())
+    for name, finding in zip("qx", report.errors, strict=True):
+        assert f'{name}_unit = "{unit}"' in finding.advice
+    changes = check_log({"q": data.q - 0.25, "x": data.x}, chain=bionic_handling_assistant())
+    assert "give `length`" in changes.errors[0].advice
+
+
+def test_a_wrong_sign_is_told():
+    log = tendon_log()
+    flipped = {**log, "q": -log["q"]}
+    finding = found(flipped, chain=CHAIN, base_is_free=False, q_sign=1)["sign", "warning"]
+    assert "set q_sign = -1" in finding.advice
+    # A half turn of a free base makes up for it where all tendons are taut.
+    assert check_log(flipped, chain=CHAIN).findings == ()
+    released = {**log, "q": np.abs(log["q"])}
+    assert "only ever lengthened" in found(released, chain=CHAIN)["sign", "warning"].message
+
+
+@pytest.mark.parametrize("base_is_free", [True, False])
+def test_clockwise_numbering_is_told(base_is_free):
+    turned = np.negative([2 * np.pi / 3 * np.arange(3)] * 2)
+    log = tendon_log(angles=turned)
+    finding = found(log, chain=CHAIN, base_is_free=base_is_free)["numbering", "warning"]
+    assert "clockwise = true" in finding.advice
+    assert check_log(tendon_log(), chain=CHAIN, base_is_free=base_is_free).ok
+
+
+def test_a_model_that_explains_nothing_is_told():
+    log = tendon_log()
+    log["q"] = np.random.default_rng(1).permutation(log["q"])
+    finding = found(log, chain=CHAIN)["geometry", "warning"]
+    assert "order of the columns" in finding.advice
+
+
+def test_check_says_what_it_needs():
+    with pytest.raises(ValueError, match=r"q of shape \(N, n\)"):
+        check_log({"q": np.ones((3, 3)), "x": np.ones((2, 3))})
+    with pytest.raises(ValueError, match="must have 6 actuators"):
+        check_log({"q": np.ones((3, 3)), "x": np.ones((3, 3))}, chain=CHAIN)
+
+
+def test_a_report_is_json(log):
+    data = load_csv(
+        log(HEADER + "0,r,1,2,3,1,2,3\n1,r,1,nan,3,1,2,3\n"), **COLUMNS, drop_invalid=True
+    )
+    record = json.loads(json.dumps(check_log(data).to_dict()))
+    assert record["n_rows"] == 1
+    assert any("(line 3)" in finding["message"] for finding in record["findings"])
 
 
 # recordings of real robots

@@ -1,14 +1,58 @@
+"""The README does what it says: each code block, each command, each link, and the examples."""
+
+import os
 import re
 import runpy
+import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+EXAMPLES = sorted((ROOT / "examples").glob("plot_*.py"))
 
 
-def test_readme_python_runs_as_printed(capsys):
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def commands(text):
+    """Return the commands of the console blocks, continued lines joined, comments off."""
+    blocks = re.findall(r"```console\n(.*?)```", text, re.DOTALL)
+    lines = "".join(blocks).replace("\\\n", " ").splitlines()
+    return [shlex.split(line, comments=True) for line in lines if line.strip()]
+
+
+COMMANDS = commands(README)
+OWN_LOG = [c for c in COMMANDS if c[0] == "hybridkin" and "train.csv" not in c]
+RECORDING = [c for c in COMMANDS if c[0] == "hybridkin" and "train.csv" in c]
+
+
+def hybridkin(command, folder):
+    """Run a command in a folder and return what it prints."""
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "MPLBACKEND": "agg"}
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_python_runs_as_printed(capsys):
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert blocks
     for block in blocks:
         exec(compile(block, "README.md", "exec"), {})
@@ -17,12 +61,96 @@ def test_readme_python_runs_as_printed(capsys):
     assert re.search(r"\(\d+, 9\)", printed)
 
 
-def test_readme_points_at_files_that_are_there():
-    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text())
-    for link in links:
+def test_every_kind_of_command_is_tried_below():
+    assert {command[0] for command in COMMANDS} == {"pip", "make", "hybridkin"}
+    assert len(OWN_LOG) >= 2
+    assert RECORDING
+
+
+def test_what_pip_installs_is_there():
+    """The installation itself is what `make` does."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    installs = [command for command in COMMANDS if command[0] == "pip"]
+    assert installs
+    for _, verb, *what in installs:
+        assert verb == "install"
+        for name in what:
+            extra = re.fullmatch(r"\.\[(\w+)\]", name)
+            if extra:
+                assert extra[1] in project["optional-dependencies"]
+            else:
+                assert any(needed.startswith(name) for needed in project["dependencies"])
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_make_knows_its_targets():
+    """`make test` runs this very file, `make paper` what tests/test_experiments.py runs."""
+    named = re.findall(r"`make\s(\w+)`", README)
+    printed = [command[1] for command in COMMANDS if command[0] == "make"]
+    assert {"paper", "test", "docs"} <= {*named, *printed}
+    for target in {*named, *printed}:
+        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert "python" in done.stdout or ".venv" in done.stdout
+
+
+QUICK = ["--folds", "2", "--seeds", "1", "--jobs", "1"]  # of `fit`, in place of 5, 5 and all cores
+
+
+def test_commands_for_a_log_of_ones_own_run(tmp_path, monkeypatch):
+    """Those of the README and of the docs, on the robot and the simulated log of the docs."""
+    page = (ROOT / "docs" / "your_robot.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    Path("robot.toml").write_text(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
+    exec(
+        compile(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], "your_robot.md", "exec"), {}
+    )
+    more = [command for command in commands(page) if command[1] not in ("fit", "track")]
+    assert {command[1] for command in more} == {"describe", "evaluate", "animate"}
+    for command in [*OWN_LOG, *more]:
+        assert hybridkin(command + (QUICK if command[1] == "fit" else []), tmp_path)
+        if "--out" in command:
+            assert Path(command[command.index("--out") + 1]).exists()
+    assert Path("model/model.safetensors").is_file()
+    track = np.genfromtxt("track/track.csv", delimiter=",", names=True)
+    assert len(track) > 100
+    assert {"s1", "s6"} <= {*track.dtype.names}
+
+
+def test_commands_for_the_recording_run(tmp_path, data_home):
+    """On every sixth row, which leaves the motions whole."""
+    lines = (data_home / "ftdcr_v4" / "train.csv").read_text(encoding="utf-8").splitlines()
+    (tmp_path / "train.csv").write_text("\n".join([lines[0], *lines[1::6]]), encoding="utf-8")
+    shutil.copytree(ROOT / "examples" / "robots", tmp_path / "examples" / "robots")
+    command = RECORDING[-1]  # the longer one
+    out = hybridkin([*command, *QUICK], tmp_path)
+    found = re.findall(r"^ +(mechanical, calibrated|hybrid, ELM) +([\d.]+)", out, re.MULTILINE)
+    assert {name: float(mean) < 12.0 for name, mean in found} == {
+        "mechanical, calibrated": True,
+        "hybrid, ELM": True,
+    }
+
+
+def test_links_lead_to_files_that_are_there():
+    for link in re.findall(r"\]\(([^)#]+)\)", README):
         assert (ROOT / link).is_file(), link
 
 
-@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("plot_*.py")), ids=str)
-def test_examples_run(example):
+def test_number_of_examples():
+    words = {10: "ten", 11: "eleven", 12: "twelve", 13: "thirteen", 14: "fourteen"}
+    assert f"a gallery of {words[len(EXAMPLES)]} examples" in README
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_run_and_draw(example, monkeypatch, capsys):
+    shown = []
+    monkeypatch.setattr(plt, "show", lambda: shown.append(len(plt.get_fignums())))
     runpy.run_path(str(example))
+    figures = plt.get_fignums()
+    plt.close("all")
+    skipped = "Skipped: " in capsys.readouterr().out
+    if example.stem == "plot_elm_dask":  # starts its workers as a script only, see test_elm_scale
+        assert not figures
+    else:
+        assert skipped != bool(figures)
+        assert skipped == (not shown)

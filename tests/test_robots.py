@@ -29,6 +29,11 @@ q = ["a", "b", "c", "d", "e", "f", "g", "h", "i", "j"]
 x = ["x", "y", "z"]
 q_unit = "mm"
 q_sign = -1
+groups = "motion"
+time = "t"
+[limits]
+q_min = -0.01
+q_max = [0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03, 0.03]
 """
 
 
@@ -93,7 +98,19 @@ def test_description_is_the_chain_it_describes(write):
     assert_close(robots.from_toml(write(TENDONS))(q), expected(q), rtol=1e-13, atol=1e-15)
     assert robot.name == "three by three"
     assert robot.calibrate == ("radii", "base")
-    assert robot.log == robots.LogFormat(tuple("abcdefghij"), ("x", "y", "z"), "mm", "m", -1)
+    log = robots.LogFormat(tuple("abcdefghij"), ("x", "y", "z"), "mm", "m", -1, "", "motion", "t")
+    assert robot.log == log
+
+
+def test_columns_of_motions_and_time_and_limits(write):
+    robot = robots.read_description(write(TENDONS))
+    assert (robot.log.groups, robot.log.time) == ("motion", "t")
+    assert robot.limits.q_min.tolist() == [-0.01] * 10
+    assert robot.limits.q_max.tolist() == [0.01] * 3 + [0.02] * 3 + [0.03] * 4
+    assert robot.limits.dq_max is None
+    plain = robots.read_description(write("[[segment]]\nradius = 0.1\n[limits]\ndq_max = 1"))
+    assert plain.limits.q_min is None
+    assert plain.limits.dq_max.tolist() == [1.0] * 3
 
 
 def test_rest_bends_and_zeros(write):
@@ -209,6 +226,14 @@ def test_defaults_are_chambers_named_after_the_file(write):
             "[[segment]]\nradius = 0.1\n[log]\nq = ['a','b','c']\nx = ['x','y','z']\nq_unit = 'in'",
             "`q_unit` in .log. must be one of",
         ),
+        (
+            "[[segment]]\nradius = 0.1\n[log]\nq = ['a','b','c']\nx = ['x','y','z']\ngroups = 3",
+            "`groups` in .log. must be text",
+        ),
+        ("[[segment]]\nradius = 0.1\n[limits]\nq_mni = 1", "did you mean `q_min`"),
+        ("[[segment]]\nradius = 0.1\n[limits]\nq_min = [1, 2]", "`q_min` in .* must hold 3"),
+        ("[[segment]]\nradius = 0.1\n[limits]\nq_min = 2\nq_max = 1", "must not exceed `q_max`"),
+        ("[[segment]]\nradius = 0.1\n[limits]\ndq_max = 0", "`dq_max` .* must be positive"),
     ],
 )
 def test_bad_descriptions_name_the_key(write, text, message):

@@ -107,7 +107,7 @@ class Report:
 
     def __init__(self, title: str) -> None:
         self.blocks = [f"# {title}"]
-        self.record: dict[str, Any] = {"title": title, "versions": _versions()}
+        self.record: dict[str, Any] = {"title": title, "versions": versions()}
         self._files: dict[str, Callable[[Path], Any]] = {}
 
     def text(self, *paragraphs: str) -> None:
@@ -171,7 +171,8 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that matter."""
     found = {"python": platform.python_version()}
     for name in ("hybridkin", "torch", "numpy", "scikit-learn", "mujoco"):
         try:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import fnmatch
+import shutil
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,18 +16,26 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
-from hybridkin import datasets, plots, robots
-from hybridkin.calibration import CalibrationResult, calibrate
+from hybridkin import robots
+from hybridkin.calibration import calibrate
 from hybridkin.elm import ELMRegressor
+from hybridkin.experiments._measured_log import (
+    MeasuredLog,
+    OnCheck,
+    checked,
+    not_told,
+    read_log,
+)
+from hybridkin.experiments._measured_report import (
+    write_calibration,
+    write_check,
+    write_comparison,
+)
 from hybridkin.experiments._report import (
-    GEOMETRY_HEADER,
-    TOLD,
     Progress,
     Report,
     check_out,
     distance,
-    geometry_entries,
-    geometry_rows,
     linear,
     quadratic,
     quiet,
@@ -38,9 +47,11 @@ from hybridkin.persistence import save_model
 ALPHAS = tuple(10.0**k for k in range(-5, 4))
 """Ridge weights to choose from."""
 
+AUTO = "hybrid, auto"
+ELM = "hybrid, ELM"
+_SAVED = ("mechanical, calibrated", "hybrid, linear", ELM, AUTO)  # what a file can hold
 _N_HIDDEN = 100
 _INNER_FOLDS = 4
-_BLOCKS = 10
 
 
 class Choice(NamedTuple):
@@ -59,6 +70,7 @@ class _Settings(NamedTuple):
     parameters: tuple[str, ...]
     loss: str
     n_seeds: int
+    auto: bool = True
 
 
 _DATA_CHOICES = tuple(Choice(alpha, None) for alpha in ALPHAS)
@@ -75,14 +87,16 @@ def compare_by_group(
     loss: str = "linear",
     n_folds: int = 5,
     n_seeds: int = 5,
+    auto: bool = True,
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> tuple[dict[str, NDArray], NDArray, list[dict[str, str]]]:
     """Return the errors of every model on motions that it has not seen.
 
     Whole groups are held out. Within the training groups of each fold the ridge weight and the
-    guard of the networks are chosen by groups held out once more, with the geometry calibrated
-    anew, so that nothing of a test motion enters its own prediction.
+    guard of the networks, and all that ``error_model="auto"`` chooses, are chosen by groups held
+    out once more, with the geometry calibrated anew, so that nothing of a test motion enters its
+    own prediction.
 
     Parameters
     ----------
@@ -98,6 +112,8 @@ def compare_by_group(
         Folds of groups.
     n_seeds : int, default=5
         Random hidden layers; the errors are their average per row.
+    auto : bool, default=True
+        Whether ``error_model="auto"`` is among the models; it takes most of the time.
     n_jobs, progress
         Processes, and a callable handed (what, done, total).
 
@@ -110,13 +126,17 @@ def compare_by_group(
     choices : list of dict
         What was chosen in each fold.
     """
-    settings = _Settings(tuple(parameters), loss, n_seeds)
+    settings = _Settings(tuple(parameters), loss, n_seeds, auto)
     folds = list(GroupKFold(min(n_folds, len(np.unique(groups)))).split(q, groups=groups))
     jobs = (delayed(_one_fold)(chain, q, x, groups, *fold, settings) for fold in folds)
     errors: dict[str, NDArray] = {}
     fold_of_row = np.empty(len(q), dtype=int)
     choices = []
-    results: Any = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
+    # Else torch and BLAS start threads in every process, and these wait for each other.
+    workers = Parallel(
+        n_jobs=n_jobs, backend="loky", inner_max_num_threads=1, return_as="generator"
+    )
+    results: Any = workers(jobs)
     for i, ((_, test), (found, chosen)) in enumerate(zip(folds, results, strict=True)):
         for name, values in found.items():
             errors.setdefault(name, np.empty(len(q)))[test] = values
@@ -131,33 +151,58 @@ def fit_log(
     robot: str | Path,
     out: str | Path,
     *,
+    log_format: robots.LogFormat | None = None,
     groups: str | None = None,
     exclude: Sequence[str] = (),
     loss: str = "linear",
+    coverage: float | None = None,
     n_folds: int = 5,
     n_seeds: int = 5,
+    auto: bool = True,
+    max_rows: int | None = 4000,
     drop_invalid: bool = False,
+    drop_frozen: bool = False,
+    delimiter: str | None = None,
+    force: bool = False,
     n_jobs: int | None = -1,
     progress: Progress = quiet,
+    on_check: OnCheck = not_told,
 ) -> tuple[Report, list[Path]]:
     """Calibrate and fit a hybrid model to a measured log, and write it with its report.
+
+    Saved is the model with the least mean error on motions held out, of the calibrated mechanical
+    model and the hybrids with a linear error model, an ELM, and what ``error_model="auto"`` takes.
 
     Parameters
     ----------
     log : str or Path
-        CSV file with the columns that the robot description names.
+        CSV, npz or parquet file with the columns that the robot description names.
     robot : str or Path
-        Robot description, see `robots.read_description`; it needs a [log] table.
+        Robot description, see `robots.read_description`.
     out : str or Path
         Folder to write into.
+    log_format : LogFormat, optional
+        How the log is written. Default: the [log] table of the description.
     groups : str, optional
-        Column that names the motion of every row. Without it the log is cut into 10 stretches.
+        Column that names the motion of every row, in place of the format's. Without any the log
+        is cut into 10 stretches.
     exclude : sequence of str, optional
         Patterns of motions to leave out, ``"*tendon*"`` for example.
-    loss, n_folds, n_seeds, n_jobs, progress
+    loss, n_folds, n_seeds, auto, n_jobs, progress
         As in `compare_by_group`.
-    drop_invalid : bool, default=False
-        Leave out rows with missing or infinite values instead of stopping there.
+    coverage : float, optional
+        As for `HybridForwardModel`: the saved model tells a radius for this share of tips.
+    max_rows : int or None, default=4000
+        Of a longer log every k-th row is taken, so that at most so many remain; None: all rows.
+    drop_invalid, drop_frozen : bool, default=False
+        Leave out rows with missing or infinite values, and rows whose tip is frozen, instead of
+        stopping there.
+    delimiter : str, optional
+        As for `datasets.load_log`.
+    force : bool, default=False
+        Fit in spite of errors that the check of the log finds.
+    on_check : callable, optional
+        Handed the `datasets.LogReport` before the work begins.
 
     Returns
     -------
@@ -165,24 +210,52 @@ def fit_log(
         Its ``record`` holds every number.
     paths : list of Path
         What was written, the model among it.
+
+    Raises
+    ------
+    ValueError
+        If the log, the description or what they hold together is no good; of a log that does not
+        pass its check with that ``report``.
     """
     check_out(out)
     description = robots.read_description(robot)
-    data, motions = _read(log, robot, description.log, groups, exclude, drop_invalid)
+    log_format = log_format or described_format(description, robot)
+    if groups is not None:
+        log_format = replace(log_format, groups=groups)
     chain, names = description.chain, description.calibrate
+    whole = read_log(
+        log,
+        log_format,
+        chain=chain,
+        base_is_free="base" in names,
+        exclude=exclude,
+        drop_invalid=drop_invalid,
+        drop_frozen=drop_frozen,
+        delimiter=delimiter,
+    )
+    n_motions = len(np.unique(whole.motions))
+    if n_motions < 2:
+        raise ValueError(
+            f"`groups` must name at least 2 motions to hold one out, but column "
+            f"{log_format.groups!r} leaves {n_motions}."
+        )
+    checked(whole, on_check, force)
+    data = whole.thinned(max_rows)
     errors, fold, choices = compare_by_group(
         chain,
         data.q,
         data.x,
-        motions,
+        data.motions,
         parameters=names,
         loss=loss,
         n_folds=n_folds,
         n_seeds=n_seeds,
+        auto=auto,
         n_jobs=n_jobs,
         progress=progress,
     )
-    progress("fitting the model to all motions", 0, 1)
+    saved = min(errors.keys() & set(_SAVED), key=lambda name: (errors[name].mean(), name))
+    progress(f"fitting {saved} to all motions", 0, 1)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = calibrate(chain, data.q, data.x, names, loss=loss)
@@ -190,29 +263,83 @@ def fit_log(
         warnings.warn(warning.message, stacklevel=2)
     settings = _Settings(names, loss, n_seeds)
     with _silence():  # all that is to say has been said of the whole log
-        choice = _choose(chain, data.q, data.x, motions, _HYBRID_CHOICES, settings)
-        model = _elm_model(result.chain, choice, 0).fit(data.q, data.x)
-    progress("fitting the model to all motions", 1, 1)
+        model, why = _final(saved, chain, result.chain, data, settings, coverage)
+    progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{description.name}: hybrid model of {Path(log).name}")
     report.record.update(
         log=Path(log).name,
+        robot=description.name,
         n=len(data.q),
-        n_motions=len(np.unique(motions)),
+        n_whole=len(whole.q),
+        n_motions=n_motions,
         excluded=list(exclude),
         n_seeds=n_seeds,
         loss=loss,
-        choice=choice._asdict(),
+        saved=saved,
+        chosen=why,
         choices_by_fold=choices,
     )
-    _write_comparison(report, errors, fold, motions, groups)
+    write_check(report, whole)
+    write_comparison(report, errors, fold, data, len(whole.q), _N_HIDDEN)
     report.text(
-        f"Chosen for the saved model, by the same cross-validation on all motions: **{choice}**. "
-        f"Chosen in the folds: " + "; ".join(c["hybrid, ELM"] for c in choices) + "."
+        f"Saved is the model with the least mean error here: **{saved}** ({why}), fitted to all "
+        f"motions. Chosen in the folds: " + "; ".join(c.get(saved, "-") for c in choices) + "."
     )
-    _write_calibration(report, chain, result, [str(warning.message) for warning in caught])
+    write_calibration(report, chain, result, [str(warning.message) for warning in caught])
     report.file("model.safetensors", lambda path: save_model(model, path))
-    report.text("The model: `hybridkin.load_model('model.safetensors')`.")
+    report.file("robot.toml", lambda path: shutil.copyfile(robot, path))
+    report.text(
+        "The model: `hybridkin.load_model('model.safetensors')`. `robot.toml` is the description "
+        "it was made from."
+    )
     return report, report.write(out)
+
+
+def described_format(description: robots.RobotDescription, path: str | Path) -> robots.LogFormat:
+    """Return how the robot's logs are written, or raise where its description does not say."""
+    if description.log is None:
+        raise ValueError(
+            f"{path} has no [log] table; name the columns of q and x there, as in "
+            "help(hybridkin.robots.read_description)."
+        )
+    return description.log
+
+
+def _final(
+    saved: str,
+    chain: Any,
+    calibrated: Any,
+    data: MeasuredLog,
+    settings: _Settings,
+    coverage: float | None,
+) -> tuple[HybridForwardModel, str]:
+    """Return the model to save, fitted to all rows, and what was chosen for it."""
+    if saved == AUTO:
+        model = _auto_model(chain, calibrated, settings)
+        why = ""
+    elif saved == ELM:
+        choice = _choose(chain, data.q, data.x, data.motions, _HYBRID_CHOICES, settings)
+        model, why = _elm_model(calibrated, choice, 0), str(choice)
+    else:
+        error_model, why = ("drop", "no correction")
+        if saved == "hybrid, linear":
+            error_model, why = linear(), "linear"
+        model = HybridForwardModel(calibrated, error_model)
+    model.set_params(coverage=coverage).fit(data.q, data.x, groups=data.motions)
+    if saved == AUTO and model.cv_results_ is not None:
+        why = str(model.cv_results_["chosen"])
+    return model, why
+
+
+def _auto_model(chain: Any, calibrated: Any, settings: _Settings) -> HybridForwardModel:
+    """Return the hybrid that chooses for itself.
+
+    It calibrates anew in every fold of its own, by least squares; a loss that bounds outliers is
+    kept by starting from the chain so calibrated.
+    """
+    if settings.loss == "linear":
+        return HybridForwardModel(chain, "auto", calibrate=settings.parameters, random_state=0)
+    return HybridForwardModel(calibrated, "auto", random_state=0)
 
 
 @contextlib.contextmanager
@@ -264,9 +391,14 @@ def _one_fold(
         "data-driven, ELM": with_elm(None, data_choice),
         "hybrid, linear": held_out(HybridForwardModel(calibrated, linear())),
         "hybrid, quadratic": held_out(HybridForwardModel(calibrated, quadratic())),
-        "hybrid, ELM": with_elm(calibrated, hybrid_choice),
+        ELM: with_elm(calibrated, hybrid_choice),
     }
-    return errors, {"data-driven, ELM": str(data_choice), "hybrid, ELM": str(hybrid_choice)}
+    chosen = {"data-driven, ELM": str(data_choice), ELM: str(hybrid_choice)}
+    if settings.auto:
+        auto: Any = _auto_model(chain, calibrated, settings).fit(*rows, groups=groups[train])
+        errors[AUTO] = distance(auto.predict(q[test]), x[test])
+        chosen[AUTO] = str(auto.cv_results_["chosen"])
+    return errors, chosen
 
 
 def _choose(
@@ -299,139 +431,3 @@ def _elm_model(chain: Any, choice: Choice, seed: int) -> HybridForwardModel:
         return HybridForwardModel(chain, "drop")
     elm = ELMRegressor(_N_HIDDEN, choice.alpha, random_state=seed)
     return HybridForwardModel(chain, elm, guard=choice.guard)
-
-
-def _read(
-    log: str | Path,
-    robot: str | Path,
-    log_format: robots.LogFormat | None,
-    groups: str | None,
-    exclude: Sequence[str],
-    drop_invalid: bool,
-) -> tuple[Any, NDArray]:
-    if log_format is None:
-        raise ValueError(
-            f"{robot} has no [log] table; name the columns of q and x there, as in "
-            "help(hybridkin.robots.read_description)."
-        )
-    data = datasets.load_csv(
-        log,
-        log_format.q,
-        log_format.x,
-        groups,
-        q_unit=log_format.q_unit,
-        x_unit=log_format.x_unit,
-        q_sign=log_format.q_sign,
-        drop_invalid=drop_invalid,
-    )
-    if groups is None:
-        if exclude:
-            raise ValueError("`exclude` needs `groups`, the column that names the motions.")
-        return data, np.arange(len(data.q)) * _BLOCKS // len(data.q)
-    motions = np.array([str(name).removesuffix(log_format.group_suffix) for name in data.groups])
-    kept = np.array([not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions])
-    if len(np.unique(motions[kept])) < 2:
-        raise ValueError(
-            f"`groups` must name at least 2 motions to hold one out, but column {groups!r} has "
-            f"{len(np.unique(motions))}, of which {len(np.unique(motions[kept]))} are kept."
-        )
-    data.q, data.x = data.q[kept], data.x[kept]
-    return data, motions[kept]
-
-
-def _write_comparison(
-    report: Report,
-    errors: dict[str, NDArray],
-    fold: NDArray,
-    motions: NDArray,
-    groups: str | None,
-) -> None:
-    n_folds = int(fold.max()) + 1
-    split = (
-        f"motions of column `{groups}`"
-        if groups
-        else f"{_BLOCKS} stretches of the log (no column of motions was named: give `--groups`)"
-    )
-    report.text(
-        "## On motions it has not seen",
-        f"{len(motions)} rows, {len(np.unique(motions))} {split}, held out whole in {n_folds} "
-        f"folds; ELM with {_N_HIDDEN} neurons, ridge weight and guard chosen by motions held out "
-        f"within the training part, {report.record['n_seeds']} random hidden layers. "
-        '"Nominal" has the geometry of the robot description with only the base pose fitted, '
-        "when that is among the calibrated. Tip error in mm.",
-    )
-    rows, record = [], {}
-    for name, values in errors.items():
-        by_fold = np.array([values[fold == k].mean() for k in range(n_folds)])
-        record[name] = {
-            "mean": values.mean(),
-            "std": values.std(),
-            "p95": np.percentile(values, 95),
-            "max": values.max(),
-            "std_folds": by_fold.std(),
-            "by_fold": by_fold,
-        }
-        columns = ("mean", "std", "p95", "max", "std_folds")
-        rows.append([name, *(f"{1000 * record[name][column]:.2f}" for column in columns)])
-    report.record["held_out"] = record
-    report.table(["model", "mean", "std over rows", "95 %", "max", "std over folds"], rows)
-    best = min(record, key=lambda name: record[name]["mean"])
-    calibrated, hybrid = (record[f"{m}"]["mean"] for m in ("mechanical, calibrated", "hybrid, ELM"))
-    report.text(
-        f"Calibrated mechanical model over hybrid ELM: **{calibrated / hybrid:.2f}**. Least mean "
-        f"error: {best}."
-    )
-    figure, ax = plots.new_figure(7.0, 3.6)
-    plots.ErrorBoxDisplay(errors).plot(ax, unit="mm")
-    ax.set_xlim(0.0, 1100 * float(np.percentile(errors["mechanical, nominal"], 99)))
-    report.figure(
-        "held_out",
-        figure,
-        "Tip error on motions held out: quartiles, 5 and 95 %; larger errors lie beyond the axis.",
-    )
-    figure, ax = plots.new_figure(5.5, 3.4)
-    shown = ("mechanical, calibrated", "hybrid, ELM")
-    plots.ErrorHistogramDisplay({name: errors[name] for name in shown}).plot(ax, unit="mm")
-    ax.set(ylabel="rows")
-    report.figure("error_histogram", figure, "Tip errors on motions held out.")
-    names = np.unique(motions)
-    means = {n: [1000 * errors[n][motions == name].mean() for name in names] for n in shown}
-    worst = np.argsort(means["hybrid, ELM"])[::-1][:5]
-    report.text("The five motions that the hybrid ELM predicts worst:")
-    report.table(
-        ["motion", "rows", *shown],
-        [
-            [
-                str(names[i]),
-                str((motions == names[i]).sum()),
-                *(f"{means[n][i]:.1f}" for n in shown),
-            ]
-            for i in worst
-        ],
-    )
-
-
-def _write_calibration(
-    report: Report, chain: Any, result: CalibrationResult, warned: list[str]
-) -> None:
-    entries = geometry_entries(chain, result)
-    report.text(
-        "## Calibration on all motions",
-        f"Root mean square tip error {1000 * result.rmse:.2f} mm. Standard errors count every row "
-        "as independent and are too small where rows follow each other closely. What narrows the "
-        f"prior of a parameter less than {TOLD:.0f} times does not tell it: its value is an "
-        "assumption. The base by its turn from the start and its position.",
-    )
-    report.table(GEOMETRY_HEADER, geometry_rows(entries))
-    report.text(*(f"Warning: {message}" for message in warned))
-    if result.unidentified:
-        report.text("What the log leaves open:", *(f"- {line}" for line in result.unidentified))
-    report.record["calibration"] = {
-        "values": result.values,
-        "std_errors": result.std_errors,
-        "rmse": result.rmse,
-        "warnings": warned,
-        "identifiable": result.identifiable,
-        "entries": entries,
-        "unidentified": result.unidentified,
-    }

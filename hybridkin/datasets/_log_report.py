@@ -1,0 +1,173 @@
+"""What a check of a log found: findings with their severity, their rows and advice."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SEVERITIES = ("error", "warning", "note")
+_WIDTH = 96
+
+
+@dataclass(frozen=True, eq=False)
+class LogFinding:
+    """One thing that a check of a log found.
+
+    Attributes
+    ----------
+    kind : str
+        "invalid", "frozen tip", "frozen actuator", "constant", "duplicates", "repeats", "jumps",
+        "time", "motions", "rows", "units", "sign", "numbering" or "geometry".
+    severity : {"error", "warning", "note"}
+        "error": a fit would be worthless; "warning": look at it; "note": good to know.
+    message : str
+        What was found.
+    advice : str
+        What to do.
+    rows : ndarray of shape (k,)
+        The rows it is about, from 0; empty where it is about all of them.
+    """
+
+    kind: str
+    severity: str
+    message: str
+    advice: str
+    rows: NDArray = field(default_factory=lambda: np.empty(0, dtype=int))
+
+
+@dataclass(frozen=True, eq=False)
+class LogReport:
+    """The findings of `check_log`, and what the log holds.
+
+    Attributes
+    ----------
+    findings : tuple of LogFinding
+        Errors first.
+    n_rows, n_actuators : int
+        Size of the log.
+    n_motions : int or None
+        How many motions its groups name.
+    q_range : ndarray of shape (n_actuators, 2)
+        Least and largest value of every actuator [m].
+    x_range : ndarray of shape (3, 2)
+        The same of the tip [m].
+    duration : float or None
+        From the first to the last time stamp [s].
+    source : str
+        Where the log came from.
+    """
+
+    findings: tuple[LogFinding, ...]
+    n_rows: int
+    n_actuators: int
+    n_motions: int | None
+    q_range: NDArray
+    x_range: NDArray
+    duration: float | None
+    source: str
+
+    @property
+    def errors(self) -> tuple[LogFinding, ...]:
+        """The findings that make a fit worthless."""
+        return tuple(f for f in self.findings if f.severity == "error")
+
+    @property
+    def warnings(self) -> tuple[LogFinding, ...]:
+        """The findings to look at."""
+        return tuple(f for f in self.findings if f.severity == "warning")
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are no errors."""
+        return not self.errors
+
+    def kinds(self) -> set[str]:
+        """Return the kinds of all findings."""
+        return {finding.kind for finding in self.findings}
+
+    def accepting(self, kind: str) -> LogReport:
+        """Return the report with findings of a kind, whose rows were left out, as notes."""
+        changed = []
+        for f in self.findings:
+            if f.kind == kind:
+                told = f"{f.message} They were left out."
+                f = replace(f, severity="note", message=told, advice="find out why.")
+            changed.append(f)
+        changed.sort(key=lambda finding: SEVERITIES.index(finding.severity))
+        return replace(self, findings=tuple(changed))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as numbers, text and lists, for JSON."""
+        return {
+            "source": self.source,
+            "ok": self.ok,
+            "n_rows": self.n_rows,
+            "n_actuators": self.n_actuators,
+            "n_motions": self.n_motions,
+            "duration_s": self.duration,
+            "q_range": self.q_range.tolist(),
+            "x_range": self.x_range.tolist(),
+            "findings": [
+                {
+                    "kind": f.kind,
+                    "severity": f.severity,
+                    "message": f.message,
+                    "advice": f.advice,
+                    "n_rows": len(f.rows),
+                    "rows": f.rows.tolist(),
+                }
+                for f in self.findings
+            ],
+        }
+
+    def summary(self) -> str:
+        """Return one sentence: how many errors and warnings."""
+        found = [
+            f"{n} {name}{'s' if n > 1 else ''}"
+            for name, n in (("error", len(self.errors)), ("warning", len(self.warnings)))
+            if n
+        ]
+        return " and ".join(found) if found else "nothing to object to"
+
+    def __str__(self) -> str:
+        """Return the report as text, one paragraph for each finding."""
+        motions = "motions not named" if self.n_motions is None else f"{self.n_motions} motions"
+        spans = 1e3 * np.ptp(self.x_range, axis=1)
+        lines = [
+            f"Log {self.source}: {self.n_rows} rows, {motions}, {self.n_actuators} actuators"
+            + ("" if self.duration is None else f", {self.duration:.4g} s"),
+            f"  q from {1e3 * self.q_range[:, 0].min():.4g} to {1e3 * self.q_range[:, 1].max():.4g}"
+            f" mm, tip within {spans[0]:.4g} x {spans[1]:.4g} x {spans[2]:.4g} mm",
+        ]
+        for finding in self.findings:
+            head = f"  {finding.severity.upper():8s} {finding.kind}: "
+            lines.append(_filled(head, finding.message))
+            lines.append(_filled(" " * 11 + "-> ", finding.advice))
+        lines.append(f"  {self.summary()}")
+        return "\n".join(lines)
+
+
+def _filled(head: str, text: str) -> str:
+    return textwrap.fill(
+        text,
+        _WIDTH,
+        initial_indent=head,
+        subsequent_indent=" " * 14,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def named_rows(rows: ArrayLike, places: NDArray, kind: str = "line") -> str:
+    """Return rows in words, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
+    found = np.sort(places[np.asarray(rows)])
+    runs = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
+    words = [f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:4]]
+    left = sum(len(run) for run in runs[4:])
+    return f"{kind}{'s' if len(found) > 1 else ''} {', '.join(words)}" + (
+        f" and {left} more" if left else ""
+    )

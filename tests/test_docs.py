@@ -1,0 +1,188 @@
+"""The pages can be reached, their code runs, and every public name says what it takes and gives."""
+
+import importlib
+import inspect
+import re
+import textwrap
+from enum import Enum
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+import hybridkin
+
+DOCS = Path(__file__).parent.parent / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+ROOMS = ("datasets", "plots", "robots", "simulation", "tasks", "trajectories")
+# In the unit of the robot's actuators, whatever that is, or of data that need no robot.
+OF_THE_ACTUATORS = {"q", "q0", "q_min", "q_max", "q_pref", "dq", "X", "y", "std"}
+WITHOUT_UNIT = {
+    *("groups", "sample_weight", "weights", "sizes", "rows", "part", "train_idx", "test_idx"),
+    *("normal", "axes", "axes_", "frames", "base", "tip", "origins", "pose", "values", "spreads"),
+    *("correlations", "narrowing", "identifiable", "singular_values", "sigma_min", "scale"),
+    *("input_weights_", "alphas", "alpha_", "cv_results_", "leverage_center_"),
+    *("feature_names_in_", "data", "geometry", "target", "s", "ndarray"),
+}
+
+
+# The pages
+
+
+def blocks(page, language):
+    text = (DOCS / page).read_text(encoding="utf-8")
+    found = re.findall(rf"^ *```{language}\n(.*?)```", text, re.DOTALL | re.MULTILINE)
+    return [textwrap.dedent(block) for block in found]
+
+
+def test_every_page_is_in_the_table_of_contents():
+    listed = {line for block in blocks("index.md", r"\{toctree\}") for line in block.splitlines()}
+    pages = {page.stem for page in PAGES} - {"index"} | {"api"}
+    assert pages <= listed
+    assert {name for name in listed if name and ":" not in name} - pages == {"gallery/index"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    examples = {f"gallery/{p.stem}.rst" for p in DOCS.parent.glob("examples/plot_*.py")}
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if link.startswith("http"):
+            continue
+        name, _, heading = link.partition("#")
+        assert not name or (DOCS / name).is_file() or name in {*examples, "gallery/index.rst"}, link
+        if heading:
+            headings = re.findall(r"^#+ (.*)$", (DOCS / (name or page.name)).read_text(), re.M)
+            assert heading in {h.lower().replace(" ", "-").replace("'", "") for h in headings}, link
+
+
+def test_equations_are_numbered_as_they_come():
+    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+    numbers = [int(n) for n in re.findall(r"^\$\$ .* \$\$ \((\d+)\)$", text, re.MULTILINE)]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert len(numbers) > 20
+    outside = re.sub(r"\$\$.*?\$\$ \(\d+\)", "", text)
+    assert {int(n) for n in re.findall(r"(?<=[\s~])\((\d{1,2})\)", outside)} <= {*numbers}
+
+
+@pytest.mark.parametrize("page", ["getting_started.md", "your_robot.md"])
+def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for block in blocks(page, "toml"):
+        Path("robot.toml").write_text(block, encoding="utf-8")
+    space = {}
+    for block in blocks(page, "python"):
+        exec(compile(block, page, "exec"), space)
+    if page == "your_robot.md":
+        errors = dict(re.findall(r"(\w+): mean ([\d.]+) mm", capsys.readouterr().out))
+        assert float(errors["hybrid"]) < 0.6 * float(errors["mechanical"])
+        assert len(Path("commands.csv").read_text().splitlines()) == len(space["path"].x)
+
+
+def test_code_of_the_learners_page_runs_as_printed(capsys):
+    exec(compile(blocks("elm.md", "python")[0], "elm.md", "exec"), {})
+    new_rows, left_out = map(float, capsys.readouterr().out.split()[:2])
+    assert new_rows < 0.6  # against the truth without noise
+    assert 0.9 < left_out < 1.2  # the noise is 1
+
+
+# The gallery
+
+
+def test_gallery_lists_every_example():
+    text = (DOCS / "_ext" / "pages.py").read_text(encoding="utf-8")
+    order = re.search(r"EXAMPLES = \((.*?)\)", text, re.DOTALL)
+    assert order
+    names = re.findall(r'"(\w+)"', order[1])
+    examples = [p.stem.removeprefix("plot_") for p in DOCS.parent.glob("examples/plot_*.py")]
+    assert sorted(names) == sorted(examples)
+
+
+# The docstrings
+
+
+def public():
+    """Return all functions and classes of the public rooms, and the classes' own methods."""
+    found = {name: getattr(hybridkin, name) for name in hybridkin.__all__}
+    found = {name: o for name, o in found.items() if callable(o)}
+    for room in ROOMS:
+        module = importlib.import_module(f"hybridkin.{room}")
+        members = {f"{room}.{name}": getattr(module, name) for name in module.__all__}
+        found |= {name: o for name, o in members.items() if callable(o)}
+    for name, cls in list(found.items()):
+        if inspect.isclass(cls):
+            for key, member in vars(cls).items():
+                member = getattr(member, "__func__", getattr(member, "fget", member))
+                if not key.startswith("_") and inspect.isfunction(member):
+                    found[f"{name}.{key}"] = member
+    return found
+
+
+PUBLIC = public()
+
+
+def section(doc, name):
+    """Return the entries (names, type, text) of one section of a docstring."""
+    pattern = rf"^{name}\n-+\n(.*?)(?=^\S[^\n]*\n-{{3,}}|\Z)"
+    body = re.search(pattern, doc, re.DOTALL | re.MULTILINE)
+    entries = re.split(r"^(?=\S)", body[1], flags=re.MULTILINE) if body else []
+    found = []
+    for entry in filter(str.strip, entries):
+        head, _, text = entry.partition("\n")
+        names, colon, kind = head.partition(" : ")
+        if not colon and name == "Returns":
+            names, kind = "", head
+        names = [n.strip().lstrip("*") for n in names.split(",") if n]
+        found.append((names, kind, text))
+    return found
+
+
+def names_in(entries):
+    return {name for names, _, _ in entries for name in names if name}
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_docstring_tells_what_goes_in_and_what_comes_out(name):
+    thing = PUBLIC[name]
+    doc = inspect.getdoc(thing)
+    assert doc, "has no docstring"
+    assert doc.splitlines()[0].endswith((".", ":")), "the first line is a sentence"
+    is_method = not inspect.isclass(thing) and "." in name and name.split(".")[-2] not in ROOMS
+    if re.search(r"; see `\w+`", doc.splitlines()[0]):  # where the details are
+        return
+    is_made_by_user = inspect.isclass(thing) and "Parameters\n---" in doc
+    documented = names_in(section(doc, "Parameters"))
+    if is_made_by_user or (inspect.isfunction(thing) and (documented or not is_method)):
+        taken = {*inspect.signature(thing).parameters} - {"self", "cls"}
+        assert documented == taken
+    if inspect.isclass(thing) and not is_made_by_user and not issubclass(thing, (Exception, Enum)):
+        assert "Attributes\n---" in doc
+    if inspect.isfunction(thing) and not is_method and doc.startswith("Return"):
+        assert section(doc, "Returns")
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_arrays_have_a_shape_and_a_unit(name):
+    doc = inspect.getdoc(PUBLIC[name]) or ""
+    for kind in ("Parameters", "Attributes", "Returns"):
+        for names, what, text in section(doc, kind):
+            is_array = re.search(r"\b(array|array-like|ndarray|Tensor)\b(?! of Axes)", what)
+            if not is_array or re.match(r"(dict|mapping)\b", what):
+                continue
+            assert "shape" in what + text, f"{names or kind}: {what}"
+            is_number = not re.search(r"\b(bool|int|str)\b|Bool|of Axes", what + text)
+            if is_number and not {*names} & (OF_THE_ACTUATORS | WITHOUT_UNIT):
+                told = re.search(r"\[.+\]|unit of|As for|as for", text, re.DOTALL)
+                assert told or not names, f"{names}: {text}"
+
+
+@pytest.mark.parametrize("name", [n for n in PUBLIC if inspect.isclass(PUBLIC[n])])
+def test_reference_lists_every_class(name):
+    """Functions and classes of the rooms are listed from `__all__` by the pages' template."""
+    text = (DOCS / "api.rst").read_text(encoding="utf-8")
+    assert re.search(rf"^   {name.split('.')[0]}$", text, re.MULTILINE)
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
