@@ -5,7 +5,7 @@ OUT ?= results
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test bench check clean
+.PHONY: paper test bench check docs clean dist oldest
 
 paper: $(VENV)/.installed
 	$(BIN)/python -m hybridkin paper --out $(OUT)
@@ -21,6 +21,17 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+dist: $(VENV)/.installed
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/python -m twine check --strict dist/*
+
+oldest:
+	.ci/oldest
+
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -W --keep-going -n -b html docs docs/_build/html
+
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -32,5 +43,9 @@ $(VENV)/.bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable ".[bench]"
 	touch $@
 
+$(VENV)/.docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --editable ".[docs]"
+	touch $@
+
 clean:
-	rm -rf $(VENV) $(OUT)
+	rm -rf $(VENV) $(OUT) build dist

@@ -12,10 +12,11 @@ It needs dask (``pip install "hybridkin[dask]"``); without it this example says 
 import copy
 import time
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from hybridkin import ELMRegressor, plots, robots
+from hybridkin import ELMRegressor, robots
 
 try:
     from dask.distributed import Client, LocalCluster
@@ -149,7 +150,9 @@ def compare(cluster, client, blocks=BLOCKS, n_rows=N_ROWS):
 
 def draw(tree, curve, seconds):
     """Return the figure: error against rows seen, and the time of one and of two workers."""
-    figure, axes = plots.new_figure(9.0, 3.8, 1, 2, width_ratios=(2.2, 1))
+    figure, axes = plt.subplots(
+        1, 2, figsize=(9.0, 3.8), layout="constrained", width_ratios=(2.2, 1)
+    )
     rows, n_features = curve[:, 0], NETWORK["n_hidden"] + 9 + 1
     law = NOISE * np.sqrt(3 * n_features / rows)
     axes[0].plot(rows, 1e3 * law, "--", color="0.6", label="noise alone, no penalty")
@@ -200,3 +203,4 @@ if __name__ == "__main__":  # each worker imports this file
             print(f"workers: {n_workers}; bounds {first:.1f} s, fit and merge {second:.1f} s")
         print(f"one merge: {1e3 * merge_time:.0f} ms, most of it to solve for the readout")
         figure = draw(tree, curve, seconds)
+        plt.show()

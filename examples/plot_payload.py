@@ -86,3 +86,4 @@ else:
     axes[1].set(xlabel="time [s]", ylabel="tip error [mm]", ylim=(0, None))
     axes[1].legend(frameon=False)
     figure.tight_layout()
+    plt.show()

@@ -9,6 +9,7 @@ by models that have not seen its motion. The recording is not part of the packag
 
 import warnings
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from joblib import Parallel, delayed
@@ -25,7 +26,6 @@ from hybridkin import (
     calibrate,
     datasets,
     fit_play,
-    plots,
 )
 
 RADII = np.full(3, 0.0045)
@@ -150,7 +150,9 @@ def draw(data, results):
     kinds[np.char.startswith(kinds, "tendon")] = "tendon"
     edges = np.flatnonzero(kinds[1:] != kinds[:-1]) + 1
     parts = np.split(np.arange(len(kinds)), edges)
-    figure, axes = plots.new_figure(8.0, 5.4, 2, sharex=True, sharey=True)
+    figure, axes = plt.subplots(
+        2, figsize=(8.0, 5.4), layout="constrained", sharex=True, sharey=True
+    )
     titles = ("Constant-curvature chain, calibrated", "Elastic chain, tendons that can only pull")
     for ax, error, title in zip(axes, errors, titles, strict=True):
         for part in parts[::2]:
@@ -182,3 +184,4 @@ except FileNotFoundError as missing:
     print(f"Skipped: {missing}")
 else:
     figure = draw(data, found["5 folds"])
+    plt.show()

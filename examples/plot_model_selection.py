@@ -1,0 +1,79 @@
+"""
+Choosing a model with scikit-learn
+==================================
+
+`HybridForwardModel` is a scikit-learn regressor: cross-validation, grid search, pipelines and
+``clone`` treat it like any other, and its calibration is done anew in every fold. The log of the
+**simulated** trunk holds single postures, no motions; here neighbouring postures make up a group,
+so that a model is examined on postures unlike those it has seen.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from sklearn.cluster import KMeans
+from sklearn.linear_model import LinearRegression
+from sklearn.metrics import make_scorer
+from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
+
+from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots
+
+data = datasets.load_trunk()
+rows = np.flatnonzero(data.part == 3)[:300]
+q, x = data.q[rows], data.x[rows]
+groups = KMeans(30, n_init=1, random_state=0).fit_predict(q)
+
+
+def mean_distance(x_true, x_predicted):
+    """Return the mean tip error [mm]."""
+    return 1e3 * np.linalg.norm(x_true - x_predicted, axis=1).mean()
+
+
+score = make_scorer(mean_distance, greater_is_better=False)
+folds = GroupKFold(3)
+
+# %%
+# Any regressor can be the error model. ``cross_val_score`` with groups judges the sum.
+
+chain = robots.bionic_handling_assistant()
+candidates = {
+    "mechanical": HybridForwardModel(chain, "drop", calibrate="default"),
+    "linear error": HybridForwardModel(chain, LinearRegression(), calibrate="default"),
+    "ELM error": HybridForwardModel(chain, calibrate="default", random_state=0),
+}
+for name, model in candidates.items():
+    errors = -cross_val_score(model, q, x, groups=groups, cv=folds, scoring=score)
+    print(f"{name}: {errors.mean():.1f} mm, folds {errors.min():.1f} to {errors.max():.1f}")
+
+# %%
+# A grid over the coupling and over parameters of the network within.
+
+model = HybridForwardModel(chain, ELMRegressor(random_state=0), calibrate="default")
+grid = {
+    "coupling": ["parallel", "serial"],
+    "error_model__n_hidden": [25, 100],
+    "error_model__alpha": np.geomspace(1e-4, 10.0, 4),
+}
+search = GridSearchCV(model, grid, cv=folds, scoring=score).fit(q, x, groups=groups)
+print("best:", search.best_params_, f"{-search.best_score_:.1f} mm")
+
+# %%
+# The penalty matters more than the size; where the error acts matters most.
+
+results = search.cv_results_
+coupling = np.array(results["param_coupling"], dtype=str)
+size = np.array(results["param_error_model__n_hidden"], dtype=int)
+alpha = np.array(results["param_error_model__alpha"], dtype=float)
+figure, ax = plt.subplots(figsize=(8, 4.4), layout="constrained")
+for where, color in (("parallel", "#E69F00"), ("serial", "#0072B2")):
+    for n_hidden, style in ((25, "o--"), (100, "s-")):
+        some = (coupling == where) & (size == n_hidden)
+        mean, spread = -results["mean_test_score"][some], results["std_test_score"][some]
+        ax.plot(alpha[some], mean, style, color=color, label=f"{where}, {n_hidden} neurons")
+        if n_hidden == 100:
+            ax.fill_between(
+                alpha[some], mean - spread, mean + spread, color=color, alpha=0.15, linewidth=0
+            )
+ax.set(xscale="log", xlabel="penalty of the network", ylabel="mean tip error, groups left out [mm]")
+ax.legend(frameon=False)
+ax.set_ylim(bottom=0)
+plt.show()
