@@ -1,7 +1,8 @@
-"""Error models that are readouts of features of the actuators: at the tip, or inside the robot."""
+"""Error models that are readouts of features, at the tip or inside the robot; and blends."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 
 from hybridkin._arc_chain import ArcChain
 from hybridkin._features import Features, HiddenFeatures, QuadraticFeatures
-from hybridkin._hybrid_modules import SerialHybridModule
+from hybridkin._hybrid_modules import BlendModule, HybridModule, SerialHybridModule
 from hybridkin._linearised import Pair
 from hybridkin._pose_features import PoseFeatures
 from hybridkin._serial_fit import SerialFit, fit_serial
@@ -19,7 +20,7 @@ from hybridkin.elm import ELMRegressor, draw_layer
 from hybridkin.elm_cv import ELMRegressorCV
 from hybridkin.guards import fit_guard
 
-__all__ = ["COUPLINGS", "READOUTS", "Readout", "fit_coupled"]
+__all__ = ["COUPLINGS", "READOUTS", "Blend", "Readout", "blended", "fit_coupled"]
 
 COUPLINGS = {"parallel": "tip", "serial": "coordinates"}
 """Where the error acts, by the name of the coupling."""
@@ -33,6 +34,22 @@ class Readout(NamedTuple):
 
     kind: str
     alphas: Pair | None = None
+
+
+class Blend(NamedTuple):
+    """Several error models, the hybrids of which are averaged."""
+
+    weights: tuple[float, ...]
+    error_models: tuple[Any, ...]
+
+
+def blended(weights: Sequence[float], fits: Sequence[tuple[Any, HybridModule]]) -> tuple[Any, Any]:
+    """Return error model and module of the weighted mean of fitted hybrids; of one these as is."""
+    if len(fits) == 1:
+        return fits[0]
+    models, modules = zip(*fits, strict=True)
+    shares = torch.tensor(weights, dtype=torch.float64)
+    return Blend(tuple(weights), models), BlendModule(modules, shares)
 
 
 def fit_coupled(
@@ -101,6 +118,11 @@ def _features(error_model: Any, mechanical: Any, q: Tensor) -> tuple[Features, P
             n_hidden=int(np.max(error_model.n_hidden)),
             activation=error_model.activation,
             random_state=error_model.random_state,
+        )
+    if np.ndim(params.alpha):
+        raise ValueError(
+            "`alpha` of the error model must be one number where it acts inside the robot, got "
+            f"{params.alpha!r}: no output of its own belongs to a coordinate there."
         )
     layer = draw_layer(params, q.numpy(), None)
     features = HiddenFeatures.of_range(

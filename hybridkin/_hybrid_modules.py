@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -16,7 +21,10 @@ from hybridkin._realtime import NumpyFunction, by_torch, numpy_function
 from hybridkin._serial import SerialModule
 from hybridkin.guards import Guard, LeverageGuard
 
-__all__ = ["HybridModule", "SerialHybridModule"]
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["BlendModule", "HybridModule", "SerialHybridModule"]
 
 
 class HybridModule(nn.Module):
@@ -116,6 +124,13 @@ class HybridModule(nn.Module):
         outside = None if guard is None else (~self.in_domain(q)).nonzero()[:, 0]
         return *forward_and_jacobian(self.error, q), outside
 
+    def with_drift(self, drift: AffineModule | None) -> Self:
+        """Return the same with another drift; this one stays as it is."""
+        module = copy.copy(self)
+        module._modules = dict(self._modules)
+        module.drift = drift
+        return module
+
     def numpy_function(self) -> NumpyFunction:
         """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n).
 
@@ -201,6 +216,71 @@ class SerialHybridModule(HybridModule):
     def numpy_function(self) -> NumpyFunction:
         """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
         return by_torch(self)
+
+
+class BlendModule(HybridModule):
+    """The weighted mean of several hybrids over one mechanical model, as a torch module.
+
+    Parameters
+    ----------
+    parts : sequence of HybridModule
+        Each with the same mechanical model.
+    weights : Tensor of shape (K,)
+        Sum to one.
+    drift : AffineModule or None
+        As for `HybridModule`; every part's guard weighs its share of it.
+    """
+
+    weights: Tensor
+
+    def __init__(
+        self, parts: Sequence[HybridModule], weights: Tensor, drift: AffineModule | None = None
+    ) -> None:
+        super().__init__(parts[0].mechanical, None, None, drift)
+        self.parts = nn.ModuleList(parts)
+        self.register_buffer("weights", weights)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return x of shape (..., m) [m]."""
+        return self._mean(q, lambda part: part(q))
+
+    def error_part(self, q: Tensor) -> Tensor:
+        """Return what is added to f_mech(q), shape (..., m) [m]."""
+        return self._mean(q, lambda part: part.error_part(q))
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        x, J = zip(*(part._forward_and_jacobian(q) for part in self._shown()), strict=True)
+        weights = self.weights.to(q)
+        return torch.tensordot(weights, torch.stack(x), 1), torch.tensordot(
+            weights, torch.stack(J), 1
+        )
+
+    def numpy_function(self) -> NumpyFunction:
+        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
+        weights = self.weights.cpu().numpy()
+        functions = [part.numpy_function() for part in self._shown()]
+
+        def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
+            x, J = zip(*(function(q) for function in functions), strict=True)
+            return np.tensordot(weights, x, 1), np.tensordot(weights, J, 1)
+
+        return tip_and_jacobian
+
+    def error_weight(self, q: Tensor) -> Tensor:
+        """Return the mean weight w(q) of the error models, shape (...)."""
+        return self._mean(q, lambda part: part.error_weight(q))
+
+    def in_domain(self, q: Tensor) -> Tensor:
+        """Return whether all error models are fully trusted, shape (...), bool."""
+        return torch.stack([part.in_domain(q) for part in self._shown()]).all(0)
+
+    def _shown(self) -> list[HybridModule]:
+        parts: list[Any] = [*self.parts]
+        return [part.with_drift(self.drift) for part in parts]
+
+    def _mean(self, q: Tensor, function: Callable[[HybridModule], Tensor]) -> Tensor:
+        values = torch.stack([function(part) for part in self._shown()])
+        return torch.tensordot(self.weights.to(q), values, 1)
 
 
 def _weighed(x: Tensor, J: Tensor, weight: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:

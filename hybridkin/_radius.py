@@ -51,7 +51,7 @@ def conformal_radius(
         part: Any = clone(model)
         given = {"sample_weight": weights, "groups": groups}
         given = {name: np.asarray(v)[train] for name, v in given.items() if v is not None}
-        part.set_params(coverage=None).fit(X[train], y[train], **given)
+        part.set_params(coverage=None, play=None).fit(X[train], y[train], **given)
         trust[test] = part.error_weight(X[test])
         errors[test] = _distance(part.predict(X[test]), y[test])
         mechanical[test] = _distance(part.predict_mechanical(X[test]), y[test])

@@ -52,10 +52,18 @@ class Tracker:
     """
 
     def __init__(
-        self, law: Law, rates: _Rates, q: Tensor, target: Tensor, feedback: Any, as_numpy: bool
+        self,
+        law: Law,
+        rates: _Rates,
+        q: Tensor,
+        target: Tensor,
+        feedback: str | None,
+        memory: float | None,
+        as_numpy: bool,
     ) -> None:
         self._law, self._rates, self._feedback, self._as_numpy = law, rates, feedback, as_numpy
-        self._q, self._target = q, target
+        self._q, self._target, self._memory = q, target, memory
+        self._missed: Any = 0.0  # by the model, at the last reading or what is left of it
         no = torch.zeros(1, dtype=torch.bool, device=q.device)
         self._held, self._damped = no, no
 
@@ -73,7 +81,7 @@ class Tracker:
         x_next : array-like of shape (3,)
             The point of the next tick [m]; the difference to the present one is the feed-forward.
         x_measured : array-like of shape (3,), optional
-            Tip measured at `q` [m], needed for feedback="measured"; NaN counts as no reading.
+            Tip measured at `q` [m], needed for feedback="measured"; NaN is no reading.
         period : float, optional
             Time to the next tick [s]. Default: `dt`.
 
@@ -111,14 +119,24 @@ class Tracker:
         look = _Look(self._q, x, seen, gram.sigma_min, self._held, self._damped)
         goal = self._target if goal is None else goal
         e = task.difference(seen if self._feedback == "measured" else x, self._target)
+        error = e.norm(dim=-1)
         v = _known(task.difference(self._target, goal))
         gain, beta, seconds = self._rates(period)
+        if self._memory is not None:
+            e = self._remembered(e, task.difference(x, self._target), seconds, self._memory)
         if self._feedback is not None:
             v = v + gain * _known(e)
         move = law.advance(self._q, J, v, beta, seconds)
         self._q, self._target = self._q + move.dq, goal
         self._held, self._damped = move.saturated.any(-1), move.damping > 0.0
-        return look, e.norm(dim=-1), move
+        return look, error, move
+
+    def _remembered(self, e: Tensor, e_model: Tensor, seconds: float, memory: float) -> Tensor:
+        """Return the error by the reading, or by the model moved as far as the last one told."""
+        seen = torch.isfinite(e).all(-1, keepdim=True)
+        missed = _known(torch.where(seen, e_model - e, self._missed))
+        self._missed = math.exp(-seconds / memory) * missed
+        return torch.where(seen, e, e_model - missed)
 
     def follow(
         self,

@@ -18,24 +18,24 @@ from sklearn.utils.validation import (
 )
 from torch import Tensor, nn
 
-from hybridkin._auto import choose
-from hybridkin._couplings import COUPLINGS, READOUTS, Readout, fit_coupled
+from hybridkin._auto import choose, choose_mechanics, rivals
+from hybridkin._couplings import blended, fit_coupled
 from hybridkin._drift import Drift
 from hybridkin._error_modules import error_module
 from hybridkin._hybrid_modules import HybridModule
-from hybridkin._pose_hybrid import PoseHybridModule, check_pose_settings, pose_errors
+from hybridkin._hybrid_settings import NAMED, check_settings
+from hybridkin._play_of import play_of
+from hybridkin._pose_hybrid import PoseHybridModule, pose_errors
 from hybridkin._radius import Radius, conformal_radius
 from hybridkin._realtime import NumpyFunction
 from hybridkin.calibration import CalibrationResult, calibrate
 from hybridkin.elm import ELMRegressor
-from hybridkin.elm_cv import ELMRegressorCV
-from hybridkin.guards import GUARDS, fit_guard
+from hybridkin.guards import fit_guard
+from hybridkin.play import PlayState
 
 __all__ = ["HybridForwardModel"]
 
 _BLOCK = 65536
-_HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)
-_NAMED = (str, Readout)
 
 
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -55,8 +55,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         and other parts penalised apart by errors on rows, or groups, left out, down to no
         correction at all; "drop" is the mechanical model alone. None is
         ``ELMRegressor()``, with serial coupling "quadratic". "auto" tries these in
-        both couplings, an `ELMRegressorCV` and, up to 2000 rows, kernel ridge, and takes what errs
-        least on groups, or rows, left out. Let the groups be what will be new at work.
+        both couplings, an `ELMRegressorCV` and, up to 2000 rows, kernel ridge, and takes the blend
+        of them that errs least on groups, or rows, left out. Where tendons of a
+        `ConstantCurvatureChain` contradict each other and its geometry is calibrated, it tries an
+        `ElasticTendonChain` first. Let the groups be what will be new at work.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
         the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q
@@ -71,6 +73,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         the error model's features, as these are to each other; "box": within the training range;
         None: everywhere. Beyond, eps fades out and f_mech remains. With a guard f_hyb is nowhere
         farther from f_mech than 1.5 times the longest correction of a training row.
+    play : float, array-like of shape (n,) or "auto", optional
+        Play of the actuators, backlash and dry friction [unit of q]: rows are taken as commands in
+        the order of time, and the model is one of what they do, see `PlayOperator`. "auto" takes
+        the width with which an `ELMRegressorCV` errs least on motions left out, or none. Each group
+        starts without a past; the inverse kinematics finds what the actuators are to do, and
+        ``play_.command`` what to send for it. Default: no play, rows in any order.
     coverage : float, optional
         Share of tips, 0.9 for example, that shall lie within the radius of
         ``predict(Q, return_radius=True)``. It costs five more fits, each with a fifth of the
@@ -90,16 +98,20 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -> tip position, with ``pose``, ``pose_jacobian`` and ``tip_transform`` as well.
     mechanical_model_ : nn.Module or None
         The mechanical part, calibrated when asked.
-    error_model_ : estimator, SerialFit or None
-        The fitted error model. Of serial coupling, "linear" and "quadratic" it tells the
-        ``alphas`` chosen and the ``residual`` of every row from a fit without it or its group [m].
+    error_model_ : estimator, SerialFit, Blend or None
+        The fitted error model; of a blend its ``weights`` and ``error_models``. Of serial
+        coupling, "linear" and "quadratic" it tells the ``alphas`` chosen and the ``residual`` of
+        every row from a fit without it or its group [m].
     cv_results_ : dict or None
-        Of error_model="auto": by candidate the mean distance on rows left out, its spread over the
-        folds [m] and the CPU time [s]; the smallest is ``chosen``. As a choice among several by
-        these very rows it is a little optimistic, and new motions that resemble none in the log
-        are harder than those left out.
+        Of error_model="auto": by candidate, the last of which is the blend, the mean distance on
+        rows left out, its spread over the folds [m] and the CPU time [s]; the ``weights`` of the
+        blend, what is ``chosen`` ("blend", or the only one of weight), and how the mechanical
+        models did (``mechanical_model``). A blend is judged by weights that do not know the fold.
+        New motions that resemble none in the log are harder than those left out.
     calibration_ : CalibrationResult or None
         What the calibration found.
+    play_ : PlayOperator or None
+        The play; None where there is none, and where "auto" found none worth its while.
     radius_ : Radius or None
         Where a coverage was asked for: the radii ``inside`` and ``outside`` the domain [m].
     n_features_in_ : int
@@ -131,6 +143,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         coupling: str = "parallel",
         calibrate: Sequence[str] | str = (),
         guard: str | None = "leverage",
+        play: ArrayLike | str | None = None,
         coverage: float | None = None,
         output: str = "position",
         random_state: int | np.random.RandomState | None = None,
@@ -140,6 +153,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.coupling = coupling
         self.calibrate = calibrate
         self.guard = guard
+        self.play = play
         self.coverage = coverage
         self.output = output
         self.random_state = random_state
@@ -189,7 +203,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Where tendons of a ConstantCurvatureChain contradict each other, as slack does; so do
             `predict` and the Jacobians.
         """
-        self._check_settings()
+        check_settings(self)
         X, y = validate_data(self, X, y=y, multi_output=True, dtype=[np.float64, np.float32])
         y = np.asarray(y, dtype=np.float64)
         weights = None
@@ -197,46 +211,46 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             weights = _check_sample_weight(
                 sample_weight, X, dtype=np.float64, ensure_non_negative=True
             )
-        q = torch.from_numpy(X.astype(np.float64))
         mechanical: Any = copy.deepcopy(self.mechanical_model)
         if hasattr(mechanical, "check_actuators"):
-            mechanical.check_actuators(q, "X")
-        self.calibration_: CalibrationResult | None = None
-        build = PoseHybridModule if self.output == "pose" else HybridModule
+            mechanical.check_actuators(torch.from_numpy(X), "X")
         names = self.calibrate
         if isinstance(names, str) and names == "default":
             names = getattr(mechanical, "default_parameters", ())
-        if mechanical is not None and len(names):
+        names = () if mechanical is None else tuple(names)
+        mechanics, counts = None, np.ones(len(X)) if weights is None else weights
+        if isinstance(self.error_model, str) and self.error_model == "auto":
+            candidates = rivals(mechanical, names, X)
+            mechanics = choose_mechanics(self, candidates, X, y, counts, groups)
+            mechanical, names = copy.deepcopy(mechanics.model), mechanics.names
+        self.play_ = play_of(self.play, mechanical, names, X, y, weights, groups)
+        self._play_state: PlayState | None = None
+        if self.play_ is not None:
+            X = self._effective(X, groups)
+            if mechanics is not None:
+                again = choose_mechanics(self, [(mechanical, names)], X, y, counts, groups)
+                mechanics = again._replace(scores=mechanics.scores | again.scores)
+        q = torch.from_numpy(X.astype(np.float64))
+        self.calibration_: CalibrationResult | None = None
+        if len(names):
             tips = y.reshape(len(y), -1)[:, :3] if self.output == "pose" else y
+            held_out = groups if mechanics is None else None  # else it has been done
             self.calibration_ = calibrate(
-                mechanical, q, torch.from_numpy(tips), names, groups=groups, sample_weight=weights
+                mechanical, q, torch.from_numpy(tips), names, groups=held_out, sample_weight=weights
             )
             mechanical = self.calibration_.chain
         else:
             _warn_contradictory(mechanical, q)
         self.mechanical_model_ = mechanical
-        error = self._errors(q, y)
-        coupling, model = self.coupling, self.error_model
-        if model is None:
-            model = self._default_error_model()
         self.cv_results_ = None
-        if isinstance(model, str) and model == "auto":
-            coupling, model, self.cv_results_ = choose(self, mechanical, X, y, weights, groups)
-        if isinstance(model, str) and model == "drop":
-            self.error_model_, self.module_ = None, build(mechanical, None)
-        elif mechanical is not None and (coupling == "serial" or isinstance(model, _NAMED)):
-            tips = torch.from_numpy(y.reshape(len(y), -1))
-            self.error_model_, self.module_ = fit_coupled(
-                model, coupling, mechanical, q, tips, weights, groups, self.guard
-            )
+        if mechanics is None:
+            model = self._default_error_model() if self.error_model is None else self.error_model
+            found = self._learned(self.coupling, model, X, y, weights, groups)
         else:
-            self.error_model_ = _fit_regressor(clone(model), X, error, weights, groups)
-            error_part = error_module(self.error_model_, q)
-            kept = q if weights is None else q[torch.from_numpy(weights > 0)]
-            guard = None  # without a mechanical model there is nothing to fall back on
-            if mechanical is not None:
-                guard = fit_guard(self.guard, error_part, kept)
-            self.module_ = build(mechanical, error_part, guard)
+            parts, self.cv_results_ = choose(self, mechanical, mechanics, X, y, counts, groups)
+            fits = [self._learned(*part[1:], X, y, weights, groups) for part in parts]
+            found = blended([part.weight for part in parts], fits)
+        self.error_model_, self.module_ = found
         self._single_output = y.ndim == 1
         n_outputs = 1 if y.ndim == 1 else y.shape[1]
         self._drift = Drift.of_range(q.amin(0).numpy(), q.amax(0).numpy(), n_outputs)
@@ -291,27 +305,29 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X, y = validate_data(
             self, X, y=y, multi_output=True, dtype=[np.float64, np.float32], reset=False
         )
+        if self.play_ is not None:
+            X, self._play_state = self.play_.apply(X, self._play_state)
         q, y = torch.from_numpy(X.astype(np.float64)), np.asarray(y, dtype=np.float64)
         weights = _check_sample_weight(sample_weight, X, dtype=np.float64, ensure_non_negative=True)
-        module = copy.copy(self.module_)  # what was handed out before stays as it was
-        module._modules = {**self.module_._modules, "drift": None}
         with torch.no_grad():
             error = self._errors(q, y).reshape(len(y), -1)
-            residual = error - module.error_part(q).numpy()
+            residual = error - self.module_.with_drift(None).error_part(q).numpy()
         self._drift = self._drift.learned(q.numpy(), residual, weights, decay)
-        module.drift = self._drift.correction(alpha)
-        self.module_ = module
+        # What was handed out before stays as it was.
+        self.module_ = self.module_.with_drift(self._drift.correction(alpha))
         return self
 
-    def predict(self, X: Any, return_radius: bool = False) -> Any:
+    def predict(self, X: Any, return_radius: bool = False, groups: ArrayLike | None = None) -> Any:
         """Return tip positions f_mech(q) + w(q) eps(q).
 
         Parameters
         ----------
         X : array-like of shape (N, n)
-            Actuator vectors.
+            Actuator vectors; with `play` those of a motion in the order of time.
         return_radius : bool, default=False
             Whether to return how far off the tips may be as well; needs `coverage`.
+        groups : array-like of shape (N,), optional
+            Motion of every row, which matters with `play` alone. Default: one motion.
 
         Returns
         -------
@@ -322,34 +338,39 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             those of the fit; wider where the error model is not trusted.
         """
         if not return_radius:
-            return self._by_blocks(lambda module, q: (module(q),), X)[0]
+            return self._by_blocks(lambda module, q: (module(q),), X, groups)[0]
         check_is_fitted(self)
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9)."
             )
-        x, weight = self._by_blocks(lambda module, q: (module(q), module.error_weight(q)), X)
+        both = self._by_blocks(lambda module, q: (module(q), module.error_weight(q)), X, groups)
+        x, weight = both
         return x, self.radius_.at(weight.astype(np.float64)).astype(x.dtype)
 
-    def predict_mechanical(self, X: Any) -> NDArray:
+    def predict_mechanical(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
-        return self._by_blocks(lambda module, q: (module.mechanical_part(q),), X)[0]
+        return self._by_blocks(lambda module, q: (module.mechanical_part(q),), X, groups)[0]
 
-    def predict_error(self, X: Any) -> NDArray:
+    def predict_error(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
-        return self._by_blocks(lambda module, q: (module.error_part(q),), X, mechanical=False)[0]
+        return self._by_blocks(
+            lambda module, q: (module.error_part(q),), X, groups, mechanical=False
+        )[0]
 
-    def jacobian(self, X: Any) -> NDArray:
+    def jacobian(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
         Of poses the last three rows give the angular velocity in the measuring frame.
         """
-        return self._by_blocks(lambda module, q: (module.jacobian(q),), X)[0]
+        return self._by_blocks(lambda module, q: (module.jacobian(q),), X, groups)[0]
 
-    def predict_and_jacobian(self, X: Any) -> tuple[NDArray, NDArray]:
+    def predict_and_jacobian(
+        self, X: Any, groups: ArrayLike | None = None
+    ) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
-        x, J = self._by_blocks(lambda module, q: module.forward_and_jacobian(q), X)
+        x, J = self._by_blocks(lambda module, q: module.forward_and_jacobian(q), X, groups)
         return x, J
 
     def numpy_function(self) -> NumpyFunction:
@@ -363,13 +384,17 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         return self._rows().numpy_function()
 
-    def in_domain(self, X: Any) -> NDArray[np.bool_]:
+    def in_domain(self, X: Any, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
-        return self._by_blocks(lambda module, q: (module.in_domain(q),), X, mechanical=False)[0]
+        return self._by_blocks(
+            lambda module, q: (module.in_domain(q),), X, groups, mechanical=False
+        )[0]
 
-    def error_weight(self, X: Any) -> NDArray:
+    def error_weight(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
-        return self._by_blocks(lambda module, q: (module.error_weight(q),), X, mechanical=False)[0]
+        return self._by_blocks(
+            lambda module, q: (module.error_weight(q),), X, groups, mechanical=False
+        )[0]
 
     def _errors(self, q: Tensor, y: NDArray) -> NDArray:
         """Return what the mechanical model lacks to y, in the rows that an error model learns."""
@@ -396,10 +421,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         function: Callable[[Any, Tensor], tuple[Tensor, ...]],
         X: Any,
+        groups: Any,
         mechanical: bool = True,
     ) -> list[NDArray]:
         module = self._rows()
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
+        X = self._effective(X, groups)
         if mechanical:
             _warn_contradictory(self.mechanical_model_, torch.from_numpy(X.astype(np.float64)))
         blocks = []
@@ -415,49 +442,36 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             results.append(array[:, 0] if self._single_output and array.ndim > 1 else array)
         return results
 
+    def _learned(
+        self, coupling: str, model: Any, X: NDArray, y: NDArray, weights: Any, groups: Any
+    ) -> tuple[Any, Any]:
+        """Return the error model fitted to what the mechanical model lacks, and the hybrid."""
+        q, mechanical = torch.from_numpy(X.astype(np.float64)), self.mechanical_model_
+        build = PoseHybridModule if self.output == "pose" else HybridModule
+        error = self._errors(q, y)
+        if isinstance(model, str) and model == "drop":
+            return None, build(mechanical, None)
+        if mechanical is not None and (coupling == "serial" or isinstance(model, NAMED)):
+            tips = torch.from_numpy(y.reshape(len(y), -1))
+            return fit_coupled(model, coupling, mechanical, q, tips, weights, groups, self.guard)
+        fitted = _fit_regressor(clone(model), X, error, weights, groups)
+        error_part = error_module(fitted, q)
+        kept = q if weights is None else q[torch.from_numpy(weights > 0)]
+        guard = None  # without a mechanical model there is nothing to fall back on
+        if mechanical is not None:
+            guard = fit_guard(self.guard, error_part, kept)
+        return fitted, build(mechanical, error_part, guard)
+
+    def _effective(self, X: NDArray, groups: Any) -> NDArray:
+        """Return what the actuators do, where there is play."""
+        if self.play_ is None or not len(X):
+            return X
+        return self.play_.apply_by_group(X, np.zeros(len(X)) if groups is None else groups)
+
     def _default_error_model(self) -> Any:
         if self.coupling == "serial":
             return "quadratic"
         return ELMRegressor(random_state=self.random_state)
-
-    def _check_settings(self) -> None:
-        if self.coupling not in COUPLINGS:
-            raise ValueError(f"`coupling` must be one of {[*COUPLINGS]}, got {self.coupling!r}.")
-        if self.coverage is not None and not 0.0 < self.coverage < 1.0:
-            raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {self.coverage!r}.")
-        if self.output not in ("position", "pose"):
-            raise ValueError(f"`output` must be 'position' or 'pose', got {self.output!r}.")
-        if self.output == "pose":
-            check_pose_settings(self)
-        if self.guard not in GUARDS:
-            raise ValueError(f"`guard` must be one of {GUARDS}, got {self.guard!r}.")
-        named, names = isinstance(self.error_model, _NAMED), ("auto", "drop", *READOUTS)
-        if isinstance(self.error_model, str) and self.error_model not in names:
-            raise ValueError(
-                f"`error_model` must be an estimator, None or one of {[*names]}, got "
-                f"{self.error_model!r}."
-            )
-        serial = self.coupling == "serial" and self.error_model != "drop"
-        if serial and not (
-            named or self.error_model is None or isinstance(self.error_model, _HIDDEN_LAYERS)
-        ):
-            raise TypeError(
-                f"`error_model` must give features that can act inside the robot with "
-                f"coupling='serial': None, one of {[*READOUTS]}, an ELMRegressor or an "
-                f"ELMRegressorCV, got {type(self.error_model).__name__}; use coupling='parallel'."
-            )
-        if self.mechanical_model is None:
-            if named or serial:
-                raise ValueError(
-                    f"`mechanical_model` must be given with coupling={self.coupling!r} and "
-                    f"error_model={self.error_model!r}: the error is that of a mechanical model. "
-                    "For the data alone give an estimator as `error_model`."
-                )
-        elif not isinstance(self.mechanical_model, nn.Module):
-            raise TypeError(
-                "`mechanical_model` must be a torch module q -> x or None, got "
-                f"{type(self.mechanical_model).__name__}; wrap a function in an nn.Module."
-            )
 
 
 def _fit_regressor(

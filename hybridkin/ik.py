@@ -336,6 +336,7 @@ class InverseKinematics:
         q0: Any = None,
         plant: Callable[[Any], Any] | None = None,
         feedback: str | None = "model",
+        memory: float | None = None,
         tol: float = 1e-4,
         progress: Callable[[int, int], None] | None = None,
     ) -> Track:
@@ -359,6 +360,10 @@ class InverseKinematics:
         feedback : {"model", "measured"} or None, default="model"
             Where the error comes from: the model's tip (with a plant: the paper's feed-forward
             control), the measured tip, or nowhere.
+        memory : float, optional
+            For how long a reading counts where the next ones are missing (NaN) [s]: the model's tip
+            is moved by what it missed there, less by exp(-age / memory). Default: without a
+            reading the motion goes on by feed-forward.
         tol : float, default=1e-4
             Error up to which a point counts as CONVERGED [m].
         progress : callable, optional
@@ -386,7 +391,7 @@ class InverseKinematics:
                 f"`path` must have shape {self._shape('T')}, got {tuple(target.shape)}."
             )
         times, periods = self._times(t, target)
-        tracker = self._tracker(target[0], q0, feedback, tol, as_numpy)
+        tracker = self._tracker(target[0], q0, feedback, memory, tol, as_numpy)
         q, x, measured, sigma_min, held, damped = tracker.follow(target, periods, plant, progress)
         target = target.to(q)
         e_model, e = (self.task.difference(a, target) for a in (x, measured))
@@ -406,6 +411,7 @@ class InverseKinematics:
         q0: Any = None,
         *,
         feedback: str | None = "model",
+        memory: float | None = None,
         tol: float | Sequence[float] = 1e-4,
     ) -> Tracker:
         """Return what follows a path tick by tick, for a controller that is given it as it goes.
@@ -418,6 +424,8 @@ class InverseKinematics:
             Start. Default: solved for the first point.
         feedback : {"model", "measured"} or None, default="model"
             As for `track`; "measured" takes the tip with every tick.
+        memory : float, optional
+            As for `track` [s].
         tol : float or sequence of floats, default=1e-4
             For the start.
 
@@ -431,7 +439,7 @@ class InverseKinematics:
             raise ValueError(
                 f"`x_target` must have shape {self.task.shape}, got {tuple(target.shape)}."
             )
-        return self._tracker(target, q0, feedback, tol, is_numpy(x_target))
+        return self._tracker(target, q0, feedback, memory, tol, is_numpy(x_target))
 
     def controller(self, q0: Any, *, tol: float = 1e-4) -> Controller:
         """Return the law tick by tick in NumPy, for one robot at its control rate.
@@ -453,10 +461,21 @@ class InverseKinematics:
         return Controller(self, q0, tol=tol)
 
     def _tracker(
-        self, target: Tensor, q0: Any, feedback: str | None, tol: Any, as_numpy: bool
+        self,
+        target: Tensor,
+        q0: Any,
+        feedback: str | None,
+        memory: float | None,
+        tol: Any,
+        as_numpy: bool,
     ) -> Tracker:
         if feedback not in FEEDBACKS:
             raise ValueError(f'`feedback` must be "model", "measured" or None, got {feedback!r}.')
+        if memory is not None and not (memory > 0.0 and feedback == "measured"):
+            raise ValueError(
+                f'`memory` must be a positive time [s] with feedback="measured", got {memory!r} '
+                f"with feedback={feedback!r}."
+            )
         if q0 is None:
             q = as_tensor(self.solve(target, tol=tol).q, "q0")
         else:
@@ -464,7 +483,8 @@ class InverseKinematics:
             if q.ndim != 1:
                 raise ValueError(f"`q0` must have shape (n,), got {tuple(q.shape)}.")
         target = target.to(q.dtype)
-        return Tracker(self._law, self._rates, q[None], target[None], feedback, as_numpy)
+        parts = self._law, self._rates, q[None], target[None], feedback, memory, as_numpy
+        return Tracker(*parts)
 
     @property
     def _law(self) -> Law:

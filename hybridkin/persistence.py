@@ -13,12 +13,13 @@ import numpy as np
 import sklearn
 import torch
 from sklearn.utils.validation import check_is_fitted
-from torch import nn
 
 from hybridkin import __version__
+from hybridkin._couplings import Blend, blended
 from hybridkin._drift import Drift
 from hybridkin._error_modules import AffineModule
 from hybridkin._hybrid_modules import HybridModule, SerialHybridModule
+from hybridkin._hybrid_settings import check_settings
 from hybridkin._model_files import Arrays, Part, plain, read, read_header, write
 from hybridkin._model_parts import (
     CHAIN_KINDS,
@@ -44,6 +45,7 @@ from hybridkin._serial_fit import SerialFit
 from hybridkin.elm import ELMRegressor, device_named
 from hybridkin.guards import BoxGuard, LeverageGuard, QuadraticReadout
 from hybridkin.hybrid import HybridForwardModel
+from hybridkin.play import PlayOperator
 from hybridkin.rigid import RigidChain
 
 __all__ = ["load_model", "model_header", "save_model"]
@@ -238,6 +240,7 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
         "guard": model.guard,
         "coverage": model.coverage,
         "output": model.output,
+        "play": plain(model.play),
         "random_state": int(seed) if isinstance(seed, (int, np.integer)) else None,
         "error_model": store_setting(model.error_model),
         "radius": None if model.radius_ is None else plain(model.radius_._asdict()),
@@ -257,9 +260,18 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
                     f"{type(part).__name__}."
                 )
             header[key] = store_chain(part, arrays, f"{key}.")
-    header["error"] = store_error(model.error_model_, arrays, "error.")
-    header["fitted_guard"] = store_guard(model.module_.guard, arrays, "guard.")
-    header["domain"] = {"guard": header["fitted_guard"]}
+    error = model.error_model_
+    if isinstance(error, Blend):
+        fits = zip(error.weights, error.error_models, model.module_.parts, strict=True)
+        header["blend"] = [
+            {"weight": weight, **_store_fit(one, module, arrays, f"blend.{k}.")}
+            for k, (weight, one, module) in enumerate(fits)
+        ]
+    else:
+        header |= _store_fit(error, model.module_, arrays, "")
+    header["domain"] = {"guard": model.guard}
+    if model.play_ is not None:
+        arrays["play.width"] = model.play_.width
     if hasattr(model, "_drift"):
         arrays |= {f"drift.{name}": array for name, array in model._drift._asdict().items()}
         center, scale = model._drift.center, model._drift.scale
@@ -272,10 +284,20 @@ def _store_hybrid(model: HybridForwardModel, arrays: Arrays) -> dict[str, Any]:
     return header
 
 
+def _store_fit(error: Any, module: HybridModule, arrays: Arrays, prefix: str) -> dict[str, Any]:
+    """Return the header of an error model and of the guard that weighs it, and add their arrays."""
+    return {
+        "error": store_error(error, arrays, f"{prefix}error."),
+        "fitted_guard": store_guard(module.guard, arrays, f"{prefix}guard."),
+    }
+
+
 def _training(model: HybridForwardModel) -> dict[str, Any]:
     """Return what a fitted hybrid knows about its training, errors in metres."""
     said: dict[str, Any] = {}
     error: Any = model.error_model_
+    if isinstance(error, Blend):
+        error = error.error_models[0]
     if isinstance(error, SerialFit):
         squares = np.square(error.residual).sum(axis=1)
         said["rows"] = int(np.isfinite(squares).sum())
@@ -308,7 +330,11 @@ def _restored_hybrid(part: Part) -> HybridForwardModel:
     for chain in (mechanical, nominal):
         if chain is not None and chain.n_actuators != n:
             raise ValueError(f"a chain of {chain.n_actuators} actuators cannot take {n}")
-    error, error_module = restored_error(part.child("error"), mechanical, n)
+    entries = part.value("blend", (list, None), None)
+    blend = [Part(one, part.arrays, f"blend.{k}.") for k, one in enumerate(entries or [])]
+    output = part.value("output", str, "position")
+    fits = [_restored_fit(one, mechanical, n, output) for one in blend or [part]]
+    error, module = blended([one.value("weight", float) for one in blend], fits)
     names = part.header.get("calibrate")
     model = HybridForwardModel(
         nominal,
@@ -317,10 +343,11 @@ def _restored_hybrid(part: Part) -> HybridForwardModel:
         calibrate=names if isinstance(names, str) else tuple(part.names("calibrate")),
         guard=part.value("guard", (str, None)),
         coverage=part.value("coverage", (float, None), None),
-        output=part.value("output", str, "position"),
+        output=output,
+        play=part.value("play", (str, float, list, None), None),
         random_state=part.value("random_state", (int, None), None),
     )
-    model._check_settings()
+    check_settings(model)
     model.mechanical_model_, model.error_model_ = mechanical, error
     model.calibration_, model.radius_ = None, _restored_radius(part)
     model.cv_results_ = _restored_results(part)
@@ -328,26 +355,31 @@ def _restored_hybrid(part: Part) -> HybridForwardModel:
     if part.header.get("feature_names_in"):
         model.feature_names_in_ = feature_names(part, n)
     model._single_output = part.value("single_output", bool)
-    own = Part(part.header, part.arrays, "guard.")
-    guard = restored_guard(part.value("fitted_guard", (str, None)), own, error_module, n)
-    model.module_ = _module(model, mechanical, error_module, guard, None)
+    own = Part(part.header, part.arrays, "play.")
+    model.play_, model._play_state = None, None
+    if "width" in own:
+        width = own.array("width", (n,) if own.arrays["play.width"].ndim else ())
+        model.play_ = PlayOperator(width)
+    model.module_ = module
     with torch.no_grad():  # a file whose arrays do not fit together fails here, not in use
         x = model._rows().forward_and_jacobian(torch.ones(1, n, dtype=torch.float64))[0]
     if model._single_output and x.shape[1] != 1:
         raise ValueError(f"`single_output` must be false with {x.shape[1]} outputs")
     drift = _restored_drift(part, model, n, x.shape[1])
     if drift is not None:
-        model.module_ = _module(model, mechanical, error_module, guard, drift)
+        model.module_ = model.module_.with_drift(drift)
     return model
 
 
-def _module(
-    model: HybridForwardModel, mechanical: Any, error: nn.Module | None, guard: Any, drift: Any
-) -> Any:
-    if isinstance(error, SerialModule):
-        return SerialHybridModule(error, guard, drift)
-    build = PoseHybridModule if model.output == "pose" else HybridModule
-    return build(mechanical, error, guard, drift)
+def _restored_fit(part: Part, mechanical: Any, n: int, output: str) -> tuple[Any, Any]:
+    """Return the error model of a part and the hybrid of it, as `_store_fit` stored them."""
+    error, module = restored_error(part.child("error"), mechanical, n)
+    own = Part(part.header, part.arrays, f"{part.prefix}guard.")
+    guard = restored_guard(part.value("fitted_guard", (str, None)), own, module, n)
+    if isinstance(module, SerialModule):
+        return error, SerialHybridModule(module, guard)
+    build = PoseHybridModule if output == "pose" else HybridModule
+    return error, build(mechanical, module, guard)
 
 
 def _restored_drift(part: Part, model: HybridForwardModel, n: int, m: int) -> AffineModule | None:

@@ -199,6 +199,47 @@ class ElasticTendonChain(ArcChain):
         warn_millimetres("radii", radii, 1.0)
         warn_millimetres("lengths", self.lengths, 10.0)
 
+    @classmethod
+    def from_chain(cls, chain: Any, **options: Any) -> ElasticTendonChain:
+        """Return elastic tendons on the geometry of a plain chain with tendons.
+
+        Parameters
+        ----------
+        chain : ConstantCurvatureChain
+            With `lengths`; its `actuator_zeros` become the `tendon_zeros`.
+        **options
+            Further arguments, `bending_stiffness` for example.
+
+        Returns
+        -------
+        ElasticTendonChain
+            Which steers the same point.
+
+        Examples
+        --------
+        >>> from hybridkin import ConstantCurvatureChain, ElasticTendonChain
+        >>> plain = ConstantCurvatureChain([0.005], lengths=[0.1])
+        >>> ElasticTendonChain.from_chain(plain).lengths
+        tensor([0.1000], dtype=torch.float64)
+        """
+        if chain.lengths is None:
+            raise ValueError(
+                "`chain` must have `lengths`: the actuators of extensible segments are no tendons."
+            )
+        counts = chain.actuators_per_segment
+        geometry = {
+            "lengths": chain.lengths,
+            "n_tendons": counts,
+            "angles": [part.tolist() for part in chain.angles.split(counts)],
+            "routing": chain.routing,
+            "tendon_zeros": chain.actuator_zeros,
+            "rest_bends": chain.rest_bends,
+            "offsets": chain.offsets,
+            "base": chain.base,
+            "dtype": chain.radii.dtype,
+        }
+        return cls(chain.radii, **(geometry | options)).with_tip(chain.tip_at)
+
     @property
     def default_parameters(self) -> tuple[str, ...]:
         """The geometry that a calibration fits by default."""

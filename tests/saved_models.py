@@ -149,6 +149,8 @@ def models() -> dict[str, tuple[Any, Any]]:
             HybridForwardModel(None, small).fit(*trunk_log()[:2]),
             trunk_log()[0],
         ),
+        "blend": _hybrid("auto", calibrate=("radii",)),
+        "play": _hybrid("linear", play=[0.01, 0.02, 0.0]),
         "drift_and_radius": _drifting(),
         "rigid_hybrid": _rigid_hybrid(),
         "elastic_hybrid": _elastic_hybrid(),

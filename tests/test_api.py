@@ -20,6 +20,8 @@ ORDER = [
     "_model_files",
     "hybrid",
     "_auto",
+    "_hybrid_settings",
+    "_play_of",
     "_couplings",
     "_pose_hybrid",
     "_hybrid_modules",

@@ -174,6 +174,11 @@ def test_other_mechanical_models_take_the_error_on_q():
         (lambda: HybridForwardModel(bha(), Ridge(), coupling="serial"), TypeError, "inside the"),
         (lambda: HybridForwardModel(torch.nn.Linear(9, 3).double(), "pose"), TypeError, "of arcs"),
         (lambda: HybridForwardModel(None, "quadratic"), ValueError, "must be given with"),
+        (
+            lambda: HybridForwardModel(bha(), ELMRegressor(alpha=np.ones(3)), coupling="serial"),
+            ValueError,
+            "`alpha` of the error model must be one number",
+        ),
         (lambda: HybridForwardModel(None, coupling="serial"), ValueError, "must be given with"),
     ],
 )

@@ -161,12 +161,18 @@ def test_lines_and_motions_are_held_out_whole(recordings):
         assert not set(case.groups) & set(lines)
         assert not rows & {tuple(row) for row in np.rint(1e4 * held_out)}
     found = cases.motion_cases(recordings, None, 2)
-    assert [case.name for case in found] == ["plain chain"] * 7 + ["elastic tendons"] * 7
-    folds = [case for case in found[:7] if "5 folds" in case.tests]
+    assert [case.name for case in found] == ["plain chain"] * 10 + ["elastic tendons"] * 10
+    folds = [case for case in found[:10] if "5 folds" in case.tests]
     assert sum(len(case.tests["5 folds"][0]) for case in folds) == 24 * 6
     for case in folds:
         assert len(np.unique(case.groups)) + len(case.tests["5 folds"][0]) // 6 == 24
-    pairs, by_segment = found[5:7]
+    for case, held in zip(found[5:8], ("pair12", "pair13", "pair23"), strict=True):
+        groups = case.tests["a pair of segments left out"][2]
+        assert np.char.find(groups.astype(str), held).min() >= 0
+        assert len(groups) == 4 * 6
+        assert np.char.find(case.groups.astype(str), held).max() < 0
+    assert [case.in_time for case in found[:10]] == [True] * 9 + [False]
+    pairs, by_segment = found[8:10]
     np.testing.assert_array_equal(pairs.q, by_segment.q)
     assert set(by_segment.groups) == {"seg1", "seg2", "seg3"}
     assert np.char.find(pairs.groups.astype(str), "_seg").min() >= 0
@@ -179,8 +185,9 @@ def test_report_of_all_three(curves, one_plant, recordings, folder, tmp_path):
         20, 1, n_test=20, models=models[:-1], data_home=recordings, folder=folder
     )
     assert {e["case"] for e in outside} == {"trunk 1", "armlab_3cable"}
-    pairs = cases.motion_cases(recordings, 0.9, 2)[5]
-    motions = cases.examined(pairs._replace(calibrate=()), ("mechanical", "auto"))
+    pairs = cases.motion_cases(recordings, 0.9, 2)[8]
+    motions = cases.examined(pairs._replace(calibrate=()), ("mechanical", "auto", "auto, play"))
+    assert [entry["model"] for entry in motions] == ["mechanical", "auto", "auto, play"]
     assert 0.0 <= motions[-1]["errors"]["pairs from single segments"]["within"] <= 1.0
     report = hybrids_report(curves, outside, motions)
     paths = {path.name for path in report.write(tmp_path / "hybrids")}

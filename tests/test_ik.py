@@ -519,6 +519,50 @@ def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
     assert seeing.largest_step == np.abs(np.diff(seeing.q, axis=0)).max()
 
 
+def wrong_plant(q):
+    return CHAIN(torch.from_numpy(1.03 * q)).numpy() + 0.01
+
+
+def test_a_reading_counts_on_where_the_next_ones_are_missing():
+    path, calls = closed_path(30), []
+
+    def now_and_then(q):
+        calls.append(q)
+        return wrong_plant(q) if len(calls) % 20 == 1 else np.full(3, np.nan)
+
+    def error(**options):
+        calls.clear()
+        track = bha(dt=0.02).track(path, plant=now_and_then, feedback="measured", **options)
+        return np.linalg.norm(wrong_plant(track.q) - path, axis=1).mean()
+
+    assert error(memory=5.0) < 0.7 * error()
+    # Once forgotten, the model's own tip is what counts.
+    assert error(memory=1e-3) > 3.0 * error(memory=5.0)
+
+
+def test_without_any_reading_memory_goes_by_the_models_tip():
+    path = closed_path(30)
+
+    def blind(q):
+        return np.full(3, np.nan)
+
+    track = bha().track(path, plant=blind, feedback="measured", memory=1.0)
+    np.testing.assert_array_equal(track.q, bha().track(path).q)
+
+
+def test_what_is_remembered_fades():
+    ik, target, q = bha(dt=0.02), np.array([0.0, 0.0, 0.75]), np.full(9, 0.25)
+    offset, nothing = np.array([0.02, 0.0, 0.0]), np.full(3, np.nan)
+    for age in (0, 1, 5):
+        tracker = ik.tracker(target, q, feedback="measured", memory=0.1)
+        tracker.tick(target, CHAIN(torch.from_numpy(q)).numpy() + offset)
+        for _ in range(age):
+            tracker.tick(target, nothing)
+        moved = CHAIN(torch.from_numpy(tracker.q)).numpy() - target
+        # The model's tip goes to where the robot's would be right, and comes back with time.
+        np.testing.assert_allclose(moved, -np.exp(-0.02 * age / 0.1) * offset, atol=2e-3)
+
+
 def test_a_failing_plant_loses_only_its_own_point():
     calls = []
 
@@ -716,6 +760,8 @@ def test_bad_settings_say_what_was_needed(settings, message):
         (lambda ik: ik.track(np.zeros((2, 3)), [1.0, 1.0]), "increasing"),
         (lambda ik: ik.track(np.zeros((2, 3)), [0.0, 2.0]), "`beta` times the period"),
         (lambda ik: ik.track(np.zeros((2, 3)), feedback="measured"), "needs `plant`"),
+        (lambda ik: ik.track(np.zeros((2, 3)), memory=1.0), "`memory` must be a positive time"),
+        (lambda ik: ik.tracker(np.zeros(3), memory=-1.0), "`memory` must be a positive time"),
         (lambda ik: ik.track(np.zeros((2, 3)), feedback="tip"), "`feedback` must be"),
     ],
 )

@@ -35,6 +35,7 @@ PLANTS: dict[str, dict[str, Any]] = {
 """Arguments of `simulation.TrunkPlant` by name; the seed of a plant is its place."""
 
 RAW, CALIBRATED, PAPER, AUTO = "mechanical, raw", "mechanical", "parallel paper's ELM", "auto"
+AUTO_PLAY = "auto, play"
 DATA_ONLY = ("data, quadratic", "data, kernel")
 
 _CABLE_NOISE, _MOCAP_NOISE = 1e-3, 5e-4  # as the defaults of `make_trunk` [m]
@@ -53,8 +54,9 @@ class Case(NamedTuple):
     q: NDArray
     x: NDArray
     groups: NDArray | None
-    tests: dict[str, tuple[NDArray, NDArray]]
+    tests: dict[str, tuple[NDArray, ...]]  # q, x and, where there are motions, these
     coverage: float | None = None
+    in_time: bool = False  # whether the rows of a group are in the order of time
 
 
 @threadpool_limits.wrap(limits=1)  # CPU time is to be that of one thread
@@ -79,11 +81,13 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
     return entries
 
 
-def _errors(model: HybridForwardModel, q: NDArray, x: NDArray) -> dict[str, float]:
-    errors = distance(model.predict(q), x)
+def _errors(
+    model: HybridForwardModel, q: NDArray, x: NDArray, groups: NDArray | None = None
+) -> dict[str, float]:
+    errors = distance(model.predict(q, groups=groups), x)
     found = {"mean": float(errors.mean()), "max": float(errors.max()), "n_test": len(errors)}
     if model.coverage is not None:
-        radius = model.predict(q, return_radius=True)[1]
+        radius = model.predict(q, return_radius=True, groups=groups)[1]
         found |= {"within": float((errors <= radius).mean()), "radius": float(radius.mean())}
     return found
 
@@ -111,9 +115,11 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     for kind in READOUTS:
         free = partial(hybrid, kind, coupling="serial", guard=None)
         learners[f"serial {kind}, no guard"] = free
-    learners[AUTO] = lambda: HybridForwardModel(
-        case.chain, AUTO, calibrate=case.calibrate, coverage=case.coverage, random_state=seed
-    )
+    auto = partial(HybridForwardModel, case.chain, AUTO, calibrate=case.calibrate)
+    auto = partial(auto, coverage=case.coverage, random_state=seed)
+    learners[AUTO] = auto
+    if case.in_time:
+        learners[AUTO_PLAY] = partial(auto, play="auto", coverage=None)
     return learners
 
 
@@ -234,11 +240,16 @@ def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case
         "plain chain": (plain, ("base", "tool", "radii", "lengths")),
         "elastic tendons": (elastic, ("base", "tool", *stiff)),
     }
-    single, pair = (np.flatnonzero(np.char.find(data.groups, w) >= 0) for w in ("_seg", "_pair"))
-    folds = list(GroupKFold(5).split(data.q, groups=data.groups))
     families = np.array([label.split("_")[1] for label in data.groups])
+    single, pair = (np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair"))
+    folds = list(GroupKFold(5).split(data.q, groups=data.groups))
+    pairs = [
+        (np.flatnonzero(families != name), np.flatnonzero(families == name))
+        for name in np.unique(families[pair])
+    ]
     ways = {
         "5 folds": (folds, data.groups),
+        "a pair of segments left out": (pairs, data.groups),
         "pairs from single segments": ([(single, pair)], data.groups),
         "the same, groups being segments": ([(single, pair)], families),
     }
@@ -248,6 +259,9 @@ def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case
             for k, (train, test) in enumerate(splits):
                 rows = train[::thin]
                 part = data.q[rows], data.x[rows], groups[rows]
-                tests = {way: (data.q[test], data.x[test])}
-                cases.append(Case(name, k, chain, ("base",), parameters, *part, tests, coverage))
+                tests = {way: (data.q[test], data.x[test], data.groups[test])}
+                in_time = groups is data.groups
+                cases.append(
+                    Case(name, k, chain, ("base",), parameters, *part, tests, coverage, in_time)
+                )
     return cases

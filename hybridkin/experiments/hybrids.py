@@ -113,9 +113,10 @@ def held_out_motions(
 ) -> list[dict[str, Any]]:
     """Return the errors of all models on motions of ftdcr_v4 that they have not seen.
 
-    Whole motions in five folds; and the motions of two segments, learned from those of a single
-    one, groups being the motions, or the segments that move. Underneath: a constant-curvature
-    chain, and one of elastic tendons.
+    Whole motions in five folds; all motions of a pair of segments left out, three times; and the
+    motions of two segments, learned from those of a single one, groups being the motions, or the
+    segments that move. Underneath: a constant-curvature chain, and one of elastic tendons. "auto,
+    play" looks for play as well; its predictions know the motion so far.
 
     Parameters
     ----------
@@ -200,13 +201,13 @@ def hybrids_report(
             rows.append([model, *(f"{mean:.2f} ({largest:.1f})" for mean, _, largest in values)])
         report.table(["model", *(", ".join(case) for case in cases)], rows)
         report.text("What auto chose, what its own score promised, and the radius, in mm:")
-        report.table(_PROMISES, [_promise(entry) for entry in entries if entry["model"] == AUTO])
+        report.table(_PROMISES, [_promise(entry) for entry in entries if "promised" in entry])
     if outside:
         report.figure("hybrid_outside", _outside_figure(outside), "Tip error outside the range.")
     return report
 
 
-_PROMISES = ("case", "draw", "chosen", "promised", "got", "within the radius", "radius")
+_PROMISES = ("case", "draw", "model", "chosen", "promised", "got", "within the radius", "radius")
 
 
 def _promise(entry: dict[str, Any]) -> list[str]:
@@ -217,6 +218,7 @@ def _promise(entry: dict[str, Any]) -> list[str]:
     return [
         entry["case"],
         str(entry["draw"]),
+        entry["model"],
         entry["chosen"],
         *numbers,
         *["-"] * (4 - len(numbers)),

@@ -1,0 +1,136 @@
+"""Hybrid models of robots with play: what the past tells, and what it does not."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hybridkin import HybridForwardModel, InverseKinematics, PlayOperator, datasets, robots
+
+WIDTH = 0.02
+CHAIN = robots.bionic_handling_assistant()
+
+
+def tips(y):
+    """Return tips of effective lengths [m], with an error to be learned; simulated."""
+    with torch.no_grad():
+        bent = torch.from_numpy(y) + 0.03 * torch.from_numpy(y[:, ::-1] - 0.25).square()
+        return CHAIN(bent).numpy()
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Twelve motions, back and forth, of actuators with play."""
+    rng = np.random.default_rng(0)
+    time = np.linspace(0.0, 2.0 * np.pi, 40)
+    swing = rng.uniform(-0.05, 0.05, (12, 9, 2))
+    waves = np.stack([np.sin(time), np.sin(2.0 * time)])
+    q = 0.25 + (swing @ waves).transpose(0, 2, 1).reshape(-1, 9)
+    groups = np.repeat(np.arange(12), 40)
+    y = PlayOperator(WIDTH).apply_by_group(q, groups)
+    return q, tips(y) + 2e-4 * rng.standard_normal((len(q), 3)), groups
+
+
+def split(log):
+    test = log[2] >= 8
+    return [part[~test] for part in log], [part[test] for part in log]
+
+
+def rms(model, q, x, groups):
+    return np.sqrt(np.mean(np.sum((model.predict(q, groups=groups) - x) ** 2, axis=1)))
+
+
+@pytest.mark.parametrize("mechanical", [CHAIN, None])
+def test_the_width_is_found_and_used(log, mechanical):
+    train, test = split(log)
+    model = HybridForwardModel(mechanical, play="auto", random_state=0)
+    model.fit(*train[:2], groups=train[2])
+    assert abs(model.play_.width - WIDTH) < (0.05 if mechanical else 0.5) * WIDTH
+    without = HybridForwardModel(mechanical, random_state=0).fit(*train[:2], groups=train[2])
+    assert rms(model, *test) < (0.1 if mechanical else 0.6) * rms(without, *test)
+
+
+def test_a_given_play_is_that_of_the_operator(log):
+    train, (q, _, groups) = split(log)
+    model = HybridForwardModel(CHAIN, "quadratic", play=WIDTH).fit(*train[:2], groups=train[2])
+    y = PlayOperator(WIDTH).apply_by_group(q, groups)
+    still = HybridForwardModel(CHAIN, "quadratic")
+    still.fit(PlayOperator(WIDTH).apply_by_group(train[0], train[2]), train[1], groups=train[2])
+    assert_array_equal(model.predict(q, groups=groups), still.predict(y))
+    assert_array_equal(model.jacobian(q, groups=groups), still.jacobian(y))
+    assert_array_equal(model.predict_mechanical(q, groups=groups), still.predict_mechanical(y))
+    assert_array_equal(model.in_domain(q, groups=groups), still.in_domain(y))
+    one = model.predict(q[groups == 9])  # without groups: one motion
+    assert_array_equal(one, still.predict(y[groups == 9]))
+
+
+def test_no_play_is_found_where_there_is_none(log):
+    q, _, groups = log
+    x = tips(q) + 2e-4 * np.random.default_rng(1).standard_normal((len(q), 3))
+    model = HybridForwardModel(CHAIN, "linear", play="auto").fit(q, x, groups=groups)
+    assert model.play_ is None
+
+
+def test_commands_for_a_path(log):
+    q, x, groups = log
+    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=WIDTH)
+    model.fit(q, x, groups=groups)
+    turn = np.linspace(0.0, 4.0 * np.pi, 200)
+    path = np.stack([0.06 * np.cos(turn), 0.06 * np.sin(turn), np.full(200, 0.75)], axis=1)
+    y = InverseKinematics(model, q_min=0.18, q_max=0.32, dt=0.05).track(path).q
+    commands, _ = model.play_.command(y)
+    reached = [tips(PlayOperator(WIDTH).apply(q)[0]) for q in (commands, y)]
+    errors = [np.linalg.norm(x - path, axis=1).mean() for x in reached]
+    assert errors[0] < 1e-3
+    assert errors[1] > 5e-3  # what the play does where it is not made up for
+
+
+def test_measurements_go_on_where_the_last_ones_ended(log):
+    train, (q, x, _) = split(log)
+    payload = x + np.array([0.0, 0.0, -0.01])
+    models = [
+        HybridForwardModel(CHAIN, "quadratic", play=WIDTH).fit(*train[:2], groups=train[2])
+        for _ in range(2)
+    ]
+    models[0].partial_fit(q[:40], payload[:40])
+    for row, tip in zip(q[:40], payload[:40], strict=True):
+        models[1].partial_fit(row[None], tip[None])
+    assert_allclose(models[0].predict(q[:40]), models[1].predict(q[:40]), atol=1e-12)
+
+
+def test_with_auto_and_a_radius(log):
+    train, test = split(log)
+    model = HybridForwardModel(CHAIN, "auto", play="auto", coverage=0.9, random_state=0)
+    model.fit(*train[:2], groups=train[2])
+    q, x, groups = test
+    predicted, radius = model.predict(q, return_radius=True, groups=groups)
+    within = np.linalg.norm(predicted - x, axis=1) <= radius
+    assert 0.75 < within.mean() <= 1.0
+    assert rms(model, *test) < 1.5e-3
+
+
+def test_a_recording_with_friction():
+    try:
+        data = datasets.load_asl_trunk()
+    except FileNotFoundError as missing:
+        pytest.skip(str(missing))
+    late = np.isin(data.groups, np.unique(data.groups)[::4])
+    errors = []
+    for play in (None, "auto"):
+        model = HybridForwardModel(None, play=play, random_state=0)
+        model.fit(data.q[~late], data.x[~late], groups=data.groups[~late])
+        predicted = model.predict(data.q[late], groups=data.groups[late])
+        errors.append(np.linalg.norm(predicted - data.x[late], axis=1).mean())
+    assert model.play_.width > 0.0
+    assert errors[1] < 0.95 * errors[0]
+
+
+def test_clear_errors(log):
+    q, x, groups = log
+    with pytest.raises(ValueError, match="`width` must be"):
+        HybridForwardModel(CHAIN, play=-1.0).fit(q, x)
+    with pytest.raises(ValueError, match=r"`play` must be a width.*got 'some'"):
+        HybridForwardModel(CHAIN, play="some").fit(q, x)
+    model = HybridForwardModel(CHAIN, "linear", play=WIDTH).fit(q, x, groups=groups)
+    with pytest.raises(ValueError, match=r"`groups` must have shape \(480,\), got \(3,\)"):
+        model.predict(q, groups=groups[:3])
