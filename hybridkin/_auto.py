@@ -57,6 +57,8 @@ def rivals(mechanical: Any, names: tuple[str, ...], X: NDArray) -> list[tuple[An
     if not (tendons and names and mechanical.contradictory(torch.from_numpy(X)).any()):
         return [(mechanical, names)]
     elastic = ElasticTendonChain.from_chain(mechanical)
+    if names == tuple(mechanical.default_parameters):
+        return [(mechanical, names), (elastic, elastic.default_parameters)]
     # A plain chain's lengths and radii take up what slack does; elastic tendons need not.
     kept = [name for name in names if name not in ("radii", "lengths", "actuator_zeros")]
     own = [name for name in elastic.default_parameters if name not in ("angles", *kept)]
@@ -268,7 +270,7 @@ def _tuned(X: NDArray, error: NDArray, weights: NDArray, folds: list[Any]) -> Ke
 def _settled(error_model: Any, fitted: Any) -> Any:
     """Return the error model with the choices that its fit to all rows made."""
     if isinstance(error_model, Readout):
-        return error_model._replace(alphas=fitted.alphas)
+        return error_model._replace(alphas=fitted.alphas, noise_ratio=fitted.noise_ratio)
     if isinstance(error_model, ELMRegressorCV):
         return ELMRegressor(**fitted.best_params_)
     return error_model

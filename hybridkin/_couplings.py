@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ class Readout(NamedTuple):
 
     kind: str
     alphas: Pair | None = None
+    noise_ratio: float = inf
 
 
 class Blend(NamedTuple):
@@ -91,6 +93,7 @@ def fit_coupled(
         sample_weight=None if weights is None else torch.from_numpy(weights),
         groups=groups,
         alphas=alphas,
+        noise_ratio=getattr(error_model, "noise_ratio", inf),
     )
     module = SerialHybridModule(fit.module)
     module.guard = fit_guard(guard, module.error_part, kept)

@@ -246,7 +246,8 @@ def _store_readout(fit: SerialFit, arrays: Arrays, prefix: str) -> dict[str, Any
         header["activation"] = features.activation
     scores = [[*map(str, alphas), score] for alphas, score in fit.scores.items()]
     alphas = [*map(str, fit.alphas)]  # infinity is no number in JSON
-    return {**header, "alphas": alphas, "scores": plain(scores), "gradient": fit.gradient}
+    header |= {"alphas": alphas, "noise_ratio": str(fit.noise_ratio), "scores": plain(scores)}
+    return {**header, "gradient": fit.gradient}
 
 
 def _restored_readout(part: Part, mechanical: Any, n: int) -> SerialFit:
@@ -273,7 +274,9 @@ def _restored_readout(part: Part, mechanical: Any, n: int) -> SerialFit:
     first, second = map(float, part.names("alphas"))
     scores = {(float(a), float(b)): float(score) for a, b, score in part.value("scores", list, [])}
     residual = part.array("residual", (None, None), nan=True)
-    return SerialFit(module, (first, second), residual, scores, part.value("gradient", float))
+    gradient = part.value("gradient", float)
+    ratio = float(part.value("noise_ratio", str, "inf"))
+    return SerialFit(module, (first, second), residual, scores, gradient, ratio)
 
 
 def store_setting(error_model: Any) -> Any:

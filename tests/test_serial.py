@@ -384,6 +384,69 @@ def test_choice_is_no_worse_than_its_parts(rng):
     assert error(fit.module) < 1.05 * min(error(linear.module), error(chain))
 
 
+def shaken(truth, q, rng):
+    """Return tips of actuators that were elsewhere by 1 mm, measured with 0.5 mm of noise."""
+    moved = truth(q + 1e-3 * torch.randn(q.shape, generator=rng, dtype=q.dtype))
+    return moved + 5e-4 * torch.randn(moved.shape, generator=rng, dtype=q.dtype)
+
+
+def test_noise_of_the_actuators_is_told_from_that_of_the_tip(rng):
+    chain, q = rows_of("trunk", rng, 1500)
+    problem = _Problem(chain, Features.of_range(q), q, q[:, :3], torch.ones(len(q)).double(), "tip")
+    assert 0.1 < problem.likeliest_ratio(shaken(chain, q, rng) - chain(q)) < 0.6  # 0.25
+    assert problem.likeliest_ratio(1e-3 * uniform(rng, 1500, 3)) > 100.0
+
+
+def test_noise_of_the_actuators_is_allowed_for(rng):
+    errors = []
+    for _ in range(4):
+        chain, q = rows_of("trunk", rng, 400)
+        truth = disturbed(chain, q, rng, size=0.01)[0]
+        x, features = shaken(truth, q, rng), QuadraticFeatures.of_range(q)
+        alphas = (1e-3, 1e-3)
+        fits = [
+            fit_serial(chain, features, q, x, alphas=alphas, noise_ratio=ratio)
+            for ratio in (0.25, inf)
+        ]
+        errors.append([(fit.module(q) - truth(q)).norm(dim=1).mean() for fit in fits])
+        chosen = fit_serial(chain, features, q, x)
+        assert (chosen.module(q) - truth(q)).norm(dim=1).mean() < 1.05 * errors[-1][0]
+    allowed, ignored = torch.tensor(errors).mean(0)
+    assert allowed < 0.9 * ignored
+
+
+def test_rows_left_out_with_noise_of_the_actuators(rng):
+    chain, q = rows_of("trunk", rng, 60)
+    x = disturbed(chain, q, rng, size=0.002, noise=0.002)[1]
+    options = {"alphas": (0.3, 3.0), "noise_ratio": 0.5}
+    fit = fit_serial(chain, Features.of_range(q), q, x, **options)
+    assert fit.noise_ratio == 0.5
+    assert fit.gradient < 1e-8
+    weight = torch.ones(60, dtype=torch.float64)
+    weight[3] = 0.0
+    other = fit_serial(chain, Features.of_range(q), q, x, sample_weight=weight, **options)
+    left = x[3] - other.module(q[3])
+    assert_close(torch.from_numpy(fit.residual[3]), left, atol=2e-4, rtol=0.05)
+
+
+def test_whitened_residuals_are_those_of_noise_of_unit_level(rng):
+    chain, q = rows_of("tendons", rng, 40)
+    weight = 1.0 + uniform(rng, 40).abs()
+    args = Features.of_range(q), q, chain(q) + 0.01, weight
+    problem = _Problem(chain, *args, "coordinates").in_noise(0.3)
+    J = chain.jacobian(q)
+    covariance = J @ J.mT + 0.3 * torch.eye(3, dtype=q.dtype)
+    W = problem.whitening
+    spherical = W @ covariance @ W.mT
+    level = spherical[0, 0, 0]
+    assert_close(spherical, level * torch.eye(3, dtype=q.dtype).expand(40, -1, -1))
+    mean = (weight[:, None, None] * covariance).diagonal(dim1=1, dim2=2).sum() / (3 * weight.sum())
+    assert_close(level, mean)
+    residual = 0.01 * uniform(rng, 40, 3)
+    whitened = (W @ (weight.sqrt()[:, None] * residual)[..., None])[..., 0]
+    assert_close(problem.in_metres(whitened), residual)
+
+
 def test_choice_finds_the_least_of_a_bowl():
     scores = lambda pair: 1.0 + (pair[0] - 0.1) ** 2 + (1.0 / pair[1] - 0.1) ** 2  # noqa: E731
     found, tried = choose(scores)
