@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import time
-import warnings
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -91,12 +90,10 @@ def choose_mechanics(
     for mechanical, names in mechanicals:
         left_out, chains = np.empty(len(X)), []
         for train, test in folds:
-            with warnings.catch_warnings():  # what is to say is said of the fit to all rows
-                warnings.simplefilter("ignore", UserWarning)
-                alone = _fit(
-                    model, mechanical, "parallel", "drop", X[train], y[train], weights[train], names
-                )
-                left_out[test] = _distance(alone.predict(X[test]), y[test])
+            alone = _fit(
+                model, mechanical, "parallel", "drop", X[train], y[train], weights[train], names
+            )
+            left_out[test] = _distance(alone.predict(X[test]), y[test])
             chains.append(alone.mechanical_model_)
         scores = {type(mechanical).__name__: float(np.average(left_out, weights=weights))}
         found.append(Mechanics(mechanical, names, folds, chains, scores))
@@ -226,7 +223,7 @@ def _distance(x: Any, y: NDArray) -> NDArray:
 def _candidates(mechanical: Any, seed: Any) -> dict[str, tuple[str, Any]]:
     """Return coupling and error model by name, the simplest first: of equals it is chosen."""
     inside = ("linear", "quadratic", *(("pose",) if isinstance(mechanical, ArcChain) else ()))
-    network = ELMRegressorCV(max_hidden=1000, random_state=seed)
+    network = ELMRegressorCV(250, max_hidden=1000, random_state=seed)
     candidates: dict[str, tuple[str, Any]] = {
         "mechanical": ("parallel", "drop"),
         "parallel linear": ("parallel", Readout("linear")),

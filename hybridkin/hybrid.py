@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -220,15 +222,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         names = () if mechanical is None else tuple(names)
         mechanics, counts = None, np.ones(len(X)) if weights is None else weights
         if isinstance(self.error_model, str) and self.error_model == "auto":
-            candidates = rivals(mechanical, names, X)
-            mechanics = choose_mechanics(self, candidates, X, y, counts, groups)
+            with _silence():
+                candidates = rivals(mechanical, names, X)
+                mechanics = choose_mechanics(self, candidates, X, y, counts, groups)
             mechanical, names = copy.deepcopy(mechanics.model), mechanics.names
-        self.play_ = play_of(self.play, mechanical, names, X, y, weights, groups)
+        with _silence():
+            self.play_ = play_of(self.play, mechanical, names, X, y, weights, groups)
         self._play_state: PlayState | None = None
         if self.play_ is not None:
             X = self._effective(X, groups)
             if mechanics is not None:
-                again = choose_mechanics(self, [(mechanical, names)], X, y, counts, groups)
+                with _silence():
+                    again = choose_mechanics(self, [(mechanical, names)], X, y, counts, groups)
                 mechanics = again._replace(scores=mechanics.scores | again.scores)
         q = torch.from_numpy(X.astype(np.float64))
         self.calibration_: CalibrationResult | None = None
@@ -247,7 +252,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             model = self._default_error_model() if self.error_model is None else self.error_model
             found = self._learned(self.coupling, model, X, y, weights, groups)
         else:
-            parts, self.cv_results_ = choose(self, mechanical, mechanics, X, y, counts, groups)
+            with _silence():
+                parts, self.cv_results_ = choose(self, mechanical, mechanics, X, y, counts, groups)
             fits = [self._learned(*part[1:], X, y, weights, groups) for part in parts]
             found = blended([part.weight for part in parts], fits)
         self.error_model_, self.module_ = found
@@ -256,7 +262,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._drift = Drift.of_range(q.amin(0).numpy(), q.amax(0).numpy(), n_outputs)
         self.radius_: Radius | None = None
         if self.coverage is not None:
-            self.radius_ = conformal_radius(self, X, y, weights, groups, self.coverage)
+            with _silence():
+                self.radius_ = conformal_radius(self, X, y, weights, groups, self.coverage)
         return self
 
     def partial_fit(
@@ -472,6 +479,14 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.coupling == "serial":
             return "quadratic"
         return ELMRegressor(random_state=self.random_state)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Leave unsaid of parts of the data what is said of all of them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
 
 
 def _fit_regressor(

@@ -68,7 +68,6 @@ def test_it_says_what_it_chose(chosen):
     assert_allclose(results["fold_distance"].std(1, ddof=1), results["std_distance"])
     assert results["rank"][results["mean_distance"].argmin()] == 1
     assert results["mean_distance"][-1] < 1.01 * results["mean_distance"].min()
-    assert results["seconds"].sum() < 60
 
 
 def test_nothing_to_learn_is_left_alone():
@@ -105,8 +104,9 @@ def test_slack_tendons_get_elastic_ones(tmp_path):
     assert isinstance(model.mechanical_model, ConstantCurvatureChain)
     assert np.linalg.norm(model.predict(q[80:]) - x[80:], axis=1).mean() < 1e-3
     as_given = HybridForwardModel(plain, "auto", random_state=0)  # nothing is to be calibrated
-    with pytest.warns(UserWarning, match="ElasticTendonChain"):
+    with pytest.warns(UserWarning, match="ElasticTendonChain") as said:
         as_given.fit(q[:80], x[:80])
+    assert len(said) == 1  # of all rows, not of every fold and candidate again
     assert isinstance(as_given.mechanical_model_, ConstantCurvatureChain)
 
 
