@@ -1,6 +1,7 @@
 """Sphinx settings; `make docs` builds the pages into docs/_build/html."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -35,6 +36,7 @@ suppress_warnings = ["config.cache"]
 # Reference: from the docstrings.
 default_role = "py:obj"
 autosummary_generate = True
+shutil.rmtree(ROOT / "docs" / "api", ignore_errors=True)  # or pages of names that are gone stay
 autosummary_ignore_module_all = False
 autodoc_typehints = "none"
 autodoc_class_signature = "mixed"
@@ -57,6 +59,7 @@ sphinx_gallery_conf = {
     "thumbnail_size": (560, 400),
     "download_all_examples": False,
     "show_signature": False,
+    "remove_config_comments": True,
     "show_memory": False,
     "write_computation_times": False,
     "plot_gallery": "True",

@@ -11,6 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+_TURNS = 4.0 * math.pi  # nobody counts the angle of a tendon further
+_SPANS = 10.0  # a tip moves within two lengths of its robot; millimetres look like 2000
+
 
 def vector(
     value: Any, name: str, dtype: torch.dtype, *, size: int | None = None, positive: bool = False
@@ -81,7 +84,15 @@ def flat_angles(angles: Any, counts: tuple[int, ...], dtype: torch.dtype) -> Ten
             f"`angles` must hold {list(counts)} angles for the segments, got "
             f"{[row.numel() for row in rows]}; give shape (n,), (S, n) or one list per segment."
         )
-    return torch.cat(rows)
+    flat = torch.cat(rows)
+    largest = float(flat.abs().max())
+    if largest > _TURNS:
+        warnings.warn(
+            f"`angles` reach {largest:.4g}, which looks like degrees; hybridkin works in radians: "
+            "give numpy.radians(angles).",
+            stacklevel=3,
+        )
+    return flat
 
 
 def pose(value: Any, name: str, dtype: torch.dtype) -> Tensor:
@@ -124,6 +135,17 @@ def check_finite_rows(rows: Tensor, name: str) -> None:
         raise ValueError(
             f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of {len(rows)} rows "
             f"(first: row {int(bad.nonzero()[0])}); drop those rows."
+        )
+
+
+def warn_span(name: str, tips: Tensor, reach: float) -> None:
+    """Warn where tips (N, 3) of a log lie further apart than a robot of that size can reach."""
+    span = float((tips.amax(dim=0) - tips.amin(dim=0)).max())
+    if span > _SPANS * reach:
+        warnings.warn(
+            f"`{name}` spans {span:.4g} m, but the robot is only {reach:.3g} m long; hybridkin "
+            "works in metres: divide millimetres by 1000, or read the log with x_unit='mm'.",
+            stacklevel=4,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
+from hybridkin._arrays import as_tensor
+from hybridkin._geometry import warn_span
 from hybridkin._least_squares import Fit, Rows, solve
 from hybridkin._open_directions import sentences
 from hybridkin._parameters import ALIASES, Problem, parameter_names
@@ -161,9 +164,10 @@ def calibrate(
     Warns
     -----
     UserWarning
-        Where a value ran into a bound or left what is physical, and where the mirror image of the
-        given robot explains the data far better: then that is returned. For tendons of a
-        ConstantCurvatureChain that contradict each other, as slack does.
+        Where q or x look like millimetres. Where a value ran into a bound or left what is
+        physical, and where the mirror image of the given robot explains the data far better: then
+        that is returned. For tendons of a ConstantCurvatureChain that contradict each other, as
+        slack does.
 
     References
     ----------
@@ -187,7 +191,10 @@ def calibrate(
     if groups is not None:
         groups = np.asarray(groups)
         if groups.shape != (len(q),):
-            raise ValueError(f"`groups` must have shape ({len(q)},), got {groups.shape}.")
+            raise ValueError(
+                f"`groups` must have shape ({len(q)},), one motion per row of `q`, got "
+                f"{groups.shape}."
+            )
     weights = _check_weights(sample_weight, q)
     kept = weights > 0
     rows = Rows(q[kept], x[kept], weights[kept])
@@ -309,7 +316,10 @@ def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> C
 def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     folds = min(5, len(np.unique(groups)))
     if folds < 2:
-        raise ValueError("`groups` must name at least 2 motions to hold one out, got 1.")
+        raise ValueError(
+            "`groups` must name at least 2 motions to hold one out, got 1; leave `groups` out "
+            "where the log is one motion."
+        )
     squares = 0.0
     for train, test in GroupKFold(folds).split(rows.q, groups=groups):
         fit = solve(best.problem, Rows(*(part[train] for part in rows)), best.theta, loss)
@@ -325,8 +335,11 @@ def _check_parameters(
     available = parameter_names(chain)
     unknown = [name for name in names if name not in available]
     if unknown or not names or len(set(names)) < len(names):
+        close = [difflib.get_close_matches(str(name), available, 1) for name in unknown]
+        hint = "".join(f"; did you mean {near[0]!r}?" for near in close[:1] if near)
         raise ValueError(
-            f"`parameters` must name different ones of {available} for this chain, got {names}."
+            f"`parameters` must name different ones of {available} for this chain, got "
+            f"{names}{hint or '.'}"
         )
     for alias, entry in ALIASES.items():
         if {alias, entry} <= set(names):
@@ -350,7 +363,7 @@ def _check_parameters(
 
 def _check_data(chain: Any, q: Any, x: Any) -> tuple[Tensor, Tensor]:
     dtype = chain.geometry()["base"].dtype
-    q, x = torch.as_tensor(q).detach().to(dtype), torch.as_tensor(x).detach().to(dtype)
+    q, x = as_tensor(q, "q").to(dtype), as_tensor(x, "x").to(dtype)
     if q.ndim != 2:
         raise ValueError(f"`q` must have shape (N, n_actuators), got {tuple(q.shape)}.")
     if x.shape != (len(q), 3):
@@ -364,13 +377,14 @@ def _check_data(chain: Any, q: Any, x: Any) -> tuple[Tensor, Tensor]:
     if not torch.isfinite(x).all():
         rows = int((~torch.isfinite(x).all(dim=1)).sum())
         raise ValueError(f"`x` must be finite, got NaN or infinity in {rows} rows; drop them.")
+    warn_span("x", x, float(chain.reach.detach()))
     return q, x
 
 
 def _check_weights(sample_weight: Any, q: Tensor) -> Tensor:
     if sample_weight is None:
         return q.new_ones(len(q))
-    weights = torch.as_tensor(sample_weight).to(q)
+    weights = as_tensor(sample_weight, "sample_weight").to(q)
     valid = weights.shape == (len(q),) and bool((torch.isfinite(weights) & (weights >= 0)).all())
     if not valid or not (weights > 0).any():
         raise ValueError(

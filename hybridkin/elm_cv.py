@@ -352,6 +352,11 @@ def _splits(cv, y_shape, groups, kept):
                 f"`groups` must have shape ({y_shape[0]},), one entry for each row of `X`, got "
                 f"{groups.shape}."
             )
+        if len(np.unique(groups)) < 2:
+            raise ValueError(
+                "`groups` must name at least 2 groups, to leave one out, got 1; without `groups` "
+                "single rows are left out."
+            )
         if cv is None:
             cv = LeaveOneGroupOut()
         elif isinstance(cv, Integral):

@@ -502,7 +502,7 @@ def _model(model: Any) -> Any:
     if not callable(module):
         raise TypeError(
             f"`model` must be a torch module or callable q -> x, got {type(model).__name__}; "
-            "an estimator must be fitted first."
+            "an estimator must be fitted first, and of a robot description hand over its `chain`."
         )
     return module
 

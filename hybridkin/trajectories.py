@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -13,6 +14,7 @@ import numpy as np
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_FAR = 20.0  # no tip is that far from where it is measured [m]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -48,6 +50,13 @@ class Trajectory:
             raise ValueError(
                 f"`t` must increase, got {t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s in row "
                 f"{late[0] + 1}; sort the rows and drop repeated times."
+            )
+        largest = float(np.abs(x).max())
+        if largest > _FAR:
+            warnings.warn(
+                f"the path reaches {largest:.4g} m, which looks like millimetres; hybridkin works "
+                "in metres: divide by 1000, or read a file with unit='mm'.",
+                stacklevel=4,
             )
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "x", x)
@@ -297,12 +306,15 @@ def from_csv(
     if rows and not _is_number(rows[0][0]):
         rows = rows[1:]
     columns = 4 if dt is None else 3
+    need = "t, x, y, z" if dt is None else "x, y, z, because `dt` is given"
     try:
         table = np.array(rows, dtype=float)
     except ValueError as error:
-        raise ValueError(f"{path} must hold numbers after one line of names: {error}.") from error
+        raise ValueError(
+            f"{path} must hold numbers in {columns} columns ({need}) after one line of names: "
+            f"{error}."
+        ) from error
     if table.ndim != 2 or table.shape[1] != columns:
-        need = "t, x, y, z" if dt is None else "x, y, z, because `dt` is given"
         raise ValueError(f"{path} must have rows of {columns} columns ({need}), got {table.shape}.")
     if dt is None:
         t = table[:, 0]

@@ -500,6 +500,27 @@ def test_singular_values_and_standard_errors_tell_the_same(rng):
     assert (known == (result.narrowing > 10)).all()
 
 
+def test_lists_and_frames_of_pandas_do_as_well(rng):
+    """In full precision, and frames, whose arrays are read-only, without a word."""
+    chain, q = ConstantCurvatureChain(RADII), chambers(rng)
+    x = chain(q).detach().numpy()
+    start = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    q = q.numpy()
+    for kind in (np.ndarray.tolist, pytest.importorskip("pandas").DataFrame):
+        result = calibrate(start, kind(q), kind(x), ("radii",), prior=math.inf)
+        np.testing.assert_allclose(result.values["radii"], RADII, rtol=1e-8)
+
+
+def test_tips_in_millimetres_are_noticed(rng):
+    chain, q = nominal_tendon_robot(), tendons(rng)
+    with torch.no_grad():
+        x = chain(q)
+    with pytest.warns(UserWarning, match=r"`x` spans .* but the robot is only 0\.18 m long"):
+        calibrate(chain, q, 1000 * x, ("base",))
+    far = x + torch.tensor([40.0, 0.0, 0.0], dtype=torch.float64)  # a far frame is none
+    assert calibrate(chain, q, far, ("base",), prior=math.inf).rmse < 1e-6
+
+
 def test_numpy_in_numpy_out_and_groups(rng):
     q = chambers(rng)
     x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(100, 3, generator=rng).double()
@@ -515,7 +536,7 @@ def test_numpy_in_numpy_out_and_groups(rng):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"parameters": ("radius",)}, "`parameters` must name different ones of"),
+        ({"parameters": ("radius",)}, "`parameters` must name different ones of .* mean 'radii'"),
         ({"parameters": ("lengths",)}, "`parameters` must name different ones of"),
         ({"parameters": ("radii", "radii")}, "`parameters` must name different ones of"),
         ({"parameters": ()}, "`parameters` must name different ones of"),

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, datasets, jacobian
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, datasets, jacobian
 from hybridkin._numerics import forward_and_reverse_jacobian, stumpff
 
 RADII = [0.100, 0.093, 0.079]
@@ -832,6 +832,14 @@ def test_wrong_types_say_what_to_do():
         bha()(np.zeros(9))
     with pytest.raises(TypeError, match="floating"):
         bha()(torch.zeros(9, dtype=torch.int64))
+
+
+def test_angles_in_degrees_are_noticed():
+    degrees = [0.0, 120.0, 240.0]
+    for kind in (ConstantCurvatureChain, ElasticTendonChain):
+        with pytest.warns(UserWarning, match="reach 240, which looks like degrees"):
+            kind([0.005], lengths=[0.1], angles=degrees)
+        assert kind([0.005], lengths=[0.1], angles=np.radians(degrees)).n_actuators == 3
 
 
 def test_lengths_in_millimetres_are_noticed():

@@ -372,6 +372,8 @@ def test_integers_with_groups_split_whole_groups():
         ({"alphas": []}, {}, "`alphas` must be one or more positive numbers"),
         ({"weight_scales": [np.nan]}, {}, "`weight_scales` must be one or more positive numbers"),
         ({}, {"groups": np.zeros(7)}, r"`groups` must have shape \(60,\)"),
+        ({}, {"groups": ["a"] * 60}, "`groups` must name at least 2 groups"),
+        ({"cv": 2}, {"groups": ["a"] * 60}, "`groups` must name at least 2 groups"),
         ({"cv": [(np.arange(60), np.arange(5))]}, {}, "must not test on rows that it trains on"),
         ({}, {"sample_weight": np.eye(60)[0]}, "at least 2 rows of positive weight"),
     ],

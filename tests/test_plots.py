@@ -492,6 +492,19 @@ def test_film_of_rows_that_are_not_known(tmp_path):
     assert None not in frames[0]["data"][0]["x"]
 
 
+def test_small_errors_are_told_apart(tmp_path):
+    """Micrometres of an error on a robot of a metre: rounded by its own size, not the robot's."""
+    chain, q = robots.bionic_handling_assistant(), np.tile(BENT, (5, 1))
+    target = plots.TrackAnimation.from_estimator(chain, q).x + [[0.0, 0.0, 1e-6]] * 5
+    target[:, 2] += 1e-6 * np.arange(5)
+    film = plots.TrackAnimation.from_estimator(chain, q, target=target)
+    assert [film.caption(k, "mm")[-9:] for k in (0, 4)] == ["0.0010 mm", "0.0050 mm"]
+    pytest.importorskip("plotly")
+    frames = frames_of(film.save(tmp_path / "a.html", unit="mm").read_text(encoding="utf-8"))
+    found = [frame["data"][-1]["y"][0] for frame in frames]
+    np.testing.assert_allclose(found, 1e-3 * np.arange(1, 6), atol=1e-6)
+
+
 def test_what_is_missing_is_named(film, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"must end in one of .*got 'a\.avi'"):
         film.save(tmp_path / "a.avi")

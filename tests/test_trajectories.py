@@ -103,6 +103,16 @@ def test_trajectory_is_checked_frozen_and_its_own():
         Trajectory([0.0, 1.0, 1.0], np.zeros((3, 3)))
 
 
+def test_paths_in_millimetres_are_noticed(tmp_path):
+    file = tmp_path / "path.csv"
+    file.write_text("t,x,y,z\n0,0,0,200\n1,10,0,200\n")
+    with pytest.warns(UserWarning, match="looks like millimetres"):
+        figure_eight([0.0, 0.0, 200.0], (40.0, 20.0))
+    with pytest.warns(UserWarning, match="read a file with unit='mm'"):
+        from_csv(file)
+    assert from_csv(file, unit="mm").x[0, 2] == 0.2  # and says nothing: warnings are errors
+
+
 def test_csv_with_and_without_times(tmp_path):
     file = tmp_path / "path.csv"
     file.write_text("# recorded\nt,x,y,z\n0.0,1,2,3\n0.5,4,5,6\n\n")
@@ -120,7 +130,7 @@ def test_csv_with_and_without_times(tmp_path):
     [
         ("1,2,3\n", {}, "rows of 4 columns"),
         ("0,1,2,3\n", {"dt": 0.1}, "rows of 3 columns"),
-        ("t,x,y,z\n0,1,two,3\n", {}, "must hold numbers"),
+        ("t,x,y,z\n0,1,two,3\n", {}, r"must hold numbers in 4 columns \(t, x, y, z\)"),
         ("t,x,y,z\n0,1,2,3\n1,2\n", {}, "must hold numbers"),
         ("t,x,y,z\n", {}, "rows of 4 columns"),
         ("0,1,2,3\n", {"unit": "inch"}, "`unit` must be one of"),

@@ -85,6 +85,13 @@ def scale_of(unit: str, known: Mapping[str, float] = LENGTHS) -> float:
     return known[unit]
 
 
+def decimals(values: Any) -> int:
+    """Return how many decimals show the largest of the values with two digits, 2 to 6."""
+    values = np.asarray(values, dtype=float)
+    largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+    return 2 if largest == 0.0 else int(np.clip(1 - np.floor(np.log10(largest)), 2, 6))
+
+
 def label_space(ax: Any, unit: str) -> None:
     """Name the axes of space, with equal scales, none too short, and panes that do not shout."""
     ax.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
@@ -134,7 +141,8 @@ def named(value: Any, name: str) -> dict[str, Any]:
     """Return several things by name; a single one is not named."""
     if not isinstance(value, Mapping) or not value:
         raise ValueError(
-            f"`{name}` must be a mapping from names to arrays, at least one, got {value!r:.80}."
+            f"`{name}` must be a mapping from names to arrays, at least one, got {value!r:.80}; "
+            f"write {{'model': ...}} for a single one."
         )
     return {str(key): item for key, item in value.items()}
 

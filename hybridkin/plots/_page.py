@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin.plots._canvas import COLORS, scale_of
+from hybridkin.plots._canvas import COLORS, decimals, scale_of
 
 if TYPE_CHECKING:
     from hybridkin.plots.animation import TrackAnimation
@@ -41,7 +41,7 @@ def page(
     still, moving = _still(film, scale, digits, unit), film.lines()
     data = still + [_trace(line, scale * line.points[0], digits) for line in moving]
     if film.error is not None:
-        data.append({**_on_error_axes(film, scale, digits, 0), "marker": {"color": "black"}})
+        data.append({**_on_error_axes(film, scale, 0), "marker": {"color": "black"}})
     layout = _layout(film, unit, speed, low, high)
     layout["scene"]["camera"] = _camera(*view)
     figure = go.Figure(data, layout).to_dict()
@@ -50,7 +50,7 @@ def page(
     for k in range(K):
         parts = [_coordinates(scale * line.points[k], digits) for line in moving]
         if film.error is not None:
-            own = _on_error_axes(film, scale, digits, k)
+            own = _on_error_axes(film, scale, k)
             parts.append({"x": own["x"], "y": own["y"]})
         frames.append({"name": str(k), "data": parts, "traces": places})
         if progress is not None:
@@ -64,7 +64,8 @@ def page(
         default_height="100vh",
         config={"responsive": True, "displaylogo": False},
     )
-    return html.replace("<head>", "<head><title>Track</title>", 1)
+    head = "<head><title>Track</title><style>body { margin: 0; overflow: hidden; }</style>"
+    return html.replace("<head>", head, 1)
 
 
 def _still(film: TrackAnimation, scale: float, digits: int, unit: str) -> list[dict[str, Any]]:
@@ -79,7 +80,7 @@ def _still(film: TrackAnimation, scale: float, digits: int, unit: str) -> list[d
         found.insert(0, {**look, **target, "line": line, "name": "target"})
     if film.error is not None:
         steps = np.arange(len(film.x)) if film.t is None else film.t
-        error = {"x": _numbers(steps, 4), "y": _numbers(scale * film.error, digits)}
+        error = {"x": _numbers(steps, 4), "y": _errors(film, scale)}
         name, line = f"tip error [{unit}]", {"color": COLORS[0], "width": 2}
         more = {"type": "scatter", "mode": "lines", "name": name, "line": line}
         found.append({**more, **error, "showlegend": False})
@@ -99,13 +100,20 @@ def _trace(line: Any, points: NDArray, digits: int) -> dict[str, Any]:
     return {**trace, **_coordinates(points, digits)}
 
 
-def _on_error_axes(film: TrackAnimation, scale: float, digits: int, k: int) -> dict[str, Any]:
+def _on_error_axes(film: TrackAnimation, scale: float, k: int) -> dict[str, Any]:
     """Return the dot that runs along the error over time."""
     assert film.error is not None
     row = film.rows[k]
     when = float(row if film.t is None else film.t[row])
-    error = _numbers(scale * film.error[row : row + 1], digits)
+    error = _errors(film, scale)[row : row + 1]
     return {"type": "scatter", "mode": "markers", "x": [when], "y": error, "showlegend": False}
+
+
+def _errors(film: TrackAnimation, scale: float) -> list[float | None]:
+    """Return the error of every row, rounded by its own size: it is far below the robot's."""
+    assert film.error is not None
+    error = scale * film.error
+    return _numbers(error, decimals(error) + 2)
 
 
 def _layout(

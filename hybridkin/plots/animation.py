@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin.plots._canvas import (
     COLORS,
     axes_or_new,
+    decimals,
     distance,
     label_space,
     plain,
@@ -296,8 +297,9 @@ class TrackAnimation:
         when = f"step {row}" if self.t is None else f"t = {self.t[row]:.2f} s"
         if self.error is None:
             return when
-        error = scale_of(unit) * self.error[row]
-        return f"{when}, error " + (f"{error:.2f} {unit}" if np.isfinite(error) else "not known")
+        error, places = scale_of(unit) * self.error[row], decimals(scale_of(unit) * self.error)
+        told = f"{error:.{places}f} {unit}" if np.isfinite(error) else "not known"
+        return f"{when}, error {told}"
 
     def _film(
         self, path: Path, writer: Any, dpi: float, unit: str, view: Any, progress: Any

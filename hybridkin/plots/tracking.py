@@ -13,6 +13,7 @@ from hybridkin.plots._canvas import (
     LENGTHS,
     STYLES,
     axes_or_new,
+    decimals,
     distance,
     label_space,
     named,
@@ -177,7 +178,7 @@ class TrackingDisplay:
     def _summary(self, name: str, scale: float, unit: str) -> str:
         error = scale * distance(self.tracks[name], self.target)
         mean = error[np.isfinite(error)].mean() if np.isfinite(error).any() else np.nan
-        return f"{name}: mean error {mean:.2f} {unit}"
+        return f"{name}: mean error {mean:.{decimals(mean)}f} {unit}"
 
     def _steps(self, ax: Any) -> NDArray:
         ax.set(xlabel="time step" if self.t is None else "time [s]")
