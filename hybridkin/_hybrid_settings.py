@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from torch import nn
@@ -25,6 +26,12 @@ def check_settings(model: Any) -> None:
         raise ValueError(f"`coupling` must be one of {[*COUPLINGS]}, got {model.coupling!r}.")
     if model.coverage is not None and not 0.0 < model.coverage < 1.0:
         raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}.")
+    names = model.calibrate
+    if (isinstance(names, str) and names != "default") or not isinstance(names, (str, Iterable)):
+        raise ValueError(
+            f'`calibrate` must be a sequence of names or "default", got {names!r}; for example '
+            '["radii", "base"].'
+        )
     if isinstance(model.play, str) and model.play != "auto":
         raise ValueError(
             f"`play` must be a width, one per actuator, 'auto' or None, got {model.play!r}."

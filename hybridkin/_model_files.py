@@ -87,6 +87,10 @@ def read_header(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
+    if path.is_dir():
+        found = sorted(file.name for file in path.glob("*.safetensors"))
+        hint = f"; in it lies {found[0]}." if found else " without a saved model."
+        raise FileNotFoundError(f"`path` must name a saved model, got the folder {path}{hint}")
     if not path.is_file():
         raise FileNotFoundError(f"`path` must name a saved model, got {path}: no such file.")
     try:

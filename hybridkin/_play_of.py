@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -41,10 +42,19 @@ def play_of(
         As for `choose_play`.
     """
     if not isinstance(play, str):
-        return None if play is None else PlayOperator(play)
+        operator = None if play is None else PlayOperator(play)
+        if operator is not None and np.any(operator.width >= np.ptp(X, axis=0)):
+            warnings.warn(
+                f"`play` {play!r} is no less than the range of `X`, {np.ptp(X, axis=0)}: such an "
+                "actuator never moves. Its unit is that of `X`, metres.",
+                stacklevel=4,
+            )
+        return operator
     if names:
         tips = y.reshape(len(y), -1)[:, :3]
-        mechanical = calibrate(mechanical, X, tips, names, sample_weight=weights).chain
+        with warnings.catch_warnings():  # what is to say is said of the model with play
+            warnings.simplefilter("ignore", UserWarning)
+            mechanical = calibrate(mechanical, X, tips, names, sample_weight=weights).chain
     return choose_play(mechanical, X, y, weights, groups)
 
 

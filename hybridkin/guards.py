@@ -17,6 +17,9 @@ from hybridkin._realtime import NumpyFunction, numpy_function
 
 __all__ = ["GUARDS", "BoxGuard", "Guard", "LeverageGuard", "QuadraticReadout", "fit_guard"]
 
+_STILL = 1e-3  # of the largest spread: the log does not go there
+_AS_IF = 0.1  # of the range: spread that is taken for granted there
+
 GUARDS = ("leverage", "box", None)
 
 NumpyStrangeness = Callable[[NDArray], tuple[float, "NDArray | None"]]
@@ -280,6 +283,9 @@ class QuadraticReadout(PortableModule):
         features = readout._features(q)
         gram = features.mT @ features
         gram.diagonal().add_(alpha)
+        still = _unexcited(q)
+        n = q.shape[1]
+        gram[1 : n + 1, 1 : n + 1] += _AS_IF**2 * len(q) * still @ still.mT
         readout.factor = torch.linalg.cholesky(gram)
         return readout
 
@@ -323,8 +329,24 @@ def fit_guard(
         if kind == "box":
             return BoxGuard(q.amin(0), q.amax(0), largest)
         own = isinstance(error_module, nn.Module) and hasattr(error_module, "leverage")
-        readout: Any = error_module if own else QuadraticReadout.fit(q)
+        own = own and not _unexcited(q).numel()
+        # Where the log went counts, not how often.
+        readout: Any = error_module if own else QuadraticReadout.fit(torch.unique(q, dim=0))
         return LeverageGuard.fit(readout, q, largest)
+
+
+def _unexcited(q: Tensor) -> Tensor:
+    """Return the directions (n, k) of q over its range, that rows (N, n) do not go.
+
+    Balanced tendons leave the common pull of a segment alone, for example. Nothing is known of it,
+    but the mechanical model; were any step along it strange, an inverse could use the fading of the
+    error model as a way to move the tip.
+    """
+    spread = q - q.mean(0)
+    half_width = 0.5 * (q.amax(0) - q.amin(0))
+    spread = spread / torch.where(half_width > 0, half_width, 1.0)
+    axes, variances, _ = torch.linalg.svd(spread.mT @ spread)
+    return axes[:, variances < _STILL**2 * variances[0]]
 
 
 def _relative(

@@ -24,6 +24,7 @@ from hybridkin._auto import choose, choose_mechanics, rivals
 from hybridkin._couplings import blended, fit_coupled
 from hybridkin._drift import Drift
 from hybridkin._error_modules import error_module
+from hybridkin._geometry import warn_span
 from hybridkin._hybrid_modules import HybridModule
 from hybridkin._hybrid_settings import NAMED, check_settings
 from hybridkin._play_of import play_of
@@ -207,7 +208,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_settings(self)
         X, y = validate_data(self, X, y=y, multi_output=True, dtype=[np.float64, np.float32])
+        X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
         y = np.asarray(y, dtype=np.float64)
+        groups = None if groups is None else _checked_groups(groups, len(X))
         weights = None
         if sample_weight is not None:
             weights = _check_sample_weight(
@@ -226,8 +229,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 candidates = rivals(mechanical, names, X)
                 mechanics = choose_mechanics(self, candidates, X, y, counts, groups)
             mechanical, names = copy.deepcopy(mechanics.model), mechanics.names
-        with _silence():
-            self.play_ = play_of(self.play, mechanical, names, X, y, weights, groups)
+        self.play_ = play_of(self.play, mechanical, names, X, y, weights, groups)
         self._play_state: PlayState | None = None
         if self.play_ is not None:
             X = self._effective(X, groups)
@@ -246,6 +248,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             mechanical = self.calibration_.chain
         else:
             _warn_contradictory(mechanical, q)
+            reach = getattr(mechanical, "reach", None)
+            if reach is not None and y.ndim == 2:
+                warn_span("y", torch.from_numpy(y[:, :3]), float(reach))
         self.mechanical_model_ = mechanical
         self.cv_results_ = None
         if mechanics is None:
@@ -487,6 +492,15 @@ def _silence() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         yield
+
+
+def _checked_groups(groups: ArrayLike, n: int) -> NDArray:
+    groups = np.asarray(groups)
+    if groups.shape != (n,):
+        raise ValueError(
+            f"`groups` must have shape ({n},), one entry for each row of `X`, got {groups.shape}."
+        )
+    return groups
 
 
 def _fit_regressor(

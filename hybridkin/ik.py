@@ -362,8 +362,9 @@ class InverseKinematics:
             control), the measured tip, or nowhere.
         memory : float, optional
             For how long a reading counts where the next ones are missing (NaN) [s]: the model's tip
-            is moved by what it missed there, less by exp(-age / memory). Default: without a
-            reading the motion goes on by feed-forward.
+            is moved by what it missed there, less by exp(-age / memory). Let it be several times
+            longer than the gaps: a short one goes back to the model's tip, which may be worse than
+            the default, to go on by feed-forward without a reading.
         tol : float, default=1e-4
             Error up to which a point counts as CONVERGED [m].
         progress : callable, optional

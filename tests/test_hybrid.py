@@ -23,10 +23,13 @@ from hybridkin import (
     ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
+    IKStatus,
+    InverseKinematics,
     datasets,
     jacobian,
     robots,
 )
+from hybridkin.trajectories import figure_eight
 
 
 class SmallSum(torch.nn.Module):
@@ -413,3 +416,56 @@ def test_weight_and_its_derivative(kind, error_model):
     assert_close(weight, guard(q))
     assert ((weight > 0.01) & (weight < 0.99)).any()
     assert_close(slope, torch.func.vmap(torch.func.jacrev(guard))(q), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("settings", "groups", "message"),
+    [
+        ({"calibrate": True}, None, "`calibrate` must be a sequence of names.*got True"),
+        ({"calibrate": "radii"}, None, "`calibrate` must be a sequence of names.*got 'radii'"),
+        ({}, np.zeros(3), r"`groups` must have shape \(20,\), one entry for each row.*got \(3,\)"),
+    ],
+)
+def test_settings_and_groups_are_checked(settings, groups, message):
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
+    chain = robots.bionic_handling_assistant()
+    with pytest.raises(ValueError, match=message):
+        HybridForwardModel(chain, "linear", **settings).fit(q, q[:, :3], groups=groups)
+
+
+def test_tips_in_millimetres_are_noticed_without_a_calibration():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
+    chain = robots.bionic_handling_assistant()
+    x = 1e3 * chain(torch.from_numpy(q)).numpy()
+    with pytest.warns(UserWarning, match="`y` spans .* works in metres"):
+        HybridForwardModel(chain, "linear").fit(q, x)
+
+
+def test_rows_that_cannot_be_written_to_are_read_without_a_word():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
+    q.flags.writeable = False
+    chain = robots.bionic_handling_assistant()
+    x = chain(torch.from_numpy(q.copy())).numpy()
+    HybridForwardModel(chain, "linear", calibrate="default").fit(q, x)
+
+
+@pytest.mark.parametrize(
+    "error_model", [KernelRidge(kernel="rbf", gamma=1e4, alpha=1e-3), None, "quadratic"]
+)
+def test_a_log_of_balanced_tendons_is_not_left_by_common_pulls(error_model):
+    """Nothing tells what a common pull does; that must be no way out for an inverse."""
+    chain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], routing="base")
+    rng = np.random.default_rng(0)
+    balanced = rng.uniform(-0.004, 0.004, (300, 2, 3))
+    q = (balanced - balanced.mean(axis=2, keepdims=True)).reshape(-1, 6)
+    x = chain(torch.from_numpy(q)).numpy() + 0.002 * np.sin(800.0 * q[:, :3])
+    model = HybridForwardModel(chain, error_model, random_state=0).fit(q, x)
+    assert model.in_domain(q).all()
+    pulled = np.repeat([[1e-4, 4e-3]], 6, axis=0).T
+    assert model.in_domain(pulled).tolist() == [True, False]
+    ik = InverseKinematics(model, q_min=-0.02, q_max=0.02, q_pref=0.0, dt=0.02)
+    track = ik.track(figure_eight((0.0, 0.0, 0.195), (0.03, 0.02), duration=5.0, dt=0.02))
+    assert (track.status == IKStatus.CONVERGED).all()
+    # A network has some slope in every direction; the others have none where nothing is known.
+    most = 1.5e-3 if error_model is None else 2e-4
+    assert np.abs(track.q.reshape(-1, 2, 3).mean(axis=2)).max() < most

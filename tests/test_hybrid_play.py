@@ -131,6 +131,8 @@ def test_clear_errors(log):
         HybridForwardModel(CHAIN, play=-1.0).fit(q, x)
     with pytest.raises(ValueError, match=r"`play` must be a width.*got 'some'"):
         HybridForwardModel(CHAIN, play="some").fit(q, x)
+    with pytest.warns(UserWarning, match="`play` 0.5 is no less than the range of `X`"):
+        HybridForwardModel(CHAIN, "drop", play=0.5).fit(q, x)
     model = HybridForwardModel(CHAIN, "linear", play=WIDTH).fit(q, x, groups=groups)
     with pytest.raises(ValueError, match=r"`groups` must have shape \(480,\), got \(3,\)"):
         model.predict(q, groups=groups[:3])
