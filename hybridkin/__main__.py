@@ -120,16 +120,19 @@ def _run_paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
 
 def _run_fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     description = hybridkin.robots.read_description(arguments.robot)
+    log_format = _log_format(arguments, description.log, arguments.robot)
+    play = arguments.play
     report, paths = hybridkin.experiments.fit_log(
         arguments.log,
         arguments.robot,
         arguments.out,
-        log_format=_log_format(arguments, description.log, arguments.robot),
+        log_format=log_format,
         loss=arguments.loss,
         coverage=arguments.coverage,
         n_folds=arguments.folds,
         n_seeds=arguments.seeds,
         auto=not arguments.no_auto,
+        play=_METRES[log_format.q_unit] * play if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
         n_jobs=arguments.jobs,
         progress=bars,

@@ -56,6 +56,10 @@ The robot description names its geometry and the columns and units of its logs:
   q_sign = -1           # the log counts a pulled tendon as positive
   groups = "motion"     # column that names the motion of a row
 
+With --play auto the rows of a motion are commands in the order of time, and backlash and dry
+friction are looked for: the tip then depends on where the tendons came from. Kept only where that
+predicts other motions better. Poses taken in any order have no play to find.
+
 All keys: python -c "import hybridkin; help(hybridkin.robots.read_description)"
 
 The log is checked first. Errors (a frozen sensor, wrong units, NaN) stop the fit with advice and
@@ -82,6 +86,8 @@ examples:
 
 A path file has columns t, x, y, z, or x, y, z together with --dt. --q-min and --q-max are in the
 unit and sign of the robot's logs (m without a description), one number or one for each actuator.
+By default the robot keeps to its limits and to the range that the model was fitted on. Of a model
+with play, track.csv has what to send, and in the columns effective_... what the actuators do.
 """
 
 _ANIMATE = "Make a film (mp4, gif) or an interactive page (html) of a robot that follows a track."
@@ -167,11 +173,19 @@ def _fit(commands: Any) -> None:
         "--no-auto", action="store_true", help="leave out the hybrid that chooses for itself: fast"
     )
     fit.add_argument(
+        "--play",
+        type=play,
+        metavar="auto|WIDTH",
+        help="play of the actuators that the hybrid which chooses for itself knows: total width in "
+        "the unit of q, or auto, found by motions left out; the rows of a motion must be in the "
+        "order of time (none)",
+    )
+    fit.add_argument(
         "--max-rows",
         type=int,
-        default=4000,
+        default=2000,
         metavar="N",
-        help="of a longer log take every k-th row, N at most; 0: all (4000)",
+        help="of a longer log take every k-th row, N at most; 0: all (2000)",
     )
     _work(fit)
 
@@ -324,6 +338,16 @@ def numbers(text: str) -> Sequence[float]:
 def names(text: str) -> Sequence[str]:
     """Return names separated by commas."""
     return tuple(part.strip() for part in text.split(","))
+
+
+def play(text: str) -> float | str:
+    """Return "auto" or a width, zero or more."""
+    if text == "auto":
+        return text
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be auto or a width, zero or more, got {text}")
+    return value
 
 
 def positive(text: str) -> float:

@@ -43,7 +43,9 @@ def fit(record: dict[str, Any]) -> Iterator[str]:
         for name, stats in record["held_out"].items()
     ]
     yield from table(["tip error on motions held out [mm]", "mean", "95 %", "max"], rows)
-    yield f"Saved: {record['saved']} ({record['chosen']}), fitted to all motions"
+    yield from _filled("Saved: ", f"{record['saved']}, fitted to all motions: {record['chosen']}")
+    for sentence in record.get("auto", {}).get("words", ()):
+        yield from _filled("  ", sentence)
 
 
 def evaluate(record: dict[str, Any]) -> Iterator[str]:
@@ -79,12 +81,22 @@ def track(record: dict[str, Any]) -> Iterator[str]:
     counts = ", ".join(f"{n} {name}" for name, n in record["statuses"].items())
     yield f"  status       {counts}"
     yield f"  limits       {record['limits']['source']}"
+    if record["in_domain"] is not None:
+        share = 100 * record["in_domain"]
+        yield f"  domain       {share:.0f} % of the points where the learned part is trusted"
+    if record["play"] is not None:
+        yield (
+            f"  play         {1e3 * max(record['play']):.3g} mm; a command jumps by that where its "
+            "actuator turns back"
+        )
     columns = record["columns"]
     sign = ", shortening positive" if columns["q_sign"] < 0 else ""
     yield (
         f"  track.csv    q in {columns['q_unit']}{sign}, x, target and error in "
         f"{columns['x_unit']}, t in s"
     )
+    if record["play"] is not None:
+        yield "               q is what to send, effective_... what the actuators do"
 
 
 def animate(record: dict[str, Any]) -> Iterator[str]:
@@ -112,9 +124,8 @@ def describe(record: dict[str, Any]) -> Iterator[str]:
     yield from _geometry(record["geometry"])
     error = record["error_model"]
     if error is not None:
-        yield (
-            f"  error model: {error['kind']}, {error['coupling']}, guard {error['guard'] or 'none'}"
-        )
+        parts = [error["kind"], error["coupling"], f"guard {error['guard'] or 'none'}"]
+        yield from _filled("  error model: ", ", ".join(part for part in parts if part))
     if record["radius"] is not None:
         radius = record["radius"]
         yield (
@@ -122,6 +133,8 @@ def describe(record: dict[str, Any]) -> Iterator[str]:
             f"{1e3 * radius['inside']:.3g} mm inside the domain, {1e3 * radius['outside']:.3g} mm "
             "outside"
         )
+    if record["play"] is not None:
+        yield f"  play of the actuators: {1e3 * max(record['play']):.3g} mm"
     if record["domain"] is not None:
         low, high = record["domain"]["q_min"], record["domain"]["q_max"]
         spans = ", ".join(f"{1e3 * a:.3g} to {1e3 * b:.3g}" for a, b in zip(low, high, strict=True))
@@ -137,20 +150,31 @@ def describe(record: dict[str, Any]) -> Iterator[str]:
             f"q in {log['q_unit']}, q_sign {log['q_sign']} ({', '.join(log['q'])}), x in "
             f"{log['x_unit']} ({', '.join(log['x'])})",
         )
-    training = record["training"]
-    if training is not None:
-        thinned = "" if training["n_whole"] == training["n"] else f" of {training['n_whole']}"
+    yield from _training(record["training"] or {})
+    if record["auto"] is not None:
+        for sentence in record["auto"]["words"]:
+            yield from _filled("  ", sentence)
+    if record["versions"] is not None:
+        versions = ", ".join(f"{name} {value}" for name, value in record["versions"].items())
+        yield from _filled(f"  saved on {record['created']} by ", versions)
+
+
+def _training(training: dict[str, Any]) -> Iterator[str]:
+    """Yield what the file says of the fit; of one that was saved by hand it may be little."""
+    if "log" in training:
+        thinned = "" if training["n_whole"] == training["rows"] else f" of {training['n_whole']}"
         yield (
-            f"  fitted to {training['log']}: {training['n']}{thinned} rows, "
+            f"  fitted to {training['log']}: {training['rows']}{thinned} rows, "
             f"{training['n_motions']} motions"
         )
-        yield f"  saved: {training['saved']}, {training['chosen']}"
-        yield "  " + ", ".join(f"{name} {value}" for name, value in training["versions"].items())
+        yield from _filled("  taken: ", f"{training['saved']}, {training['chosen']}")
         rows = [
             [name, *(f"{1e3 * entry[key]:.2f}" for key in ("mean", "p95", "max"))]
             for name, entry in training["held_out"].items()
         ]
         yield from table(["tip error on motions held out [mm]", "mean", "95 %", "max"], rows)
+    elif "rows" in training:
+        yield f"  fitted to {training['rows']} rows"
 
 
 def _geometry(geometry: dict[str, Any] | None) -> Iterator[str]:
@@ -192,4 +216,6 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]
 
 
 def _filled(head: str, text: str) -> list[str]:
-    return textwrap.wrap(text, 96, initial_indent=head, subsequent_indent=" " * len(head))
+    return textwrap.wrap(
+        text, 96, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False
+    )

@@ -146,7 +146,36 @@ class RobotDescription:
 
 
 def from_toml(path: str | Path) -> Chain:
-    """Return the chain that a TOML file describes; see `read_description` for the format."""
+    r"""Return the chain that a TOML file describes.
+
+    Parameters
+    ----------
+    path : str or Path
+        A robot description; `read_description` has its format, and returns the rest of it too.
+
+    Returns
+    -------
+    ConstantCurvatureChain or ElasticTendonChain
+        The nominal kinematics, lengths in metres.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not TOML, lacks a key, or has one that is not known; the message names it.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from hybridkin import robots
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder) / "robot.toml"
+    ...     _ = path.write_text("[[segment]]\nradius = 0.005\nlength = 0.1\nrepeat = 2\n")
+    ...     chain = robots.from_toml(path)
+    >>> chain.n_actuators
+    6
+    """
     return read_description(path).chain
 
 

@@ -540,7 +540,7 @@ def test_columns_that_never_change():
     assert ("constant", "error") in found(log)
 
 
-def test_duplicates_and_repeats():
+def test_duplicates_and_same_commands():
     log = tendon_log()
     for name in ("q", "x"):
         log[name][200:203] = log[name][20:23]
@@ -549,7 +549,7 @@ def test_duplicates_and_repeats():
     assert "3 of them in another motion" in finding.message
     log = tendon_log()
     log["q"][120:], log["x"][120:] = log["q"][:120], log["x"][:120] + np.array([3e-4, 0, 0])
-    finding = found(log)["repeats", "note"]
+    finding = found(log)["same command", "note"]
     assert "scatters by 0.21 mm rms" in finding.message  # 0.3 / sqrt(2), and all start at 0
 
 

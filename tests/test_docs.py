@@ -14,11 +14,12 @@ import hybridkin
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
-ROOMS = ("datasets", "plots", "robots", "simulation", "tasks", "trajectories")
+ROOMS = ("datasets", "experiments", "plots", "robots", "simulation", "tasks", "trajectories")
 # In the unit of the robot's actuators, whatever that is, or of data that need no robot.
 OF_THE_ACTUATORS = {"q", "q0", "q_min", "q_max", "q_pref", "dq", "X", "y", "std"}
 WITHOUT_UNIT = {
     *("groups", "sample_weight", "weights", "sizes", "rows", "part", "train_idx", "test_idx"),
+    *("motions", "fold", "late"),
     *("normal", "axes", "axes_", "frames", "base", "tip", "origins", "pose", "values", "spreads"),
     *("correlations", "narrowing", "identifiable", "singular_values", "sigma_min", "scale"),
     *("input_weights_", "alphas", "alpha_", "cv_results_", "leverage_center_"),

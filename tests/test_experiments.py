@@ -1,5 +1,6 @@
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import torch
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    HybridForwardModel,
+    PlayOperator,
     calibrate,
     datasets,
     experiments,
@@ -15,9 +18,11 @@ from hybridkin import (
     robots,
 )
 from hybridkin.__main__ import main
+from hybridkin.experiments._domain import known_commands
 from hybridkin.experiments._identifiability import ASKED, TELLABLE, identifiability
 from hybridkin.experiments._report import geometry_entries
 from hybridkin.experiments.paper import summary
+from hybridkin.persistence import model_header
 
 ROBOT = """
 calibrate = ["radii", "base"]
@@ -268,3 +273,60 @@ def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home, t
     mean = {name: values.mean() for name, values in errors.items()}
     assert mean["hybrid, ELM"] <= mean["mechanical, calibrated"] < mean["mechanical, nominal"]
     assert mean["hybrid, ELM"] < mean["data-driven, ELM"]
+
+
+def test_auto_on_slack_tendons_tells_that_it_took_elastic_ones(slack_log, tmp_path):
+    path, data = slack_log
+    robot = tmp_path / "plain.toml"
+    robot.write_text('calibrate = ["radii"]\n' + SLACK_ROBOT)
+    with pytest.warns(UserWarning, match="pull the tendons"):
+        report, _ = experiments.fit_log(
+            path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, n_jobs=1
+        )
+    assert report.record["saved"] == "hybrid, auto"
+    chosen = report.record["auto"]
+    assert chosen["taken"] == "ElasticTendonChain"
+    errors = chosen["mechanical_models"]
+    assert errors["ElasticTendonChain"] < 0.5 * errors["ConstantCurvatureChain"]
+    assert "on ElasticTendonChain" in report.record["chosen"]
+    assert any(
+        sentence.startswith("Auto compared two mechanical models") for sentence in chosen["words"]
+    )
+    text = (tmp_path / "m" / "report.md").read_text()
+    assert "## Calibration of the elastic tendons that auto took" in text
+    names = [entry["name"] for entry in report.record["calibration_of_saved"]["entries"]]
+    assert "bending_stiffness[0]" in names
+    header = model_header(tmp_path / "m" / "model.safetensors")
+    assert header["training"]["rows"] == 120
+    assert header["training"]["held_out"].keys() == report.record["held_out"].keys()
+    assert experiments.open_model(tmp_path / "m").header == header
+    predicted = experiments.open_model(tmp_path / "m").predict(data["q"])
+    assert np.linalg.norm(predicted - data["x"], axis=1).mean() < 0.0005
+
+
+def test_play_lowers_the_errors_of_auto_on_motions_held_out():
+    rng = np.random.default_rng(0)
+    chain = ConstantCurvatureChain([0.005], lengths=[0.1])
+    groups = np.repeat(np.arange(8), 20)
+    swing = np.sin(np.linspace(0, 6, 20)) * rng.uniform(1, 8, 8)[:, None]
+    q = 0.0005 * np.stack([np.cos(groups - a) * swing.ravel() for a in (0, 2.0944, 4.1888)], axis=1)
+    with torch.no_grad():
+        x = chain(torch.from_numpy(PlayOperator(4e-4).apply_by_group(q, groups))).numpy()
+    options = {"parameters": ("radii",), "n_folds": 2, "n_seeds": 1, "n_jobs": 1}
+    errors, _, choices = experiments.compare_by_group(chain, q, x, groups, play=4e-4, **options)
+    assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
+    assert all(choice["hybrid, auto"].endswith("play 0.4 mm") for choice in choices)
+
+
+def test_an_actuator_that_never_moved_is_held_where_it_was():
+    data = datasets.load_trunk()
+    q = data.q[:200].copy()
+    q[:, 4] = 0.25
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, "linear").fit(q, data.x[:200])
+    opened = experiments.OpenedModel("trunk", Path("trunk"), model, None, None)
+    limits = experiments.path_limits(opened)
+    assert limits["q_min"] == pytest.approx(q.min(axis=0))
+    assert limits["q_max"] == pytest.approx(q.max(axis=0))
+    assert limits["source"] == "range of the fit"
+    assert model.module_.in_domain(torch.from_numpy(known_commands(opened, limits)[0])).all()

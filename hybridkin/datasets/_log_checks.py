@@ -293,11 +293,12 @@ def _duplicates(log: _Log) -> list[LogFinding]:
         spread = np.sqrt(((x - means[inverse])[again] ** 2).sum() / freedom)
         found.append(
             log.finding(
-                "repeats",
+                "same command",
                 "note",
-                f"{again.sum()} rows repeat a command exactly; the tip scatters by "
-                f"{1e3 * spread:.3g} mm rms.",
-                "no model of the command alone can be better than that.",
+                f"{again.sum()} rows share their command with another row, as on a way out and "
+                f"back; there the tip scatters by {1e3 * spread:.3g} mm rms.",
+                "this is noise, or play where the robot came from another side, which --play auto "
+                "(play=) can learn; no model of the command alone errs less.",
                 keep[again],
             )
         )

@@ -20,8 +20,8 @@ class LogFinding:
     Attributes
     ----------
     kind : str
-        "invalid", "frozen tip", "frozen actuator", "constant", "duplicates", "repeats", "jumps",
-        "time", "motions", "rows", "units", "sign", "numbering" or "geometry".
+        "invalid", "frozen tip", "frozen actuator", "constant", "duplicates", "same command",
+        "jumps", "time", "motions", "rows", "units", "sign", "numbering" or "geometry".
     severity : {"error", "warning", "note"}
         "error": a fit would be worthless; "warning": look at it; "note": good to know.
     message : str

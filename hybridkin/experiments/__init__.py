@@ -1,5 +1,6 @@
 """The paper's tables and figures, fits and tests on measured logs, tracks, learners compared."""
 
+from hybridkin.experiments._domain import middle_tip, path_limits
 from hybridkin.experiments._measured_log import LogError, MeasuredLog, read_log
 from hybridkin.experiments._opened import OpenedModel, open_model, trunk_model
 from hybridkin.experiments.describing import describe_model
@@ -17,9 +18,6 @@ from hybridkin.experiments.paper import run_paper, table1, tracking
 from hybridkin.experiments.speed import measure_speed
 from hybridkin.experiments.steering import (
     animate_track,
-    middle_tip,
-    path_limits,
-    preferred,
     read_path,
     track_path,
 )
@@ -44,7 +42,6 @@ __all__ = [
     "middle_tip",
     "open_model",
     "path_limits",
-    "preferred",
     "read_log",
     "read_path",
     "run_paper",

@@ -44,8 +44,12 @@ class MeasuredLog(NamedTuple):
         Actuator vectors and tips [m].
     motions : ndarray of shape (N,)
         Motion of every row.
+    named : bool
+        Whether the log names them; else they are stretches of it.
     split : str
         What the motions are, in words.
+    late : ndarray of shape (k,)
+        Rows that come before the row above them in time, within their motion.
     report : LogReport
         What the check of the whole log found.
     """
@@ -53,8 +57,18 @@ class MeasuredLog(NamedTuple):
     q: NDArray
     x: NDArray
     motions: NDArray
+    named: bool
     split: str
+    late: NDArray
     report: datasets.LogReport
+
+    def check_order(self, why: str) -> None:
+        """Raise where rows of a motion are not in the order of time; `why` begins the message."""
+        if len(self.late):
+            raise ValueError(
+                f"{why} needs the rows of a motion in the order of time, but {len(self.late)} come "
+                "before the row above them; sort the log by motion and time."
+            )
 
     def thinned(self, max_rows: int | None) -> MeasuredLog:
         """Return every k-th row, so that at most `max_rows` are left; None: all."""
@@ -62,6 +76,15 @@ class MeasuredLog(NamedTuple):
             return self
         kept = slice(None, None, -(-len(self.q) // max_rows))
         return self._replace(q=self.q[kept], x=self.x[kept], motions=self.motions[kept])
+
+
+def _late(motions: NDArray, time: NDArray | None) -> NDArray:
+    """Return rows whose time is before that of the row above them in their motion."""
+    if time is None:
+        return np.empty(0, dtype=int)
+    order = np.argsort(motions, kind="stable")
+    same = motions[order][1:] == motions[order][:-1]
+    return np.sort(order[1:][same & (np.diff(time[order]) < 0)])
 
 
 def read_log(
@@ -92,8 +115,15 @@ def read_log(
     delimiter : str or None, default=None
         As for `datasets.load_log`.
 
+    Returns
+    -------
+    MeasuredLog
+        In SI units, with the report of its check.
+
     Raises
     ------
+    FileNotFoundError
+        If there is no such file.
     ValueError
         If columns or motions are not there.
     """
@@ -141,7 +171,9 @@ def read_log(
         for finding in report.findings:
             rows[finding.rows] &= finding.kind != "frozen tip"
         report = report.accepting("frozen tip")
-    return MeasuredLog(data.q[rows], data.x[rows], motions[kept][rows], split, report)
+    motions, named = motions[kept][rows], data.groups is not None
+    late = _late(motions, None if data.time is None else data.time[rows])
+    return MeasuredLog(data.q[rows], data.x[rows], motions, named, split, late, report)
 
 
 def checked(log: MeasuredLog, on_check: OnCheck, force: bool) -> MeasuredLog:

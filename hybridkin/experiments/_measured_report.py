@@ -106,13 +106,97 @@ def write_comparison(
     )
 
 
+def auto_entry(model: Any) -> dict[str, Any]:
+    """Return what a fitted HybridForwardModel with error_model="auto" chose.
+
+    Returns
+    -------
+    dict
+        "chosen"; "weights" of the parts; "mechanical_models" by name with their mean distance on
+        motions left out [m], and which was "taken"; "candidates" with the same distance [m]; "play"
+        of every actuator [m], None without.
+    """
+    found = model.cv_results_
+    width = None if model.play_ is None else np.ravel(model.play_.width).tolist()
+    return {
+        "chosen": str(found["chosen"]),
+        "weights": {name: float(w) for name, w in found["weights"].items() if w > 0.0},
+        "taken": type(model.mechanical_model_).__name__,
+        "mechanical_models": {name: float(e) for name, e in found["mechanical_model"].items()},
+        "candidates": dict(
+            zip(found["candidate"], np.asarray(found["mean_distance"]).tolist(), strict=True)
+        ),
+        "play": width,
+        "play_asked": model.play is not None,
+    }
+
+
+def auto_in_short(entry: dict[str, Any]) -> str:
+    """Return in a few words what auto chose: parts, mechanical model, play."""
+    weights = sorted(entry["weights"].items(), key=lambda item: -item[1])
+    words = weights[0][0]
+    if len(weights) > 1:
+        words = "blend of " + ", ".join(f"{w:.1f} {name}" for name, w in weights)
+    if len(entry["mechanical_models"]) > 1:
+        words += f" on {entry['taken']}"
+    if entry["play"] is not None:
+        words += f", play {1e3 * max(entry['play']):.3g} mm"
+    return words
+
+
+def auto_in_words(entry: dict[str, Any]) -> list[str]:
+    """Return in sentences what auto compared, by motions left out, and what it took."""
+    said = []
+    tried = sorted(entry["mechanical_models"].items(), key=lambda item: item[1])
+    if len(tried) > 1:
+        (best, least), (other, more) = tried[:2]
+        said.append(
+            f"Auto compared two mechanical models, each calibrated: {best} errs by "
+            f"{1e3 * least:.2f} mm on motions left out, {other} by {1e3 * more:.2f} mm. It took "
+            f"{entry['taken']}."
+        )
+    candidates = entry["candidates"]
+    alone = min((e, name) for name, e in candidates.items() if name != "blend")
+    if len(entry["weights"]) > 1:
+        said.append(
+            "The blend of auto is the weighted mean of several hybrids: "
+            f"{1e3 * candidates['blend']:.2f} mm on motions left out, {1e3 * alone[0]:.2f} mm with "
+            f"the best of them alone ({alone[1]}), {1e3 * candidates['mechanical']:.2f} mm without "
+            "any."
+        )
+    else:
+        said.append(
+            f"Auto took the error model {alone[1]}: {1e3 * alone[0]:.2f} mm on motions left out, "
+            f"{1e3 * candidates['mechanical']:.2f} mm without any."
+        )
+    if entry["play"] is not None:
+        said.append(
+            f"Play of the actuators: {1e3 * max(entry['play']):.3g} mm. Predictions follow the "
+            "order of the rows, motion by motion."
+        )
+    elif entry["play_asked"]:
+        said.append("Play of the actuators was looked for; none was worth its while.")
+    return said
+
+
+def write_auto(report: Report, entry: dict[str, Any]) -> None:
+    """Add what auto chose for the model that is saved."""
+    report.record["auto"] = {**entry, "words": auto_in_words(entry)}
+    report.text(" ".join(report.record["auto"]["words"]))
+
+
 def write_calibration(
-    report: Report, chain: Any, result: CalibrationResult, warned: list[str]
+    report: Report,
+    chain: Any,
+    result: CalibrationResult,
+    warned: list[str],
+    title: str = "Calibration on all motions",
+    key: str = "calibration",
 ) -> None:
-    """Add what the calibration found, and what the log leaves open."""
+    """Add what the calibration found, and what the log leaves open, to the record as `key`."""
     entries = geometry_entries(chain, result)
     report.text(
-        "## Calibration on all motions",
+        f"## {title}",
         f"Root mean square tip error {1000 * result.rmse:.2f} mm. Standard errors count every row "
         "as independent and are too small where rows follow each other closely. What narrows the "
         f"prior of a parameter less than {TOLD:.0f} times does not tell it: its value is an "
@@ -122,7 +206,7 @@ def write_calibration(
     report.text(*(f"Warning: {message}" for message in warned))
     if result.unidentified:
         report.text("What the log leaves open:", *(f"- {line}" for line in result.unidentified))
-    report.record["calibration"] = {
+    report.record[key] = {
         "values": result.values,
         "std_errors": result.std_errors,
         "rmse": result.rmse,

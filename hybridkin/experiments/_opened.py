@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,9 +12,10 @@ from torch import nn
 
 from hybridkin import datasets, robots
 from hybridkin.hybrid import HybridForwardModel
-from hybridkin.persistence import load_model
+from hybridkin.persistence import load_model, model_header
+from hybridkin.play import PlayOperator
 
-_MODEL, _ROBOT, _RECORD = "model.safetensors", "robot.toml", "report.json"
+_MODEL, _ROBOT = "model.safetensors", "robot.toml"
 
 
 class OpenedModel(NamedTuple):
@@ -31,15 +31,15 @@ class OpenedModel(NamedTuple):
         A chain, a fitted hybrid or a fitted ELM.
     description : RobotDescription or None
         The robot's, where it stood beside the model or was given.
-    record : dict or None
-        What the fit reported, where that stood beside the model.
+    header : dict or None
+        What the file says of the model, see `persistence.model_header`; of a saved model only.
     """
 
     name: str
     path: Path
     model: Any
     description: robots.RobotDescription | None
-    record: dict[str, Any] | None
+    header: dict[str, Any] | None
 
     @property
     def is_hybrid(self) -> bool:
@@ -67,22 +67,39 @@ class OpenedModel(NamedTuple):
 
     @property
     def trained_range(self) -> tuple[NDArray, NDArray] | None:
-        """Least and largest q of the fit (n,), where the model knows them."""
+        """Least and largest q of the fit (n,), where the model knows them.
+
+        With play it is that of what the actuators did.
+        """
         drift = getattr(self.model, "_drift", None)
         if drift is None:
             return None
-        return drift.center - drift.scale, drift.center + drift.scale
+        half = np.where(drift.scale == 1.0, 0.0, drift.scale)  # one that never moved counts as 1
+        return drift.center - half, drift.center + half
 
-    def predict(self, q: NDArray) -> NDArray:
-        """Return tips (N, 3) [m]."""
-        if isinstance(self.model, nn.Module):
-            with torch.no_grad():
-                return self.model(torch.from_numpy(np.ascontiguousarray(q))).numpy()
-        return self.model.predict(q)
+    @property
+    def play(self) -> PlayOperator | None:
+        """The play of the actuators, where the model has some."""
+        return getattr(self.model, "play_", None)
 
-    def in_domain(self, q: NDArray) -> NDArray | None:
+    def effective(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
+        """Return what the actuators do (N, n) at commands q, of one motion or by motion."""
+        if self.play is None:
+            return q
+        return self.play.apply_by_group(q, np.zeros(len(q)) if groups is None else groups)
+
+    def predict(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
+        """Return tips (N, 3) [m]; with play by `groups`, the motion of every row."""
+        if self.is_hybrid:
+            return self.model.predict(q, groups=groups)
+        if not isinstance(self.model, nn.Module):
+            return self.model.predict(q)
+        with torch.no_grad():
+            return self.model(torch.from_numpy(np.ascontiguousarray(q))).numpy()
+
+    def in_domain(self, q: NDArray, groups: NDArray | None = None) -> NDArray | None:
         """Return where the error model is trusted (N,), None without one."""
-        return self.model.in_domain(q) if self.is_hybrid else None
+        return self.model.in_domain(q, groups=groups) if self.is_hybrid else None
 
     def log_format(self) -> robots.LogFormat:
         """Return how the robot's logs are written, or plain names in SI units."""
@@ -104,6 +121,11 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> OpenedModel
         Robot description, for the format of its logs and its limits. Default: ``robot.toml`` in
         the folder of the model.
 
+    Returns
+    -------
+    OpenedModel
+        The model, with what is known of it.
+
     Raises
     ------
     FileNotFoundError
@@ -120,15 +142,13 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> OpenedModel
             raise FileNotFoundError(f"`model` {path} is a folder without {_MODEL}; name the file.")
         path = path / _MODEL
     model, beside = load_model(path), path.parent
-    description = record = None
+    description = None
     if robot is not None:
         description = robots.read_description(robot)
     elif path.name == _MODEL and (beside / _ROBOT).is_file():
         description = robots.read_description(beside / _ROBOT)
-    if path.name == _MODEL and (beside / _RECORD).is_file():
-        record = _record(beside / _RECORD)
     name = path.stem if description is None else description.name
-    opened = OpenedModel(name, path, model, description, record)
+    opened = OpenedModel(name, path, model, description, model_header(path))
     if description is not None and description.chain.n_actuators != opened.n_actuators:
         raise ValueError(
             f"`robot` {description.name!r} has {description.chain.n_actuators} actuators, the "
@@ -138,7 +158,13 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> OpenedModel
 
 
 def trunk_model() -> OpenedModel:
-    """Return the paper's: a hybrid of the trunk's nominal chain and an ELM, fitted to its data."""
+    """Return the paper's: a hybrid of the trunk's nominal chain and an ELM, fitted to its data.
+
+    Returns
+    -------
+    OpenedModel
+        With the trunk's limits; its data are the simulated ones of `datasets.load_trunk`.
+    """
     data = datasets.load_trunk()
     chain = robots.bionic_handling_assistant()
     model = HybridForwardModel(chain, random_state=0).fit(data.q, data.x)
@@ -147,10 +173,3 @@ def trunk_model() -> OpenedModel:
         "simulated trunk", chain, (), None, robots.Limits(low, high)
     )
     return OpenedModel("simulated trunk, hybrid ELM", Path("trunk"), model, description, None)
-
-
-def _record(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}); move it away.") from error

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sklearn.linear_model import LinearRegression
@@ -166,7 +167,7 @@ def quiet(label: str, done: int, total: int) -> None:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)):
+    if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} has no JSON form")
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from hybridkin.experiments._measured_report import auto_entry, auto_in_short, auto_in_words
 from hybridkin.experiments._opened import OpenedModel
 
 
@@ -23,7 +24,8 @@ def describe_model(opened: OpenedModel) -> dict[str, Any]:
     -------
     dict
         "kind", "n_actuators", "geometry" of the chain, "error_model", "training", "domain",
-        "radius" and "log_format"; None where there is nothing to tell.
+        "radius", "play" (width [m]), "auto", "log_format", "limits", "created" and "versions" of
+        what wrote the file; None where there is nothing to tell.
     """
     found: dict[str, Any] = {
         "name": opened.name,
@@ -32,7 +34,11 @@ def describe_model(opened: OpenedModel) -> dict[str, Any]:
         "n_actuators": opened.n_actuators,
         "geometry": None if opened.chain is None else geometry(opened.chain),
         "error_model": None,
-        "training": _training(opened.record),
+        "play": None if opened.play is None else np.ravel(opened.play.width).tolist(),
+        "auto": None,
+        "training": None,
+        "created": None,
+        "versions": None,
         "domain": None,
         "radius": None,
         "log_format": None,
@@ -41,7 +47,7 @@ def describe_model(opened: OpenedModel) -> dict[str, Any]:
     if opened.is_hybrid:
         model = opened.model
         found["error_model"] = {
-            "kind": "none" if model.error_model_ is None else type(model.error_model_).__name__,
+            "kind": _kind(model.error_model_),
             "coupling": model.coupling,
             "guard": model.guard,
             "calibrated": list(model.calibrate)
@@ -50,6 +56,12 @@ def describe_model(opened: OpenedModel) -> dict[str, Any]:
         }
         if model.radius_ is not None:
             found["radius"] = model.radius_._asdict()
+        if model.cv_results_ is not None:
+            entry = auto_entry(model)
+            found["error_model"] |= {"kind": auto_in_short(entry), "coupling": None}
+            found["auto"] = {**entry, "words": auto_in_words(entry)}
+    if opened.header is not None:
+        found |= {key: opened.header.get(key) for key in ("training", "created", "versions")}
     if opened.trained_range is not None:
         low, high = opened.trained_range
         found["domain"] = {"q_min": low.tolist(), "q_max": high.tolist()}
@@ -103,17 +115,14 @@ def _base(chain: Any) -> dict[str, Any] | None:
     return {"position": pose[:3, 3].tolist(), "rotation_vector_deg": turn.tolist()}
 
 
-def _training(record: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Return what the report of the fit says of it."""
-    if record is None or "held_out" not in record:
-        return None
-    keys = ("log", "n", "n_whole", "n_motions", "excluded", "loss", "saved", "chosen", "versions")
-    found = {key: record.get(key) for key in keys}
-    found["held_out"] = {
-        name: {key: entry[key] for key in ("mean", "p95", "max")}
-        for name, entry in record["held_out"].items()
-    }
-    return found
+def _kind(error_model: Any) -> str:
+    """Return the name of an error model, of a blend that of its parts with their weights."""
+    if error_model is None:
+        return "none"
+    if not hasattr(error_model, "error_models"):
+        return type(error_model).__name__
+    parts = zip(error_model.weights, error_model.error_models, strict=True)
+    return "blend of " + ", ".join(f"{w:.1f} {_kind(one)}" for w, one in parts)
 
 
 def _numbers(value: torch.Tensor) -> np.ndarray:

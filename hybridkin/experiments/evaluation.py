@@ -73,12 +73,15 @@ def evaluate_log(
             f"{data.q.shape[1]}."
         )
     checked(data, on_check, force)
-    predicted = opened.predict(data.q)
+    motion = data.motions if data.named else np.zeros(len(data.q))  # else it is one
+    if opened.play is not None:
+        data.check_order("A model with play")
+    predicted = opened.predict(data.q, motion)
     errors = distance(predicted, data.x)
-    inside = opened.in_domain(data.q)
+    inside = opened.in_domain(data.q, motion)
     radius = None
     if getattr(opened.model, "radius_", None) is not None:
-        radius = opened.model.predict(data.q, return_radius=True)[1]
+        radius = opened.model.predict(data.q, return_radius=True, groups=motion)[1]
     names = list(dict.fromkeys(data.motions.tolist()))
     motions = {str(name): _entry(errors, inside, radius, data.motions == name) for name in names}
     everything = _entry(errors, inside, radius, np.ones(len(errors), dtype=bool))
@@ -97,9 +100,19 @@ def evaluate_log(
     ax.set(ylabel="rows")
     report.figure("error_histogram", figure, "Tip errors of all rows.")
     figure, ax = plots.new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
-    plots.WorkspaceDisplay.from_estimator(opened.model, data.q, data.x).plot(ax, unit="mm")
+    row = int(np.argsort(errors)[int(0.95 * len(errors))])
+    display = plots.WorkspaceDisplay(data.x, predicted, _body(opened, data.q, motion, row), row)
+    display.plot(ax, unit="mm")
     report.figure("workspace", figure, "Measured tips, coloured by the model's error.")
     return report, report.write(out)
+
+
+def _body(opened: OpenedModel, q: NDArray, motion: NDArray, row: int) -> NDArray | None:
+    """Return points along the robot in one row (P, 3) [m], where the model has a body."""
+    if not hasattr(opened.chain, "backbone"):
+        return None
+    effective = opened.effective(q, motion)[row]
+    return plots.BackboneDisplay.from_estimator(opened.chain, effective).points[0]
 
 
 def _entry(

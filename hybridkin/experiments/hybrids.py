@@ -95,7 +95,19 @@ def extrapolation(
 
     The trunks: learned from the inner 60 % of the range of every length, examined on rows of the
     whole range that leave this box. armlab_3cable: learned where no cable is shortened by more than
-    6 mm, examined where one is. Arguments and result are those of `learning_curves`.
+    6 mm, examined where one is.
+
+    Parameters
+    ----------
+    n : int, default=400
+        Rows to learn from.
+    n_draws, n_test, models, data_home, folder, n_jobs, progress
+        As in `learning_curves`.
+
+    Returns
+    -------
+    list of dict
+        One entry per case and model, as in `learning_curves`.
     """
     cases = trunk_cases([n], n_draws, n_test, folder, n_jobs, inner=True)
     cases += armlab_cases([n], n_draws, n_test, data_home, inner=True)
@@ -128,6 +140,12 @@ def held_out_motions(
     models, data_home, n_jobs, progress
         As in `learning_curves`; where the recording is absent, a warning says so and the result is
         empty.
+
+    Returns
+    -------
+    list of dict
+        One entry per case and model, as in `learning_curves`, its "errors" with "within", the share
+        of tips inside the radius, and "radius", its mean [m], where the model tells one.
     """
     return examine(motion_cases(data_home, coverage, thin), models, n_jobs, progress)
 
@@ -149,10 +167,19 @@ def examine(
 
 
 def data_demand(curves: list[dict[str, Any]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return by case and test what the best data-only model errs with all rows, and the demand.
+    """Return how many rows "auto" needs to err as little as the best data-only model with all.
 
-    The error [m] is the mean over draws; the demand is the number of rows from which "auto" errs as
-    little, between two sizes by a straight line in logarithms, infinite where it never does.
+    Parameters
+    ----------
+    curves : list of dict
+        As from `learning_curves`.
+
+    Returns
+    -------
+    dict of (str, str) to (float, float)
+        By case and test: the error of the data-only model with all rows [m], the mean over draws;
+        and the number of rows from which "auto" errs as little, between two sizes by a straight
+        line in logarithms, infinite where it never does.
     """
     found = {}
     for case, test in _tests(curves):
@@ -171,7 +198,18 @@ def data_demand(curves: list[dict[str, Any]]) -> dict[tuple[str, str], tuple[flo
 def hybrids_report(
     curves: list[dict[str, Any]], outside: list[dict[str, Any]], motions: list[dict[str, Any]]
 ) -> Report:
-    """Return the report of `learning_curves`, `extrapolation` and `held_out_motions`."""
+    """Return the report of `learning_curves`, `extrapolation` and `held_out_motions`.
+
+    Parameters
+    ----------
+    curves, outside, motions : list of dict
+        What the three returned, in this order.
+
+    Returns
+    -------
+    Report
+        Tables in mm and two figures; ``report.write(folder)`` writes them with ``report.json``.
+    """
     report = Report("Hybrid models compared")
     report.record.update(curves=curves, outside=outside, motions=motions)
     report.text("## Few rows", "Tip error in mm, mean ± standard deviation over draws.")

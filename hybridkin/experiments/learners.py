@@ -176,9 +176,23 @@ def time_learners(
 ) -> list[dict[str, Any]]:
     """Return CPU time per fit and the error reached against the number of rows, on the arm.
 
-    Sizes ascend; a learner whose fit took more than `longest` seconds is not tried on more rows.
-    The errors are those on `n_test` other rows. One dict per fit: "learner", "n", "seconds", "rmse"
-    [mm]; the other arguments are those of `compare_learners`, by default with `TIMED`.
+    Parameters
+    ----------
+    learners : mapping of str to Learner, optional
+        Default: `TIMED`.
+    sizes : sequence of int, default=(250, 500, 1000, 2000, 4000)
+        Rows to learn from, ascending.
+    longest : float, default=60.0
+        A learner whose fit took more CPU seconds is not tried on more rows.
+    n_test : int, default=2000
+        Other rows that the errors are those of.
+    random_state, progress
+        As in `compare_learners`.
+
+    Returns
+    -------
+    list of dict
+        One entry per fit: "learner", "n", "seconds" (CPU time) and "rmse" [mm].
     """
     learners = TIMED if learners is None else learners
     X, y = make_arm(n_test + max(sizes), random_state)
@@ -195,7 +209,20 @@ def time_learners(
 
 
 def learners_report(table: list[dict[str, Any]], curve: list[dict[str, Any]]) -> Report:
-    """Return the report of what `compare_learners` and `time_learners` returned."""
+    """Return the report of what `compare_learners` and `time_learners` returned.
+
+    Parameters
+    ----------
+    table : list of dict
+        As from `compare_learners`.
+    curve : list of dict
+        As from `time_learners`.
+
+    Returns
+    -------
+    Report
+        Tables of errors and CPU times, and a figure; ``report.write(folder)`` writes them.
+    """
     report = Report("Learners compared")
     report.record.update(table=table, curve=curve)
     header = ["set", *dict.fromkeys(entry["learner"] for entry in table)]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
@@ -27,6 +27,9 @@ from hybridkin.experiments._measured_log import (
     read_log,
 )
 from hybridkin.experiments._measured_report import (
+    auto_entry,
+    auto_in_short,
+    write_auto,
     write_calibration,
     write_check,
     write_comparison,
@@ -43,6 +46,7 @@ from hybridkin.experiments._report import (
 from hybridkin.guards import GUARDS
 from hybridkin.hybrid import HybridForwardModel
 from hybridkin.persistence import save_model
+from hybridkin.tendons import ElasticTendonChain
 
 ALPHAS = tuple(10.0**k for k in range(-5, 4))
 """Ridge weights to choose from."""
@@ -52,6 +56,7 @@ ELM = "hybrid, ELM"
 _SAVED = ("mechanical, calibrated", "hybrid, linear", ELM, AUTO)  # what a file can hold
 _N_HIDDEN = 100
 _INNER_FOLDS = 4
+_ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto: fewer do not pay for a start
 
 
 class Choice(NamedTuple):
@@ -71,6 +76,7 @@ class _Settings(NamedTuple):
     loss: str
     n_seeds: int
     auto: bool = True
+    play: float | str | None = None
 
 
 _DATA_CHOICES = tuple(Choice(alpha, None) for alpha in ALPHAS)
@@ -88,6 +94,7 @@ def compare_by_group(
     n_folds: int = 5,
     n_seeds: int = 5,
     auto: bool = True,
+    play: float | str | None = None,
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> tuple[dict[str, NDArray], NDArray, list[dict[str, str]]]:
@@ -114,8 +121,11 @@ def compare_by_group(
         Random hidden layers; the errors are their average per row.
     auto : bool, default=True
         Whether ``error_model="auto"`` is among the models; it takes most of the time.
+    play : float or "auto", optional
+        Play of the actuators [m] that this hybrid knows, see `HybridForwardModel`; the rows of a
+        motion are in the order of time then.
     n_jobs, progress
-        Processes, and a callable handed (what, done, total).
+        Processes at most, and a callable handed (what, done, total).
 
     Returns
     -------
@@ -126,16 +136,15 @@ def compare_by_group(
     choices : list of dict
         What was chosen in each fold.
     """
-    settings = _Settings(tuple(parameters), loss, n_seeds, auto)
+    settings = _Settings(tuple(parameters), loss, n_seeds, auto, play)
     folds = list(GroupKFold(min(n_folds, len(np.unique(groups)))).split(q, groups=groups))
     jobs = (delayed(_one_fold)(chain, q, x, groups, *fold, settings) for fold in folds)
     errors: dict[str, NDArray] = {}
     fold_of_row = np.empty(len(q), dtype=int)
     choices = []
+    most = min(effective_n_jobs(n_jobs or 1), len(folds), max(1, len(q) // _ROWS_PER_PROCESS[auto]))
     # Else torch and BLAS start threads in every process, and these wait for each other.
-    workers = Parallel(
-        n_jobs=n_jobs, backend="loky", inner_max_num_threads=1, return_as="generator"
-    )
+    workers = Parallel(n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator")
     results: Any = workers(jobs)
     for i, ((_, test), (found, chosen)) in enumerate(zip(folds, results, strict=True)):
         for name, values in found.items():
@@ -159,7 +168,8 @@ def fit_log(
     n_folds: int = 5,
     n_seeds: int = 5,
     auto: bool = True,
-    max_rows: int | None = 4000,
+    play: float | str | None = None,
+    max_rows: int | None = 2000,
     drop_invalid: bool = False,
     drop_frozen: bool = False,
     delimiter: str | None = None,
@@ -188,11 +198,11 @@ def fit_log(
         is cut into 10 stretches.
     exclude : sequence of str, optional
         Patterns of motions to leave out, ``"*tendon*"`` for example.
-    loss, n_folds, n_seeds, auto, n_jobs, progress
-        As in `compare_by_group`.
+    loss, n_folds, n_seeds, auto, play, n_jobs, progress
+        As in `compare_by_group`. `play` needs `auto`, and named motions in the order of time.
     coverage : float, optional
         As for `HybridForwardModel`: the saved model tells a radius for this share of tips.
-    max_rows : int or None, default=4000
+    max_rows : int or None, default=2000
         Of a longer log every k-th row is taken, so that at most so many remain; None: all rows.
     drop_invalid, drop_frozen : bool, default=False
         Leave out rows with missing or infinite values, and rows whose tip is frozen, instead of
@@ -218,6 +228,8 @@ def fit_log(
         pass its check with that ``report``.
     """
     check_out(out)
+    if play is not None and not auto:
+        raise ValueError('`play` is known to the hybrid "auto" alone; leave out --no-auto.')
     description = robots.read_description(robot)
     log_format = log_format or described_format(description, robot)
     if groups is not None:
@@ -239,6 +251,13 @@ def fit_log(
             f"`groups` must name at least 2 motions to hold one out, but column "
             f"{log_format.groups!r} leaves {n_motions}."
         )
+    if play is not None:
+        if not whole.named:
+            raise ValueError(
+                "`play` needs motions, their rows in the order of time; name the column that tells "
+                "them apart: --groups COLUMN, or groups = in [log]."
+            )
+        whole.check_order("`play`")
     checked(whole, on_check, force)
     data = whole.thinned(max_rows)
     errors, fold, choices = compare_by_group(
@@ -251,6 +270,7 @@ def fit_log(
         n_folds=n_folds,
         n_seeds=n_seeds,
         auto=auto,
+        play=play,
         n_jobs=n_jobs,
         progress=progress,
     )
@@ -261,7 +281,7 @@ def fit_log(
         result = calibrate(chain, data.q, data.x, names, loss=loss)
     for warning in caught:
         warnings.warn(warning.message, stacklevel=2)
-    settings = _Settings(names, loss, n_seeds)
+    settings = _Settings(names, loss, n_seeds, auto, play)
     with _silence():  # all that is to say has been said of the whole log
         model, why = _final(saved, chain, result.chain, data, settings, coverage)
     progress(f"fitting {saved} to all motions", 1, 1)
@@ -285,8 +305,19 @@ def fit_log(
         f"Saved is the model with the least mean error here: **{saved}** ({why}), fitted to all "
         f"motions. Chosen in the folds: " + "; ".join(c.get(saved, "-") for c in choices) + "."
     )
+    if saved == AUTO:
+        write_auto(report, auto_entry(model))
     write_calibration(report, chain, result, [str(warning.message) for warning in caught])
-    report.file("model.safetensors", lambda path: save_model(model, path))
+    if isinstance(model.mechanical_model_, ElasticTendonChain) and model.calibration_ is not None:
+        start = chain
+        if not isinstance(chain, ElasticTendonChain):
+            start = ElasticTendonChain.from_chain(chain)
+        title = "Calibration of the elastic tendons that auto took"
+        write_calibration(report, start, model.calibration_, [], title, "calibration_of_saved")
+    kept = ("log", "robot", "n_whole", "n_motions", "excluded", "loss", "saved", "chosen")
+    training = {key: report.record[key] for key in (*kept, "held_out")}
+    training |= {"rows": len(data.q), "split": whole.split}
+    report.file("model.safetensors", lambda path: save_model(model, path, training=training))
     report.file("robot.toml", lambda path: shutil.copyfile(robot, path))
     report.text(
         "The model: `hybridkin.load_model('model.safetensors')`. `robot.toml` is the description "
@@ -327,7 +358,7 @@ def _final(
         model = HybridForwardModel(calibrated, error_model)
     model.set_params(coverage=coverage).fit(data.q, data.x, groups=data.motions)
     if saved == AUTO and model.cv_results_ is not None:
-        why = str(model.cv_results_["chosen"])
+        why = auto_in_short(auto_entry(model))
     return model, why
 
 
@@ -337,9 +368,9 @@ def _auto_model(chain: Any, calibrated: Any, settings: _Settings) -> HybridForwa
     It calibrates anew in every fold of its own, by least squares; a loss that bounds outliers is
     kept by starting from the chain so calibrated.
     """
-    if settings.loss == "linear":
-        return HybridForwardModel(chain, "auto", calibrate=settings.parameters, random_state=0)
-    return HybridForwardModel(calibrated, "auto", random_state=0)
+    names = settings.parameters if settings.loss == "linear" else ()
+    start = chain if settings.loss == "linear" else calibrated
+    return HybridForwardModel(start, "auto", calibrate=names, play=settings.play, random_state=0)
 
 
 @contextlib.contextmanager
@@ -396,8 +427,8 @@ def _one_fold(
     chosen = {"data-driven, ELM": str(data_choice), ELM: str(hybrid_choice)}
     if settings.auto:
         auto: Any = _auto_model(chain, calibrated, settings).fit(*rows, groups=groups[train])
-        errors[AUTO] = distance(auto.predict(q[test]), x[test])
-        chosen[AUTO] = str(auto.cv_results_["chosen"])
+        errors[AUTO] = distance(auto.predict(q[test], groups=groups[test]), x[test])
+        chosen[AUTO] = auto_in_short(auto_entry(auto))
     return errors, chosen
 
 

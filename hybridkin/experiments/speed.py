@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from hybridkin._numerics import forward_and_jacobian
+from hybridkin.experiments._domain import path_limits, preferred
 from hybridkin.experiments._opened import OpenedModel
 from hybridkin.experiments._report import Progress, quiet, versions
-from hybridkin.experiments.steering import path_limits, preferred
 from hybridkin.ik import InverseKinematics
 
 _SECONDS = 0.3  # of every measurement, at least
@@ -51,9 +51,10 @@ def measure_speed(
     rng = np.random.default_rng(0)
     limits = path_limits(opened)
     low, high, middle = limits["q_min"], limits["q_max"], preferred(opened, limits)
-    ik = InverseKinematics(opened.model, q_min=low, q_max=high, q_pref=middle, dt=0.01)
+    ik = InverseKinematics(opened.module, q_min=low, q_max=high, q_pref=middle, dt=0.01)
     q = middle + 0.2 * (rng.uniform(low, high) - middle)
-    x = opened.predict(middle[None])[0]
+    with torch.no_grad():
+        x = opened.module(torch.from_numpy(middle[None]))[0].numpy()
     controller = ik.controller(q)
     jobs: list[tuple[str, int, Callable[[], Any]]] = []
     for n in batches:

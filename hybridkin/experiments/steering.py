@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
-import warnings
 from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin import datasets, plots, robots
+from hybridkin.experiments._domain import homeward, known_commands, path_limits
 from hybridkin.experiments._opened import OpenedModel
 from hybridkin.experiments._report import Report, check_out
-from hybridkin.ik import IKStatus, InverseKinematics
+from hybridkin.ik import IKStatus, InverseKinematics, Track
 from hybridkin.trajectories import Trajectory, from_csv
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
+_STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
+_STARTS = 16
+_PULLS = (0.2, 0.0, 0.0, 0.2)  # to the preferred configuration, one attempt at the path each
 
 
 def track_path(
@@ -41,7 +47,11 @@ def track_path(
 
     Written are ``track.csv``, with one row per point in the units, names and sign of the robot's
     logs: time, commands, the model's tip, the target, the error and its status; a figure, and the
-    report.
+    report. Points far apart are passed in several steps on a straight line; where points are
+    missed, other starts and postures are tried, and the track that reaches most within the domain
+    is kept. Of a model with play
+    the commands are those to send, which lead or trail what the actuators do by half its width, and
+    further columns ``effective_NAME`` hold the latter.
 
     Parameters
     ----------
@@ -52,8 +62,9 @@ def track_path(
     out : str or Path
         Folder to write into.
     q_min, q_max, dq_max : array-like of shape (n,), optional
-        Limits [m], speeds [m/s]. Default: those of the robot's description, else the range that
-        the model was fitted on.
+        Limits [m], speeds [m/s]. Default: those of the robot's description within the range that
+        the model was fitted on, or that range, see `path_limits`. With play `dq_max` holds for what
+        the actuators do.
     beta, tol
         As for `InverseKinematics` and its `track`.
     log_format : LogFormat, optional
@@ -64,7 +75,8 @@ def track_path(
     Returns
     -------
     report : Report
-        Its ``record`` holds "errors" [m], "statuses", "reached" and "limits".
+        Its ``record`` holds "errors" [m], "statuses", "reached", "in_domain" (share of the points,
+        None without a learned part), "limits" and "play" (width [m]).
     paths : list of Path
         What was written.
     """
@@ -72,24 +84,35 @@ def track_path(
     log_format = log_format or opened.log_format()
     limits = path_limits(opened, q_min, q_max, dq_max)
     periods = np.diff(path.t)
-    dt = float(periods.max()) if len(periods) else 0.01
-    posture = preferred(opened, limits)
-    ik = InverseKinematics(
-        opened.model,
-        q_min=limits["q_min"],
-        q_max=limits["q_max"],
-        dq_max=limits["dq_max"],
-        q_pref=posture,
-        beta=min(beta, 1.0 / dt),
-        dt=dt,
-    )
+    commands, tips = known_commands(opened, limits)
+    way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
+    extent = np.linalg.norm(np.ptp(tips, axis=0))
+    fine, every = _in_steps(path, max(1, math.ceil(way / (_STEP * extent))))
+    dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
+    track: Any = None
+    for attempt, pull in enumerate(_PULLS):
+        ik = InverseKinematics(
+            opened.module,
+            q_min=limits["q_min"],
+            q_max=limits["q_max"],
+            dq_max=limits["dq_max"],
+            q_pref=homeward(opened, limits, pull),
+            beta=min(beta, 1.0 / dt),
+            dt=dt,
+        )
 
-    def told(done: int, total: int) -> None:
-        if progress is not None:
-            progress("tracking", done + 1, total)
+        def told(done: int, total: int, attempt: int = attempt) -> None:
+            if progress is not None:
+                progress(f"tracking, attempt {attempt + 1}", done + 1, total)
 
-    first = ik.solve(path.x[0], tol=0.1 * tol, max_iter=200, restarts=16, random_state=0)
-    track = ik.track(path, q0=first.q, tol=tol, progress=told)
+        first = _starts(ik, path.x[0], commands, tips, 0.1 * tol)[attempt % 2]
+        found = _rows(ik.track(fine, q0=first, tol=tol, progress=told), slice(None, None, every))
+        if track is None or _score(found) > _score(track):
+            track = found
+        if _score(track) == (len(path), len(path)):
+            break
+    sent = track.q if opened.play is None else opened.play.command(track.q)[0]
+    inside = opened.module.in_domain(torch.from_numpy(track.q)) if opened.is_hybrid else None
     names = [IKStatus(int(code)).name for code in track.status]
     reached = np.isin(track.status, _REACHED)
     report = Report(f"{opened.name}: a path of {len(path)} points")
@@ -100,6 +123,8 @@ def track_path(
         reached=int(reached.sum()),
         errors={"mean": track.mean_error, "p95": track.p95_error, "max": track.max_error},
         tol=tol,
+        in_domain=None if inside is None else float(inside.double().mean()),
+        play=None if opened.play is None else np.ravel(opened.play.width).tolist(),
         statuses={name: names.count(name) for name in dict.fromkeys(names)},
         limits={**limits, "source": limits["source"]},
         largest_speed=np.abs(np.diff(track.q, axis=0) / periods[:, None]).max(initial=0.0),
@@ -107,69 +132,55 @@ def track_path(
     )
     report.record["columns"] |= {"x": log_format.x, "x_unit": log_format.x_unit}
     _write_summary(report)
-    _add_figures(report, opened, track)
-    report.file("track.csv", lambda file: _write_track(file, track, names, log_format))
+    _add_figures(report, opened, track, sent)
+    effective = None if opened.play is None else track.q
+    report.file(
+        "track.csv", lambda file: _write_track(file, track, sent, effective, names, log_format)
+    )
     return report, report.write(out)
 
 
-def path_limits(
-    opened: OpenedModel,
-    q_min: ArrayLike | None = None,
-    q_max: ArrayLike | None = None,
-    dq_max: ArrayLike | None = None,
-) -> dict[str, Any]:
-    """Return the limits of the actuators: those given, the description's, the fitted range."""
-    found = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
-    source = "given"
-    if opened.description is not None:
-        own = opened.description.limits
-        for name in found:
-            if found[name] is None and getattr(own, name) is not None:
-                found[name], source = getattr(own, name), "robot description"
-    trained = opened.trained_range
-    if trained is not None:
-        for name, value in zip(("q_min", "q_max"), trained, strict=True):
-            if found[name] is None:
-                found[name], source = value, "range of the fit"
-    if found["q_min"] is None or found["q_max"] is None:
-        raise ValueError(
-            "`q_min` and `q_max` must be given (--q-min, --q-max), or stand as [limits] in the "
-            "robot description: this model does not know the range of its actuators."
-        )
-    sized = {
-        name: None if value is None else np.broadcast_to(value, opened.n_actuators).astype(float)
-        for name, value in found.items()
-    }
-    return {**sized, "source": source}
+def _in_steps(path: Trajectory, n: int) -> tuple[Trajectory, int]:
+    """Return the path with every way between two points cut into n, and n."""
+    if n == 1 or len(path) < 2:
+        return path, 1
+    places = np.arange((len(path) - 1) * n + 1) / n
+    columns = np.column_stack([path.t, path.x])
+    t, *x = (np.interp(places, np.arange(len(path)), column) for column in columns.T)
+    return Trajectory(t, np.stack(x, axis=1)), n
 
 
-def preferred(opened: OpenedModel, limits: dict[str, Any]) -> NDArray:
-    """Return the configuration to keep near (n,), within the limits.
+def _starts(
+    ik: InverseKinematics, target: NDArray, commands: NDArray, tips: NDArray, tol: float
+) -> list[NDArray]:
+    """Return two configurations (n,) to start from, at the target.
 
-    It is the middle of the fit's range, near the rows that the model learned from; without a fit
-    where no tendon is pulled, else the middle of the limits.
+    One that the first of the commands, near the preferred one, leads to; and of those from the
+    commands whose tips are nearest to the target, in the domain if possible, the one with the
+    largest singular value sigma_min.
     """
-    low, high = opened.trained_range or (limits["q_min"], limits["q_max"])
-    tendons = getattr(opened.chain, "lengths", None) is not None
-    at_rest = tendons and opened.trained_range is None
-    middle = np.zeros(opened.n_actuators) if at_rest else 0.5 * (low + high)
-    return np.clip(middle, limits["q_min"], limits["q_max"])
+    near = np.argsort(np.linalg.norm(tips[1:] - target, axis=1))[:_STARTS] + 1
+    near = np.concatenate([[0], near])
+    targets = np.broadcast_to(target, (len(near), 3)).copy()
+    found = ik.solve(targets, q0=commands[near], tol=tol, max_iter=200)
+    for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN):
+        rows = np.flatnonzero(found.status[1:] == wanted) + 1
+        if len(rows):
+            return [found.q[0], found.q[rows[found.sigma_min[rows].argmax()]]]
+    free = ik.solve(target, tol=tol, max_iter=200, restarts=_STARTS, random_state=0)
+    return [found.q[0], free.q]
 
 
-def middle_tip(opened: OpenedModel, limits: dict[str, Any]) -> NDArray:
-    """Return a place (3,) in the midst of the workspace [m].
+def _score(track: Track) -> tuple[int, int]:
+    """Return how many points were reached within the domain, and how many at all."""
+    statuses = np.asarray(track.status)
+    return int((statuses == IKStatus.CONVERGED).sum()), int(np.isin(statuses, _REACHED).sum())
 
-    It is the tip of random commands that is nearest to their mean: some robots reach only a
-    surface.
-    """
-    low, high = opened.trained_range or (limits["q_min"], limits["q_max"])
-    low, high = np.maximum(low, limits["q_min"]), np.minimum(high, limits["q_max"])
-    q = np.random.default_rng(0).uniform(low, high, (256, opened.n_actuators))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"\d+ of \d+ rows of `\w+` pull the tendons")
-        tips = opened.predict(q)
-    tips = tips[np.isfinite(tips).all(axis=1)]
-    return tips[np.linalg.norm(tips - tips.mean(axis=0), axis=1).argmin()]
+
+def _rows(track: Track, kept: slice) -> Track:
+    """Return some rows of a track."""
+    parts = {f.name: getattr(track, f.name) for f in fields(track)}
+    return replace(track, **{k: v[kept] for k, v in parts.items() if v is not None})
 
 
 def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> Trajectory:
@@ -183,6 +194,18 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
         Of the positions.
     dt : float, optional
         Time between points [s]; a file with times is read at this period, straight in between.
+
+    Returns
+    -------
+    Trajectory
+        Points [m] and times [s].
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it has no times and `dt` is not given, or is not a table of numbers.
     """
     file = Path(path)
     if not file.is_file():
@@ -251,9 +274,13 @@ def animate_track(
     out = Path(out)
     if not out.absolute().parent.is_dir():
         raise FileNotFoundError(f"`out` must lie in a folder that exists, got {out}.")
+    q = opened.effective(q)
+    with torch.no_grad():
+        tips = opened.module(torch.from_numpy(q)).numpy()
     film = plots.TrackAnimation.from_estimator(
-        opened.model, q, target=target, t=t, n_frames=n_frames
+        opened.chain, q, target=target, t=t, x=tips, n_frames=n_frames
     )
+    film.name = "tip (model)"
 
     def told(done: int, total: int) -> None:
         if progress is not None:
@@ -298,18 +325,30 @@ def _read_track(
     return data.q, data.x if known else None, data.time
 
 
-def _write_track(file: Path, track: Any, statuses: list[str], log_format: robots.LogFormat) -> None:
-    q = track.q * log_format.q_sign / _METRES[log_format.q_unit]
-    scale = 1.0 / _METRES[log_format.x_unit]
-    columns = np.column_stack([track.t, q, scale * track.x, scale * track.target])
+def _write_track(
+    file: Path,
+    track: Track,
+    sent: NDArray,
+    effective: NDArray | None,
+    statuses: list[str],
+    log_format: robots.LogFormat,
+) -> None:
+    """Write commands, and what the actuators do where that is something else, point by point."""
+    unit, scale = log_format.q_sign / _METRES[log_format.q_unit], 1 / _METRES[log_format.x_unit]
+    columns = np.column_stack([track.t, unit * sent, scale * track.x, scale * track.target])
+    further = [] if effective is None else [f"effective_{name}" for name in log_format.q]
+    tail = np.empty((len(sent), 0)) if effective is None else unit * effective
     with open(file, "w", encoding="utf-8", newline="") as lines:
         writer = csv.writer(lines, lineterminator="\n")
-        writer.writerow([TIME, *log_format.q, *log_format.x, *TARGET, "error", "status"])
-        for row, error, status in zip(columns, scale * track.error, statuses, strict=True):
-            writer.writerow([*(f"{v + 0.0:.9g}" for v in row), f"{error:.6g}", status])
+        head = [TIME, *log_format.q, *log_format.x, *TARGET, "error", "status", *further]
+        writer.writerow(head)
+        rows = zip(columns, scale * track.error, statuses, tail, strict=True)
+        for row, error, status, does in rows:
+            cells = [f"{v + 0.0:.9g}" for v in row]
+            writer.writerow([*cells, f"{error:.6g}", status, *(f"{v + 0.0:.9g}" for v in does)])
 
 
-def _add_figures(report: Report, opened: OpenedModel, track: Any) -> None:
+def _add_figures(report: Report, opened: OpenedModel, track: Track, sent: NDArray) -> None:
     figure, axes = plots.new_figure(11.0, 4.2, 1, 3)
     display = plots.TrackingDisplay.from_tracks({"model": track})
     i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])  # where most happens
@@ -321,8 +360,12 @@ def _add_figures(report: Report, opened: OpenedModel, track: Any) -> None:
     shares = getattr(opened.chain, "actuators_per_segment", (opened.n_actuators,))
     n = len(shares)
     figure, axes = plots.new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
-    plots.ActuatorDisplay.from_tracks({"commands": track}, shares).plot(axes[:, 0], unit="mm")
-    axes[0, 0].get_legend().remove()
+    shown = {"commands": replace(track, q=sent)}
+    if opened.play is not None:
+        shown["what the actuators do"] = track
+    plots.ActuatorDisplay.from_tracks(shown, shares).plot(axes[:, 0], unit="mm")
+    if len(shown) == 1:
+        axes[0, 0].get_legend().remove()
     report.figure("commands", figure, "Commands as the model counts them.")
 
 
