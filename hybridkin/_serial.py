@@ -18,7 +18,7 @@ _BLOCK = 2**18  # numbers in the features of a block of rows: near in the cache
 
 
 class SerialModule(PortableModule):
-    """The tip x = f(z(q) + w(q) W phi(q)) as a torch module q (..., n) -> x (..., m).
+    """The tip x = f(z(q) + W phi(q)) as a torch module q (..., n) -> x (..., m).
 
     Parameters
     ----------
@@ -35,8 +35,6 @@ class SerialModule(PortableModule):
         R with R R' the posterior covariance of W for noise of variance 1. Default: none, zero.
     noise_variance : Tensor of shape (), optional
         Variance of one coordinate of a measured tip [m^2].
-    guard : nn.Module, optional
-        The weight w(q) in [0, 1], shape (..., 1). None: one everywhere.
     """
 
     weights: Tensor
@@ -52,14 +50,12 @@ class SerialModule(PortableModule):
         place: str = "coordinates",
         factor: Tensor | None = None,
         noise_variance: Tensor | None = None,
-        guard: nn.Module | None = None,
     ) -> None:
         super().__init__()
         if place not in PLACES:
             raise ValueError(f"`place` must be one of {PLACES}, got {place!r}.")
         self.mechanical = mechanical
         self.features = features
-        self.guard = guard
         self.place = place
         self.register_buffer("weights", weights)
         nothing, unknown = weights.new_zeros(weights.numel(), 0), weights.new_full((), nan)
@@ -78,7 +74,7 @@ class SerialModule(PortableModule):
         return in_blocks(self._forward, q)[0]
 
     def jacobian(self, q: Tensor) -> Tensor:
-        """Return dx/dq = J_z (dz/dq + d(w W phi)/dq), shape (..., m, n), in closed form."""
+        """Return dx/dq = J_z (dz/dq + d(W phi)/dq), shape (..., m, n), in closed form."""
         return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -87,20 +83,9 @@ class SerialModule(PortableModule):
         x, J = in_blocks(self._forward_and_jacobian, q, min(rows, 4096))
         return x, J
 
-    def mechanical_part(self, q: Tensor) -> Tensor:
-        """Return the tip f(z(q)) without correction, shape (..., m) [m]."""
-        return self.mechanical(q)
-
     def correction(self, q: Tensor) -> Tensor:
-        """Return w(q) W phi(q), shape (..., C) [unit of z]."""
-        delta = self.features(q) @ self.weights.to(q).mT
-        return delta if self.guard is None else self.guard(q) * delta
-
-    def in_domain(self, q: Tensor) -> Tensor:
-        """Return whether the correction is fully trusted, shape (...), bool."""
-        if self.guard is None:
-            return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
-        return self.guard.strangeness(q) <= 1.0  # pyright: ignore[reportCallIssue]
+        """Return W phi(q), shape (..., C) [unit of z]."""
+        return self.features(q) @ self.weights.to(q).mT
 
     def tip_covariance(self, q: Tensor) -> Tensor:
         """Return the posterior covariance of the tip, without noise, shape (..., m, m) [m^2].
@@ -130,13 +115,6 @@ class SerialModule(PortableModule):
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         delta, turn = self.features.readout(q, self.weights.to(q))
-        if self.guard is not None:
-            outside = (~self.in_domain(q)).nonzero()[:, 0]  # inside it is exactly one
-            if len(outside):
-                weight, fading = forward_and_jacobian(self.guard, q[outside])
-                own = weight[..., None] * turn[outside] + delta[outside][..., None] * fading
-                turn = turn.index_copy(0, outside, own)
-                delta = delta.index_copy(0, outside, weight * delta[outside])
         z, slope = coordinates(self.mechanical, q, self.place)
         x, J = tip_and_columns(self.mechanical, z + delta, self.place)
         return x, J @ (slope + turn)

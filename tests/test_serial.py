@@ -40,20 +40,6 @@ class Wave(torch.nn.Module):
         )
 
 
-class Fading(torch.nn.Module):
-    """A guard: full trust within a distance of the mean, fading beyond."""
-
-    def __init__(self, q, radius):
-        super().__init__()
-        self.center, self.radius = q.mean(0), radius
-
-    def strangeness(self, q):
-        return (q - self.center).square().sum(-1) / self.radius**2
-
-    def forward(self, q):
-        return (1.0 / (1.0 + (self.strangeness(q) - 1.0).clamp(min=0.0) ** 3))[..., None]
-
-
 def uniform(rng, *shape):
     return 2.0 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1.0
 
@@ -156,28 +142,6 @@ def test_jacobian(robot, kind, place, rng):
     assert_close(x[3], module(q[3]))
     if robot != "tendons":  # a difference may reach across where a tendon goes slack
         assert_close(J, central_differences(module, q), atol=1e-6, rtol=1e-5)
-
-
-def test_jacobian_with_a_guard(rng):
-    chain, q = rows_of("trunk", rng, 60)
-    guard = Fading(q, 0.085)
-    features = QuadraticFeatures.of_range(q)
-    module = SerialModule(chain, features, 0.01 * uniform(rng, 9, 55), guard=guard)
-    inside = module.in_domain(q)
-    assert 10 < inside.sum() < 50
-    z = coordinates(chain, q, "coordinates")[0]
-    expected = tip_and_columns(
-        chain, z + guard(q) * (features(q) @ module.weights.mT), "coordinates"
-    )[0]
-    assert_close(module(q), expected)
-    x, J = module.forward_and_jacobian(q)
-    assert_close(x, expected)
-    assert_close(J, central_differences(module, q), atol=1e-6, rtol=1e-5)
-    far = torch.full((1, 9), 0.25, dtype=torch.float64)
-    far[0, 0] = 50.0
-    assert (
-        module.correction(far).abs().max() < 1e-2 * (features(far) @ module.weights.mT).abs().max()
-    )
 
 
 @pytest.mark.parametrize("robot", ["trunk", "cables", "arm"])
@@ -500,10 +464,7 @@ def test_turning_the_frame_turns_the_model(rng):
 
 def test_a_bad_row_stays_alone(rng):
     chain, q = rows_of("trunk", rng, 12)
-    guard = Fading(q, 0.085)
-    module = SerialModule(
-        chain, QuadraticFeatures.of_range(q), 0.01 * uniform(rng, 9, 55), guard=guard
-    )
+    module = SerialModule(chain, QuadraticFeatures.of_range(q), 0.01 * uniform(rng, 9, 55))
     x, J = module.forward_and_jacobian(q)
     broken = q.clone()
     broken[5, 2] = float("nan")
