@@ -34,6 +34,7 @@ BENT = np.array([0.25, 0.3, 0.27, 0.25, 0.21, 0.3, 0.2, 0.25, 0.22])
 
 @pytest.fixture(autouse=True)
 def no_figure_left_open():
+    plt.close("all")  # of other tests
     yield
     left = plt.get_fignums()
     plt.close("all")
