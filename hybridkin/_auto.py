@@ -16,6 +16,7 @@ from sklearn.model_selection import GroupKFold, KFold
 
 from hybridkin._arc_chain import ArcChain
 from hybridkin._couplings import Readout
+from hybridkin._radius import distance
 from hybridkin.chain import ConstantCurvatureChain
 from hybridkin.elm import ELMRegressor
 from hybridkin.elm_cv import ELMRegressorCV
@@ -93,7 +94,7 @@ def choose_mechanics(
             alone = _fit(
                 model, mechanical, "parallel", "drop", X[train], y[train], weights[train], names
             )
-            left_out[test] = _distance(alone.predict(X[test]), y[test])
+            left_out[test] = distance(alone.predict(X[test]), y[test])
             chains.append(alone.mechanical_model_)
         scores = {type(mechanical).__name__: float(np.average(left_out, weights=weights))}
         found.append(Mechanics(mechanical, names, folds, chains, scores))
@@ -161,7 +162,7 @@ def choose(
             left_out[i, test] = part.predict(X[test])
             seconds[i] += time.process_time() - start
     blended = _blended(left_out, y, weights, fold_of)
-    distances = np.array([_distance(x, y) for x in (*left_out, blended)])
+    distances = np.array([distance(x, y) for x in (*left_out, blended)])
     by_fold = np.array(
         [
             np.average(distances[:, test], axis=1, weights=weights[test])
@@ -209,15 +210,11 @@ def _shares(left_out: NDArray, y: NDArray, weights: NDArray) -> NDArray:
     """
     picks, total = np.zeros(len(left_out)), np.zeros_like(y)
     for k in range(1, _PICKS + 1):
-        means = [weights @ _distance((total + x) / k, y) for x in left_out]
+        means = [weights @ distance((total + x) / k, y) for x in left_out]
         best = int(np.argmin(means))
         picks[best] += 1
         total += left_out[best]
     return picks / _PICKS
-
-
-def _distance(x: Any, y: NDArray) -> NDArray:
-    return np.linalg.norm((x - y).reshape(len(y), -1), axis=1)
 
 
 def _candidates(mechanical: Any, seed: Any) -> dict[str, tuple[str, Any]]:
@@ -249,8 +246,8 @@ def _tuned(X: NDArray, error: NDArray, weights: NDArray, folds: list[Any]) -> Ke
             missed[place] = 0.0
             for train, test in folds:
                 part = ridge(place).fit(X[train], error[train], sample_weight=weights[train])
-                left = (error[test] - part.predict(X[test])).reshape(len(test), -1)
-                missed[place] += weights[test] @ np.linalg.norm(left, axis=1)
+                left = distance(part.predict(X[test]), error[test])
+                missed[place] += float(weights[test] @ left)
         return missed[place]
 
     widths, penalties = range(len(_GAMMAS)), range(len(_ALPHAS))

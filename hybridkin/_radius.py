@@ -53,8 +53,8 @@ def conformal_radius(
         given = {name: np.asarray(v)[train] for name, v in given.items() if v is not None}
         part.set_params(coverage=None, play=None).fit(X[train], y[train], **given)
         trust[test] = part.error_weight(X[test])
-        errors[test] = _distance(part.predict(X[test]), y[test])
-        mechanical[test] = _distance(part.predict_mechanical(X[test]), y[test])
+        errors[test] = distance(part.predict(X[test]), y[test])
+        mechanical[test] = distance(part.predict_mechanical(X[test]), y[test])
     weights = np.ones(len(y)) if weights is None else weights
     trusted = weights * (trust >= 0.5)
     if not trusted.any():
@@ -68,7 +68,8 @@ def conformal_radius(
     return Radius(factor * inside, factor * outside, coverage, len(y))
 
 
-def _distance(a: NDArray, b: NDArray) -> NDArray:
+def distance(a: Any, b: NDArray) -> NDArray:
+    """Return how far two sets of tips are apart, row by row, shape (N,)."""
     return np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)
 
 

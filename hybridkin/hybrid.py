@@ -109,8 +109,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Of error_model="auto": by candidate, the last of which is the blend, the mean distance on
         rows left out, its spread over the folds [m] and the CPU time [s]; the ``weights`` of the
         blend, what is ``chosen`` ("blend", or the only one of weight), and how the mechanical
-        models did (``mechanical_model``). A blend is judged by weights that do not know the fold.
-        New motions that resemble none in the log are harder than those left out.
+        models did, without play (``mechanical_model``). A blend is judged by weights that do not
+        know the fold. New motions that resemble none in the log are harder than those left out.
     calibration_ : CalibrationResult or None
         What the calibration found.
     play_ : PlayOperator or None
@@ -236,7 +236,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             if mechanics is not None:
                 with _silence():
                     again = choose_mechanics(self, [(mechanical, names)], X, y, counts, groups)
-                mechanics = again._replace(scores=mechanics.scores | again.scores)
+                mechanics = again._replace(scores=mechanics.scores)  # of all, without play
         q = torch.from_numpy(X.astype(np.float64))
         self.calibration_: CalibrationResult | None = None
         if len(names):

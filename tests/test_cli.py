@@ -161,7 +161,7 @@ def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
     assert "radius for 90 % of the tips" in printed
 
 
-def test_fit_of_npz_and_parquet_is_that_of_csv(log, robot, tmp_path, capsys):
+def test_npz_and_parquet_are_read_as_csv_is(log, robot, tmp_path, capsys):
     pd = pytest.importorskip("pandas")
     pytest.importorskip("pyarrow")
     table = rows()
@@ -670,8 +670,8 @@ def test_every_command_has_help_with_exit_codes(command, capsys):
         ["fly"],
         ["fit"],
         ["benchmark", "--batches", "0"],
-        ["track", "--tol", "-1"],
-        ["fit", "l", "--play", "-1"],
+        ["track", "model", "--shape", "line", "--tol", "-1", "--out", "out"],
+        ["fit", "l", "--robot", "r", "--play", "-1", "--out", "out"],
     ],
 )
 def test_wrong_options_end_with_2(arguments, capsys):

@@ -79,6 +79,12 @@ def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
         assert len(Path("commands.csv").read_text().splitlines()) == len(space["path"].x)
 
 
+@pytest.mark.parametrize("page", sorted(path.name for path in DOCS.glob("*.md")))
+def test_code_of_every_page_is_python(page):
+    for block in blocks(page, "python"):
+        compile(block, page, "exec")
+
+
 def test_code_of_the_learners_page_runs_as_printed(capsys):
     exec(compile(blocks("elm.md", "python")[0], "elm.md", "exec"), {})
     new_rows, left_out = map(float, capsys.readouterr().out.split()[:2])
@@ -111,7 +117,9 @@ def public():
         found |= {name: o for name, o in members.items() if callable(o)}
     for name, cls in list(found.items()):
         if inspect.isclass(cls):
-            for key, member in vars(cls).items():
+            own = [base for base in cls.__mro__ if base.__module__.startswith("hybridkin")]
+            members = {key: o for base in reversed(own) for key, o in vars(base).items()}
+            for key, member in members.items():
                 member = getattr(member, "__func__", getattr(member, "fget", member))
                 if not key.startswith("_") and inspect.isfunction(member):
                     found[f"{name}.{key}"] = member

@@ -711,3 +711,15 @@ def test_own_axes_when_none_are_given(x):
         assert isinstance(figure, Figure)
         assert plt.gcf() is figure
         plt.close(figure)
+
+
+def test_a_workspace_without_a_known_error_is_drawn_empty():
+    figure, ax = plots.new_figure(3, 3, subplot_kw={"projection": "3d"})
+    nothing = np.full((2, 3), np.nan)
+    assert plots.WorkspaceDisplay(nothing, nothing).plot(ax).ax_ is ax
+    figure.canvas.draw()
+
+
+def test_actuators_of_other_lengths_are_refused_at_the_door():
+    with pytest.raises(ValueError, match=r"one shape \(T, 3\).*\(4, 3\) for 'b'"):
+        plots.ActuatorDisplay({"a": np.zeros((5, 3)), "b": np.zeros((4, 3))}, (3,))

@@ -183,7 +183,7 @@ def _frozen(log: _Log) -> list[LogFinding]:
                 tips,
             )
         )
-    for name, column in (*zip(log.x_names, log.x.T, strict=True),):
+    for name, column in zip(log.x_names, log.x.T, strict=True):
         still = np.diff(column) == 0
         rows = np.setdiff1d(_frozen_rows(log, still, spans), tips)
         if len(rows) and np.ptp(column) > 0 and still.mean() < 0.2:
@@ -316,7 +316,7 @@ def _jumps(log: _Log) -> list[LogFinding]:
     if len(moving) == 0:
         return []
     steps = np.flatnonzero(ratio > _JUMP * np.quantile(moving, 0.9))
-    rows = np.unique(np.concatenate([steps[:0], steps + 1]))
+    rows = steps + 1
     if len(rows) == 0 or len(rows) > 0.1 * len(log.q):
         return []
     return [

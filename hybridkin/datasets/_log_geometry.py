@@ -13,7 +13,7 @@ from hybridkin.datasets._logs import METRES
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to tell one robot from its mirror image
-_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "um": "micrometres"}
+_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 # Of the tip's spread over the robot's reach, of strokes over radii (a bend, in rad) and of
 # chamber lengths over radii: what cannot be, what is usual.
 _REACH, _USUAL_REACH = 5.0, 0.7

@@ -85,10 +85,6 @@ class LogReport:
         """Whether there are no errors."""
         return not self.errors
 
-    def kinds(self) -> set[str]:
-        """Return the kinds of all findings."""
-        return {finding.kind for finding in self.findings}
-
     def accepting(self, kind: str) -> LogReport:
         """Return the report with findings of a kind, whose rows were left out, as notes."""
         changed = []

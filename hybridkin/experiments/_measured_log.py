@@ -160,12 +160,13 @@ def read_log(
     for name in ("q", "x", "line", "groups", "time"):
         if data[name] is not None:
             data[name] = data[name][kept]
-    options: dict[str, Any] = {
-        "chain": chain,
-        "base_is_free": base_is_free,
-        "q_sign": log_format.q_sign,
-    }
-    report = datasets.check_log(data, drop_invalid=drop_invalid, **options)
+    report = datasets.check_log(
+        data,
+        chain=chain,
+        base_is_free=base_is_free,
+        q_sign=log_format.q_sign,
+        drop_invalid=drop_invalid,
+    )
     rows = np.ones(len(data.q), dtype=bool)
     if drop_frozen:
         for finding in report.findings:
@@ -176,8 +177,8 @@ def read_log(
     return MeasuredLog(data.q[rows], data.x[rows], motions, named, split, late, report)
 
 
-def checked(log: MeasuredLog, on_check: OnCheck, force: bool) -> MeasuredLog:
-    """Return the log, once its report has been handed on and holds no error or `force` is set.
+def check(log: MeasuredLog, on_check: OnCheck, force: bool) -> None:
+    """Hand on the report of a log that holds no error, or where `force` is set.
 
     Raises
     ------
@@ -187,7 +188,6 @@ def checked(log: MeasuredLog, on_check: OnCheck, force: bool) -> MeasuredLog:
     if log.report.errors and not force:
         raise LogError(log.report)
     on_check(log.report)
-    return log
 
 
 def not_told(report: datasets.LogReport) -> None:

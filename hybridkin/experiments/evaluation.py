@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin import plots, robots
-from hybridkin.experiments._measured_log import OnCheck, checked, not_told, read_log
+from hybridkin.experiments._measured_log import OnCheck, check, not_told, read_log
 from hybridkin.experiments._measured_report import write_check
 from hybridkin.experiments._opened import OpenedModel
 from hybridkin.experiments._report import Report, check_out, distance
@@ -72,7 +72,7 @@ def evaluate_log(
             f"`q` must name {opened.n_actuators} columns, as many as the model has actuators, got "
             f"{data.q.shape[1]}."
         )
-    checked(data, on_check, force)
+    check(data, on_check, force)
     motion = data.motions if data.named else np.zeros(len(data.q))  # else it is one
     if opened.play is not None:
         data.check_order("A model with play")

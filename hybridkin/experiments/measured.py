@@ -22,7 +22,7 @@ from hybridkin.elm import ELMRegressor
 from hybridkin.experiments._measured_log import (
     MeasuredLog,
     OnCheck,
-    checked,
+    check,
     not_told,
     read_log,
 )
@@ -258,7 +258,7 @@ def fit_log(
                 "them apart: --groups COLUMN, or groups = in [log]."
             )
         whole.check_order("`play`")
-    checked(whole, on_check, force)
+    check(whole, on_check, force)
     data = whole.thinned(max_rows)
     errors, fold, choices = compare_by_group(
         chain,

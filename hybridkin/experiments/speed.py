@@ -6,6 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,8 @@ def measure_speed(
     for n in batches:
         rows = torch.from_numpy(rng.uniform(low, high, (n, len(low))))
         jobs.append(("forward kinematics", n, lambda rows=rows: opened.module(rows)))
-        jobs.append(("forward kinematics and Jacobian", n, lambda r=rows: _both(opened.module, r)))
+        both = partial(forward_and_jacobian, opened.module, rows)
+        jobs.append(("forward kinematics and Jacobian", n, both))
     jobs.append(("step of inverse kinematics (torch)", 1, lambda: ik.step(q, x)))
     jobs.append(("tick of the controller (NumPy)", 1, lambda: controller.step(x)))
     entries = []
@@ -77,10 +79,6 @@ def measure_speed(
         "cores": os.cpu_count(),
         "processor": platform.processor() or platform.machine(),
     }
-
-
-def _both(module: Any, q: torch.Tensor) -> Any:
-    return forward_and_jacobian(module, q)
 
 
 def _timed(job: Callable[[], Any], seconds: float) -> float:

@@ -38,9 +38,7 @@ def track_path(
     q_min: ArrayLike | None = None,
     q_max: ArrayLike | None = None,
     dq_max: ArrayLike | None = None,
-    beta: float = 1.0,
     tol: float = 1e-4,
-    log_format: robots.LogFormat | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> tuple[Report, list[Path]]:
     """Compute the commands that lead the tip along a path, and write them.
@@ -65,10 +63,8 @@ def track_path(
         Limits [m], speeds [m/s]. Default: those of the robot's description within the range that
         the model was fitted on, or that range, see `path_limits`. With play `dq_max` holds for what
         the actuators do.
-    beta, tol
-        As for `InverseKinematics` and its `track`.
-    log_format : LogFormat, optional
-        Names, units and sign of what is written. Default: those of the robot's logs.
+    tol : float, default=1e-4
+        As for `InverseKinematics.track` [m].
     progress : callable, optional
         Handed (what, done, total).
 
@@ -81,7 +77,7 @@ def track_path(
         What was written.
     """
     check_out(out)
-    log_format = log_format or opened.log_format()
+    log_format = opened.log_format()
     limits = path_limits(opened, q_min, q_max, dq_max)
     periods = np.diff(path.t)
     commands, tips = known_commands(opened, limits)
@@ -97,7 +93,7 @@ def track_path(
             q_max=limits["q_max"],
             dq_max=limits["dq_max"],
             q_pref=homeward(opened, limits, pull),
-            beta=min(beta, 1.0 / dt),
+            beta=min(1.0, 1.0 / dt),
             dt=dt,
         )
 
@@ -126,7 +122,7 @@ def track_path(
         in_domain=None if inside is None else float(inside.double().mean()),
         play=None if opened.play is None else np.ravel(opened.play.width).tolist(),
         statuses={name: names.count(name) for name in dict.fromkeys(names)},
-        limits={**limits, "source": limits["source"]},
+        limits=limits,
         largest_speed=np.abs(np.diff(track.q, axis=0) / periods[:, None]).max(initial=0.0),
         columns={"q": log_format.q, "q_unit": log_format.q_unit, "q_sign": log_format.q_sign},
     )
@@ -230,7 +226,6 @@ def animate_track(
     path: str | Path,
     out: str | Path,
     *,
-    log_format: robots.LogFormat | None = None,
     unit: str = "cm",
     speed: float = 1.0,
     n_frames: int = 150,
@@ -246,8 +241,6 @@ def animate_track(
         ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format.
     out : str or Path
         File that ends in ".mp4", ".gif" or ".html".
-    log_format : LogFormat, optional
-        How the file is written. Default: as the robot's logs are.
     unit : {"m", "cm", "mm"}, default="cm"
         Of the axes.
     speed : float, default=1.0
@@ -267,10 +260,10 @@ def animate_track(
             f"`model` {opened.path} has no body to draw; animate one with a chain as its "
             "mechanical part."
         )
-    file, log_format = Path(path), log_format or opened.log_format()
+    file = Path(path)
     if file.is_dir():
         file = file / "track.csv"
-    q, target, t = _read_track(file, log_format)
+    q, target, t = _read_track(file, opened.log_format())
     out = Path(out)
     if not out.absolute().parent.is_dir():
         raise FileNotFoundError(f"`out` must lie in a folder that exists, got {out}.")

@@ -26,7 +26,6 @@ from hybridkin.plots._canvas import (
 )
 from hybridkin.plots._page import page
 from hybridkin.plots.space import BackboneDisplay, Line
-from hybridkin.plots.tracking import reached
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -176,9 +175,8 @@ class TrackAnimation:
         TrackAnimation
             Nothing is drawn yet.
         """
-        x = None if track.x_measured is None else reached(track)
         return cls.from_estimator(
-            model, track.q, target=track.target, t=track.t, x=x, n_frames=n_frames
+            model, track.q, target=track.target, t=track.t, x=track.x_measured, n_frames=n_frames
         )
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +29,34 @@ __all__ = ["BarDisplay", "ErrorBoxDisplay", "ErrorHistogramDisplay", "Prediction
 _KINDS = ("residual_vs_predicted", "predicted_vs_measured")
 
 
-class _ErrorDisplay:
+class _OfModels:
+    """What is made of measured and predicted tips, or of the models that predict."""
+
+    from_predictions: Callable[..., Any]
+
+    @classmethod
+    def from_estimator(cls, models: Any, q: ArrayLike, x: ArrayLike) -> Any:
+        """Return the display of the errors of fitted models on measured rows.
+
+        Parameters
+        ----------
+        models : mapping of str to estimator, or estimator
+            Fitted estimators, or chains, by name. A single `HybridForwardModel` shows its
+            mechanical part and itself.
+        q : array-like of shape (N, n)
+            Actuator vectors, best of motions that the models have not seen.
+        x : array-like of shape (N, m)
+            Measured tips [m].
+
+        Returns
+        -------
+        Display
+            Not drawn yet.
+        """
+        return cls.from_predictions(measured(models, x), predictions_of(models, q))
+
+
+class _ErrorDisplay(_OfModels):
     """Tip errors by model, however they are drawn."""
 
     def __init__(self, errors: Mapping[str, ArrayLike]) -> None:
@@ -61,27 +88,6 @@ class _ErrorDisplay:
         """
         x, predictions = _compared(x, predictions)
         return cls({name: distance(p, x) for name, p in predictions.items()})
-
-    @classmethod
-    def from_estimator(cls, models: Any, q: ArrayLike, x: ArrayLike) -> Self:
-        """Return the display of the errors of fitted models on measured rows.
-
-        Parameters
-        ----------
-        models : mapping of str to estimator, or estimator
-            Fitted estimators, or chains, by name. A single `HybridForwardModel` shows its
-            mechanical part and itself.
-        q : array-like of shape (N, n)
-            Actuator vectors, best of motions that the models have not seen.
-        x : array-like of shape (N, m)
-            Measured tips [m].
-
-        Returns
-        -------
-        Display
-            Not drawn yet.
-        """
-        return cls.from_predictions(measured(models, x), predictions_of(models, q))
 
     def _known(self, unit: str) -> dict[str, NDArray]:
         scale = scale_of(unit)
@@ -266,7 +272,7 @@ class BarDisplay:
         return self
 
 
-class PredictionErrorDisplay:
+class PredictionErrorDisplay(_OfModels):
     """Predicted against measured coordinates, or what is left of the error, axis by axis.
 
     Parameters
@@ -304,27 +310,6 @@ class PredictionErrorDisplay:
     def from_predictions(cls, x: ArrayLike, predictions: Mapping[str, ArrayLike]) -> Self:
         """Return the display of arrays, as the constructor does."""
         return cls(x, predictions)
-
-    @classmethod
-    def from_estimator(cls, models: Any, q: ArrayLike, x: ArrayLike) -> Self:
-        """Return the display of fitted models on measured rows.
-
-        Parameters
-        ----------
-        models : mapping of str to estimator, or estimator
-            Fitted estimators, or chains, by name. A single `HybridForwardModel` shows its
-            mechanical part and itself.
-        q : array-like of shape (N, n)
-            Actuator vectors, best of motions that the models have not seen.
-        x : array-like of shape (N, m)
-            Measured tips [m].
-
-        Returns
-        -------
-        PredictionErrorDisplay
-            Not drawn yet.
-        """
-        return cls(measured(models, x), predictions_of(models, q))
 
     def plot(
         self, axes: Any = None, *, unit: str = "cm", kind: str = "residual_vs_predicted"

@@ -145,7 +145,7 @@ class WorkspaceDisplay:
         errors = scale * distance(self.predicted, self.x)
         known = np.isfinite(errors)
         order = np.flatnonzero(known)[np.argsort(errors[known])]  # the worst in front
-        top = float(np.quantile(errors[order], _TOP)) if len(order) else None
+        top = float(np.quantile(errors[order], _TOP)) if len(order) else 1.0
         look = {"c": errors[order], "s": 7, "cmap": "cividis", "vmin": 0.0, "vmax": top}
         look |= {"depthshade": False, "linewidths": 0.0, "alpha": 0.8, "rasterized": True}
         ax.computed_zorder = False  # the robot in front of the cloud

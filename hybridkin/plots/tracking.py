@@ -218,13 +218,14 @@ class ActuatorDisplay:
         self.actuators_per_segment = tuple(actuators_per_segment)
         n = sum(self.actuators_per_segment)
         self.paths = {name: plain(q, "paths") for name, q in named(paths, "paths").items()}
+        rows = len(next(iter(self.paths.values())))
         for name, q in self.paths.items():
-            if q.ndim != 2 or q.shape[1] != n:
+            if q.shape != (rows, n):
                 raise ValueError(
-                    f"`paths` must hold arrays of shape (T, {n}), as `actuators_per_segment` says, "
-                    f"got {q.shape} for {name!r}."
+                    f"`paths` must hold arrays of one shape (T, {n}), as `actuators_per_segment` "
+                    f"says, got {q.shape} for {name!r}; the first has {rows} rows."
                 )
-        self.t = times(t, len(next(iter(self.paths.values()))))
+        self.t = times(t, rows)
 
     @classmethod
     def from_tracks(cls, tracks: Any, actuators_per_segment: Sequence[int]) -> Self:
@@ -264,9 +265,10 @@ class ActuatorDisplay:
         scale, n = scale_of(unit, _ACTUATOR_UNITS), len(self.actuators_per_segment)
         axes = several_axes(axes, n, 6.0, 1.0 + 1.6 * n, rows=True)
         ends = np.cumsum(self.actuators_per_segment)
+        rows = len(next(iter(self.paths.values())))
+        steps = np.arange(rows) if self.t is None else self.t
         for k, ax in enumerate(axes):
             for i, (name, q) in enumerate(self.paths.items()):
-                steps = np.arange(len(q)) if self.t is None else self.t
                 part = scale * q[:, ends[k] - self.actuators_per_segment[k] : ends[k]]
                 lines = ax.plot(steps, part, STYLES[i % 4], color=COLORS[i % 8], linewidth=1.2)
                 lines[0].set_label(name)
