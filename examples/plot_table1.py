@@ -11,9 +11,9 @@ This is a small version of what ``hybridkin paper`` does: 4 random test sets, 2 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hybridkin import datasets, experiments
+from hybridkin import datasets, paper
 
-table = experiments.table1(datasets.load_trunk(), n_splits=4, n_seeds=2, n_jobs=1)
+table = paper.table1(datasets.load_trunk(), n_splits=4, n_seeds=2, n_jobs=1)
 
 # %%
 # Every model is fitted to 1500 rows of one moving segment and 400 random rows, and tested on the

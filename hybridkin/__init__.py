@@ -4,26 +4,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybridkin import datasets, experiments, plots, robots, simulation, tasks, trajectories
-    from hybridkin._numerics import jacobian
-    from hybridkin.calibration import CalibrationResult, calibrate
-    from hybridkin.chain import ConstantCurvatureChain
-    from hybridkin.elm import ELMRegressor
-    from hybridkin.elm_cv import ELMRegressorCV
-    from hybridkin.hybrid import HybridForwardModel
-    from hybridkin.ik import (
-        Controller,
-        IKSolution,
-        IKStatus,
-        InverseKinematics,
-        Step,
-        Track,
-        Tracker,
-    )
-    from hybridkin.persistence import load_model, save_model
-    from hybridkin.play import PlayFit, PlayOperator, PlayState, fit_play
-    from hybridkin.rigid import RigidChain
-    from hybridkin.tendons import ElasticTendonChain
+    from hybridkin import datasets, paper, plots, simulation, workflow
+    from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
+    from hybridkin.calibration.calibrate import CalibrationResult, calibrate
+    from hybridkin.calibration.play_fit import PlayFit, fit_play
+    from hybridkin.chains import robots
+    from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+    from hybridkin.chains.elastic_tendons import ElasticTendonChain
+    from hybridkin.chains.play import PlayOperator, PlayState
+    from hybridkin.chains.rigid import RigidChain
+    from hybridkin.hybrid.estimator import HybridForwardModel
+    from hybridkin.ik import tasks, trajectories
+    from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
+    from hybridkin.ik.solver import Controller, InverseKinematics, Tracker
+    from hybridkin.learning.elm import ELMRegressor
+    from hybridkin.learning.elm_cv import ELMRegressorCV
+    from hybridkin.saving.saved_model import load_model, save_model
 
 __version__ = "0.1.0"
 
@@ -34,6 +30,7 @@ __all__ = [
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
+    "ForwardModel",
     "HybridForwardModel",
     "IKSolution",
     "IKStatus",
@@ -46,52 +43,47 @@ __all__ = [
     "Track",
     "Tracker",
     "__version__",
+    "as_forward_model",
     "calibrate",
     "datasets",
-    "experiments",
     "fit_play",
     "jacobian",
     "load_model",
+    "paper",
     "plots",
     "robots",
     "save_model",
     "simulation",
     "tasks",
     "trajectories",
+    "workflow",
 ]
 
-# Rooms are opened when first used: torch and scikit-learn take seconds to import.
-_ROOM_OF = {
-    "CalibrationResult": "calibration",
-    "ConstantCurvatureChain": "chain",
-    "ELMRegressor": "elm",
-    "ELMRegressorCV": "elm_cv",
-    "ElasticTendonChain": "tendons",
-    "HybridForwardModel": "hybrid",
-    "IKSolution": "ik",
-    "IKStatus": "ik",
-    "InverseKinematics": "ik",
-    "PlayFit": "play",
-    "PlayOperator": "play",
-    "PlayState": "play",
-    "RigidChain": "rigid",
-    "Controller": "ik",
-    "Step": "ik",
-    "Track": "ik",
-    "Tracker": "ik",
-    "calibrate": "calibration",
-    "fit_play": "play",
-    "jacobian": "_numerics",
-    "load_model": "persistence",
-    "save_model": "persistence",
+_NAMES_OF = {
+    "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
+    "calibration.calibrate": ("CalibrationResult", "calibrate"),
+    "calibration.play_fit": ("PlayFit", "fit_play"),
+    "chains.constant_curvature": ("ConstantCurvatureChain",),
+    "chains.elastic_tendons": ("ElasticTendonChain",),
+    "chains.play": ("PlayOperator", "PlayState"),
+    "chains.rigid": ("RigidChain",),
+    "hybrid.estimator": ("HybridForwardModel",),
+    "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),
+    "ik.solver": ("Controller", "InverseKinematics", "Tracker"),
+    "learning.elm": ("ELMRegressor",),
+    "learning.elm_cv": ("ELMRegressorCV",),
+    "saving.saved_model": ("load_model", "save_model"),
 }
+_MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
+_FOLDER_OF = {"robots": "chains.", "tasks": "ik.", "trajectories": "ik."}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _ROOM_OF:
-        return getattr(import_module(f"hybridkin.{_ROOM_OF[name]}"), name)
+    """Open public names on first use: torch and scikit-learn take seconds to import."""
+    if name in _MODULE_OF:
+        return getattr(import_module(f"hybridkin.{_MODULE_OF[name]}"), name)
     if name in __all__:
-        return import_module(f"hybridkin.{name}")
+        return import_module(f"hybridkin.{_FOLDER_OF.get(name, '')}{name}")
     raise AttributeError(f"module 'hybridkin' has no attribute {name!r}")
 
 

@@ -8,116 +8,73 @@ import pytest
 import hybridkin
 
 ROOT = Path(hybridkin.__file__).parent
-ROOMS = sorted(path for path in ROOT.rglob("*.py"))
-# Each room may import from rooms further down only.
-ORDER = [
-    "__main__",
-    "_cli",
-    "_cli_text",
-    "experiments",
-    "persistence",
-    "_model_parts",
-    "_model_files",
-    "hybrid",
-    "_auto",
-    "_hybrid_settings",
-    "_play_of",
-    "_couplings",
-    "_pose_hybrid",
-    "_hybrid_modules",
-    "_drift",
-    "_error_modules",
-    "_radius",
-    "guards",
-    "_serial_fit",
-    "_serial",
-    "_linearised",
-    "_pose_features",
-    "_features",
-    "play",
-    "calibration",
-    "_starts",
-    "_open_directions",
-    "_least_squares",
-    "_parameters",
-    "ik",
-    "_realtime",
-    "_tracking",
-    "_implicit",
-    "_search",
-    "_law",
-    "tasks",
-    "_box",
-    "robots",
-    "chain",
-    "tendons",
-    "rigid",
-    "_arm_files",
-    "_slack",
-    "_arc_chain",
-    "_arcs",
-    "_geometry",
-    "elm_cv",
-    "_left_out",
-    "elm",
-    "_readout",
-    "_network",
-    "_outcomes",
-    "_arrays",
-    "_solvers",
-    "_numerics",
-    "plots",
-    "datasets",
-    "simulation",
-    "trajectories",
+FILES = sorted(path for path in ROOT.rglob("*.py") if path.parent != ROOT)
+# A folder may import from folders further down only; those on one line do not know each other.
+FLOORS = [
+    {"cli"},
+    {"paper"},
+    {"workflow"},
+    {"saving"},
+    {"hybrid"},
+    {"calibration"},
+    {"chains", "learning", "ik"},
+    {"_core", "datasets", "plots", "simulation"},
 ]
+BESIDE = {"datasets": {"simulation"}, "plots": set(), "simulation": set(), "_core": set()}
 
 
-def room_of(path):
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return parts[0]
+def folder_of(path):
+    return path.relative_to(ROOT).parts[0]
 
 
-def imported_rooms(path):
-    found = set()
+def imports_of(path):
+    """Yield (module, names) of every import, those for type checkers and in functions too."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            parts = node.module.split(".")
-            if parts[0] == "hybridkin":
-                found |= {parts[1]} if len(parts) > 1 else {alias.name for alias in node.names}
-    return found & set(ORDER)
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, []) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide where they lead"
+            names = [alias.name for alias in node.names]
+            yield node.module, names
 
 
-@pytest.mark.parametrize("path", ROOMS, ids=[str(p.relative_to(ROOT)) for p in ROOMS])
+def imported_folders(path):
+    found = set()
+    for module, names in imports_of(path):
+        parts = module.split(".")
+        if parts[0] == "hybridkin":
+            found |= (
+                {parts[1]}
+                if len(parts) > 1
+                else {hybridkin._FOLDER_OF.get(n, n).strip(".") for n in names}
+            )
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=[str(p.relative_to(ROOT)) for p in FILES])
 def test_imports_run_one_way(path):
-    room = room_of(path)
-    if room == "__init__":
-        return
-    assert room in ORDER, f"say where {room} stands"
-    lower = ORDER[ORDER.index(room) :]
-    assert imported_rooms(path) <= set(lower)
+    folder = folder_of(path)
+    (floor,) = [k for k, folders in enumerate(FLOORS) if folder in folders]
+    allowed = BESIDE.get(folder, set().union(*FLOORS[floor + 1 :])) | {folder, "__version__"}
+    assert imported_folders(path) <= allowed
 
 
-def test_ground_rooms_stand_alone():
-    allowed = {"plots": {"plots"}, "trajectories": set(), "elm": {"_network", "_readout"}}
-    allowed["chain"] = {"_arc_chain", "_arcs", "_geometry", "_numerics"}
-    for room, lower in allowed.items():
-        files = [path for path in ROOMS if room_of(path) == room]
-        assert files
-        assert set().union(*map(imported_rooms, files)) <= lower
+@pytest.mark.parametrize("path", FILES, ids=[str(p.relative_to(ROOT)) for p in FILES])
+def test_modules_with_an_underscore_are_their_folders_own(path):
+    for module, names in imports_of(path):
+        parts = module.split(".")
+        if parts[0] == "hybridkin" and len(parts) > 1 and parts[1] != folder_of(path):
+            assert not any(name.startswith("_") for name in (*parts[2:], *names)), module
 
 
 def test_only_plots_uses_matplotlib_and_only_the_command_line_prints():
-    for path in ROOMS:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
-            if isinstance(node, (ast.Import, ast.ImportFrom)):
-                names = [alias.name for alias in node.names]
-                names.append(getattr(node, "module", None) or "")
-                if any(name.split(".")[0] == "matplotlib" for name in names):
-                    assert room_of(path) == "plots"
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "print":
-                assert room_of(path) == "__main__"
+    for path in FILES:
+        assert folder_of(path) == "plots" or not any(
+            module.split(".")[0] == "matplotlib" for module, _ in imports_of(path)
+        )
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id != "print" or folder_of(path) == "cli"
 
 
 def test_import_is_light():

@@ -1,6 +1,5 @@
 """The pages can be reached, their code runs, and every public name says what it takes and gives."""
 
-import importlib
 import inspect
 import re
 import textwrap
@@ -14,7 +13,7 @@ import hybridkin
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
-ROOMS = ("datasets", "experiments", "plots", "robots", "simulation", "tasks", "trajectories")
+ROOMS = ("datasets", "paper", "plots", "robots", "simulation", "tasks", "trajectories", "workflow")
 # In the unit of the robot's actuators, whatever that is, or of data that need no robot.
 OF_THE_ACTUATORS = {"q", "q0", "q_min", "q_max", "q_pref", "dq", "X", "y", "std"}
 WITHOUT_UNIT = {
@@ -112,7 +111,7 @@ def public():
     found = {name: getattr(hybridkin, name) for name in hybridkin.__all__}
     found = {name: o for name, o in found.items() if callable(o)}
     for room in ROOMS:
-        module = importlib.import_module(f"hybridkin.{room}")
+        module = getattr(hybridkin, room)
         members = {f"{room}.{name}": getattr(module, name) for name in module.__all__}
         found |= {name: o for name, o in members.items() if callable(o)}
     for name, cls in list(found.items()):

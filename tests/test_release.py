@@ -106,7 +106,7 @@ def test_the_wheel_says_what_it_needs(built):
         assert f"Provides-Extra: {extra}\n" in metadata
     for requirement in PROJECT["dependencies"]:
         assert f"Requires-Dist: {name_of(requirement)}" in metadata
-    assert "hybridkin = hybridkin.__main__:main" in wheel.read(about + "entry_points.txt").decode()
+    assert "hybridkin = hybridkin.cli.main:main" in wheel.read(about + "entry_points.txt").decode()
     assert about + "licenses/LICENSE" in wheel.namelist()
 
 

@@ -14,7 +14,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from hybridkin import HybridForwardModel, datasets, robots
-from hybridkin._numerics import forward_and_reverse_jacobian
+from hybridkin._core.model import reverse_jacobian
 
 BATCHES = (1_000, 10_000, 100_000)
 BATCH_OF_SMOKE = 8
@@ -187,7 +187,7 @@ def autodiff(request):
     """A name, what gives the Jacobian of any module by that way, and how much faster to be."""
     ways = {
         "vmap(jacrev)": (lambda module, q: torch.func.vmap(torch.func.jacrev(module))(q), 8),
-        "3 backward passes": (lambda module, q: forward_and_reverse_jacobian(module, q)[1], 3),
+        "3 backward passes": (lambda module, q: reverse_jacobian(module, q)[1], 3),
     }
     return request.param, *ways[request.param]
 

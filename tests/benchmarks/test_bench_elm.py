@@ -1,13 +1,13 @@
 """The ELM against scikit-learn on the same features, and the choosing ELM against kernel ridge."""
 
 import numpy as np
+from learners import LEARNERS, make_arm
 from numpy.testing import assert_allclose
 from scipy.special import expit
 from sklearn.datasets import make_friedman1
 from sklearn.linear_model import Ridge, RidgeCV
 
 from hybridkin import ELMRegressor, ELMRegressorCV
-from hybridkin.experiments.learners import LEARNERS, make_arm
 
 N_HIDDEN = 1000
 

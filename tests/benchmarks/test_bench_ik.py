@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from hybridkin import InverseKinematics, RigidChain
-from hybridkin.tasks import PoseTask
+from hybridkin.ik.tasks import PoseTask
 
 TOL = (1e-3, 1e-2)  # [m], [rad]
 BATCH = 10_000

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hybridkin import InverseKinematics, RigidChain
-from hybridkin._realtime import Controller
-from hybridkin.trajectories import figure_eight
+from hybridkin.ik._realtime import Controller
+from hybridkin.ik.trajectories import figure_eight
 
 DT, N_JOINTS = 0.01, 7
 START = np.array([0.3, 0.5, -0.4, 0.8, 0.3, -0.6, 0.2])  # [rad]

@@ -1,0 +1,267 @@
+"""Robots, rows to learn from and to be examined on, and the models of `hybrids`."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.compose import TransformedTargetRegressor
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import RidgeCV
+from sklearn.model_selection import GridSearchCV, GroupKFold, KFold
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
+from threadpoolctl import threadpool_limits
+
+from hybridkin import datasets, robots
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.hybrid._couplings import COUPLINGS, READOUTS
+from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.learning.elm import ELMRegressor
+from hybridkin.paper.paper import PAPER_ELM
+from hybridkin.workflow.report import distance
+
+PLANTS: dict[str, dict[str, Any]] = {
+    "trunk 1": {},
+    "trunk 2": {"tilt": 1.2, "mass": 1.6, "tip_mass": 0.15, "bending_stiffness": 1.3},
+}
+"""Arguments of `simulation.TrunkPlant` by name; the seed of a plant is its place."""
+
+RAW, CALIBRATED, PAPER, AUTO = "mechanical, raw", "mechanical", "parallel paper's ELM", "auto"
+AUTO_PLAY = "auto, play"
+DATA_ONLY = ("data, quadratic", "data, kernel")
+
+_CABLE_NOISE, _MOCAP_NOISE = 1e-3, 5e-4  # as the defaults of `make_trunk` [m]
+_LOW, _HIGH, _INNER = 0.19, 0.31, 0.6  # the range of `paper_protocol` [m]; its inner part
+_NEAR = 6.05e-3  # cables of the inner part of armlab_3cable [m]
+
+
+class Case(NamedTuple):
+    """Rows to learn from and rows to be examined on, with the robot's nominal kinematics."""
+
+    name: str
+    draw: int
+    chain: Any
+    raw: tuple[str, ...]  # what even the raw model has fitted: where the frame is unknown
+    calibrate: tuple[str, ...] | str
+    q: NDArray
+    x: NDArray
+    groups: NDArray | None
+    tests: dict[str, tuple[NDArray, ...]]  # q, x and, where there are motions, these
+    coverage: float | None = None
+    in_time: bool = False  # whether the rows of a group are in the order of time
+
+
+@threadpool_limits.wrap(limits=1)  # CPU time is to be that of one thread
+def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
+    """Return the entries of a case, of the models by these names or all."""
+    entries = []
+    with warnings.catch_warnings():  # a plain chain warns of the slack that is examined here
+        warnings.simplefilter("ignore", UserWarning)
+        for name, learner in _learners(case).items():
+            if names is not None and name not in names:
+                continue
+            start = time.process_time()
+            model = learner().fit(case.q, case.x, groups=case.groups)
+            entry = {"case": case.name, "draw": case.draw, "n": len(case.q), "model": name}
+            entry["seconds"] = time.process_time() - start
+            if model.cv_results_ is not None:
+                results = model.cv_results_
+                scores = zip(results["candidate"], results["mean_distance"].tolist(), strict=True)
+                entry |= {"chosen": results["chosen"], "promised": dict(scores)}
+            entry["errors"] = {test: _errors(model, *rows) for test, rows in case.tests.items()}
+            entries.append(entry)
+    return entries
+
+
+def _errors(
+    model: HybridForwardModel, q: NDArray, x: NDArray, groups: NDArray | None = None
+) -> dict[str, float]:
+    errors = distance(model.predict(q, groups=groups), x)
+    found = {"mean": float(errors.mean()), "max": float(errors.max()), "n_test": len(errors)}
+    if model.coverage is not None:
+        radius = model.predict(q, return_radius=True, groups=groups)[1]
+        found |= {"within": float((errors <= radius).mean()), "radius": float(radius.mean())}
+    return found
+
+
+def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
+    """Return the models by name; all but auto share one calibration to all rows."""
+    q, x, groups, seed = case.q, case.x, case.groups, case.draw
+    splitter: Any = KFold(5, shuffle=True, random_state=seed)
+    if groups is not None:
+        splitter = GroupKFold(min(5, len(np.unique(groups))))
+    folds = [*splitter.split(q, groups=groups)]
+    calibrated = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate).fit(q, x)
+    hybrid = partial(HybridForwardModel, calibrated.mechanical_model_, random_state=seed)
+    learners: dict[str, Callable[[], HybridForwardModel]] = {
+        RAW: lambda: HybridForwardModel(case.chain, "drop", calibrate=case.raw),
+        CALIBRATED: lambda: hybrid("drop"),
+        DATA_ONLY[0]: lambda: HybridForwardModel(None, _quadratic()),
+        DATA_ONLY[1]: lambda: HybridForwardModel(None, _kernel(q, x, folds)),
+        PAPER: lambda: hybrid(ELMRegressor(**PAPER_ELM, random_state=seed)),
+        "parallel kernel": lambda: hybrid(_kernel(q, x - calibrated.predict(q), folds)),
+    }
+    for coupling in COUPLINGS:
+        for kind in READOUTS:
+            learners[f"{coupling} {kind}"] = partial(hybrid, kind, coupling=coupling)
+    for kind in READOUTS:
+        free = partial(hybrid, kind, coupling="serial", guard=None)
+        learners[f"serial {kind}, no guard"] = free
+    auto = partial(HybridForwardModel, case.chain, AUTO, calibrate=case.calibrate)
+    auto = partial(auto, coverage=case.coverage, random_state=seed)
+    learners[AUTO] = auto
+    if case.in_time:
+        learners[AUTO_PLAY] = partial(auto, play="auto", coverage=None)
+    return learners
+
+
+def _quadratic() -> Any:
+    features = PolynomialFeatures(2, include_bias=False)
+    return make_pipeline(MinMaxScaler((-1, 1)), features, RidgeCV(np.logspace(-6, 3, 19)))
+
+
+def _kernel(q: NDArray, y: NDArray, folds: list[tuple[NDArray, NDArray]]) -> Any:
+    """Return kernel ridge with the width and the penalty that err least on the folds."""
+    ridge = make_pipeline(StandardScaler(), KernelRidge(kernel="rbf"))
+    grid = {"alpha": np.logspace(-5, 0, 6), "gamma": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)}
+    grid = {f"kernelridge__{name}": values for name, values in grid.items()}
+    search = GridSearchCV(ridge, grid, cv=folds, scoring="neg_mean_squared_error", refit=False)
+    ridge.set_params(**search.fit(q, y - y.mean(0)).best_params_)
+    return TransformedTargetRegressor(ridge, transformer=StandardScaler(with_std=False))
+
+
+def trunk_cases(
+    sizes: Sequence[int],
+    n_draws: int,
+    n_test: int,
+    folder: Any,
+    n_jobs: int | None,
+    inner: bool = False,
+) -> list[Case]:
+    cases, largest = [], max(sizes)
+    for seed, name in enumerate(PLANTS):
+        make = partial(_without_noise, name, folder, n_jobs)
+        rows = make(n_random=n_test + (0 if inner else n_draws * largest))
+        test, data = (rows[0][:n_test], rows[1][:n_test]), (rows[0][n_test:], rows[1][n_test:])
+        if inner:
+            middle, half = 0.5 * (_LOW + _HIGH), 0.5 * _INNER * (_HIGH - _LOW)
+            unit = np.random.default_rng([seed, 60]).random((n_draws * largest, 9))
+            data = make(q_target=middle + half * (2.0 * unit - 1.0))
+            beyond = (np.abs(test[0] - middle) > half).any(1)
+            test = test[0][beyond], test[1][beyond]
+        tests = {"without noise": test, "with noise": _noisy(*test, [seed, 1])}
+        for draw in range(n_draws):
+            drawn = slice(draw * largest, (draw + 1) * largest)
+            q, x = _noisy(data[0][drawn], data[1][drawn], [seed, 2, draw])
+            chain = robots.bionic_handling_assistant()
+            cases += [
+                Case(name, draw, chain, (), "default", q[:n], x[:n], None, tests) for n in sizes
+            ]
+    return cases
+
+
+def _without_noise(
+    name: str, folder: Any, n_jobs: int | None, **rows: Any
+) -> tuple[NDArray, NDArray]:
+    """Return rows of a plant as they are, so that noise can be added and left out."""
+    checkpoint = None
+    if folder is not None:
+        asked = f"{rows['n_random']}" if "n_random" in rows else f"inner, {len(rows['q_target'])}"
+        checkpoint = Path(folder) / f"{name}, {asked} rows.npz"
+    return datasets.make_trunk(
+        **rows,
+        n_segment=0,
+        random_state=[*PLANTS].index(name),
+        cable_noise=0.0,
+        mocap_noise=0.0,
+        n_jobs=n_jobs,
+        checkpoint=checkpoint,
+        return_X_y=True,
+        **PLANTS[name],
+    )
+
+
+def _noisy(q: NDArray, x: NDArray, seed: list[int]) -> tuple[NDArray, NDArray]:
+    rng = np.random.default_rng(seed)
+    noise = _CABLE_NOISE * rng.standard_normal(q.shape), _MOCAP_NOISE * rng.standard_normal(x.shape)
+    return q + noise[0], x + noise[1]
+
+
+def armlab_cases(
+    sizes: Sequence[int], n_draws: int, n_test: int, data_home: Any, inner: bool = False
+) -> list[Case]:
+    try:
+        data = datasets.load_armlab(data_home)
+    except FileNotFoundError as missing:
+        warnings.warn(f"Left out: {missing}", stacklevel=3)
+        return []
+    turns = -2.0 * np.pi / 3.0 * np.arange(3)[None]
+    chain = ConstantCurvatureChain([0.003], angles=turns, lengths=[0.15])
+    names, cases = ("radii", "lengths", "base", "tool"), []
+    lines, near = np.unique(data.groups), (data.q >= -_NEAR).all(1)
+    for draw in range(n_draws):
+        rng = np.random.default_rng(draw)
+        out = np.isin(data.groups, rng.permutation(lines)[: len(lines) // 5])
+        rows, test = (near, ~near) if inner else (~out, out)
+        rows, test = (rng.permutation(np.flatnonzero(part)) for part in (rows, test))
+        tests = {"measured": (data.q[test[:n_test]], data.x[test[:n_test]])}
+        for n in sizes:
+            some = data.q[rows[:n]], data.x[rows[:n]], data.groups[rows[:n]]
+            cases.append(Case("armlab_3cable", draw, chain, ("base",), names, *some, tests))
+    return cases
+
+
+def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case]:
+    try:
+        data = datasets.load_ftdcr(data_home)
+    except FileNotFoundError as missing:
+        warnings.warn(f"Left out: {missing}", stacklevel=3)
+        return []
+    radii, turns = np.full(3, 0.0045), 2.0 * np.pi / 3.0 * np.arange(3)
+    geometry: dict[str, Any] = {
+        "lengths": (0.06, 0.0625, 0.064),
+        "angles": np.add.outer([-3.03, -2.52, -2.01], turns),
+        "routing": "base",
+    }
+    plain = ConstantCurvatureChain(radii, **geometry)
+    elastic = ElasticTendonChain(
+        radii, **geometry, bending_stiffness=0.15 * radii**2, axial_stiffness=10.0
+    )
+    stiff = ("rest_bends", "bending_stiffness", "axial_stiffness", "tendon_zeros")
+    chains = {
+        "plain chain": (plain, ("base", "tool", "radii", "lengths")),
+        "elastic tendons": (elastic, ("base", "tool", *stiff)),
+    }
+    families = np.array([label.split("_")[1] for label in data.groups])
+    single, pair = (np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair"))
+    folds = list(GroupKFold(5).split(data.q, groups=data.groups))
+    pairs = [
+        (np.flatnonzero(families != name), np.flatnonzero(families == name))
+        for name in np.unique(families[pair])
+    ]
+    ways = {
+        "5 folds": (folds, data.groups),
+        "a pair of segments left out": (pairs, data.groups),
+        "pairs from single segments": ([(single, pair)], data.groups),
+        "the same, groups being segments": ([(single, pair)], families),
+    }
+    cases = []
+    for name, (chain, parameters) in chains.items():
+        for way, (splits, groups) in ways.items():
+            for k, (train, test) in enumerate(splits):
+                rows = train[::thin]
+                part = data.q[rows], data.x[rows], groups[rows]
+                tests = {way: (data.q[test], data.x[test], data.groups[test])}
+                in_time = groups is data.groups
+                cases.append(
+                    Case(name, k, chain, ("base",), parameters, *part, tests, coverage, in_time)
+                )
+    return cases

@@ -1,0 +1,328 @@
+"""Hybrid models compared: with few rows, outside the training range, on motions held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from hybrid_cases import (
+    AUTO,
+    CALIBRATED,
+    DATA_ONLY,
+    PAPER,
+    RAW,
+    Case,
+    armlab_cases,
+    examined,
+    motion_cases,
+    trunk_cases,
+)
+from joblib import Parallel, delayed
+
+from hybridkin import plots
+from hybridkin.workflow.report import Progress, Report, quiet
+
+SIZES = (25, 50, 100, 200, 400, 800, 1600)
+
+_LOOKS = {RAW: ("black", ":"), CALIBRATED: ("black", "--")}
+_LOOKS |= dict(zip(DATA_ONLY, (("#E69F00", "s-"), ("#D55E00", "o-")), strict=True))
+_LOOKS |= {PAPER: ("0.6", "v-"), "parallel quadratic": ("#F0E442", "s-")}
+_LOOKS |= {"parallel kernel": ("#0072B2", "o-"), "serial quadratic": ("#56B4E9", "s-")}
+_LOOKS |= {"serial pose": ("#CC79A7", "^-"), AUTO: ("#009E73", "D-")}
+
+
+def learning_curves(
+    sizes: Sequence[int] = SIZES,
+    n_draws: int = 3,
+    *,
+    n_test: int = 1000,
+    models: Sequence[str] | None = None,
+    data_home: Any = None,
+    folder: Any = None,
+    n_jobs: int | None = 1,
+    progress: Progress = quiet,
+) -> list[dict[str, Any]]:
+    """Return the errors of all models against the number of rows they learn from.
+
+    On two simulated trunks, rows fully random, lengths and tips measured with the noise of
+    `datasets.make_trunk`, and examined on other rows without noise and with it; and on
+    armlab_3cable, examined on a fifth of its grid lines, groups being lines.
+
+    Parameters
+    ----------
+    sizes : sequence of int
+        Rows to learn from; fewer rows are part of more rows of the same draw.
+    n_draws : int, default=3
+        Draws of these rows and of the noise; of armlab_3cable also of the lines held out.
+    n_test : int, default=1000
+        Rows to be examined on.
+    models : sequence of str, optional
+        Names of the models, as in the result. Default: all.
+    data_home : path-like, optional
+        Folder of the recordings, see `datasets.load_armlab`. One that is absent is left out with
+        a warning.
+    folder : path-like, optional
+        Where rows of the plants are kept and found again.
+    n_jobs, progress
+        Processes, and a callable handed (what, done, total).
+
+    Returns
+    -------
+    list of dict
+        One entry per case and model: "case", "draw", "n", "model", "seconds" (CPU time of the fit)
+        and by "errors" of every test "mean", "max" [m] and "n_test". Of "auto" also "chosen" and
+        "promised", its own score by candidate [m].
+    """
+    cases = trunk_cases(sizes, n_draws, n_test, folder, n_jobs)
+    return examine(
+        cases + armlab_cases(sizes, n_draws, n_test, data_home), models, n_jobs, progress
+    )
+
+
+def extrapolation(
+    n: int = 400,
+    n_draws: int = 3,
+    *,
+    n_test: int = 1000,
+    models: Sequence[str] | None = None,
+    data_home: Any = None,
+    folder: Any = None,
+    n_jobs: int | None = 1,
+    progress: Progress = quiet,
+) -> list[dict[str, Any]]:
+    """Return the errors of all models outside the range that they learned from.
+
+    The trunks: learned from the inner 60 % of the range of every length, examined on rows of the
+    whole range that leave this box. armlab_3cable: learned where no cable is shortened by more than
+    6 mm, examined where one is.
+
+    Parameters
+    ----------
+    n : int, default=400
+        Rows to learn from.
+    n_draws, n_test, models, data_home, folder, n_jobs, progress
+        As in `learning_curves`.
+
+    Returns
+    -------
+    list of dict
+        One entry per case and model, as in `learning_curves`.
+    """
+    cases = trunk_cases([n], n_draws, n_test, folder, n_jobs, inner=True)
+    cases += armlab_cases([n], n_draws, n_test, data_home, inner=True)
+    return examine(cases, models, n_jobs, progress)
+
+
+def held_out_motions(
+    *,
+    coverage: float | None = 0.9,
+    thin: int = 2,
+    models: Sequence[str] | None = None,
+    data_home: Any = None,
+    n_jobs: int | None = 1,
+    progress: Progress = quiet,
+) -> list[dict[str, Any]]:
+    """Return the errors of all models on motions of ftdcr_v4 that they have not seen.
+
+    Whole motions in five folds; all motions of a pair of segments left out, three times; and the
+    motions of two segments, learned from those of a single one, groups being the motions, or the
+    segments that move. Underneath: a constant-curvature chain, and one of elastic tendons. "auto,
+    play" looks for play as well; its predictions know the motion so far.
+
+    Parameters
+    ----------
+    coverage : float or None, default=0.9
+        Share of tips within the radius of "auto"; the result has the share found, and the mean
+        radius [m].
+    thin : int, default=2
+        Learn from every so many rows only: the motions are slow.
+    models, data_home, n_jobs, progress
+        As in `learning_curves`; where the recording is absent, a warning says so and the result is
+        empty.
+
+    Returns
+    -------
+    list of dict
+        One entry per case and model, as in `learning_curves`, its "errors" with "within", the share
+        of tips inside the radius, and "radius", its mean [m], where the model tells one.
+    """
+    return examine(motion_cases(data_home, coverage, thin), models, n_jobs, progress)
+
+
+def examine(
+    cases: Sequence[Case],
+    models: Sequence[str] | None = None,
+    n_jobs: int | None = 1,
+    progress: Progress = quiet,
+) -> list[dict[str, Any]]:
+    """Return the entries of all cases, see `learning_curves`; the seed of a case is its draw."""
+    table: list[dict[str, Any]] = []
+    jobs = (delayed(examined)(case, models) for case in cases)
+    results: Any = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
+    for done, (case, entries) in enumerate(zip(cases, results, strict=True), 1):
+        table += entries
+        progress(f"{case.name}, {len(case.q)} rows", done, len(cases))
+    return table
+
+
+def data_demand(curves: list[dict[str, Any]]) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return how many rows "auto" needs to err as little as the best data-only model with all.
+
+    Parameters
+    ----------
+    curves : list of dict
+        As from `learning_curves`.
+
+    Returns
+    -------
+    dict of (str, str) to (float, float)
+        By case and test: the error of the data-only model with all rows [m], the mean over draws;
+        and the number of rows from which "auto" errs as little, between two sizes by a straight
+        line in logarithms, infinite where it never does.
+    """
+    found = {}
+    for case, test in _tests(curves):
+        means = _means(curves, case, test, by_size=True)
+        sizes = sorted({n for _, n in means})
+        goal = min(means[model, sizes[-1]][0] for model in DATA_ONLY)
+        # What was reached with fewer rows does not get lost with more.
+        errors = np.minimum.accumulate([means[AUTO, n][0] for n in sizes])
+        demand = np.inf
+        if errors[-1] <= goal:
+            demand = np.exp(np.interp(-np.log(goal), -np.log(errors), np.log(sizes)))
+        found[case, test] = goal, float(demand)
+    return found
+
+
+def hybrids_report(
+    curves: list[dict[str, Any]], outside: list[dict[str, Any]], motions: list[dict[str, Any]]
+) -> Report:
+    """Return the report of `learning_curves`, `extrapolation` and `held_out_motions`.
+
+    Parameters
+    ----------
+    curves, outside, motions : list of dict
+        What the three returned, in this order.
+
+    Returns
+    -------
+    Report
+        Tables in mm and two figures; ``report.write(folder)`` writes them with ``report.json``.
+    """
+    report = Report("Hybrid models compared")
+    report.record.update(curves=curves, outside=outside, motions=motions)
+    report.text("## Few rows", "Tip error in mm, mean ± standard deviation over draws.")
+    for case, test in _tests(curves):
+        means = _means(curves, case, test, by_size=True)
+        sizes = sorted({n for _, n in means})
+        report.text(f"{case}, {test}:")
+        rows = []
+        for model in dict.fromkeys(model for model, _ in means):
+            values = (1e3 * np.array(means[model, n]) for n in sizes)
+            rows.append([model, *(f"{mean:.2f} ± {std:.2f}" for mean, std, _ in values)])
+        report.table(["rows", *map(str, sizes)], rows)
+    if curves:
+        report.text("Rows with which auto errs as little as the best data-only model with all:")
+        demand = [
+            [*key, f"{1e3 * e:.2f}", f"{n:.0f}"] for key, (e, n) in data_demand(curves).items()
+        ]
+        report.table(["case", "test", "error [mm]", "rows of auto"], demand)
+        report.figure("hybrid_curves", _curves_figure(curves), "Tip error against training rows.")
+    for title, entries in (("Outside the training range", outside), ("Unseen motions", motions)):
+        cases = _tests(entries)
+        found = [_means(entries, *case) for case in cases]
+        report.text(f"## {title}", "Tip error in mm, mean over draws or folds (largest of all).")
+        rows = []
+        for model in dict.fromkeys(entry["model"] for entry in entries):
+            values = (1e3 * np.array(means.get(model, [np.nan] * 3)) for means in found)
+            rows.append([model, *(f"{mean:.2f} ({largest:.1f})" for mean, _, largest in values)])
+        report.table(["model", *(", ".join(case) for case in cases)], rows)
+        report.text("What auto chose, what its own score promised, and the radius, in mm:")
+        report.table(_PROMISES, [_promise(entry) for entry in entries if "promised" in entry])
+    if outside:
+        report.figure("hybrid_outside", _outside_figure(outside), "Tip error outside the range.")
+    return report
+
+
+_PROMISES = ("case", "draw", "model", "chosen", "promised", "got", "within the radius", "radius")
+
+
+def _promise(entry: dict[str, Any]) -> list[str]:
+    errors = next(iter(entry["errors"].values()))
+    numbers = [f"{1e3 * e:.2f}" for e in (entry["promised"][entry["chosen"]], errors["mean"])]
+    if "within" in errors:
+        numbers += [f"{100 * errors['within']:.1f} %", f"{1e3 * errors['radius']:.1f}"]
+    return [
+        entry["case"],
+        str(entry["draw"]),
+        entry["model"],
+        entry["chosen"],
+        *numbers,
+        *["-"] * (4 - len(numbers)),
+    ]
+
+
+def _tests(table: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    return [*dict.fromkeys((entry["case"], test) for entry in table for test in entry["errors"])]
+
+
+def _means(
+    table: list[dict[str, Any]], case: str, test: str, *, by_size: bool = False
+) -> dict[Any, tuple[float, float, float]]:
+    """Return by model the mean over draws, its spread and the largest error [m]."""
+    runs: dict[Any, list[Any]] = {}
+    for entry in table:
+        if entry["case"] == case and test in entry["errors"]:
+            key = (entry["model"], entry["n"]) if by_size else entry["model"]
+            errors = entry["errors"][test]
+            runs.setdefault(key, []).append([errors["mean"], errors["max"], errors["n_test"]])
+    found = {}
+    for key, rows in runs.items():
+        means, largest, weights = np.array(rows).T
+        spread = means.std(ddof=1) if len(means) > 1 else 0.0
+        found[key] = np.average(means, weights=weights), spread, largest.max()
+    return found
+
+
+def _curves_figure(curves: list[dict[str, Any]]) -> Any:
+    cases = [(case, test) for case, test in _tests(curves) if test != "with noise"]
+    figure, axes = plots.new_figure(3.4 * len(cases), 4.0, 1, len(cases), squeeze=False)
+    for ax, (case, test) in zip(axes[0], cases, strict=True):
+        means = _means(curves, case, test, by_size=True)
+        sizes = sorted({n for _, n in means})
+        errors = {m: [means[m, n][0] for n in sizes] for m in _LOOKS if (m, sizes[0]) in means}
+        plots.LearningCurveDisplay(sizes, errors).plot(ax, unit="mm", styles=_LOOKS)
+        ax.get_legend().remove()
+        ax.set(title=f"{case}, {test}", ylabel="mean tip error [mm]" if ax is axes[0, 0] else "")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+    return figure
+
+
+def _outside_figure(outside: list[dict[str, Any]]) -> Any:
+    cases = [(case, test) for case, test in _tests(outside) if test != "with noise"]
+    figure, axes = plots.new_figure(8.0, 4.2, 1, len(cases), sharey=True, squeeze=False)
+    names = [name for name in dict.fromkeys(entry["model"] for entry in outside) if name != RAW]
+    for ax, case in zip(axes[0], cases, strict=True):
+        means = _means(outside, *case)
+        shown = [name for name in names if name in means]
+        places = [len(names) - names.index(name) for name in shown]
+        for k, label, mark, color in ((0, "mean", "o", "#0072B2"), (2, "largest", "x", "#D55E00")):
+            values = [1e3 * means[name][k] for name in shown]
+            ax.plot(values, places, mark, color=color, label=label)
+            ax.axvline(1e3 * means[CALIBRATED][k], color="0.7", linewidth=1.0, linestyle="--")
+        ax.set(xscale="log", xlabel="tip error [mm]", title=case[0])
+        _plain_ticks(ax.xaxis)
+        ax.set_yticks(range(len(names), 0, -1), names)
+        ax.grid(alpha=0.3)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def _plain_ticks(axis: Any) -> None:
+    low, high = axis.get_view_interval()
+    ticks = [t for t in (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if low < t < high]
+    axis.set_ticks(ticks, [f"{t:g}" for t in ticks])
+    axis.set_ticks([], minor=True)

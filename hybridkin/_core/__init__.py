@@ -1,0 +1,1 @@
+"""What stands on nothing else: the interface of models, arrays, and entire functions."""

@@ -1,0 +1,54 @@
+"""Row-by-row functions in blocks of rows, and the check of their input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def in_blocks(
+    function: Callable[[Tensor], tuple[Tensor, ...]], q: Tensor, size: int = 4096
+) -> tuple[Tensor, ...]:
+    """Return what a row-by-row function gives for q (..., n), computed in blocks of rows.
+
+    The temporaries of a block stay in the cache: a million rows cost as much each as a thousand.
+    What the function gives may lie in memory with the batch last; the result is contiguous.
+    """
+    if not isinstance(q, Tensor) or q.ndim == 0:
+        return function(q)  # which says what is wrong
+    blocks = q.reshape(-1, q.shape[-1]).split(size)
+    first = function(blocks[0])
+    if len(blocks) == 1:
+        whole = [part.flatten(1).contiguous() for part in first]
+    elif any(part.requires_grad for part in first):  # a graph would grow by every write
+        parts = zip(first, *(function(rows) for rows in blocks[1:]), strict=True)
+        whole = [torch.cat(part) for part in parts]
+    else:
+        whole = [part.new_empty(q.shape[:-1].numel(), part.shape[1:].numel()) for part in first]
+        for k, rows in enumerate(blocks):
+            for result, part in zip(whole, function(rows) if k else first, strict=True):
+                result[k * size : k * size + len(part)].copy_(part.flatten(1))
+    shapes = (part.shape[1:] for part in first)
+    return tuple(
+        result.reshape(*q.shape[:-1], *shape) for result, shape in zip(whole, shapes, strict=True)
+    )
+
+
+def check_vectors(value: Tensor, size: int, name: str, why: str) -> Tensor:
+    """Return `value` when it is a floating tensor of shape (..., size), else raise."""
+    if not isinstance(value, Tensor):
+        raise TypeError(
+            f"`{name}` must be a torch tensor of shape (..., {size}), got "
+            f"{type(value).__name__}; wrap it in torch.as_tensor(...)."
+        )
+    if not value.is_floating_point():
+        raise TypeError(
+            f"`{name}` must be a floating tensor, got {value.dtype}; convert it with `.double()`."
+        )
+    if value.ndim == 0 or value.shape[-1] != size:
+        raise ValueError(
+            f"`{name}` must have shape (..., {size}), got {tuple(value.shape)}; {why}."
+        )
+    return value

@@ -1,0 +1,286 @@
+"""The one interface: a model of a robot, q -> x, and how anything that is one becomes one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Transform3d
+
+__all__ = ["ForwardModel", "FunctionModel", "PortableModule", "PoseModel", "as_forward_model"]
+
+
+class PortableModule(nn.Module):
+    """A module of buffers whose pickle and joblib hash are the same in every process.
+
+    Buffers are stored as plain arrays and come back on their device, or on the CPU where that
+    device does not exist.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        state["_buffers"] = {
+            name: None if value is None else (value.detach().cpu().numpy(), str(value.device))
+            for name, value in self._buffers.items()
+        }
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        buffers: dict[str, Tensor | None] = {}
+        for name, stored in state["_buffers"].items():
+            buffers[name] = None
+            if stored is not None:
+                array, device = stored
+                at_home = device == "cpu" or torch.cuda.is_available()
+                buffers[name] = torch.tensor(array, device=device if at_home else "cpu")
+        super().__setstate__({**state, "_buffers": buffers})
+
+
+class ForwardModel(PortableModule):
+    """A model of a robot: a torch module that maps every row of q to a row of x.
+
+    Chains, error models, hybrids and wrapped functions are forward models; inverse kinematics,
+    calibration and plots know nothing else. A subclass gives `forward`, and `forward_and_jacobian`
+    where it has a closed form.
+
+    Attributes
+    ----------
+    n_actuators : int
+        Length of q; 0 where it is not known, as of a function.
+    n_outputs : int
+        Length of x; 0 where it is not known.
+    """
+
+    n_actuators: int = 0
+    n_outputs: int = 0
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return x of shape (..., n_outputs) for q of shape (..., n_actuators)."""
+        raise NotImplementedError
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., n_outputs) and dx/dq (..., n_outputs, n_actuators).
+
+        By default one backward pass per output coordinate.
+        """
+        return reverse_jacobian(self, q)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return dx/dq, shape (..., n_outputs, n_actuators)."""
+        return self.forward_and_jacobian(q)[1]
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return how far q is from the rows that the model learned from, shape (...).
+
+        At most 1 within the domain, larger outside; 0 where nothing was learned. Differentiable.
+        """
+        return q.new_zeros(q.shape[:-1])
+
+    def in_domain(self, q: Tensor) -> Tensor:
+        """Return whether q lies within the domain of the model, shape (...), bool."""
+        return self.domain_distance(q) <= 1.0
+
+    # Serial coupling corrects a model inside, at coordinates z between q and x. By default z is q.
+
+    def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inner coordinates z (N, C) of rows q (N, n) and dz/dq, (C, n) or (N, C, n)."""
+        return q, torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
+
+    def from_coordinates(self, z: Tensor) -> Tensor:
+        """Return x (N, m) of inner coordinates z (N, C)."""
+        return self(z)
+
+    def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (N, m) of inner coordinates z (N, C) and dx/dz (N, m, C)."""
+        return self.forward_and_jacobian(z)
+
+
+class PoseModel(ForwardModel):
+    """A forward model of the tip's position that knows the pose of the tip as well."""
+
+    n_outputs: int = 3
+
+    def pose(self, q: Tensor) -> Tensor:
+        """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
+        return self.pose_and_jacobian(q)[0]
+
+    def pose_jacobian(self, q: Tensor) -> Tensor:
+        """Return the tip's linear and angular Jacobian, shape (..., 6, n_actuators).
+
+        The angular rows give the angular velocity in the measuring frame.
+        """
+        return self.pose_and_jacobian(q)[1]
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
+        raise NotImplementedError
+
+    def tip_transform(self, q: Tensor) -> Transform3d:
+        """Return the tip pose as a pytorch_kinematics Transform3d, for q of shape (N, n)."""
+        from pytorch_kinematics import Transform3d  # takes a second and loads pyplot
+
+        return Transform3d(matrix=self.pose(q))
+
+
+class FunctionModel(ForwardModel):
+    """Any function q (..., n) -> x (..., m), torch to torch, as a forward model.
+
+    Parameters
+    ----------
+    function : nn.Module or callable
+        Works row by row. Of a module the methods ``forward_and_jacobian`` or ``jacobian``,
+        ``in_domain`` and the attribute ``n_actuators`` are used where it has them.
+    jacobian : callable, optional
+        Maps q to dx/dq (..., m, n). Default: the module's own, else reverse mode.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Tensor], Tensor],
+        jacobian: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        self.function = function
+        names = ("jacobian", "forward_and_jacobian", "in_domain", "n_actuators")
+        own, pair, domain, n = (getattr(function, name, None) for name in names)
+        self.own_jacobian = own if jacobian is None else jacobian
+        self.own_pair = pair if jacobian is None else None
+        self.own_domain = domain
+        self.n_actuators = int(n or 0)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return x of shape (..., m)."""
+        return _checked(self.function(q))
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., m) and dx/dq (..., m, n)."""
+        if self.own_pair is not None:
+            return self.own_pair(q)
+        if self.own_jacobian is not None:
+            return self(q), _checked(self.own_jacobian(q))
+        return reverse_jacobian(self, q)
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return 0 within the domain of the function and 2 outside, shape (...)."""
+        if self.own_domain is None:
+            return super().domain_distance(q)
+        inside = torch.as_tensor(self.own_domain(q), device=q.device)
+        return torch.where(inside, 0.0, 2.0).to(q)
+
+
+def as_forward_model(model: Any) -> ForwardModel:
+    """Return a model of a robot as a `ForwardModel`.
+
+    Parameters
+    ----------
+    model : ForwardModel, nn.Module, callable, (callable, callable) or fitted estimator
+        A function or module maps q ``(..., n)`` to x ``(..., m)`` row by row, torch to torch; a pair
+        is such a function and its Jacobian ``(..., m, n)``. Of a fitted estimator its ``module_``
+        is taken.
+
+    Returns
+    -------
+    ForwardModel
+        The model itself where it is one.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import as_forward_model
+    >>> square = as_forward_model(lambda q: q**2)
+    >>> square.jacobian(torch.tensor([1.0, 3.0]))
+    tensor([[2., 0.],
+            [0., 6.]])
+    """
+    if isinstance(model, ForwardModel):
+        return model
+    if isinstance(model, (tuple, list)):
+        if len(model) != 2 or not all(callable(part) for part in model):
+            raise TypeError(
+                f"`model` must be two callables, q -> x and its Jacobian, got {model!r}."
+            )
+        return FunctionModel(*model)
+    fitted = getattr(model, "module_", None)
+    if fitted is not None:
+        return as_forward_model(fitted)
+    if not callable(model):
+        raise TypeError(
+            f"`model` must be a torch module or callable q -> x, got {type(model).__name__}; "
+            "an estimator must be fitted first, and of a robot description hand over its `chain`."
+        )
+    return FunctionModel(model)
+
+
+def jacobian(model: Any, q: Tensor) -> Tensor:
+    """Return dx/dq of any model that maps every row of q by itself to a row of x.
+
+    In closed form where the model has one, else by one backward pass per output coordinate.
+
+    Parameters
+    ----------
+    model : ForwardModel, nn.Module or callable
+        Maps ``(..., n)`` to ``(..., m)``, row by row; see `as_forward_model`.
+    q : Tensor of shape (..., n)
+        Actuator vectors.
+
+    Returns
+    -------
+    Tensor of shape (..., m, n)
+        Jacobian at every row.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import jacobian
+    >>> jacobian(lambda q: q**2, torch.tensor([1.0, 3.0]))
+    tensor([[2., 0.],
+            [0., 6.]])
+    """
+    return as_forward_model(model).jacobian(q)
+
+
+def forward_and_jacobian(model: Any, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x and dx/dq, in closed form where the model has one."""
+    return as_forward_model(model).forward_and_jacobian(q)
+
+
+def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x and dx/dq by one backward pass per output coordinate."""
+    keep_graph = q.requires_grad and torch.is_grad_enabled()
+    with torch.enable_grad():
+        leaf = q if keep_graph else q.detach().requires_grad_(True)
+        x = function(leaf)
+        rows = [
+            torch.autograd.grad(
+                x[..., i].sum(), leaf, create_graph=keep_graph, retain_graph=True, allow_unused=True
+            )[0]
+            for i in range(x.shape[-1])
+        ]
+    rows = [torch.zeros_like(leaf) if row is None else row for row in rows]
+    J = torch.stack(rows, dim=-2)
+    return (x, J) if keep_graph else (x.detach(), J.detach())
+
+
+def device_of(model: nn.Module) -> torch.device:
+    """Return the device of a module's tensors; the CPU where it has none."""
+    for tensor in (*model.parameters(), *model.buffers()):
+        return tensor.device
+    return torch.device("cpu")
+
+
+def _checked(x: Any) -> Tensor:
+    if not isinstance(x, Tensor):
+        raise TypeError(
+            f"`model` must return torch tensors, got {type(x).__name__}; for NumPy functions use "
+            "`tasks.PositionTask.from_numpy(function, jacobian)`."
+        )
+    return x

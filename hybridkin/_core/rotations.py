@@ -1,0 +1,58 @@
+"""Rotations: their exponential, its left Jacobian, and their logarithm."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.stumpff import stumpff
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+
+
+def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
+    """Return exp(phi) and the left Jacobian J_l(phi) of SO(3), both (..., 3, 3).
+
+    J_l dphi/dt is the angular velocity of exp(phi). Both are entire functions of phi [rad].
+    See Barfoot, State Estimation for Robotics (2017), section 7.1.
+    """
+    K = cross_matrix(phi)
+    square, eye = K @ K, torch.eye(3).to(phi)
+    _, f, g, c3, _ = (part[..., None, None] for part in stumpff(phi.square().sum(-1)))
+    return eye + f * K + g * square, eye + g * K + c3 * square
+
+
+def rotation_vector(R: Tensor) -> Tensor:
+    """Return the logarithm (..., 3) of rotations (..., 3, 3) [rad], up to half turns and at them.
+
+    By the unit quaternion with the largest component first, which no rotation makes small.
+    """
+    r = [[R[..., i, j] for j in range(3)] for i in range(3)]
+    skew = torch.stack([r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]], dim=-1)
+    diagonal = torch.stack([r[0][0], r[1][1], r[2][2]], dim=-1)
+    trace = diagonal.sum(-1, keepdim=True)
+    # Row k: 4 q_k times the quaternion (w, x, y, z).
+    symmetric = R + R.mT - torch.diag_embed(2.0 * diagonal)
+    inner = symmetric + torch.diag_embed(1.0 + 2.0 * diagonal - trace)
+    whole = torch.cat(
+        [
+            torch.cat([1.0 + trace, skew], dim=-1)[..., None, :],
+            torch.cat([skew[..., None], inner], dim=-1),
+        ],
+        dim=-2,
+    )
+    largest = torch.diagonal(whole, dim1=-2, dim2=-1).argmax(-1)[..., None, None]
+    row = whole.gather(-2, largest.expand(*largest.shape[:-1], 4))[..., 0, :]
+    row = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+    row = torch.where(row[..., :1] < 0.0, -row, row)
+    w, axis = row[..., :1], row[..., 1:]
+    square = axis.square().sum(-1, keepdim=True)
+    tiny = square < 1e-12
+    size = torch.where(tiny, 1.0, square).sqrt()
+    ratio = torch.where(tiny, 2.0 + square / 3.0, 2.0 * torch.atan2(size, w) / size)
+    return ratio * axis

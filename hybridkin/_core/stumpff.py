@@ -1,0 +1,84 @@
+"""Entire functions of the bend angle: sines and cosines of arcs without a singular point."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+_SERIES_END = 1.0  # [rad^2]; from here on nothing cancels in the trigonometric forms
+# Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
+_DEGREE = {torch.float64: 7, torch.float32: 4}
+_SERIES = tuple(
+    ((-1.0) ** j / math.factorial(2 * j + 3), (-1.0) ** j / math.factorial(2 * j + 4))
+    for j in range(max(_DEGREE.values()), -1, -1)
+)
+
+
+class Stumpff(NamedTuple):
+    """Entire functions of s = theta^2, with theta the bend angle of an arc.
+
+    c = cos(theta), f = sin(theta)/theta, g = (1 - cos(theta))/theta^2,
+    c3 = (theta - sin(theta))/theta^3, c4 = (cos(theta) - 1 + theta^2/2)/theta^4.
+    With respect to s: 2 f' = c3 - g, 2 g' = 2 c4 - c3, 2 c' = -f.
+    """
+
+    c: Any
+    f: Any
+    g: Any
+    c3: Any
+    c4: Any
+
+
+def stumpff(s: Tensor) -> Stumpff:
+    """Return the Stumpff functions of s = theta^2, smooth through theta = 0.
+
+    Up to one radian the power series is summed: no square root, no division. Beyond, where
+    nothing cancels any more, trigonometry takes over; both agree to rounding where they meet.
+
+    Parameters
+    ----------
+    s : Tensor
+        Squared bend angles [rad^2], any shape.
+
+    Returns
+    -------
+    Stumpff
+        Five tensors of the shape of `s`.
+    """
+    # c3 and c4 together: one multiply-add per power, however small the batch.
+    # Not s.new_tensor: before torch 2.5 it does not know functional transforms.
+    powers = torch.tensor(_SERIES[-1 - _DEGREE.get(s.dtype, 7) :], dtype=s.dtype, device=s.device)
+    powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
+    near = s.clamp(max=_SERIES_END)
+    both = powers[0]
+    for power in powers[1:]:
+        both = torch.addcmul(power, both, near)
+    c3, c4 = both.expand(2, *s.shape).unbind()
+    far = s.clamp(min=_SERIES_END)
+    theta = far.sqrt()
+    c, far_c3, far_c4 = _by_trigonometry(far, theta, torch.cos(theta), torch.sin(theta))
+    bent = s > _SERIES_END
+    c3, c4 = torch.where(bent, far_c3, c3), torch.where(bent, far_c4, c4)
+    f, g = 1.0 - s * c3, 0.5 - s * c4
+    return Stumpff(torch.where(bent, c, 1.0 - s * g), f, g, c3, c4)
+
+
+def stumpff_of_number(s: float) -> Stumpff:
+    """Return the Stumpff functions of one number; see `stumpff`."""
+    if s > _SERIES_END:
+        theta = math.sqrt(s)
+        c, c3, c4 = _by_trigonometry(s, theta, math.cos(theta), math.sin(theta))
+        return Stumpff(c, 1.0 - s * c3, 0.5 - s * c4, c3, c4)
+    c3 = c4 = 0.0
+    for of_c3, of_c4 in _SERIES:
+        c3, c4 = of_c3 + c3 * s, of_c4 + c4 * s
+    g = 0.5 - s * c4
+    return Stumpff(1.0 - s * g, 1.0 - s * c3, g, c3, c4)
+
+
+def _by_trigonometry(s: Any, theta: Any, c: Any, sine: Any) -> tuple[Any, Any, Any]:
+    """Return c, c3 and c4 of s = theta^2 that is not small."""
+    return c, (1.0 - sine / theta) / s, (0.5 - (1.0 - c) / s) / s

@@ -1,0 +1,1 @@
+"""Geometry and backlash of a robot from measured tips."""

@@ -1,0 +1,283 @@
+"""The geometry of a chain as free parameters of natural size one, zero at the start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hybridkin._core.rotations import cross_matrix, rotation
+
+ALIASES = {"turns": "angles", "tool": "offsets"}  # name -> the entry that it moves a part of
+# Positive geometry, and the factor of its start within which it stays, both ways.
+SCALED = {"radii": 5.0, "lengths": 5.0, "bending_stiffness": 1e4, "axial_stiffness": 1e4}
+_SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """One name of `calibrate`, and how its free directions move an entry of the geometry.
+
+    Attributes
+    ----------
+    name, entry : str
+        What the user calls it, and the entry of ``chain.geometry()`` that it moves.
+    start : Tensor
+        The entry at the start.
+    labels : tuple of str
+        Its free directions, as "radii[0]".
+    units : ndarray
+        How far one natural unit of each direction goes: [m], [rad], or [-] of its start.
+    kind : tuple of str
+        What each unit is: "m", "rad" or "-".
+    """
+
+    name: str
+    entry: str
+    start: Tensor
+    labels: tuple[str, ...]
+    units: NDArray
+    kind: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of free directions."""
+        return len(self.labels)
+
+    def moved(self, part: Tensor) -> Tensor:
+        """Return the entry at a point of the free directions (size,)."""
+        raise NotImplementedError
+
+    def tangents(self, part: Tensor) -> Tensor:
+        """Return the derivatives of `moved`, shape (size, ...)."""
+        raise NotImplementedError
+
+    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
+        """Return the limits of the free directions, by default the physical ones."""
+        raise NotImplementedError
+
+    def value(self, entry: Tensor) -> Tensor:
+        """Return what the user knows by this name."""
+        return entry
+
+    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
+        """Return the standard errors of `value` from those of the free directions."""
+        raise NotImplementedError
+
+    def flags(self, known: NDArray) -> NDArray:
+        """Return for each entry of `value` whether the directions that move it are known."""
+        return known
+
+
+class Scaled(Parameter):
+    """Positive numbers, moved by their logarithm."""
+
+    def moved(self, part: Tensor) -> Tensor:
+        return self.start * torch.exp(part).reshape(self.start.shape)
+
+    def tangents(self, part: Tensor) -> Tensor:
+        return torch.diag(self.moved(part).flatten()).reshape(-1, *self.start.shape)
+
+    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
+        start = self.start.numpy().ravel()
+        if bound is None:
+            farthest = math.log(SCALED[self.name])
+            return np.full(start.size, -farthest), np.full(start.size, farthest)
+        if bound[0] < 0:
+            raise ValueError(f"`bounds` of {self.name!r} must not be negative, got {bound}.")
+        with np.errstate(divide="ignore"):
+            return np.log(bound[0] / start), np.log(bound[1] / start)
+
+    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
+        return std.reshape(value.shape) * value
+
+    def flags(self, known: NDArray) -> NDArray:
+        return known.reshape(tuple(self.start.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Shifted(Parameter):
+    """Numbers moved along constant directions, each entry by at most one of them.
+
+    `origin` is what bounds count from, `physical` are those by default; where the user knows only
+    some entries by this name, `shown` has their indices.
+    """
+
+    directions: NDArray  # (numel, size)
+    origin: NDArray
+    physical: tuple[float, float] = (-np.inf, np.inf)
+    shown: NDArray | None = None
+
+    def moved(self, part: Tensor) -> Tensor:
+        directions = torch.as_tensor(self.directions).to(part)
+        return self.start + (directions @ part).reshape(self.start.shape)
+
+    def tangents(self, part: Tensor) -> Tensor:
+        return torch.as_tensor(self.directions.T.copy()).to(part).reshape(-1, *self.start.shape)
+
+    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
+        low, high = self.physical if bound is None else bound
+        if bound is None:  # the start is never wrong
+            low, high = np.minimum(low, self.origin), np.maximum(high, self.origin)
+        return (low - self.origin) / self.units, (high - self.origin) / self.units
+
+    def value(self, entry: Tensor) -> Tensor:
+        if self.shown is None:
+            return entry
+        value = entry.flatten()[torch.as_tensor(self.shown)]
+        return value[0] if self.name == "tool" else value
+
+    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
+        return self._of_entries(np.abs(self.directions) @ std).reshape(value.shape)
+
+    def flags(self, known: NDArray) -> NDArray:
+        flags = ~((self.directions != 0) & ~known).any(axis=1)
+        return self._of_entries(flags).reshape(tuple(self.value(self.start).shape))
+
+    def _of_entries(self, all_entries: NDArray) -> NDArray:
+        return all_entries if self.shown is None else all_entries[self.shown]
+
+
+class Posed(Parameter):
+    """A pose, turned by a rotation vector and moved, both in the measuring frame."""
+
+    def moved(self, part: Tensor) -> Tensor:
+        turned = rotation(part[:3])[0] @ self.start[:3, :3]
+        position = self.start[:3, 3] + part[3:] * torch.as_tensor(self.units[3:]).to(part)
+        pose = torch.cat([turned, position[:, None]], dim=1)
+        return torch.cat([pose, self.start[3:]], dim=0)
+
+    def tangents(self, part: Tensor) -> Tensor:
+        spins = cross_matrix(
+            rotation(part[:3])[1].T
+        )  # of the columns of the left Jacobian of the rotation group
+        tangents = self.start.new_zeros(6, 4, 4)
+        tangents[:3, :3, :3] = spins @ self.moved(part)[:3, :3]
+        tangents[3:, :3, 3] = torch.diag(torch.as_tensor(self.units[3:]).to(part))
+        return tangents
+
+    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
+        if bound is not None:
+            raise ValueError(
+                f"`bounds` cannot hold {self.name!r}; tighten it by `prior={{{self.name!r}: ...}}`."
+            )
+        return np.full(6, -np.inf), np.full(6, np.inf)
+
+    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
+        return std * self.units
+
+
+def parameter_names(chain: Any) -> list[str]:
+    """Return the names that `calibrate` knows for a chain."""
+    names = list(chain.geometry())
+    return names + [alias for alias, entry in ALIASES.items() if entry in names]
+
+
+def parameter(chain: Any, name: str) -> Parameter:
+    """Return the free directions of one name, at the chain's present geometry."""
+    geometry = {key: value.detach().cpu() for key, value in chain.geometry().items()}
+    reach = float(chain.reach)
+    if name == "tool" and name not in geometry:
+        offsets = geometry["offsets"]
+        last = np.eye(len(offsets))[:, -1:] * reach
+        origin = offsets[-1:].numpy()
+        units, low = np.array([reach]), (_SHORTEST * reach, np.inf)
+        shown = np.array([len(offsets) - 1])
+        return Shifted(name, "offsets", offsets, ("tool",), units, ("m",), last, origin, low, shown)
+    if name == "turns":
+        start, counts = geometry["angles"], np.array(chain.actuators_per_segment)
+        rings = np.repeat(np.eye(len(counts)), counts, axis=0)
+        first = np.cumsum(counts) - counts
+        labels, kind = _labels(name, (len(counts),)), ("rad",) * len(counts)
+        origin, ones = start.numpy()[first], np.ones(len(counts))
+        return Shifted(name, "angles", start, labels, ones, kind, rings, origin, shown=first)
+    start = geometry[name]
+    if name == "base":
+        labels = tuple(f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z"))
+        units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
+        return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
+    labels, size = _labels(name, tuple(start.shape)), start.numel()
+    if name in SCALED:
+        return Scaled(name, name, start, labels, np.ones(size), ("-",) * size)
+    unit, kind, physical = reach, "m", (-np.inf, np.inf)
+    if name == "rest_bends":
+        unit, kind, physical = 1.0, "rad", (-math.pi, math.pi)
+    elif name == "angles":
+        unit, kind = 1.0, "rad"
+    elif name == "offsets":
+        physical = (_SHORTEST * reach, np.inf)
+    elif name.endswith("_zeros"):
+        unit = float(geometry["radii"].mean())
+    units, origin, kinds = np.full(size, unit), start.numpy().ravel(), (kind,) * size
+    return Shifted(name, name, start, labels, units, kinds, np.diag(units), origin, physical)
+
+
+def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
+    if len(shape) == 2 and shape[1] == 2:
+        return tuple(f"{name}[{k}, {axis}]" for k in range(shape[0]) for axis in "xy")
+    if not shape:
+        return (name,)
+    return tuple(f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(*shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The free parameters theta of a chain, all of natural size one, zero at the start."""
+
+    chain: Any
+    parameters: tuple[Parameter, ...]
+    prior_std: NDArray
+    low: NDArray
+    high: NDArray
+
+    @classmethod
+    def of(
+        cls,
+        chain: Any,
+        names: tuple[str, ...],
+        bounds: Mapping[str, tuple[float, float]],
+        prior: Mapping[str, float],
+    ) -> Problem:
+        """Return the problem of these names, with limits and priors from the user's."""
+        parameters = tuple(parameter(chain, name) for name in names)
+        limits = [part.bounds(bounds.get(part.name)) for part in parameters]
+        stds = [np.full(part.size, prior[part.name]) for part in parameters]
+        low, high = (np.concatenate(side) for side in zip(*limits, strict=True))
+        return cls(chain, parameters, np.concatenate(stds), low, high)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of all free directions."""
+        return tuple(label for part in self.parameters for label in part.labels)
+
+    def start(self) -> NDArray:
+        """Return the start, brought inside the limits."""
+        return np.clip(np.zeros(self.prior_std.size), self.low, self.high)
+
+    def parts(self, theta: Any) -> list[Any]:
+        """Return theta (P,) by parameters."""
+        ends = np.cumsum([part.size for part in self.parameters])
+        starts = [0, *ends[:-1]]
+        return [theta[a:b] for a, b in zip(starts, ends, strict=True)]
+
+    def moved(self, theta: Tensor) -> Any:
+        """Return the chain at theta (P,), differentiable in it."""
+        pairs = zip(self.parameters, self.parts(theta), strict=True)
+        return self.chain.with_geometry(**{part.entry: part.moved(at) for part, at in pairs})
+
+    def tangents(self, theta: Tensor) -> dict[str, Tensor]:
+        """Return the derivatives of the geometry by theta, (P, ...) for every moved entry."""
+        tangents, row = {}, 0
+        for part, at in zip(self.parameters, self.parts(theta), strict=True):
+            own = part.tangents(at)
+            whole = own.new_zeros(len(theta), *own.shape[1:])
+            whole[row : row + part.size] = own
+            tangents[part.entry] = whole
+            row += part.size
+        return tangents

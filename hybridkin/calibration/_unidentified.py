@@ -1,0 +1,106 @@
+"""What calibration data leave open, in sentences: few parameters each, and what to do."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+from hybridkin.calibration._least_squares import Fit
+from hybridkin.calibration._parameters import Problem
+
+_N_TERMS = 6  # moves in a sentence
+_FAIR = 0.5  # of the largest share, which may lead a sentence
+_SMALL = 0.05  # of a step, or of what a sentence moves: not worth a word
+_SLIGHT = 0.01  # of what the moves of one sentence do each alone
+_ALIKE = 0.02
+_STILL = 1e-6  # [mm]
+_INSIDE = 0.05  # of a unit vector: within a span
+_STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%")}
+
+
+def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
+    """Say which moves of the parameters hardly move the tips, each by few of them.
+
+    `directions` (K, P) are orthonormal moves in units of the prior.
+    """
+    problem = fit.problem
+    units = np.concatenate([part.units for part in problem.parameters])
+    steps = [_STEPS[kind] for part in problem.parameters for kind in part.kind]
+    to_steps = problem.prior_std * units / np.array([size for size, _ in steps])
+    columns = 1e3 * fit.jacobian * problem.prior_std / np.sqrt(n_rows)  # [mm] of tip
+    said = []
+    for move in _few_terms(directions):
+        # Led by the first with a fair share, which moves one step.
+        lead = int(np.argmax(np.abs(move) > _FAIR * np.abs(move).max()))
+        move = move / (move[lead] * to_steps[lead])
+        tips = float(np.linalg.norm(columns @ move))
+        alone = np.abs(move) * np.linalg.norm(columns, axis=0)
+        counts = alone > max(_SMALL * tips, _SLIGHT * alone.max(), _STILL)
+        effect = (
+            "does not move the tips" if tips < _STILL else f"moves the tips by {tips:.2g} mm rms"
+        )
+        terms = _terms(problem, move * to_steps, lead)
+        shown = [term for term in terms if abs(term[1]) > _SMALL][:_N_TERMS]
+        hidden = sum(counts[term[2]] for term in terms if term not in shown)
+        words = [f"{label} {at:+.3g} {steps[i][1]}" for label, at, i in shown]
+        rest = [", ".join(words[1:]), f"{hidden} smaller" if hidden else ""]
+        moved = " with ".join(filter(None, [words[0], " and ".join(filter(None, rest))]))
+        name_of = [part.name for part in problem.parameters for _ in part.labels]
+        first, *others = [(label.removeprefix("all "), name_of[i]) for label, _, i in shown]
+        advice = f"leave {first[0]} out or measure it"
+        if others:
+            second = next((other for other in others if other[1] != first[1]), others[0])
+            advice = f"leave out or measure {first[0]} or {second[0]}"
+        said.append(f"{moved} {effect}: {advice}.")
+    return tuple(said)
+
+
+def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float, int]]:
+    """Return a move by (label, size, index): what leads, then the largest first.
+
+    Entries of one name that all move alike are one.
+    """
+    terms, row = [], 0
+    for part in problem.parameters:
+        own = shown[row : row + part.size]
+        alike = part.size > 1 and np.ptp(own) < _ALIKE * np.abs(own).max()
+        for i, at in enumerate(own[:1] if alike else own):
+            label = f"all {part.name}" if alike else part.labels[i]
+            leads = row <= lead < row + part.size if alike else row + i == lead
+            terms.append((not leads, -abs(at), (label, float(at), row + i)))
+        row += part.size
+    return [term for *_, term in sorted(terms)]
+
+
+def _few_terms(directions: NDArray) -> NDArray:
+    """Return a basis (K, P) of the span of orthonormal rows, each of few entries.
+
+    The least sum of absolute entries for each entry held, then the shortest that are independent.
+    """
+    K, P = directions.shape
+    if K < 2:
+        return directions
+    cost = np.concatenate([np.zeros(K), np.ones(P)])
+    eye = np.eye(P)
+    above = np.block([[directions.T, -eye], [-directions.T, -eye]])
+
+    def shortest(held: NDArray) -> NDArray:
+        equal = np.concatenate([held, np.zeros(P)])[None]
+        found = linprog(cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)).x
+        a = held if found is None else found[:K]  # the nearest to it will do as well
+        return a / np.linalg.norm(a)
+
+    columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
+    candidates = sorted((shortest(held) for held in columns), key=lambda a: _spread(a @ directions))
+    chosen: list[NDArray] = []
+    while len(chosen) < K:
+        taken = np.array(chosen).reshape(-1, K)
+        rest = np.linalg.svd(taken)[2][len(chosen) :]  # what no chosen one has
+        free = [a for a in candidates if np.linalg.norm(rest @ a) > _INSIDE]
+        chosen.append(free[0] if free else shortest(rest[0]))
+    return np.array(chosen) @ directions
+
+
+def _spread(move: NDArray) -> float:
+    return float(np.abs(move).sum() / np.abs(move).max())

@@ -1,0 +1,394 @@
+"""Geometry of a kinematic chain from measured tips, with standard errors and identifiability."""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.model_selection import GroupKFold
+from torch import Tensor
+
+from hybridkin._core.arrays import as_tensor
+from hybridkin._core.units import warn_span
+from hybridkin.calibration._initial_guesses import Start, starts
+from hybridkin.calibration._least_squares import Fit, Rows, solve
+from hybridkin.calibration._parameters import ALIASES, Problem, parameter_names
+from hybridkin.calibration._unidentified import sentences
+
+__all__ = ["CalibrationResult", "calibrate"]
+
+_LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
+_WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
+_KNOWN = 0.1  # k parameters that share one unknown direction narrow to 1 / sqrt(k) by the prior
+_EQUAL = 1.0 - 1e-4  # of starts that explain the tips alike the given one counts
+_BETTER = 0.8  # another handedness than the given one must explain the tips this much better,
+_FAR_BETTER = 0.5  # and this much where the user has not asked for it
+_MEASURED = ("radii", "lengths")  # sizes that a ruler tells:
+_UNPHYSICAL = 1.75  # one that moves by this factor is worth a word
+
+
+@dataclass(frozen=True, repr=False)
+class CalibrationResult:
+    """Calibrated chain and what the data say about its geometry.
+
+    Attributes
+    ----------
+    chain
+        Copy of the given chain with the calibrated geometry.
+    values : dict of str to array
+        The calibrated geometry by parameter name, in the chain's shapes and units, as
+        ``chain.geometry()`` has it; "tool" () [m] is the last of the offsets, "turns" (S,) [rad]
+        the angle of the first actuator of each segment.
+    std_errors : dict of str to array
+        One standard error for each entry of `values`; for "base" shape (6,), three of rotation
+        [rad] and three of translation [m], in the measuring frame.
+    correlations : ndarray of shape (P, P)
+        Correlation of the P free parameters, ordered as `names`.
+    names : tuple of P str
+        Free parameters, as "radii[0]" or "base[rot x]".
+    narrowing : ndarray of shape (P,)
+        How many times the data narrow the prior of each of `names`.
+    identifiable : dict of str to bool array
+        False where the data narrow the prior less than tenfold: that value is an assumption.
+    singular_values : ndarray of shape (P,)
+        How many times the data narrow the prior, along P directions that they tell apart, largest
+        first. Below 10 the prior decides.
+    unidentified : tuple of str
+        A sentence for each direction that the data leave open, with what to do.
+    rmse : float
+        Root mean square tip distance on the given data [m].
+    cv_rmse : float or None
+        The same on groups held out (at most 5 folds), when `groups` was given [m].
+    converged : bool
+        Whether the solver met its tolerance.
+    """
+
+    chain: Any
+    values: dict[str, Any]
+    std_errors: dict[str, Any]
+    correlations: NDArray
+    names: tuple[str, ...]
+    narrowing: NDArray
+    identifiable: dict[str, NDArray]
+    singular_values: NDArray
+    unidentified: tuple[str, ...]
+    rmse: float
+    cv_rmse: float | None
+    converged: bool
+
+    def __repr__(self) -> str:
+        lines = [f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"]
+        for name, value in self.values.items():
+            lines.append(f"  {name}: {_shown(value)}")
+            lines.append(f"    std. error {_shown(self.std_errors[name])}")
+        if self.unidentified:
+            lines.append("  These data cannot tell, and the prior decides:")
+            lines += [f"    {sentence}" for sentence in self.unidentified]
+        return "\n".join(lines)
+
+
+def _shown(value: Any) -> str:
+    array = np.asarray(value)
+    rows = array[:3].reshape(3, 4) if array.shape == (4, 4) else np.atleast_2d(array)
+    return "; ".join(" ".join(f"{entry:.4g}" for entry in row) for row in rows)
+
+
+def calibrate(
+    chain: Any,
+    q: Any,
+    x: Any,
+    parameters: Sequence[str] = ("radii", "base"),
+    *,
+    loss: str = "linear",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    prior: float | Mapping[str, float] = 0.5,
+    groups: Any = None,
+    sample_weight: Any = None,
+) -> CalibrationResult:
+    """Return the chain whose geometry explains measured tips best.
+
+    Nonlinear least squares on the tip distance with exact derivatives. Radii and lengths are
+    fitted by their logarithm and so stay positive. A weak prior keeps every parameter near its
+    start where the data say nothing; its weight against the data follows the noise level, which
+    is estimated from the residuals, so exact data override it. With a free base or free angles
+    several starts are tried, other turns and mirror images of the actuator rings among them: of a
+    robot wired the other way round the data tell.
+
+    Parameters
+    ----------
+    chain : ConstantCurvatureChain, RigidChain or nn.Module
+        Start of the search; it is not changed. Any module q -> x with `geometry()`,
+        `with_geometry()`, `reach` and `check_actuators()` will do.
+    q : array or Tensor of shape (N, n_actuators)
+        Actuator vectors [m], of revolute joints [rad].
+    x : array or Tensor of shape (N, 3)
+        Measured tip positions [m].
+    parameters : sequence of str, default=("radii", "base")
+        Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
+        chains), "offsets", "rest_bends", "actuator_zeros", "base" (pose), of elastic tendon chains
+        "bending_stiffness", "axial_stiffness" and "tendon_zeros"; or instead of all angles
+        "turns", of each segment's ring of actuators as a whole, and instead of all offsets "tool",
+        the last one.
+    loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
+        All but "linear" bound the influence of outliers.
+    bounds : dict of str to (low, high), optional
+        Limits of all entries of a name, in its own unit. Default: a factor of 5 on radii and
+        lengths and of 10 000 on stiffnesses, half a turn on rest bends, and offsets that are no
+        shorter than minus a tenth of the robot's length.
+    prior : float or dict of str to float, default=0.5
+        Standard deviation of the weak prior in natural units: a fraction of radii, lengths and
+        stiffnesses, of the mean radius for actuator and tendon zeros, of the robot's length for
+        "offsets", "tool" and the base position, radians for angles, rest bends and the base
+        orientation. ``inf`` turns it off.
+    groups : array-like of shape (N,), optional
+        Motion of every row; asks for `cv_rmse` on motions held out.
+    sample_weight : array-like of shape (N,), optional
+        How many times each row counts; rows of weight zero are left out.
+
+    Returns
+    -------
+    CalibrationResult
+        ``.chain`` is the calibrated chain.
+
+    Raises
+    ------
+    ValueError
+        For unknown parameters, wrong shapes, or data that are not finite.
+
+    Warns
+    -----
+    UserWarning
+        Where q or x look like millimetres. Where a value ran into a bound or left what is
+        physical, and where the mirror image of the given robot explains the data far better: then
+        that is returned. For tendons of a ConstantCurvatureChain that contradict each other, as
+        slack does.
+
+    References
+    ----------
+    Reinhart & Steil (2016), section 2.1 (radii fitted to recorded movements).
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import ConstantCurvatureChain, calibrate
+    >>> q = 0.25 + 0.05 * torch.rand(50, 6, generator=torch.manual_seed(0), dtype=torch.float64)
+    >>> truth = ConstantCurvatureChain([0.05, 0.04])
+    >>> result = calibrate(ConstantCurvatureChain([0.06, 0.06]), q, truth(q), ("radii",))
+    >>> result.values["radii"]
+    tensor([0.0500, 0.0400], dtype=torch.float64)
+    """
+    names = _check_parameters(chain, parameters, bounds, prior)
+    if loss not in _LOSSES:
+        raise ValueError(f"`loss` must be one of {_LOSSES}, got {loss!r}.")
+    torch_given = isinstance(q, Tensor)
+    q, x = _check_data(chain, q, x)
+    if groups is not None:
+        groups = np.asarray(groups)
+        if groups.shape != (len(q),):
+            raise ValueError(
+                f"`groups` must have shape ({len(q)},), one motion per row of `q`, got "
+                f"{groups.shape}."
+            )
+    weights = _check_weights(sample_weight, q)
+    kept = weights > 0
+    rows = Rows(q[kept], x[kept], weights[kept])
+    stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
+    stds = {name: min(float(stds.get(name, 0.5)), _WIDEST) for name in names}
+    with torch.no_grad():
+        candidates = starts(chain, rows, names)
+    fits = []
+    for start in candidates:
+        problem = Problem.of(start.chain, names, bounds or {}, stds)
+        first = _first_theta(problem, start)
+        fits.append(solve(problem, rows, first, loss, roughly=len(candidates) > 1))
+    best = _best(fits, candidates, bool({"angles", "turns"} & {*names}))
+    if len(candidates) > 1:
+        best = solve(best.problem, rows, best.theta, loss)
+    _warn_unphysical(best)
+    result_chain = best.chain()
+    if hasattr(result_chain, "warn_contradictory"):
+        result_chain.warn_contradictory(q)
+    cv_rmse = None
+    if groups is not None:
+        cv_rmse = _cross_validate(best, rows, groups[kept.numpy()], loss)
+    return _result(best, rows, cv_rmse, torch_given)
+
+
+def _first_theta(problem: Problem, start: Start) -> NDArray:
+    theta = [np.zeros(part.size) for part in problem.parameters]
+    for part, own in zip(problem.parameters, theta, strict=True):
+        if part.name == "radii":
+            own += np.log(start.scale)
+    return np.clip(np.concatenate(theta), problem.low, problem.high)
+
+
+def _best(fits: list[Fit], candidates: list[Start], free_angles: bool) -> Fit:
+    """Return the best fit: of equals the first, and a mirror image only where clearly better."""
+    best, image = fits[0], None
+    for fit, start in zip(fits[1:], candidates[1:], strict=True):
+        if not any(start.mirrored):
+            best = fit if fit.rmse < _EQUAL * best.rmse else best
+        elif image is None or fit.rmse < image.rmse:
+            image = fit
+    if image is None or image.rmse >= (_BETTER if free_angles else _FAR_BETTER) * best.rmse:
+        return best
+    if not free_angles:
+        warnings.warn(
+            f"the actuators run the other way round than `chain` says: its mirror image leaves "
+            f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
+            "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`.",
+            stacklevel=3,
+        )
+    return image
+
+
+def _warn_unphysical(fit: Fit) -> None:
+    problem, theta = fit.problem, fit.theta
+    words = []
+    for label, at, low, high in zip(problem.labels, theta, problem.low, problem.high, strict=True):
+        if min(at - low, high - at) < 1e-6:
+            side = "lower" if at - low < high - at else "upper"
+            words.append(f"{label} ran into its {side} bound")
+    before = problem.chain.geometry()
+    for part, at in zip(problem.parameters, problem.parts(theta), strict=True):
+        for label, moved in zip(part.labels, at, strict=True):
+            if part.name in _MEASURED and abs(moved) > np.log(_UNPHYSICAL):
+                words.append(f"{label} went to {np.exp(moved):.2g} times its start")
+        if part.entry == "offsets":
+            offsets = fit.chain().geometry()["offsets"]
+            further = before["offsets"] - offsets > 1e-3 * part.units[0]
+            worse = further & (offsets < -0.02 * part.units[0])
+            for k in worse.nonzero().flatten().tolist():
+                label = "tool" if part.name == "tool" else part.labels[k]
+                words.append(f"{label} became {1e3 * float(offsets[k]):.3g} mm")
+    if words:
+        warnings.warn(
+            f"calibration left what is physical: {'; '.join(words)}. Check the units and the "
+            "start, narrow the `prior`, or fit less; the robot may do what this model does not "
+            "know (slack tendons, gravity, twist).",
+            stacklevel=3,
+        )
+
+
+def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> CalibrationResult:
+    problem, chain = fit.problem, fit.chain()
+    prior_std = problem.prior_std
+    # By singular values in units of the prior: squares would lose what the data leave open.
+    J = fit.jacobian * prior_std
+    _, told, directions = np.linalg.svd(J / fit.noise, full_matrices=len(J) < J.shape[1])
+    told = np.pad(told, (0, len(prior_std) - told.size))
+    factor = prior_std[:, None] * directions.T / np.sqrt(told**2 + 1.0)
+    covariance = factor @ factor.T
+    std = np.sqrt(np.diag(covariance))
+    safe = np.where(std > 0, std, 1.0)
+    geometry = {name: value.detach() for name, value in chain.geometry().items()}
+    values, std_errors, identifiable = {}, {}, {}
+    pieces = (problem.parts(part) for part in (std, std < _KNOWN * prior_std))
+    for part, error, known in zip(problem.parameters, *pieces, strict=True):
+        value = part.value(geometry[part.entry])
+        error = part.std_errors(error, value.numpy())
+        values[part.name] = value if torch_given else value.numpy()
+        std_errors[part.name] = torch.as_tensor(error) if torch_given else np.asarray(error)
+        identifiable[part.name] = np.asarray(part.flags(known))
+    open_ones = directions[told * _KNOWN < 1.0]
+    return CalibrationResult(
+        chain=chain,
+        values=values,
+        std_errors=std_errors,
+        correlations=covariance / np.outer(safe, safe),
+        names=problem.labels,
+        narrowing=prior_std / safe,
+        identifiable=identifiable,
+        singular_values=told,
+        unidentified=sentences(fit, open_ones, float(rows.weight.sum())),
+        rmse=fit.rmse,
+        cv_rmse=cv_rmse,
+        converged=fit.converged,
+    )
+
+
+def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
+    folds = min(5, len(np.unique(groups)))
+    if folds < 2:
+        raise ValueError(
+            "`groups` must name at least 2 motions to hold one out, got 1; leave `groups` out "
+            "where the log is one motion."
+        )
+    squares = 0.0
+    for train, test in GroupKFold(folds).split(rows.q, groups=groups):
+        fit = solve(best.problem, Rows(*(part[train] for part in rows)), best.theta, loss)
+        held_out = Rows(*(part[test] for part in rows))
+        squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weight.sum())
+    return float(np.sqrt(squares / float(rows.weight.sum())))
+
+
+def _check_parameters(
+    chain: Any, parameters: Sequence[str], bounds: Mapping | None, prior: float | Mapping
+) -> tuple[str, ...]:
+    names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
+    available = parameter_names(chain)
+    unknown = [name for name in names if name not in available]
+    if unknown or not names or len(set(names)) < len(names):
+        close = [difflib.get_close_matches(str(name), available, 1) for name in unknown]
+        hint = "".join(f"; did you mean {near[0]!r}?" for near in close[:1] if near)
+        raise ValueError(
+            f"`parameters` must name different ones of {available} for this chain, got "
+            f"{names}{hint or '.'}"
+        )
+    for alias, entry in ALIASES.items():
+        if {alias, entry} <= set(names):
+            raise ValueError(
+                f"`parameters` must not hold both {entry!r} and {alias!r}, which moves a part of "
+                f"them; leave {alias!r} out."
+            )
+    for argument, given in (("bounds", bounds), ("prior", prior)):
+        if isinstance(given, Mapping) and not set(given) <= set(names):
+            raise ValueError(f"`{argument}` must name only {names}, got {sorted(given)}.")
+    for name, (low, high) in (bounds or {}).items():
+        if not low < high:
+            raise ValueError(
+                f"`bounds` of {name!r} must be (low, high) with low < high, got {(low, high)}."
+            )
+    stds = list(prior.values()) if isinstance(prior, Mapping) else [prior]
+    if not all(std > 0 for std in stds):
+        raise ValueError(f"`prior` must be positive standard deviations, got {prior}.")
+    return names
+
+
+def _check_data(chain: Any, q: Any, x: Any) -> tuple[Tensor, Tensor]:
+    dtype = chain.geometry()["base"].dtype
+    q, x = as_tensor(q, "q").to(dtype), as_tensor(x, "x").to(dtype)
+    if q.ndim != 2:
+        raise ValueError(f"`q` must have shape (N, n_actuators), got {tuple(q.shape)}.")
+    if x.shape != (len(q), 3):
+        raise ValueError(
+            f"`x` must have shape ({len(q)}, 3), one tip position per row of `q`, got "
+            f"{tuple(x.shape)}."
+        )
+    if len(q) == 0:
+        raise ValueError("`q` must hold at least one row, got none.")
+    chain.check_actuators(q)
+    if not torch.isfinite(x).all():
+        rows = int((~torch.isfinite(x).all(dim=1)).sum())
+        raise ValueError(f"`x` must be finite, got NaN or infinity in {rows} rows; drop them.")
+    warn_span("x", x, float(chain.reach.detach()))
+    return q, x
+
+
+def _check_weights(sample_weight: Any, q: Tensor) -> Tensor:
+    if sample_weight is None:
+        return q.new_ones(len(q))
+    weights = as_tensor(sample_weight, "sample_weight").to(q)
+    valid = weights.shape == (len(q),) and bool((torch.isfinite(weights) & (weights >= 0)).all())
+    if not valid or not (weights > 0).any():
+        raise ValueError(
+            f"`sample_weight` must hold {len(q)} non-negative numbers, not all zero, got shape "
+            f"{tuple(weights.shape)}."
+        )
+    return weights

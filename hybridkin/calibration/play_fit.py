@@ -1,0 +1,152 @@
+"""Backlash of the actuators from a log, chosen by held-out motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.model_selection import GroupKFold
+
+from hybridkin.calibration.calibrate import CalibrationResult, calibrate
+from hybridkin.chains.play import PlayOperator
+
+__all__ = ["PlayFit", "fit_play"]
+
+_FOLDS = 5
+
+
+@dataclass(frozen=True)
+class PlayFit:
+    """Play that a log shows, and the chain calibrated with it.
+
+    Attributes
+    ----------
+    width : float
+        Chosen play [m]; zero where none was kept.
+    widths : ndarray of shape (W,)
+        Widths tried [m], ascending, the first zero.
+    cv_rmse : ndarray of shape (W,)
+        Root mean square tip distance on motions held out, with each width [m].
+    gain : float
+        By how much the best width lowers the error of a fold, on average [m].
+    gain_std_error : float
+        Standard error of `gain` over the folds [m].
+    kept : bool
+        Whether play is worth its while: `gain` is above `gain_std_error`.
+    result : CalibrationResult
+        The calibration on all rows with the chosen width.
+    """
+
+    width: float
+    widths: NDArray
+    cv_rmse: NDArray
+    gain: float
+    gain_std_error: float
+    kept: bool
+    result: CalibrationResult
+
+    @property
+    def play(self) -> PlayOperator:
+        """The operator to put before ``result.chain``."""
+        return PlayOperator(self.width)
+
+
+def fit_play(
+    chain: Any,
+    q: Any,
+    x: Any,
+    groups: ArrayLike,
+    widths: Sequence[float] = (0.0, 0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3),
+    parameters: Sequence[str] | None = None,
+    **calibrate_options: Any,
+) -> PlayFit:
+    """Return the play of the tendons, chosen by motions held out, and the chain behind it.
+
+    With every width the chain is calibrated on the effective changes of the training motions and
+    measured on the others, in at most 5 folds. The best width is kept only where its gain over no
+    play, averaged over the folds, exceeds its standard error.
+
+    Parameters
+    ----------
+    chain : ElasticTendonChain, ConstantCurvatureChain or nn.Module
+        Start of the calibration; it is not changed.
+    q : array or Tensor of shape (N, n_actuators)
+        Commanded tendon length changes, the rows of one motion in the order of time [m].
+    x : array or Tensor of shape (N, 3)
+        Measured tip positions [m].
+    groups : array-like of shape (N,)
+        Motion of every row; each starts without a past.
+    widths : sequence of float, default=(0, 0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3)
+        Total play to try, the same for all tendons [m]. Zero is tried in any case.
+    parameters : sequence of str, optional
+        What to calibrate, see `calibrate`. Default: the chain's own list.
+    **calibrate_options
+        `loss`, `prior` and `bounds` of `calibrate`.
+
+    Returns
+    -------
+    PlayFit
+        ``.play`` and ``.result.chain`` make the model.
+
+    Raises
+    ------
+    ValueError
+        For fewer than two motions, negative widths, and what `calibrate` raises.
+
+    References
+    ----------
+    Krasnosel'skii & Pokrovskii, Systems with Hysteresis, Springer 1989, section 2 (play).
+
+    Examples
+    --------
+    >>> import numpy as np, torch
+    >>> from hybridkin import ConstantCurvatureChain, PlayOperator, fit_play
+    >>> truth = ConstantCurvatureChain([0.005], lengths=[0.1])
+    >>> groups = np.repeat(np.arange(8), 20)
+    >>> swing = np.sin(np.linspace(0, 6, 20)) * np.arange(1, 9)[:, None]
+    >>> q = 0.0005 * np.stack([np.cos(groups - a) * swing.ravel() for a in (0, 2.1, 4.2)], axis=1)
+    >>> with torch.no_grad():
+    ...     x = truth(torch.as_tensor(PlayOperator(0.0004).apply_by_group(q, groups))).numpy()
+    >>> fit = fit_play(truth, q, x, groups, parameters=("radii",))
+    >>> fit.kept, fit.width
+    (True, 0.0004)
+    """
+    tried = np.unique(np.concatenate([[0.0], np.asarray(widths, dtype=float).ravel()]))
+    groups = np.asarray(groups)
+    folds = min(_FOLDS, len(np.unique(groups)))
+    if folds < 2:
+        raise ValueError("`groups` must name at least 2 motions to hold one out, got 1.")
+    names = tuple(chain.default_parameters) if parameters is None else parameters
+    effective = [PlayOperator(width).apply_by_group(q, groups) for width in tried]
+    splits = list(GroupKFold(folds).split(groups, groups=groups))
+    mean_squares = np.array(
+        [
+            [_mean_square(chain, y, x, names, split, calibrate_options) for split in splits]
+            for y in effective
+        ]
+    )
+    sizes = [len(test) for _, test in splits]
+    cv_rmse = np.sqrt(np.average(mean_squares, axis=1, weights=sizes))
+    best = int(np.argmin(cv_rmse))
+    gains = np.sqrt(mean_squares[0]) - np.sqrt(mean_squares[best])
+    gain, std_error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(folds))
+    kept = best > 0 and gain > std_error
+    chosen = best if kept else 0
+    result = calibrate(chain, effective[chosen], x, names, **calibrate_options)
+    return PlayFit(float(tried[chosen]), tried, cv_rmse, gain, std_error, kept, result)
+
+
+def _mean_square(
+    chain: Any, y: Any, x: Any, names: Sequence[str], split: Any, options: dict[str, Any]
+) -> float:
+    """Return the mean squared tip distance on the motions held out."""
+    train, test = split
+    fitted = calibrate(chain, y[train], x[train], names, **options).chain
+    with torch.no_grad():
+        held_out = torch.as_tensor(y[test]).to(fitted.geometry()["base"])
+        error = fitted(held_out) - torch.as_tensor(x[test]).to(held_out)
+    return float(error.square().sum(dim=1).mean())

@@ -1,0 +1,1 @@
+"""Mechanical models: constant curvature, elastic tendons, rigid arms; robots and backlash."""

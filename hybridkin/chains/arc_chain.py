@@ -1,0 +1,374 @@
+"""What all chains of circular arcs share: tip, poses and derivatives from one arc per segment."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.stumpff import stumpff
+from hybridkin.chains._arcs import arc_transforms, tip, tip_and_columns
+from hybridkin.chains._checks import check_replacements
+from hybridkin.chains.chain import Chain
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class ArcChain(Chain):
+    """A chain of circular arcs; its kinds differ in how the actuators shape them.
+
+    A kind names its geometry in `_entries` and what else makes it in `_structure`, sets the
+    attributes below and gives `_set_geometry`, `_arcs_and_slope` and `_arc_tangents`.
+    """
+
+    _entries: ClassVar[tuple[str, ...]]
+    _structure: ClassVar[tuple[str, ...]] = (
+        *("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at"),
+    )
+
+    n_segments: int
+    actuators_per_segment: tuple[int, ...]
+    tip_at: float  # the point that is steered, in segments from the base
+    offsets: Tensor  # (S,)
+
+    def geometry(self) -> dict[str, Tensor]:
+        """Return the geometry by name, as in the constructor; what a kind lacks is left out."""
+        tensors = {name: getattr(self, name) for name in self._entries}
+        return {name: value for name, value in tensors.items() if value is not None}
+
+    def with_geometry(self, **geometry: Tensor) -> Self:
+        """Return a chain with some of the geometry replaced, differentiable in the new values.
+
+        Parameters
+        ----------
+        **geometry : Tensor
+            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
+
+        Returns
+        -------
+        ArcChain
+            A new chain of the same kind; this one is left as it was.
+        """
+        current = self.geometry()
+        check_replacements(geometry, current)
+        chain = type(self).__new__(type(self))
+        nn.Module.__init__(chain)
+        for name in self._structure:
+            setattr(chain, name, getattr(self, name))
+        chain._set_geometry({**dict.fromkeys(self._entries), **current, **geometry})
+        return chain
+
+    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
+        for name in self._entries:
+            self.register_buffer(name, geometry[name])
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the tip position.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        Tensor of shape (..., 3)
+            Tip position in the measuring frame [m].
+        """
+        return in_blocks(self._forward, q, 8192)[0]
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return the position Jacobian dx/dq, shape (..., 3, n_actuators), in closed form."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip position [m] and its Jacobian in one pass.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        x : Tensor of shape (..., 3)
+            Tip position [m].
+        J : Tensor of shape (..., 3, n_actuators)
+            Closed-form Jacobian dx/dq [-].
+        """
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        x, J = in_blocks(self._forward_and_jacobian, q)
+        return x, J
+
+    def pose_jacobian(self, q: Tensor) -> Tensor:
+        """Return the tip's linear [-] and angular [rad/m] Jacobian, shape (..., 6, n_actuators).
+
+        The angular rows give the angular velocity in the measuring frame.
+        """
+        arcs, slope = self._arcs_and_slope(self._rows(q))
+        length, bending = self._split(self._to_tip(arcs))
+        _, columns = tip_and_columns(length, bending, self._tip_offsets().to(q), angular=True)
+        parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
+        return torch.cat(parts, dim=-2)
+
+    def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivative of the tip along changes of the geometry, in closed form.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+        tangents : dict of str to Tensor of shape (P, ...)
+            P changes of entries of `geometry()`, stacked; entries left out stay as they are.
+
+        Returns
+        -------
+        Tensor of shape (..., 3, P)
+            How fast the tip moves along every change [m per unit of the change].
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ConstantCurvatureChain
+        >>> chain = ConstantCurvatureChain([0.01], lengths=[0.1])
+        >>> longer = {"lengths": torch.ones(1, 1, dtype=torch.float64)}
+        >>> chain.geometry_jacobian(torch.zeros(3, dtype=torch.float64), longer).flatten()
+        tensor([0., 0., 1.], dtype=torch.float64)
+        """
+        rows = self._rows(q)
+        length, bending = self._split(self._to_tip(self._arcs_and_slope(rows)[0]))
+        offsets, base = self._tip_offsets().to(q), self.base.to(q)
+        tail, columns = tip_and_columns(length, bending, offsets, rigid=True)
+        tangents = {name: value.to(q) for name, value in tangents.items()}
+        moves = self._to_tip(self._arc_tangents(rows, tangents).permute(2, 1, 0)).permute(2, 1, 0)
+        columns = (base[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
+        by_arcs, by_offsets = (
+            columns.permute(2, 0, 1).contiguous().split([3 * len(length), len(length)], dim=2)
+        )
+        J = by_arcs @ moves.mT
+        if "offsets" in tangents:
+            J = J + by_offsets @ self._tip_offsets(tangents["offsets"]).T
+        if "base" in tangents:
+            turned = tail.T @ tangents["base"][:, :3, :3].permute(2, 1, 0).flatten(1)
+            J = J + turned.unflatten(1, J.shape[1:]) + tangents["base"][:, :3, 3].T
+        return J.reshape(*q.shape[:-1], *J.shape[1:])
+
+    def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the arc of every segment.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        length : Tensor of shape (..., S)
+            Centre-line lengths [m].
+        bending : Tensor of shape (..., S, 2)
+            Bending vectors [rad]: their norm is the bend angle, they point where it bends.
+        """
+        return self._leading(self._arcs(q), q)
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Return the pose of the base and of the end of every segment, its offset included.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+
+        Returns
+        -------
+        Tensor of shape (..., S + 1, 4, 4)
+            Homogeneous transforms into the measuring frame; the last one is the robot's end.
+        """
+        return self._poses(*self.arcs(q), self.offsets)
+
+    def pose(self, q: Tensor) -> Tensor:
+        """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
+        arcs = self._leading(self._to_tip(self._arcs(q)), q)
+        return self._poses(*arcs, self._tip_offsets())[..., -1, :, :]
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `pose(q)` and `pose_jacobian(q)`."""
+        return self.pose(q), self.pose_jacobian(q)
+
+    def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
+        """Return points along the whole backbone, base to end.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator lengths, or tendon length changes [m].
+        n_points : int, default=20
+            Points per segment; the last of each is the segment's end, its offset included.
+
+        Returns
+        -------
+        Tensor of shape (..., S * n_points + 1, 3)
+            Positions in the measuring frame [m].
+        """
+        if n_points < 1:
+            raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
+        length, bending = self.arcs(q)
+        poses = self._poses(length, bending, self.offsets)
+        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
+        f, g = stumpff((t * bending[..., None, :]).square().sum(-1))[1:3]
+        bend = (g[..., None] * t) * bending[..., None, :]
+        arc = (t * length[..., None, None]) * torch.cat([bend, f[..., None]], dim=-1)
+        start, end = poses[..., :-1, :, :], poses[..., 1:, None, :3, 3]
+        points = arc @ start[..., :3, :3].mT + start[..., None, :3, 3]
+        points = torch.cat([points[..., :-1, :], end], dim=-2)
+        return torch.cat([poses[..., 0, None, :3, 3], points.flatten(-3, -2)], dim=-2)
+
+    def with_tip(self, at: float) -> Self:
+        """Return a chain that steers another point of the same robot.
+
+        Parameters
+        ----------
+        at : float
+            Where on the backbone, in segments from the base: 1.5 is the middle of the second
+            segment's arc, 2.0 its end with its rigid offset, S (the default) the robot's end.
+
+        Returns
+        -------
+        ArcChain
+            Its tip, Jacobians and tip transform are those of that point; actuators, arcs, poses and
+            backbone stay those of the whole robot.
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ConstantCurvatureChain
+        >>> chain = ConstantCurvatureChain([0.01, 0.01], lengths=[0.1, 0.1]).with_tip(1.5)
+        >>> chain(torch.zeros(6, dtype=torch.float64))
+        tensor([0.0000, 0.0000, 0.1500], dtype=torch.float64)
+        """
+        if not 0.0 < at <= self.n_segments:
+            raise ValueError(
+                f"`at` must lie in (0, {self.n_segments}], in segments from the base, got {at}."
+            )
+        chain = copy.deepcopy(self)
+        chain.tip_at = float(at)
+        return chain
+
+    def extra_repr(self) -> str:
+        """Return the summary shown by repr()."""
+        where = "" if self.tip_at == self.n_segments else f", tip at {self.tip_at:g}"
+        return f"{self.n_segments} segments, {self.n_actuators} actuators{where}"
+
+    def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return arcs (3 S, N) of rows (N, n) and their derivative, (3 S, n) or (3 S, n, N).
+
+        Arcs are the lengths of all segments, then the x-, then the y-bendings.
+        """
+        raise NotImplementedError
+
+    def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
+        raise NotImplementedError
+
+    def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the arcs (N, 3 m) up to the tip and their derivative, (3 m, n) or (N, 3 m, n).
+
+        Lengths [m], then x-, then y-bendings [rad] of the m segments up to the tip.
+        """
+        arcs, slope = (self._to_tip(part) for part in self._arcs_and_slope(q))
+        return arcs.mT, slope if slope.ndim == 2 else slope.permute(2, 0, 1)
+
+    def from_coordinates(self, z: Tensor) -> Tensor:
+        """Return the tip (N, 3) of arcs (N, 3 m) up to it."""
+        arcs = z.mT
+        tail = tip(*self._split(arcs), self._tip_offsets().to(arcs))
+        return self._in_measuring_frame(tail, z)
+
+    def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip (N, 3) of arcs (N, 3 m) up to it, and its derivative (N, 3, 3 m)."""
+        arcs = z.mT
+        tail, columns = tip_and_columns(*self._split(arcs), self._tip_offsets().to(arcs))
+        turned = (self.base.to(arcs)[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
+        return self._in_measuring_frame(tail, arcs.T), turned.permute(2, 0, 1)
+
+    def _rows(self, q: Tensor) -> Tensor:
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        return q.reshape(-1, self.n_actuators)
+
+    def _why_shape(self) -> str:
+        per_segment = " + ".join(str(n) for n in self.actuators_per_segment)
+        if len(set(self.actuators_per_segment)) == 1:
+            per_segment = f"{self.actuators_per_segment[0]} actuators each"
+        return f"this chain has {self.n_segments} segments of {per_segment}"
+
+    def _arcs(self, q: Tensor) -> Tensor:
+        return self._arcs_and_slope(self._rows(q))[0]
+
+    def _to_tip(self, arcs: Tensor) -> Tensor:
+        """Return the rows (3 m, ...) of arcs (3 S, ...), or of their slope, up to the tip."""
+        if self.tip_at == self.n_segments:
+            return arcs
+        m = math.ceil(self.tip_at)
+        parts = arcs.unflatten(0, (3, self.n_segments))[:, :m]
+        last = parts[:, -1:] * (self.tip_at - m + 1)
+        return torch.cat([parts[:, :-1], last], dim=1).flatten(0, 1)
+
+    def _tip_offsets(self, offsets: Tensor | None = None) -> Tensor:
+        """Return the rigid offsets (..., m) up to the tip, by default of the chain itself."""
+        offsets = self.offsets if offsets is None else offsets
+        if self.tip_at == self.n_segments:
+            return offsets
+        m = math.ceil(self.tip_at)
+        last = offsets[..., m - 1 : m] * float(self.tip_at == m)
+        return torch.cat([offsets[..., : m - 1], last], dim=-1)
+
+    @staticmethod
+    def _split(arcs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return lengths (S, N) and bending vectors (2, S, N)."""
+        parts = arcs.unflatten(0, (3, -1))
+        return parts[0], parts[1:]
+
+    def _leading(self, arcs: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return lengths (..., S) and bending vectors (..., S, 2)."""
+        parts = arcs.unflatten(0, (3, -1)).permute(2, 1, 0)
+        parts = parts.reshape(*q.shape[:-1], *parts.shape[1:])
+        return parts[..., 0], parts[..., 1:]
+
+    def _poses(self, length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
+        steps = arc_transforms(length, bending, offsets.to(length))
+        pose = self.base.to(length).expand(*length.shape[:-1], 4, 4)
+        poses = [pose]
+        for step in steps.unbind(-3):
+            pose = pose @ step
+            poses.append(pose)
+        return torch.stack(poses, dim=-3)
+
+    def _forward(self, q: Tensor) -> tuple[Tensor]:
+        length, bending = self._split(self._to_tip(self._arcs(q)))
+        tail = tip(length, bending, self._tip_offsets().to(q))
+        return (self._in_measuring_frame(tail, q),)
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        arcs, slope = self._arcs_and_slope(self._rows(q))
+        length, bending = self._split(self._to_tip(arcs))
+        tail, columns = tip_and_columns(length, bending, self._tip_offsets().to(q))
+        return self._in_measuring_frame(tail, q), self._by_actuators(columns, slope, q)
+
+    def _in_measuring_frame(self, tail: Tensor, q: Tensor) -> Tensor:
+        base = self.base.to(q)
+        return (base[:3, :3] @ tail + base[:3, 3:]).T.reshape(*q.shape[:-1], 3)
+
+    def _by_actuators(self, columns: Tensor, slope: Tensor, q: Tensor) -> Tensor:
+        """Fold the slope of the arcs and the base into columns (3, 3 m, N)."""
+        columns = (self.base.to(q)[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
+        slope = self._to_tip(slope)
+        if slope.ndim == 3:
+            J = torch.matmul(columns.permute(2, 0, 1), slope.permute(2, 0, 1))
+            return J.reshape(*q.shape[:-1], 3, self.n_actuators)
+        J = torch.matmul(slope.T, columns)  # (3, n, N)
+        return J.permute(2, 0, 1).reshape(*q.shape[:-1], 3, self.n_actuators)

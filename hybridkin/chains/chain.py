@@ -1,0 +1,79 @@
+"""What every mechanical model offers: a tip, poses, and a geometry that can be calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.model import PoseModel
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["Chain"]
+
+
+class Chain(PoseModel):
+    """A mechanical model of a robot: q -> tip position, with a geometry.
+
+    Attributes
+    ----------
+    base : Tensor of shape (4, 4)
+        Pose of the robot's base in the measuring frame.
+    """
+
+    base: Tensor
+
+    @property
+    def default_parameters(self) -> tuple[str, ...]:
+        """The geometry that a calibration fits by default."""
+        raise NotImplementedError
+
+    @property
+    def reach(self) -> Tensor:
+        """The natural size of the robot, shape () [m]."""
+        raise NotImplementedError
+
+    def geometry(self) -> dict[str, Tensor]:
+        """Return the geometry by name, as in the constructor."""
+        raise NotImplementedError
+
+    def with_geometry(self, **geometry: Tensor) -> Self:
+        """Return a chain with some of the geometry replaced, differentiable in the new values."""
+        raise NotImplementedError
+
+    def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return how fast the tip moves along P changes of the geometry, shape (..., 3, P).
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator vectors.
+        tangents : dict of str to Tensor of shape (P, ...)
+            P changes of entries of `geometry()`, stacked; entries left out stay as they are.
+        """
+        current = self.geometry()
+
+        def tip(t: Tensor) -> Tensor:
+            moved = {name: current[name] + torch.tensordot(t, v, 1) for name, v in tangents.items()}
+            return self.with_geometry(**moved)(q)
+
+        return torch.func.jacfwd(tip)(q.new_zeros(len(next(iter(tangents.values())))))
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Return the poses (..., K, 4, 4) of the base and of the frames along the robot."""
+        raise NotImplementedError
+
+    def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
+        """Return points (..., P, 3) along the robot, base to end [m]."""
+        raise NotImplementedError
+
+    def check_actuators(self, q: Tensor, name: str = "q") -> None:
+        """Raise where q (..., n) cannot be a log of this robot, warn where its unit looks wrong."""
+        raise NotImplementedError
+
+    def warn_contradictory(self, q: Tensor, name: str = "q", stacklevel: int = 3) -> None:
+        """Warn where the actuators contradict each other; most chains do not know of it."""

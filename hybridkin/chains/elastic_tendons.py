@@ -1,0 +1,435 @@
+"""Tendons that can only pull on an elastic backbone, as a torch module q -> x."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hybridkin._core.blocks import check_vectors
+from hybridkin._core.units import warn_millimetres
+from hybridkin.chains._arcs import levers, reading_matrix
+from hybridkin.chains._checks import (
+    actuator_counts,
+    check_finite_rows,
+    filled,
+    flat_angles,
+    pose,
+    vector,
+)
+from hybridkin.chains._slack import (
+    MOST,
+    Balance,
+    Elasticity,
+    FindTaut,
+    Responses,
+    applied,
+    as_mask,
+    extended,
+    find_by_solving,
+    find_in_table,
+    relaxed,
+    responses_of,
+    rough_of,
+)
+from hybridkin.chains.arc_chain import ArcChain
+
+__all__ = ["ElasticTendonChain"]
+
+_ROUTINGS = ("segment", "base")
+_SHAPING = (
+    *("radii", "angles", "bending_stiffness", "axial_stiffness", "rest_bends", "tendon_zeros"),
+)
+_TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are kept
+
+
+class ElasticTendonChain(ArcChain):
+    """Tip position of an elastic backbone behind tendons that can pull but not push.
+
+    A shape a = (length changes, bending vectors of all segments) stretches the tendons by
+    ``e = B a - (q - tendon_zeros)``, B the path lengths of `ConstantCurvatureChain`. A taut tendon
+    pulls with its stretch, in units of the tendons' stiffness; a slack one (e < 0) does nothing.
+    The backbone takes the shape of least energy,
+    ``1/2 (a - a0)' K (a - a0) + 1/2 sum max(0, e)^2``, with a0 the rest bends: strictly convex, one
+    answer for every q, continuous in it and linear while the same tendons are taut.
+
+    Where all tendons are taut and the bending stiffness goes to zero the bends become those of
+    `ConstantCurvatureChain` (for evenly spaced tendons at any axial stiffness, else where that is
+    large), while a common pull shortens the backbone.
+
+    Parameters
+    ----------
+    radii : array-like of shape (S,)
+        Radius of the tendon circle of each segment, base to tip [m].
+    lengths : array-like of shape (S,)
+        Backbone lengths without any pull [m].
+    n_tendons : int or sequence of S ints, default=3
+        Tendons that end at each segment.
+    angles : array-like, optional
+        Tendon angles about the backbone, counter-clockwise from the base x-axis [rad]: shape
+        ``(n,)`` for all segments alike, ``(S, n)``, or one sequence per segment. Default: evenly
+        spaced from 0.
+    routing : {"base", "segment"}, default="base"
+        "base": tendons of a segment also run through all segments nearer the base, at their own
+        radius and angle. "segment": each tendon spans its own segment (sheathed before).
+    bending_stiffness : float or array-like of shape (S,), optional
+        Moment per bend of a segment over the stiffness of a tendon [m^2/rad^2]. Default: a
+        hundredth of the squared radius. Three segments then bend 2 % less than the plain chain
+        while all tendons are taut, 7 % where the far side goes slack.
+    axial_stiffness : float or array-like of shape (S,), optional
+        Of a segment over that of a tendon [-]. Default: 10.
+    tendon_zeros : float or array-like of shape (n,), default=0.0
+        Pre-tension: stretch of each tendon at q = 0 on the straight backbone [m]; negative where it
+        hangs slack. A list of lists, one per segment, will do as well.
+    rest_bends : float or array-like of shape (S, 2), default=0.0
+        Pre-curvature: bending vector of each segment without tendons [rad].
+    smoothing : float, default=0.0
+        Width over which a tendon's tension sets in [m], for derivatives without kinks:
+        ``(e + sqrt(e^2 + smoothing^2)) / 2`` in place of ``max(0, e)``. Slower, row by row.
+    offsets : float or array-like of shape (S,), default=0.0
+        Rigid length after each segment along its tangent [m]; the last one is the tool.
+    base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
+        Pose of the robot's base in the measuring frame. Default: identity.
+    dtype : torch.dtype, default=torch.float64
+        Precision in which the geometry is held. Results come in the dtype of q.
+
+    Notes
+    -----
+    q holds the *changes* of tendon length from straight [m], negative where a tendon is shortened.
+
+    The taut tendons are found by block principal pivoting: all tendons that contradict their role
+    change it at once, and after eight such steps only the first, by Murty's rule, which ends for
+    certain. Up to twelve tendons the linear answers of all sets of taut tendons are kept from the
+    first use on, beyond they are solved for row by row.
+
+    Derivatives are those of the present set of taut tendons: where a tendon is just about to pull,
+    the one-sided derivative towards its taut side.
+
+    References
+    ----------
+    Camarillo et al., IEEE Trans. Robotics 24 (2008), mechanics of tendon-driven continuum robots
+    with slack; Murty, Opsearch 11 (1974); Judice & Pires, Computers & Op. Research 21 (1994).
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import ElasticTendonChain
+    >>> chain = ElasticTendonChain([0.005], [0.1], axial_stiffness=100.0)
+    >>> q = torch.tensor([-0.004, 0.004, 0.004], dtype=torch.float64)
+    >>> chain.slack(q)
+    tensor([False,  True,  True])
+    >>> chain(q)
+    tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
+    """
+
+    _entries = (*_SHAPING, "lengths", "offsets", "base")
+    _structure = (*ArcChain._structure, "smoothing", "_table")  # the table knows its geometry
+
+    radii: Tensor
+    angles: Tensor
+    lengths: Tensor
+    bending_stiffness: Tensor
+    axial_stiffness: Tensor
+    rest_bends: Tensor
+    tendon_zeros: Tensor
+
+    def __init__(
+        self,
+        radii: Any,
+        lengths: Any,
+        *,
+        n_tendons: int | Sequence[int] = 3,
+        angles: Any = None,
+        routing: str = "base",
+        bending_stiffness: Any = None,
+        axial_stiffness: Any = None,
+        tendon_zeros: Any = 0.0,
+        rest_bends: Any = 0.0,
+        smoothing: float = 0.0,
+        offsets: Any = 0.0,
+        base: Any = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        if routing not in _ROUTINGS:
+            raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
+        radii = vector(radii, "radii", dtype, positive=True)
+        n_segments = radii.numel()
+        counts = actuator_counts(n_tendons, n_segments, "n_tendons", least=1)
+        if sum(counts) > MOST:
+            raise ValueError(f"`n_tendons` must be at most {MOST} in all, got {sum(counts)}.")
+        self.n_segments = n_segments
+        self.actuators_per_segment = counts
+        self.n_actuators = sum(counts)
+        self.routing = routing
+        self.tip_at = float(n_segments)
+        if not (smoothing >= 0.0 and math.isfinite(smoothing)):
+            raise ValueError(f"`smoothing` must be a width >= 0 [m], got {smoothing!r}.")
+        self.smoothing = float(smoothing)
+        stiffness = {
+            "bending_stiffness": 0.01 * radii**2
+            if bending_stiffness is None
+            else bending_stiffness,
+            "axial_stiffness": 10.0 if axial_stiffness is None else axial_stiffness,
+        }
+        stiffness = {
+            name: filled(value, name, dtype, (n_segments,)) for name, value in stiffness.items()
+        }
+        for name, value in stiffness.items():
+            if not (value > 0).all():
+                raise ValueError(f"`{name}` must be positive, got {value.tolist()}.")
+        self._table: tuple[Any, ...] | None = None
+        self._set_geometry(
+            {
+                "radii": radii,
+                "angles": flat_angles(angles, counts, dtype),
+                "lengths": vector(lengths, "lengths", dtype, size=n_segments, positive=True),
+                "rest_bends": filled(rest_bends, "rest_bends", dtype, (n_segments, 2)),
+                "tendon_zeros": filled(tendon_zeros, "tendon_zeros", dtype, (sum(counts),)),
+                "offsets": filled(offsets, "offsets", dtype, (n_segments,)),
+                "base": pose(base, "base", dtype),
+                **stiffness,
+            }
+        )
+        warn_millimetres("radii", radii, 1.0)
+        warn_millimetres("lengths", self.lengths, 10.0)
+
+    @classmethod
+    def from_chain(cls, chain: Any, **options: Any) -> ElasticTendonChain:
+        """Return elastic tendons on the geometry of a plain chain with tendons.
+
+        Parameters
+        ----------
+        chain : ConstantCurvatureChain
+            With `lengths`; its `actuator_zeros` become the `tendon_zeros`.
+        **options
+            Further arguments, `bending_stiffness` for example.
+
+        Returns
+        -------
+        ElasticTendonChain
+            Which steers the same point.
+
+        Examples
+        --------
+        >>> from hybridkin import ConstantCurvatureChain, ElasticTendonChain
+        >>> plain = ConstantCurvatureChain([0.005], lengths=[0.1])
+        >>> ElasticTendonChain.from_chain(plain).lengths
+        tensor([0.1000], dtype=torch.float64)
+        """
+        if chain.lengths is None:
+            raise ValueError(
+                "`chain` must have `lengths`: the actuators of extensible segments are no tendons."
+            )
+        counts = chain.actuators_per_segment
+        geometry = {
+            "lengths": chain.lengths,
+            "n_tendons": counts,
+            "angles": [part.tolist() for part in chain.angles.split(counts)],
+            "routing": chain.routing,
+            "tendon_zeros": chain.actuator_zeros,
+            "rest_bends": chain.rest_bends,
+            "offsets": chain.offsets,
+            "base": chain.base,
+            "dtype": chain.radii.dtype,
+        }
+        return cls(chain.radii, **(geometry | options)).with_tip(chain.tip_at)
+
+    @property
+    def default_parameters(self) -> tuple[str, ...]:
+        """The geometry that a calibration fits by default."""
+        stiffness = ("bending_stiffness", "axial_stiffness")
+        return ("base", "angles", "rest_bends", *stiffness, "tendon_zeros")
+
+    @property
+    def reach(self) -> Tensor:
+        """The natural size of the robot, shape () [m]: its backbone."""
+        return self.lengths.sum()
+
+    def tensions(self, q: Tensor) -> Tensor:
+        """Return how far every tendon is stretched.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Tendon length changes [m].
+
+        Returns
+        -------
+        Tensor of shape (..., n_actuators)
+            Stretch [m], zero where slack; times the stiffness of the tendons it is their force.
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ElasticTendonChain
+        >>> chain = ElasticTendonChain([0.005], [0.1], axial_stiffness=1.0, tendon_zeros=0.004)
+        >>> chain.tensions(torch.zeros(3))
+        tensor([0.0010, 0.0010, 0.0010])
+        """
+        return self._balance(self._rows(q)).pull.reshape(q.shape)
+
+    def slack(self, q: Tensor) -> Tensor:
+        """Return which tendons hang slack, a bool tensor of the shape of q."""
+        return (self._balance(self._rows(q)).share < 0.5).reshape(q.shape)
+
+    def taut_posture(self, minimum: float = 0.0) -> Callable[[Tensor], Tensor]:
+        """Return a posture that keeps tendons taut, for ``InverseKinematics(q_pref=...)``.
+
+        Parameters
+        ----------
+        minimum : float, default=0.0
+            Stretch that every tendon should keep [m].
+
+        Returns
+        -------
+        function
+            Maps q (..., n_actuators) to itself with every tendon shortened by what it lacks. In the
+            null space of the task the inverse kinematics moves there and leaves the tip alone; how
+            far that goes the task decides.
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ElasticTendonChain
+        >>> chain = ElasticTendonChain([0.005], [0.1], axial_stiffness=100.0)
+        >>> chain.taut_posture(1e-3)(torch.zeros(3))
+        tensor([-0.0010, -0.0010, -0.0010])
+        """
+        if not (minimum >= 0.0 and math.isfinite(minimum)):
+            raise ValueError(f"`minimum` must be a stretch >= 0 [m], got {minimum!r}.")
+        return partial(self._shortened, minimum=minimum)
+
+    def _shortened(self, q: Tensor, minimum: float) -> Tensor:
+        rows = self._rows(q)
+        zeros, readings = self.tendon_zeros.to(q), self._elasticity().readings.to(q)
+        stretch = self._balance(rows).shape @ readings.T - rows + zeros
+        return q - (minimum - stretch).clamp(min=0.0).reshape(q.shape)
+
+    def check_actuators(self, q: Tensor, name: str = "q") -> None:
+        """Raise where q cannot be a log of this robot, and warn where it looks like millimetres.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Tendon length changes [m].
+        name : str, default="q"
+            What to call `q` in a message.
+
+        Raises
+        ------
+        ValueError
+            For NaN or infinite entries.
+        """
+        check_vectors(q, self.n_actuators, name, self._why_shape())
+        rows = q.detach().reshape(-1, self.n_actuators)
+        check_finite_rows(rows, name)
+        warn_millimetres(name, rows.abs(), 10.0 * float(self.lengths.detach().sum()))
+
+    def extra_repr(self) -> str:
+        """Return the summary shown by repr()."""
+        return f"{super().extra_repr()}, routing {self.routing!r}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_table": None}
+
+    def _elasticity(self) -> Elasticity:
+        counts = self.actuators_per_segment
+        at = levers(self.radii, self.angles, counts)
+        one = torch.ones_like(self.radii)
+        return Elasticity(
+            reading_matrix(at, counts, self.routing, True),
+            torch.cat([one, 1.0 / self.radii, 1.0 / self.radii]),
+            torch.cat([self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]),
+            torch.cat([0.0 * one, *self.rest_bends.unbind(-1)]),
+            self.tendon_zeros,
+        )
+
+    def _all_responses(self, rows: Tensor) -> tuple[Responses, tuple[Tensor, Tensor]]:
+        """Return the responses of all sets of tendons, kept while the geometry stays."""
+        shaping = [getattr(self, name) for name in _SHAPING]
+        learning = torch.is_grad_enabled() and any(value.requires_grad for value in shaping)
+        passing = learning or any(value.is_inference() for value in shaping)
+        key = None if passing else (rows.dtype, rows.device, *(v._version for v in shaping))
+        if key is not None and self._table is not None:
+            kept, kept_key, responses, rough = self._table
+            if key == kept_key and all(a is b for a, b in zip(kept, shaping, strict=True)):
+                return responses, rough
+        codes = torch.arange(2**self.n_actuators, device=self.radii.device)
+        guard = contextlib.nullcontext()
+        if torch.is_inference_mode_enabled():  # or derivatives could not use what is kept
+            guard = torch.inference_mode(False)
+        with guard:
+            elasticity = Elasticity(*(part.double() for part in self._elasticity()))
+            responses = responses_of(as_mask(codes, self.n_actuators), *elasticity)
+            responses = Responses(*(part.to(rows) for part in responses))
+            rough = rough_of(responses.stretch.detach())
+        if not passing:
+            self._table = (shaping, key, responses, rough)
+        return responses, rough
+
+    def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, Responses]:
+        """Return the sets of taut tendons (N,) as bits, and where among responses they stand."""
+        if self.n_actuators <= _TABLE:
+            table, rough = self._all_responses(rows)
+            stretch = table.stretch.detach()
+            codes = FindTaut.apply(find_in_table, rows.detach(), stretch, *rough)
+            return codes, codes, table
+        elasticity = [part.to(rows) for part in self._elasticity()]
+        codes = FindTaut.apply(
+            find_by_solving, rows.detach(), *(part.detach() for part in elasticity)
+        )
+        each = torch.arange(len(rows), device=rows.device)
+        return codes, each, responses_of(as_mask(codes, self.n_actuators), *elasticity)
+
+    def _balance(self, rows: Tensor) -> Balance:
+        codes, at, responses = self._find(rows)
+        shape, stretch = (
+            applied(maps.index_select(0, at), extended(rows)) for maps in responses[:2]
+        )
+        if self.smoothing > 0.0:
+            elasticity = Elasticity(*(part.to(rows) for part in self._elasticity()))
+            return relaxed(rows, shape, self.smoothing, elasticity)
+        taut = as_mask(codes, self.n_actuators).to(rows)
+        compliance = responses.compliance.index_select(0, at)
+        return Balance(shape, stretch.relu() * taut, taut, compliance)
+
+    def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        straight = nn.functional.pad(self.lengths.to(rows), (0, 2 * self.n_segments))
+        if self.smoothing > 0.0:
+            shape, _, share, compliance = self._balance(rows)
+            slope = compliance @ (self._elasticity().readings.to(rows).T * share[:, None])
+            return (shape + straight).T.contiguous(), slope.permute(1, 2, 0)
+        _, at, responses = self._find(rows)
+        maps = responses.shape.index_select(0, at)
+        arcs = (applied(maps, extended(rows)) + straight).T.contiguous()
+        return arcs, maps[..., :-1].permute(1, 2, 0)
+
+    def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
+        counts, S = self.actuators_per_segment, self.n_segments
+        P = len(next(iter(tangents.values())))
+        change = {
+            name: tangents.get(name, torch.zeros_like(value).expand(P, *value.shape)).to(rows)
+            for name, value in self.geometry().items()
+        }
+        crossing = levers(self.radii, self.angles, counts).to(rows)
+        turned = torch.stack([-crossing[1], crossing[0]]) * change["angles"][:, None]
+        moved = turned + levers(change["radii"], self.angles.to(rows), counts)
+        by_readings = nn.functional.pad(reading_matrix(moved, counts, self.routing, False), (S, 0))
+        readings, _, stiffness, rest, _ = (part.to(rows) for part in self._elasticity())
+        shape, pull, share, compliance = self._balance(rows)
+        bending = change["bending_stiffness"]
+        by_stiffness = torch.cat([change["axial_stiffness"], bending, bending], dim=-1)
+        by_rest = nn.functional.pad(change["rest_bends"].mT.flatten(1), (S, 0))
+        # By the implicit function theorem: the forces out of balance, times the compliance.
+        force = stiffness * by_rest + (rest - shape)[:, None] * by_stiffness
+        force = force - torch.einsum("ni,pik->npk", pull, by_readings)
+        stretch = torch.einsum("nk,pik->npi", shape, by_readings) + change["tendon_zeros"]
+        moves = (force - (stretch * share[:, None]) @ readings) @ compliance
+        return moves + nn.functional.pad(change["lengths"], (0, 2 * S))

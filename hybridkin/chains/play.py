@@ -1,0 +1,191 @@
+"""Play of tendons: backlash and dry friction as the classical play operator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+__all__ = ["PlayOperator", "PlayState"]
+
+
+class PlayState(NamedTuple):
+    """Where a play operator stands, to be carried from one call to the next.
+
+    Attributes
+    ----------
+    command : array or Tensor of shape (n,)
+        Last command q [m].
+    effective : array or Tensor of shape (n,)
+        Last effective change y [m], within half the width of the command.
+    """
+
+    command: Any
+    effective: Any
+
+
+class PlayOperator:
+    """Play between commanded and effective tendon length changes.
+
+    The effective change stands still until the command has moved away by half the width, then
+    follows at that distance: ``y_t = clip(y_{t-1}, q_t - width / 2, q_t + width / 2)``. The
+    outcome depends on the order of the commands, not on their speed. The operator holds no state:
+    it is handed over and returned, so that several robots or branches of a plan share one.
+
+    Parameters
+    ----------
+    width : float or array-like of shape (n,)
+        Total play of all or of each tendon [m], zero or more. Zero is the identity.
+
+    References
+    ----------
+    Krasnosel'skii & Pokrovskii, Systems with Hysteresis, Springer 1989, section 2 (play).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin import PlayOperator
+    >>> play = PlayOperator(0.5)
+    >>> y, state = play.apply(np.array([[0.0], [1.0], [0.75], [0.0]]))
+    >>> y.ravel()
+    array([0.  , 0.75, 0.75, 0.25])
+    >>> q, state = play.command(np.array([[0.5], [0.0]]), state)
+    >>> q.ravel()
+    array([ 0.75, -0.25])
+    """
+
+    def __init__(self, width: ArrayLike) -> None:
+        self.width = np.array(width, dtype=float)
+        valid = np.isfinite(self.width) & (self.width >= 0)
+        if self.width.ndim > 1 or not valid.all():
+            raise ValueError(
+                f"`width` must be one or (n,) finite numbers, zero or more, got {width!r}."
+            )
+
+    def apply(self, q: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
+        """Return the effective changes of a motion, and the state at its end.
+
+        Parameters
+        ----------
+        q : array or Tensor of shape (T, n)
+            Commanded tendon length changes in the order of time [m].
+        state : PlayState, optional
+            Where the motion before ended. None: the first row counts as it is, y_0 = q_0.
+
+        Returns
+        -------
+        y : array or Tensor of shape (T, n)
+            Effective changes [m], what the robot's model is to be given.
+        state : PlayState
+            For the rows that follow.
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape, for entries that are not finite, or for no rows without a state.
+        """
+        rows, half, before = self._checked(q, state, "q")
+        y, (sent, effective) = [], before
+        for sent in rows:
+            effective = torch.minimum(torch.maximum(effective, sent - half), sent + half)
+            y.append(effective)
+        return _like(q, y, rows, PlayState(sent, effective))
+
+    def command(self, y: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
+        """Return the commands by which the effective changes become y: the inverse of `apply`.
+
+        A tendon that moves is sent half the width further; one that rests keeps its command.
+
+        Parameters
+        ----------
+        y : array or Tensor of shape (T, n)
+            Wanted effective changes in the order of time [m].
+        state : PlayState, optional
+            Where the motion before ended. None: the first row is sent as it is, q_0 = y_0.
+
+        Returns
+        -------
+        q : array or Tensor of shape (T, n)
+            Commands to send [m]. They jump by the width where a tendon turns back.
+        state : PlayState
+            For the rows that follow.
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape, for entries that are not finite, or for no rows without a state.
+        """
+        rows, half, before = self._checked(y, state, "y")
+        q, (sent, effective) = [], before
+        for row in rows:
+            sent = torch.where(row == effective, sent, row + half * torch.sign(row - effective))
+            effective = row
+            q.append(sent)
+        return _like(y, q, rows, PlayState(sent, effective))
+
+    def apply_by_group(self, q: Any, groups: ArrayLike) -> Any:
+        """Return the effective changes of a log of several motions, each started afresh.
+
+        Parameters
+        ----------
+        q : array or Tensor of shape (N, n)
+            Commanded tendon length changes, the rows of one motion in the order of time [m].
+        groups : array-like of shape (N,)
+            Motion of every row.
+
+        Returns
+        -------
+        array or Tensor of shape (N, n)
+            Effective changes [m].
+
+        Raises
+        ------
+        ValueError
+            For wrong shapes or entries that are not finite.
+        """
+        groups = np.asarray(groups)
+        if groups.shape != tuple(q.shape)[:1]:
+            raise ValueError(f"`groups` must have shape ({len(q)},), got {groups.shape}.")
+        order = np.argsort(groups, kind="stable")  # a motion's rows keep their order
+        starts = np.flatnonzero(groups[order][1:] != groups[order][:-1]) + 1
+        parts = [self.apply(q[at])[0] for at in np.split(order, starts)]
+        back = np.argsort(order)
+        return torch.cat(parts)[back] if isinstance(q, Tensor) else np.concatenate(parts)[back]
+
+    def __repr__(self) -> str:
+        return f"PlayOperator(width={self.width.tolist()})"
+
+    def _checked(
+        self, rows: Any, state: PlayState | None, name: str
+    ) -> tuple[Tensor, Tensor, PlayState]:
+        """Return the rows, half the width and the state before them as tensors."""
+        rows = rows if isinstance(rows, Tensor) else torch.as_tensor(np.asarray(rows))
+        rows = rows if rows.is_floating_point() else rows.to(torch.float64)
+        if rows.ndim != 2 or self.width.shape not in ((), rows.shape[1:]):
+            needed = self.width.size if self.width.ndim else "n"
+            raise ValueError(f"`{name}` must have shape (T, {needed}), got {tuple(rows.shape)}.")
+        if not torch.isfinite(rows).all():
+            raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
+        if state is None:
+            if not len(rows):
+                raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
+            state = PlayState(rows[0], rows[0])
+        before = PlayState(*(torch.as_tensor(part).to(rows) for part in state))
+        if any(part.shape != rows.shape[1:] for part in before):
+            shapes = [tuple(part.shape) for part in before]
+            raise ValueError(
+                f"`state` must hold vectors of shape {(rows.shape[1],)}, got {shapes}."
+            )
+        return rows, torch.as_tensor(self.width / 2).to(rows), before
+
+
+def _like(given: Any, rows: Sequence[Tensor], like: Tensor, state: PlayState) -> tuple[Any, Any]:
+    """Return rows and state as tensors or arrays, whichever was given."""
+    out = torch.stack(tuple(rows)) if rows else torch.zeros_like(like)
+    if isinstance(given, Tensor):
+        return out, state
+    return out.numpy(), PlayState(*(part.numpy() for part in state))

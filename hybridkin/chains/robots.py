@@ -1,0 +1,421 @@
+"""Robots by name, and robot descriptions read from TOML files."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+__all__ = [
+    "BHA_LENGTH_LIMITS",
+    "BHA_WORKING_BOX",
+    "Limits",
+    "LogFormat",
+    "RobotDescription",
+    "bionic_handling_assistant",
+    "from_toml",
+    "read_description",
+]
+
+BHA_LENGTH_LIMITS = (0.10, 0.40)
+"""Shortest and longest chamber of the Bionic Handling Assistant [m]."""
+
+BHA_WORKING_BOX = (0.19, 0.31)
+"""Chamber lengths it works in: 0.25 m, give or take 0.06 m."""
+
+_UNITS = ("m", "cm", "mm")
+_MODELS = ("constant-curvature", "elastic-tendon")
+_STIFFNESS = ("bending_stiffness", "axial_stiffness")
+
+Chain = ConstantCurvatureChain | ElasticTendonChain
+
+
+def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
+    """Return the nominal chain of Festo's Bionic Handling Assistant.
+
+    Three segments of three chambers at 0, 120 and 240 degrees; q holds the nine chamber lengths,
+    segment by segment from the base.
+
+    Parameters
+    ----------
+    tool : float, default=0.0
+        Rigid length beyond the last segment [m].
+
+    Returns
+    -------
+    ConstantCurvatureChain
+        With the published radii 0.100, 0.093 and 0.079 m.
+
+    References
+    ----------
+    Reinhart & Steil (2016), section 2; Rolf & Steil (2012), Constant curvature continuum
+    kinematics as fast approximate model for the Bionic Handling Assistant, IROS.
+
+    Examples
+    --------
+    >>> from hybridkin import robots
+    >>> robots.bionic_handling_assistant().n_actuators
+    9
+    """
+    return ConstantCurvatureChain([0.100, 0.093, 0.079], offsets=[0.0, 0.0, tool])
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """How a robot's log is written: columns, units and sign.
+
+    Attributes
+    ----------
+    q, x : tuple of str
+        Columns of the actuator vector and of the tip position, in the chain's order.
+    q_unit, x_unit : {"m", "cm", "mm"}
+        Units of these columns.
+    q_sign : int
+        -1 where the log counts a pulled (shortened) tendon as positive.
+    group_suffix : str
+        Rows whose motion ends in this belong to the motion named without it.
+    groups, time : str or None
+        Columns of the motion that a row belongs to, and of its time stamp [s].
+    """
+
+    q: tuple[str, ...]
+    x: tuple[str, ...]
+    q_unit: str = "m"
+    x_unit: str = "m"
+    q_sign: int = 1
+    group_suffix: str = ""
+    groups: str | None = None
+    time: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the actuators can do.
+
+    Attributes
+    ----------
+    q_min, q_max : ndarray of shape (n,) or None
+        Least and largest value of every actuator, as the chain counts them [m].
+    dq_max : ndarray of shape (n,) or None
+        Largest speed [m/s].
+    """
+
+    q_min: np.ndarray | None = None
+    q_max: np.ndarray | None = None
+    dq_max: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """A robot as its TOML file describes it.
+
+    Attributes
+    ----------
+    name : str
+        What to call it.
+    chain : ConstantCurvatureChain or ElasticTendonChain
+        Its nominal kinematics.
+    calibrate : tuple of str
+        Geometry that should be fitted to data.
+    log : LogFormat or None
+        How its logs are written.
+    limits : Limits
+        What its actuators can do, as far as it is known.
+    """
+
+    name: str
+    chain: Chain
+    calibrate: tuple[str, ...]
+    log: LogFormat | None
+    limits: Limits = Limits()
+
+
+def from_toml(path: str | Path) -> Chain:
+    r"""Return the chain that a TOML file describes.
+
+    Parameters
+    ----------
+    path : str or Path
+        A robot description; `read_description` has its format, and returns the rest of it too.
+
+    Returns
+    -------
+    ConstantCurvatureChain or ElasticTendonChain
+        The nominal kinematics, lengths in metres.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not TOML, lacks a key, or has one that is not known; the message names it.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from hybridkin import robots
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder) / "robot.toml"
+    ...     _ = path.write_text("[[segment]]\nradius = 0.005\nlength = 0.1\nrepeat = 2\n")
+    ...     chain = robots.from_toml(path)
+    >>> chain.n_actuators
+    6
+    """
+    return read_description(path).chain
+
+
+def read_description(path: str | Path) -> RobotDescription:
+    """Return the robot that a TOML file describes.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file like this one::
+
+            name = "my trunk"
+            model = "constant-curvature"    # the default, or "elastic-tendon"
+            routing = "base"                # or "segment", the default; of elastic tendons "base"
+            calibrate = ["radii", "base"]   # optional, else the chain's own list
+
+            [[segment]]                     # base to tip
+            radius = 0.0045                 # of the actuator circle [m]
+            length = 0.060                  # [m]; leave out for extensible segments
+            actuators = 3                   # the default
+            angle_deg = 0.0                 # of the first actuator; or angles_deg = [0, 120, 240]
+            clockwise = false               # which way the others follow
+            offset = 0.0                    # rigid length after the segment [m]
+            rest_bend_deg = [0.0, 0.0]      # its pre-curvature: a bending vector
+            zeros = [0.0, 0.0, 0.0]         # what the sensor of each actuator reads too much [m]
+                                            # of elastic tendons their `tendon_zeros`
+            bending_stiffness = 2.0e-7      # of elastic tendons only, in all segments or in none
+            axial_stiffness = 10.0          # likewise; units and defaults: `ElasticTendonChain`
+            repeat = 2                      # as many segments like this one
+
+            [base]                          # optional
+            position = [0.0, 0.0, 0.0]      # [m]
+            rotation_vector_deg = [0.0, 0.0, 0.0]
+
+            [log]                           # how its logs are written, optional
+            q = ["servo_1", "servo_2", "servo_3"]
+            x = ["tip_x", "tip_y", "tip_z"]
+            q_unit = "mm"
+            x_unit = "mm"
+            q_sign = -1                     # -1: the log counts a pulled tendon as positive
+            groups = "motion"               # column that names the motion of a row, optional
+            group_suffix = "_hold"          # rows of motion "a_hold" belong to motion "a"
+            time = "t"                      # column of the time stamp [s], optional
+
+            [limits]                        # of the actuators, optional; one number or one each
+            q_min = -0.010                  # as the chain counts them: shortening < 0 [m]
+            q_max = 0.010
+            dq_max = 0.020                  # [m/s]
+
+    Returns
+    -------
+    RobotDescription
+        The nominal chain and what else the file says.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not TOML, lacks a key, or has one that is not known; the message names it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"`path` must name a robot description, got {path}: no such file.")
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not a TOML file: {error}.") from error
+    try:
+        return _description(content, path.stem)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
+    top = {"name", "model", "routing", "calibrate", "segment", "base", "log", "limits"}
+    _known(content, top, "the file")
+    model = content.get("model", _MODELS[0])
+    if model not in _MODELS:
+        raise ValueError(f"`model` must be one of {_MODELS}, got {model!r}.")
+    segments = []
+    tables = content.get("segment", [])
+    if not isinstance(tables, list) or not tables:
+        raise ValueError("`segment` is missing; describe each segment in a [[segment]] table.")
+    for i, table in enumerate(tables):
+        segments += _segments(table, f"[[segment]] {i + 1}")
+    build = _elastic_chain if model == "elastic-tendon" else _plain_chain
+    chain = build(
+        {key: [segment[key] for segment in segments] for key in segments[0]},
+        angles=[segment["angles"] for segment in segments],
+        offsets=[segment["offset"] for segment in segments],
+        rest_bends=[segment["rest_bend"] for segment in segments],
+        base=_base(content.get("base", {})),
+        **({"routing": content["routing"]} if "routing" in content else {}),
+    )
+    calibrate = content.get("calibrate", chain.default_parameters)
+    if not isinstance(calibrate, (list, tuple)):
+        raise ValueError(f"`calibrate` must be a list of names, got {calibrate!r}.")
+    log = _log_format(content["log"], chain.n_actuators) if "log" in content else None
+    limits = _limits(content.get("limits", {}), chain.n_actuators)
+    return RobotDescription(str(content.get("name", stem)), chain, tuple(calibrate), log, limits)
+
+
+def _plain_chain(segments: Mapping[str, list[Any]], **options: Any) -> ConstantCurvatureChain:
+    for name in _STIFFNESS:
+        if any(value is not None for value in segments[name]):
+            raise ValueError(
+                f"`{name}` in [[segment]] is not known to model 'constant-curvature'; leave it "
+                'out, or set model = "elastic-tendon".'
+            )
+    lengths = _all_or_none(segments, "length", "every [[segment]] (tendons) or in none (chambers)")
+    return ConstantCurvatureChain(
+        segments["radius"],
+        n_actuators=[len(angles) for angles in segments["angles"]],
+        lengths=lengths,
+        actuator_zeros=segments["zeros"],
+        **options,
+    )
+
+
+def _elastic_chain(segments: Mapping[str, list[Any]], **options: Any) -> ElasticTendonChain:
+    for i, length in enumerate(segments["length"]):
+        if length is None:
+            raise ValueError(
+                f"`length` is missing for segment {i + 1}; model 'elastic-tendon' needs the "
+                "backbone length [m] in every [[segment]]."
+            )
+    stiffness = {
+        name: _all_or_none(segments, name, "every [[segment]] or in none") for name in _STIFFNESS
+    }
+    return ElasticTendonChain(
+        segments["radius"],
+        segments["length"],
+        n_tendons=[len(angles) for angles in segments["angles"]],
+        tendon_zeros=segments["zeros"],
+        **stiffness,
+        **options,
+    )
+
+
+def _all_or_none(segments: Mapping[str, list[Any]], key: str, where: str) -> list[Any] | None:
+    given = [value is not None for value in segments[key]]
+    if any(given) and not all(given):
+        raise ValueError(f"`{key}` must stand in {where}.")
+    return segments[key] if any(given) else None
+
+
+def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
+    keys = {"radius", "length", "actuators", "angle_deg", "angles_deg", "clockwise", "offset"}
+    _known(table, keys | {"rest_bend_deg", "zeros", "repeat", *_STIFFNESS}, where)
+    if "radius" not in table:
+        raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
+    if "angles_deg" in table:
+        for other in ("angle_deg", "actuators", "clockwise"):
+            if other in table:
+                raise ValueError(f"`{other}` cannot stand beside `angles_deg` in {where}.")
+        angles = np.radians(np.asarray(table["angles_deg"], dtype=float))
+    else:
+        n = _number(table, "actuators", where, 3)
+        step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
+        angles = math.radians(_number(table, "angle_deg", where, 0.0)) + step * np.arange(n)
+    segment = {
+        "radius": _number(table, "radius", where),
+        "offset": _number(table, "offset", where, 0.0),
+        "angles": angles,
+        "rest_bend": np.radians(_numbers(table, "rest_bend_deg", where, 2)),
+        "zeros": _numbers(table, "zeros", where, len(angles)),
+    }
+    for key in ("length", *_STIFFNESS):
+        segment[key] = _number(table, key, where) if key in table else None
+    return [segment] * int(_number(table, "repeat", where, 1))
+
+
+def _base(table: Mapping[str, Any]) -> np.ndarray:
+    _known(table, {"position", "rotation_vector_deg"}, "[base]")
+    pose = np.eye(4)
+    pose[:3, 3] = _numbers(table, "position", "[base]", 3)
+    turn = _numbers(table, "rotation_vector_deg", "[base]", 3)
+    pose[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    return pose
+
+
+def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
+    keys = {"q", "x", "q_unit", "x_unit", "q_sign", "group_suffix", "groups", "time"}
+    _known(table, keys, "[log]")
+    columns = {}
+    for key, size in (("q", n_actuators), ("x", 3)):
+        value = table.get(key, [])
+        if not isinstance(value, list) or len(value) != size:
+            raise ValueError(f"`{key}` in [log] must name {size} columns, got {value!r}.")
+        columns[key] = tuple(str(name) for name in value)
+    for key in ("q_unit", "x_unit"):
+        if table.get(key, "m") not in _UNITS:
+            raise ValueError(f"`{key}` in [log] must be one of {[*_UNITS]}, got {table[key]!r}.")
+    if table.get("q_sign", 1) not in (1, -1):
+        raise ValueError(f"`q_sign` in [log] must be 1 or -1, got {table['q_sign']!r}.")
+    for key in ("group_suffix", "groups", "time"):
+        if not isinstance(table.get(key, ""), str):
+            raise ValueError(f"`{key}` in [log] must be text, got {table[key]!r}.")
+    options = ("q_unit", "x_unit", "q_sign", "group_suffix", "groups", "time")
+    extra = {key: table[key] for key in options if key in table}
+    return LogFormat(**columns, **extra)
+
+
+def _limits(table: Mapping[str, Any], n_actuators: int) -> Limits:
+    _known(table, {"q_min", "q_max", "dq_max"}, "[limits]")
+    found = {}
+    for key, value in table.items():
+        values = [value] * n_actuators if type(value) in (int, float) else value
+        found[key] = _numbers({key: values}, key, "[limits]", n_actuators)
+    limits = Limits(**found)
+    if (
+        limits.q_min is not None
+        and limits.q_max is not None
+        and (limits.q_min > limits.q_max).any()
+    ):
+        raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
+    if limits.dq_max is not None and not (limits.dq_max > 0).all():
+        raise ValueError(f"`dq_max` in [limits] must be positive, got {table['dq_max']!r}.")
+    return limits
+
+
+def _number(table: Mapping[str, Any], key: str, where: str, default: float | None = None) -> Any:
+    value = table.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"`{key}` in {where} must be a number, got {value!r}.")
+    return value
+
+
+def _numbers(table: Mapping[str, Any], key: str, where: str, size: int) -> np.ndarray:
+    value = table.get(key, [0.0] * size)
+    wrong = not isinstance(value, list) or len(value) != size
+    if wrong or not all(type(v) in (int, float) and math.isfinite(v) for v in value):
+        raise ValueError(f"`{key}` in {where} must hold {size} numbers, got {value!r}.")
+    return np.array(value, dtype=float)
+
+
+def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
+    for key in table:
+        if key not in keys:
+            close = difflib.get_close_matches(key, keys, n=1)
+            hint = f"did you mean `{close[0]}`?" if close else f"known: {sorted(keys)}."
+            raise ValueError(f"`{key}` in {where} is not known; {hint}")

@@ -1,0 +1,1 @@
+"""A mechanical model plus a learned model of its error."""

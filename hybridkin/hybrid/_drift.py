@@ -1,0 +1,59 @@
+"""What has changed since a model was fitted: an affine correction, learned as it is measured."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridkin.learning.regressor_modules import AffineModule
+
+
+class Drift(NamedTuple):
+    """Statistics of the residuals of a fitted model, earlier ones fading.
+
+    The correction B [1, u], ``u = (q - center) / scale``, is the ridge regression of the residuals
+    with penalty `alpha`: it starts at zero, and is zero again where nothing has been measured for
+    long. So the fitted model stays what it was.
+
+    Parameters
+    ----------
+    center, scale : ndarray of shape (n,)
+        Map of the range of the fit to [-1, 1] [unit of q].
+    gram : ndarray of shape (n + 1, n + 1)
+        Weighted products of [1, u].
+    moment : ndarray of shape (n + 1, m)
+        Their weighted products with the residuals [m].
+    """
+
+    center: NDArray
+    scale: NDArray
+    gram: NDArray
+    moment: NDArray
+
+    @classmethod
+    def of_range(cls, low: NDArray, high: NDArray, n_outputs: int) -> Drift:
+        """Return the drift of no measurement, for a fit to rows in a box."""
+        scale = 0.5 * (high - low)
+        scale = np.where(scale > 0, scale, 1.0)
+        n = len(scale) + 1
+        return cls(0.5 * (low + high), scale, np.zeros((n, n)), np.zeros((n, n_outputs)))
+
+    def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
+        """Return the statistics after rows q (N, n) in order of time.
+
+        Each row multiplies the weight of all before it by `decay`.
+        """
+        phi = np.column_stack([np.ones(len(q)), (q - self.center) / self.scale])
+        weighed = (weights * decay ** np.arange(len(q) - 1, -1, -1))[:, None] * phi
+        kept = decay ** len(q)
+        gram, moment = kept * self.gram + weighed.T @ phi, kept * self.moment + weighed.T @ residual
+        return self._replace(gram=gram, moment=moment)
+
+    def correction(self, alpha: float) -> AffineModule:
+        """Return the correction as a torch module q (..., n) -> (..., m)."""
+        system = self.gram + alpha * np.eye(len(self.gram))
+        readout = np.linalg.solve(system, self.moment)
+        coef = readout[1:].T / self.scale
+        return AffineModule(coef, readout[0] - coef @ self.center)

@@ -1,0 +1,1 @@
+"""Inverse kinematics of any forward model: steps, solutions, tracks, tasks and paths."""

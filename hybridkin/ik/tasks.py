@@ -1,0 +1,464 @@
+"""What inverse kinematics steers: positions, poses, several points, one task before another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hybridkin._core.blocks import in_blocks
+from hybridkin._core.model import PoseModel, as_forward_model, forward_and_jacobian
+from hybridkin._core.rotations import rotation_vector
+
+__all__ = [
+    "PointsTask",
+    "PoseTask",
+    "PositionTask",
+    "PrioritizedTask",
+    "StackedTask",
+    "Task",
+    "away_from_limits",
+    "downhill",
+]
+
+
+class Task:
+    """What the model does at q, and what it lacks to a target: x(q), J(q) and an error of m rows.
+
+    A subclass sets the attributes and gives `evaluate` and `difference`.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Of one target, and of one x.
+    parts : tuple of int
+        Rows of the error that belong together, as the position and the rotation of a pose.
+    units : tuple of float
+        What one unit of every part counts in metres.
+    first : int or None
+        Number of leading rows that come before the others; None: all count alike.
+    models : tuple of callables
+        What is evaluated.
+    """
+
+    shape: tuple[int, ...]
+    parts: tuple[int, ...]
+    units: tuple[float, ...]
+    first: int | None = None
+    models: tuple[Any, ...]
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x ``(N, *shape)`` and how fast the error falls along q (N, m, n), q (N, n).
+
+        Rows that are angles count `units` metres per radian.
+        """
+        raise NotImplementedError
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return the error (N, m) of x with respect to targets, both ``(N, *shape)`` [m].
+
+        To first order, J dq = difference(x, x_target) leads from x to the target.
+        """
+        raise NotImplementedError
+
+    def check(self, x_target: Tensor, name: str) -> None:
+        """Raise where targets ``(..., *shape)`` cannot be meant."""
+
+    def reached(self, error: Tensor, tol: float | tuple[float, ...]) -> Tensor:
+        """Return whether errors (N, m) are within one tolerance [m], or one for every part."""
+        if not isinstance(tol, tuple):
+            return error.norm(dim=-1) <= tol
+        sizes = [part.norm(dim=-1) for part in error.split(self.parts, dim=-1)]
+        limits = (t * unit for t, unit in zip(tol, self.units, strict=True))
+        return torch.stack([a <= b for a, b in zip(sizes, limits, strict=True)]).all(0)
+
+    @property
+    def n_actuators(self) -> int | None:
+        """Length of q, where a model tells it."""
+        return next((model.n_actuators for model in self.models if model.n_actuators), None)
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return how far q is from what the models learned from, at most 1 inside, shape (N,)."""
+        return torch.stack([model.domain_distance(q) for model in self.models]).amax(0)
+
+    def in_domain(self, q: Tensor) -> Tensor:
+        """Return whether q lies within the domains of all models, shape (N,)."""
+        return self.domain_distance(q) <= 1.0
+
+
+class PositionTask(Task):
+    """The tip is to be at a point: the task of `InverseKinematics` unless told otherwise.
+
+    Parameters
+    ----------
+    model : nn.Module, callable or (callable, callable)
+        Maps q ``(..., n)`` to x ``(..., size)``, or a pair of such a function and its Jacobian
+        ``(..., size, n)``; row by row, for torch tensors or for NumPy arrays. A fitted estimator
+        is unwrapped to its ``module_``.
+    size : int, default=3
+        Number of coordinates.
+
+    Examples
+    --------
+    A planar arm of two links, in NumPy:
+
+    >>> import numpy as np
+    >>> from hybridkin import InverseKinematics
+    >>> from hybridkin.ik.tasks import PositionTask
+    >>> def tip(q):
+    ...     a, b = q[..., 0], q[..., 0] + q[..., 1]
+    ...     return np.stack([np.cos(a) + np.cos(b), np.sin(a) + np.sin(b)], axis=-1)
+    >>> def jacobian(q):
+    ...     a, b = q[..., 0], q[..., 0] + q[..., 1]
+    ...     second = np.stack([-np.sin(b), np.cos(b)], axis=-1)
+    ...     first = np.stack([-np.sin(a), np.cos(a)], axis=-1) + second
+    ...     return np.stack([first, second], axis=-1)
+    >>> ik = InverseKinematics(PositionTask((tip, jacobian), size=2))
+    >>> ik.solve(np.array([1.2, 0.9]), q0=np.array([0.2, 0.8]), tol=1e-9).x.round(6)
+    array([1.2, 0.9])
+    """
+
+    def __init__(self, model: Any, size: int = 3) -> None:
+        self.models = (_model(model),)
+        self.shape, self.parts, self.units = (int(size),), (int(size),), (1.0,)
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (N, size) and J (N, size, n), in closed form where the model offers it."""
+        x, J = forward_and_jacobian(self.models[0], q)
+        if x.shape != (len(q), *self.shape):
+            raise ValueError(
+                f"`model` must map q of shape {tuple(q.shape)} to tips of shape "
+                f"{(len(q), *self.shape)}, got {tuple(x.shape)}; other sizes: PositionTask(model, "
+                "size=...)."
+            )
+        return x.to(q), J.to(q)
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return x_target - x."""
+        return x_target - x
+
+
+class PoseTask(Task):
+    """The tip is to be at a point and turned as asked: six rows.
+
+    The error of the rotation is its logarithm, the rotation vector from the present to the wanted
+    frame, in the measuring frame. Targets are homogeneous (4, 4) matrices, or a
+    pytorch_kinematics Transform3d.
+
+    Parameters
+    ----------
+    model : nn.Module
+        A chain with ``pose_jacobian(q)`` and ``tip_transform(q)``, or any model of the tip's
+        position if `orientation` is given.
+    radian : float, default=0.1
+        Metres that a radian counts as.
+    orientation : nn.Module, optional
+        The chain that tells the orientation, where `model` does not: a hybrid model of positions
+        learns nothing else, and its chain turns the tip. Default: `model`.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import InverseKinematics, robots
+    >>> from hybridkin.ik.tasks import PoseTask
+    >>> chain = robots.bionic_handling_assistant()
+    >>> target = chain.poses(torch.linspace(0.22, 0.28, 9, dtype=torch.float64))[-1]
+    >>> ik = InverseKinematics(PoseTask(chain), q_min=0.1, q_max=0.4)
+    >>> ik.solve(target, tol=(1e-6, 1e-5)).converged  # [m], [rad]
+    tensor(True)
+    """
+
+    def __init__(self, model: Any, radian: float = 0.1, orientation: Any = None) -> None:
+        if not (radian > 0.0 and math.isfinite(radian)):
+            raise ValueError(f"`radian` must be positive metres, got {radian!r}.")
+        model = _model(model)
+        turning = model if orientation is None else _model(orientation)
+        if not isinstance(turning, PoseModel):
+            raise TypeError(
+                "`model` must have pose_jacobian(q) and tip_transform(q), got "
+                f"{type(turning).__name__}; give the chain that knows as `orientation`."
+            )
+        self.models = (model,) if turning is model else (model, turning)
+        self.shape, self.parts, self.units = (4, 4), (3, 3), (1.0, float(radian))
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip's poses (N, 4, 4) and J (N, 6, n), its angular rows times `radian`."""
+        T, J = in_blocks(self._evaluate, q)
+        return T.to(q), J.to(q)
+
+    def _evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        turning: Any = self.models[-1]
+        T, J = turning.pose_and_jacobian(q)
+        if turning is not self.models[0]:
+            x, linear = forward_and_jacobian(self.models[0], q)
+            moved = torch.cat([T[:, :3, :3], x.to(T)[..., None]], dim=-1)
+            T, J = torch.cat([moved, T[:, 3:]], dim=-2), torch.cat([linear.to(J), J[:, 3:]], -2)
+        return T, torch.cat([J[:, :3], self.units[1] * J[:, 3:]], dim=-2)
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return the way [m] and the rotation vector [rad] times `radian`, (N, 6)."""
+        turn = rotation_vector(x_target[..., :3, :3] @ x[..., :3, :3].mT)
+        return torch.cat([x_target[..., :3, 3] - x[..., :3, 3], self.units[1] * turn], dim=-1)
+
+    def check(self, x_target: Tensor, name: str) -> None:
+        """Raise where a finite target holds no rotation."""
+        R = x_target[..., :3, :3]
+        R = R[torch.isfinite(R).all(-1).all(-1)]
+        off = (R.mT @ R - torch.eye(3).to(R)).abs().amax((-2, -1))
+        if ((off > 1e-3) | (torch.linalg.det(R) < 0.0)).any():
+            raise ValueError(
+                f"`{name}` must hold rotations in its upper left 3 x 3 blocks (orthonormal, "
+                f"right-handed), got a block that is off by {float(off.max()):.3g}."
+            )
+
+
+class StackedTask(Task):
+    """Several tasks at once, their errors traded by weights: least squares of all rows.
+
+    A target is one vector: `join` makes it from the targets of the tasks.
+
+    Parameters
+    ----------
+    *tasks : Task, nn.Module or callable
+        The tasks; a model stands for its `PositionTask`.
+    weights : sequence of float, optional
+        What a metre of every task's error counts. Default: 1 each.
+
+    Examples
+    --------
+    The tip at one point, the end of the second segment near another:
+
+    >>> import torch
+    >>> from hybridkin import InverseKinematics, robots
+    >>> from hybridkin.ik.tasks import StackedTask
+    >>> chain = robots.bionic_handling_assistant()
+    >>> task = StackedTask(chain, chain.with_tip(2.0), weights=[1.0, 0.1])
+    >>> tip, elbow = torch.tensor([[0.1, 0.0, 0.75], [0.0, 0.0, 0.5]], dtype=torch.float64)
+    >>> ik = InverseKinematics(task, q_min=0.1, q_max=0.4)
+    >>> ik.solve(task.join(tip, elbow)).converged
+    tensor(True)
+    """
+
+    def __init__(self, *tasks: Any, weights: Sequence[float] | None = None) -> None:
+        if not tasks:
+            raise ValueError("`tasks` must hold at least one task or model, got none.")
+        self.tasks = tuple(as_task(task) for task in tasks)
+        weights = [1.0] * len(tasks) if weights is None else [float(w) for w in weights]
+        if len(weights) != len(tasks) or not all(0.0 < w < math.inf for w in weights):
+            raise ValueError(
+                f"`weights` must be {len(tasks)} positive numbers, one per task, got {weights}."
+            )
+        self.weights = weights
+        self.models = tuple(model for task in self.tasks for model in task.models)
+        self._sizes = [math.prod(task.shape) for task in self.tasks]
+        self.shape = (sum(self._sizes),)
+        self.parts = tuple(rows for task in self.tasks for rows in task.parts)
+        self.units = tuple(
+            w * unit for w, task in zip(weights, self.tasks, strict=True) for unit in task.units
+        )
+
+    def join(self, *x: Any) -> Any:
+        """Return one target (..., k) of the targets ``(..., *shape)`` of all tasks."""
+        if len(x) != len(self.tasks):
+            raise ValueError(f"`x` must be {len(self.tasks)} targets, one per task, got {len(x)}.")
+        tensors = [a if isinstance(a, Tensor) else torch.as_tensor(np.asarray(a)) for a in x]
+        leads = [
+            a.shape[: a.ndim - len(task.shape)] for a, task in zip(tensors, self.tasks, strict=True)
+        ]
+        lead = torch.broadcast_shapes(*leads)
+        rows = [
+            a.expand(*lead, *task.shape).reshape(*lead, size)
+            for a, task, size in zip(tensors, self.tasks, self._sizes, strict=True)
+        ]
+        joined = torch.cat(rows, dim=-1)
+        return joined if any(isinstance(a, Tensor) for a in x) else joined.numpy()
+
+    def split(self, x: Any) -> tuple[Any, ...]:
+        """Return the targets, or the x, of every task from one vector (..., k)."""
+        ends = np.cumsum(self._sizes)
+        return tuple(
+            x[..., end - size : end].reshape(*x.shape[:-1], *task.shape)
+            for end, size, task in zip(ends, self._sizes, self.tasks, strict=True)
+        )
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return all x (N, k), side by side, and the weighted J (N, m, n)."""
+        parts = [task.evaluate(q) for task in self.tasks]
+        rows = [w * J for w, (_, J) in zip(self.weights, parts, strict=True)]
+        return torch.cat([x.flatten(1) for x, _ in parts], dim=1), torch.cat(rows, dim=-2)
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return the weighted errors (N, m), one task after another."""
+        pairs = zip(self.split(x), self.split(x_target), strict=True)
+        errors = [task.difference(a, b) for task, (a, b) in zip(self.tasks, pairs, strict=True)]
+        return torch.cat([w * e for w, e in zip(self.weights, errors, strict=True)], dim=-1)
+
+    def check(self, x_target: Tensor, name: str) -> None:
+        """Raise where a part of a target cannot be meant."""
+        for task, part in zip(self.tasks, self.split(x_target), strict=True):
+            task.check(part, name)
+
+
+class PrioritizedTask(StackedTask):
+    """Two tasks, the second one in the null space of the first: it never costs the first anything.
+
+    Parameters
+    ----------
+    first, second : Task, nn.Module or callable
+        The tasks; a model stands for its `PositionTask`.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import InverseKinematics, robots
+    >>> from hybridkin.ik.tasks import PrioritizedTask
+    >>> chain = robots.bionic_handling_assistant()
+    >>> task = PrioritizedTask(chain, chain.with_tip(2.0))
+    >>> tip, elbow = torch.tensor([[0.1, 0.0, 0.75], [5.0, 0.0, 0.5]], dtype=torch.float64)
+    >>> solution = InverseKinematics(task, q_min=0.1, q_max=0.4).solve(task.join(tip, elbow))
+    >>> [bool((a - b).norm() < 1e-4) for a, b in zip(task.split(solution.x), (tip, elbow))]
+    [True, False]
+    """
+
+    def __init__(self, first: Any, second: Any) -> None:
+        super().__init__(first, second)
+        self.first = sum(self.tasks[0].parts)
+
+
+class PointsTask(Task):
+    """Several points along the backbone are to be at points: 3 P rows, targets (P, 3).
+
+    Parameters
+    ----------
+    chain : nn.Module
+        Offers ``with_tip(at)``.
+    at : sequence of float
+        Where on the backbone, in segments from the base.
+    weights : sequence of float, optional
+        What a metre of every point's error counts. Default: 1 each.
+    """
+
+    def __init__(
+        self, chain: Any, at: Sequence[float], weights: Sequence[float] | None = None
+    ) -> None:
+        if not hasattr(chain, "with_tip"):
+            raise TypeError(
+                f"`chain` must have with_tip(at), got {type(chain).__name__}; stack the models of "
+                "the points with StackedTask."
+            )
+        self._stack = StackedTask(*(chain.with_tip(float(a)) for a in at), weights=weights)
+        self.models, self.parts, self.units = (
+            *(self._stack.models, self._stack.parts, self._stack.units),
+        )
+        self.shape = (len(self.parts), 3)
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the points (N, P, 3) and the weighted J (N, 3 P, n)."""
+        x, J = self._stack.evaluate(q)
+        return x.unflatten(1, self.shape), J
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return the weighted errors (N, 3 P)."""
+        return self._stack.difference(x.flatten(-2), x_target.flatten(-2))
+
+
+def as_task(model: Any) -> Task:
+    """Return a task as it is, and a model as the task to put its tip somewhere."""
+    return model if isinstance(model, Task) else PositionTask(model)
+
+
+def away_from_limits(q_min: Any, q_max: Any, reach: float = 1.0) -> Callable[[Tensor], Tensor]:
+    """Return a posture for ``q_pref=`` that keeps actuators off their limits.
+
+    It moves against the gradient of sum_i u_i^4 / 4 with u in [-1, 1] between the limits: next to
+    nothing in the middle, and all the way there at a limit.
+
+    Parameters
+    ----------
+    q_min, q_max : float or array-like of shape (n,)
+        The limits, finite.
+    reach : float, default=1.0
+        Share of the way from a limit to the middle that is asked for.
+
+    Returns
+    -------
+    function
+        Maps q (..., n) to preferred configurations (..., n).
+    """
+    low, high = (torch.as_tensor(np.asarray(a), dtype=torch.float64) for a in (q_min, q_max))
+    half = 0.5 * (high - low)
+    if not (torch.isfinite(half) & (half > 0.0)).all():
+        raise ValueError(
+            f"`q_min` must lie below `q_max`, both finite, got {low.tolist()} and {high.tolist()}."
+        )
+
+    def posture(q: Tensor) -> Tensor:
+        u = (q - (low + half).to(q)) / half.to(q)
+        return q - reach * half.to(q) * u**3
+
+    return posture
+
+
+def downhill(gradient: Callable[[Tensor], Tensor], rate: float = 1.0) -> Callable:
+    """Return a posture for ``q_pref=`` that lowers a cost of q in the null space of the task.
+
+    Parameters
+    ----------
+    gradient : callable
+        Maps q (..., n) to the gradient of the cost (..., n), torch to torch.
+    rate : float, default=1.0
+        Step along the gradient; at most 2 over the cost's largest curvature.
+
+    Returns
+    -------
+    function
+        Maps q to ``q - rate gradient(q)``.
+    """
+    return lambda q: q - rate * gradient(q)
+
+
+class _FunctionPair:
+    """A function and its Jacobian as a model, for torch tensors or for NumPy arrays."""
+
+    def __init__(self, f: Callable, J: Callable) -> None:
+        self.f, self.J = f, J
+        self.speaks_torch: bool | None = None
+
+    def __call__(self, q: Tensor) -> Tensor:
+        return self._ask(self.f, q)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        return self._ask(self.f, q), self._ask(self.J, q)
+
+    def _ask(self, function: Callable, q: Tensor) -> Tensor:
+        if self.speaks_torch is None:
+            try:
+                self.speaks_torch = isinstance(self.f(q), Tensor)
+            except Exception:
+                self.speaks_torch = False  # and if that was not the reason, NumPy says it again
+        if self.speaks_torch:
+            return function(q)
+        if q.requires_grad and torch.is_grad_enabled():
+            raise ValueError(
+                "`model` must be twice differentiable by torch for derivatives of the solution, "
+                "got functions for NumPy."
+            )
+        return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)
+
+
+def _model(model: Any) -> Any:
+    pair = isinstance(model, (tuple, list)) and len(model) == 2 and all(map(callable, model))
+    return as_forward_model(_FunctionPair(*model) if pair else model)
+
+
+def device_of(task: Task) -> torch.device:
+    """Return the device of the first model that has one."""
+    for model in task.models:
+        if isinstance(model, nn.Module):
+            for tensor in (*model.parameters(), *model.buffers()):
+                return tensor.device
+    return torch.device("cpu")

@@ -1,0 +1,385 @@
+"""Paths for the tip in metres and seconds: figure eight, spiral, line, recorded points."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
+
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_FAR = 20.0  # no tip is that far from where it is measured [m]
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Trajectory:
+    """A path of the tip with its times.
+
+    Attributes
+    ----------
+    t : ndarray of shape (T,)
+        Times [s], increasing.
+    x : ndarray of shape (T, 3)
+        Positions [m].
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check shapes and times."""
+        t, x = np.array(self.t, dtype=float), np.array(self.x, dtype=float)
+        if x.ndim != 2 or x.shape[1] != 3 or len(x) == 0:
+            raise ValueError(f"`x` must have shape (T, 3) with T >= 1, got {x.shape}.")
+        if t.shape != (len(x),):
+            raise ValueError(f"`t` must have shape ({len(x)},), as many as `x`, got {t.shape}.")
+        bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(x).all(axis=1)))
+        if bad.size:
+            raise ValueError(
+                f"`t` and `x` must be finite, got NaN or infinity in {bad.size} rows (first: row "
+                f"{bad[0]}); drop those rows."
+            )
+        late = np.flatnonzero(np.diff(t) <= 0)
+        if late.size:
+            raise ValueError(
+                f"`t` must increase, got {t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s in row "
+                f"{late[0] + 1}; sort the rows and drop repeated times."
+            )
+        largest = float(np.abs(x).max())
+        if largest > _FAR:
+            warnings.warn(
+                f"the path reaches {largest:.4g} m, which looks like millimetres; hybridkin works "
+                "in metres: divide by 1000, or read a file with unit='mm'.",
+                stacklevel=4,
+            )
+        object.__setattr__(self, "t", t)
+        object.__setattr__(self, "x", x)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last point [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    def repeated(self, n_laps: int) -> Trajectory:
+        """Return the path run several times on end, for a path that ends where it starts.
+
+        Parameters
+        ----------
+        n_laps : int
+            Number of laps, at least 1.
+
+        Returns
+        -------
+        Trajectory
+            ``n_laps (T - 1) + 1`` points.
+        """
+        if n_laps < 1:
+            raise ValueError(f"`n_laps` must be at least 1, got {n_laps}.")
+        gap = float(np.linalg.norm(self.x[-1] - self.x[0]))
+        if n_laps > 1 and (
+            len(self) < 2 or gap > 1e-9 + 1e-6 * float(np.ptp(self.x, axis=0).max())
+        ):
+            raise ValueError(
+                f"only a closed path can be repeated; this one ends {gap:.4g} m from its start."
+            )
+        t = [self.t[0] + lap * self.duration + (self.t[1:] - self.t[0]) for lap in range(n_laps)]
+        return Trajectory(
+            np.concatenate([self.t[:1], *t]), np.concatenate([self.x[:1], *[self.x[1:]] * n_laps])
+        )
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        """Return a one-line summary."""
+        low, high = self.x.min(axis=0), self.x.max(axis=0)
+        span = " x ".join(f"{side:.3g}" for side in high - low)
+        return f"Trajectory({len(self)} points, {self.duration:.4g} s, {span} m)"
+
+
+def min_jerk(s: Any) -> np.ndarray:
+    """Return the minimum-jerk timing law 10 s^3 - 15 s^4 + 6 s^5.
+
+    It runs from 0 to 1 with speed and acceleration zero at both ends.
+
+    Parameters
+    ----------
+    s : array-like of shape (...)
+        Share of the time, clipped to [0, 1].
+
+    Returns
+    -------
+    ndarray of shape (...)
+        Share of the way.
+
+    References
+    ----------
+    Flash & Hogan, J. Neurosci. 5 (1985).
+    """
+    s = np.clip(np.asarray(s, dtype=float), 0.0, 1.0)
+    return s * s * s * (10.0 + s * (6.0 * s - 15.0))
+
+
+def figure_eight(
+    center: Any,
+    size: Sequence[float] = (0.3, 0.15),
+    *,
+    duration: float = 10.0,
+    dt: float = 0.01,
+    normal: Any = (0.0, 0.0, 1.0),
+    timing: str = "min_jerk",
+) -> Trajectory:
+    """Return a figure eight (Gerono's lemniscate) that starts and ends in its crossing.
+
+    Parameters
+    ----------
+    center : array-like of shape (3,)
+        The crossing [m].
+    size : (float, float), default=(0.3, 0.15)
+        Full width and height [m].
+    duration : float, default=10.0
+        Time for one lap [s], rounded to whole periods.
+    dt : float, default=0.01
+        Time between points [s].
+    normal : array-like of shape (3,), default=(0, 0, 1)
+        Normal of the plane. The width lies along the x-axis projected into the plane (along y
+        where the normal is the x-axis).
+    timing : {"min_jerk", "uniform"}, default="min_jerk"
+        "min_jerk" starts and ends at rest; "uniform" passes the curve's parameter evenly, as for
+        laps on end.
+
+    Returns
+    -------
+    Trajectory
+        ``duration / dt + 1`` points.
+
+    References
+    ----------
+    Reinhart & Steil (2016), Fig. 3, left column.
+
+    Examples
+    --------
+    >>> from hybridkin.ik.trajectories import figure_eight
+    >>> figure_eight([0.0, 0.0, 0.7], (0.4, 0.2), duration=8.0)
+    Trajectory(801 points, 8 s, 0.4 x 0.2 x 0 m)
+    """
+    center = _point(center, "center")
+    width, height = _sizes(size, "size")
+    t, s = _timing(duration, dt, timing)
+    across, up, _ = _plane(normal)
+    phase = 2.0 * math.pi * s[:, None]
+    x = 0.5 * width * np.sin(phase) * across + 0.5 * height * np.sin(2.0 * phase) * up
+    return Trajectory(t, center + _closed(x))
+
+
+def spiral(
+    center: Any,
+    radius: float | Sequence[float] = (0.0, 0.15),
+    *,
+    rise: float = 0.0,
+    turns: float = 3.0,
+    duration: float = 15.0,
+    dt: float = 0.01,
+    normal: Any = (0.0, 0.0, 1.0),
+    timing: str = "min_jerk",
+) -> Trajectory:
+    """Return a spiral or helix.
+
+    Parameters
+    ----------
+    center : array-like of shape (3,)
+        Centre of the first turn [m].
+    radius : float or (float, float), default=(0.0, 0.15)
+        Radius, or radius at the start and at the end [m].
+    rise : float, default=0.0
+        Way along the normal from start to end [m].
+    turns : float, default=3.0
+        Number of turns; negative runs clockwise about the normal.
+    duration : float, default=15.0
+        Time for the path [s], rounded to whole periods.
+    dt : float, default=0.01
+        Time between points [s].
+    normal : array-like of shape (3,), default=(0, 0, 1)
+        Axis of the spiral. It starts along the x-axis projected into the plane (along y where
+        the normal is the x-axis).
+    timing : {"min_jerk", "uniform"}, default="min_jerk"
+        "min_jerk" starts and ends at rest; "uniform" passes the angle evenly.
+
+    Returns
+    -------
+    Trajectory
+        ``duration / dt + 1`` points.
+
+    References
+    ----------
+    Reinhart & Steil (2016), Fig. 3, right column.
+
+    Examples
+    --------
+    >>> from hybridkin.ik.trajectories import spiral
+    >>> spiral([0.0, 0.0, 0.7], (0.05, 0.2), rise=0.1, turns=2.0, duration=5.0)
+    Trajectory(501 points, 5 s, 0.363 x 0.326 x 0.1 m)
+    """
+    center = _point(center, "center")
+    radii = (
+        np.broadcast_to(np.asarray(radius, dtype=float), (2,)) if np.ndim(radius) == 0 else radius
+    )
+    first, last = _sizes(radii, "radius", smallest=0.0)
+    if not (math.isfinite(rise) and math.isfinite(turns)):
+        raise ValueError(f"`rise` [m] and `turns` must be finite, got {rise!r} and {turns!r}.")
+    t, s = _timing(duration, dt, timing)
+    across, up, along = _plane(normal)
+    s = s[:, None]
+    angle = 2.0 * math.pi * turns * s
+    r = first + (last - first) * s
+    x = r * np.cos(angle) * across + r * np.sin(angle) * up + rise * s * along
+    return Trajectory(t, center + x)
+
+
+def line(
+    start: Any, end: Any, *, duration: float = 5.0, dt: float = 0.01, timing: str = "min_jerk"
+) -> Trajectory:
+    """Return a straight line.
+
+    Parameters
+    ----------
+    start, end : array-like of shape (3,)
+        End points [m].
+    duration : float, default=5.0
+        Time for the path [s], rounded to whole periods.
+    dt : float, default=0.01
+        Time between points [s].
+    timing : {"min_jerk", "uniform"}, default="min_jerk"
+        "min_jerk" starts and ends at rest; "uniform" has constant speed.
+
+    Returns
+    -------
+    Trajectory
+        ``duration / dt + 1`` points.
+
+    Examples
+    --------
+    >>> from hybridkin.ik.trajectories import line
+    >>> line([0.1, 0.0, 0.7], [-0.1, 0.0, 0.7], duration=2.0).x[100].tolist()
+    [0.0, 0.0, 0.7]
+    """
+    start, end = _point(start, "start"), _point(end, "end")
+    t, s = _timing(duration, dt, timing)
+    # Weighting both ends meets both exactly.
+    return Trajectory(t, (1.0 - s)[:, None] * start + s[:, None] * end)
+
+
+def from_csv(
+    path: str | PathLike[str], *, dt: float | None = None, unit: str = "m", delimiter: str = ","
+) -> Trajectory:
+    """Return a recorded path.
+
+    Parameters
+    ----------
+    path : path-like
+        A text file with columns t, x, y, z, or x, y, z together with `dt`. One line of names
+        and lines that start with # are allowed.
+    dt : float, optional
+        Time between rows [s], for files without a time column.
+    unit : {"m", "cm", "mm"}, default="m"
+        Unit of the positions in the file. Times are seconds.
+    delimiter : str, default=","
+        Separator of the columns.
+
+    Returns
+    -------
+    Trajectory
+        In metres and seconds, as timed in the file.
+    """
+    if unit not in _UNITS:
+        raise ValueError(f"`unit` must be one of {tuple(_UNITS)}, got {unit!r}.")
+    with open(path, encoding="utf-8-sig") as file:
+        lines = [text.strip() for text in file]
+    rows = [text.split(delimiter) for text in lines if text and not text.startswith("#")]
+    if rows and not _is_number(rows[0][0]):
+        rows = rows[1:]
+    columns = 4 if dt is None else 3
+    need = "t, x, y, z" if dt is None else "x, y, z, because `dt` is given"
+    try:
+        table = np.array(rows, dtype=float)
+    except ValueError as error:
+        raise ValueError(
+            f"{path} must hold numbers in {columns} columns ({need}) after one line of names: "
+            f"{error}."
+        ) from error
+    if table.ndim != 2 or table.shape[1] != columns:
+        raise ValueError(f"{path} must have rows of {columns} columns ({need}), got {table.shape}.")
+    if dt is None:
+        t = table[:, 0]
+    else:
+        _check_positive(dt, "dt")
+        t = dt * np.arange(len(table))
+    return Trajectory(t, _UNITS[unit] * table[:, -3:])
+
+
+def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and the share of the way at each."""
+    _check_positive(duration, "duration")
+    _check_positive(dt, "dt")
+    laws: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "min_jerk": min_jerk,
+        "uniform": lambda s: s,
+    }
+    if timing not in laws:
+        raise ValueError(f"`timing` must be one of {tuple(laws)}, got {timing!r}.")
+    n = max(1, round(duration / dt))
+    return dt * np.arange(n + 1), laws[timing](np.arange(n + 1) / n)
+
+
+def _closed(x: np.ndarray) -> np.ndarray:
+    """Return the curve with its last point exactly on the first: sin(2 pi) is not zero."""
+    return np.concatenate([x[:-1], x[:1]])
+
+
+def _plane(normal: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a right-handed frame (across, up, normal)."""
+    normal = _point(normal, "normal")
+    norm = np.linalg.norm(normal)
+    if norm == 0.0:
+        raise ValueError("`normal` must not be zero; it is the normal of the plane.")
+    normal = normal / norm
+    axis = np.eye(3)[0 if abs(normal[0]) < 1.0 - 1e-9 else 1]
+    across = axis - (axis @ normal) * normal
+    across = across / np.linalg.norm(across)
+    return across, np.cross(normal, across), normal
+
+
+def _point(value: Any, name: str) -> np.ndarray:
+    point = np.array(value, dtype=float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(f"`{name}` must be 3 finite numbers [m], got {value!r}.")
+    return point
+
+
+def _sizes(value: Any, name: str, *, smallest: float | None = None) -> tuple[float, float]:
+    pair = np.array(value, dtype=float)
+    good = pair.shape == (2,) and np.isfinite(pair).all()
+    if not good or not (pair > 0.0 if smallest is None else pair >= smallest).all():
+        need = "positive" if smallest is None else "not negative"
+        raise ValueError(f"`{name}` must be two numbers, {need} [m], got {value!r}.")
+    return float(pair[0]), float(pair[1])
+
+
+def _check_positive(value: float, name: str) -> None:
+    if not (value > 0.0 and math.isfinite(value)):
+        raise ValueError(f"`{name}` must be positive [s], got {value!r}.")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,147 @@
+"""Exact errors of a ridge readout on rows left out, for a whole grid of penalties, in one pass."""
+
+import numpy as np
+import torch
+from scipy import linalg
+from sklearn.utils import gen_batches
+
+from hybridkin.learning._ridge import moments
+
+_BLOCK_ELEMENTS = 2_000_000  # 16 MB of float64 per temporary
+
+
+class LeftOut:
+    """Errors that the readout of a hidden layer makes on rows that it has not seen.
+
+    With the residuals ``r = y - Phi W`` of all rows and their operator ``P = 1 - Phi A^-1 Phi'``,
+    ``A = Phi' Phi + alpha 1``, the errors on rows S without S are ``P_SS^-1 r_S``: no refit. In the
+    eigenbasis of ``Phi' Phi``, with coordinates Z, ``P = 1 - Z D Z'`` and ``r = y - Z D Z'y`` with
+    a diagonal D. For fewer rows than features, Z is the eigenbasis of ``Phi Phi'`` itself and
+    ``P = Z D Z'``, ``r = Z D Z'y``: nothing cancels. Rows carry the root of their weight.
+
+    Parameters
+    ----------
+    elm : ELM
+        Hidden layer; its readout is not used.
+    stats : Statistics
+        Of all rows.
+    X, y : ndarray of shape (n_samples, n_inputs) and (n_samples, n_outputs)
+        All rows.
+    sample_weight : ndarray of shape (n_samples,) or None
+        Positive weights, or ones.
+    fit_intercept : bool
+        Whether the readout has an intercept; it is fitted anew without the rows left out.
+
+    References
+    ----------
+    .. [1] Allen, D. M. (1974). The relationship between variable selection and data augmentation
+       and a method for prediction. Technometrics, 16, 125-127.
+    .. [2] Cook, R. D., & Weisberg, S. (1982). Residuals and influence in regression, section 3.7.
+    """
+
+    def __init__(self, elm, stats, X, y, sample_weight, fit_intercept):
+        n_features = len(elm.output_weights)
+        self._elm, self._X, self._intercept = elm, X, fit_intercept
+        mean, G, C, _ = moments(stats, n_features, fit_intercept)
+        self._n, self._center = stats.n, mean[:n_features]
+        self._root = np.ones(len(X)) if sample_weight is None else np.sqrt(sample_weight)
+        self._y = (y - mean[n_features:]) * self._root[:, None]
+        self._wide = len(X) <= n_features
+        if self._wide:
+            phi = self._features(np.arange(len(X)))
+            gram = phi @ phi.T
+            if fit_intercept:  # the direction of the mean, which has no residual, comes last
+                gram += (1 + np.trace(gram)) * np.outer(self._root, self._root) / self._n
+            eigenvalues, self._basis = linalg.eigh(gram)
+            if fit_intercept:
+                eigenvalues, self._basis = eigenvalues[:-1], self._basis[:, :-1]
+            self._Zy = self._basis.T @ self._y
+        else:
+            eigenvalues, self._basis = linalg.eigh(G)
+            self._Zy = self._basis.T @ C
+        self.eigenvalues = np.maximum(eigenvalues, 0.0)
+
+    def rows_at_a_time(self, n_alphas):
+        """Return how many rows may be asked for at once in little memory."""
+        return max(1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1]))
+
+    def each(self, rows, alphas):
+        """Return the errors (n_alphas, n_rows, n_outputs) on rows each left out alone.
+
+        Of a row of weight above 1, a repeated one, a weight of 1 is left out.
+        """
+        Z, D, root = self._z(rows), self._d(alphas), self._root[rows]
+        p = D @ (Z * Z).T
+        if not self._wide:
+            p += 1.0 - (root**2 / self._n if self._intercept else 0.0)
+        out = 1.0 / np.maximum(root**2, 1.0)
+        p = (1.0 - out) + out * p
+        return self._residuals(Z, D, rows) / p[:, :, None] / root[:, None]
+
+    def together(self, out, asked, alphas):
+        """Return the errors (n_alphas, n_asked, n_outputs) on rows `asked`, without rows `out`.
+
+        Parameters
+        ----------
+        out : ndarray of int of shape (n_out,)
+            Rows left out, ascending.
+        asked : ndarray of int of shape (n_asked,)
+            Some of them.
+        alphas : ndarray of shape (n_alphas,)
+            Penalties.
+        """
+        if not self._wide and len(out) > len(self._center):
+            return self._refitted(out, asked, alphas)
+        Z, D = self._z(out), self._d(alphas)
+        residuals, among = self._residuals(Z, D, out), np.searchsorted(out, asked)
+        fixed = np.zeros((len(out), len(out)))
+        if not self._wide:
+            fixed += np.eye(len(out))
+            if self._intercept:
+                fixed -= np.outer(self._root[out], self._root[out]) / self._n
+        errors = (
+            linalg.solve(fixed + (Z * d) @ Z.T, r, assume_a="sym")[among]
+            for d, r in zip(D, residuals, strict=True)
+        )
+        return np.stack(list(errors)) / self._root[asked, None]
+
+    def _d(self, alphas):
+        numerator = alphas[:, None] if self._wide else -1.0
+        return numerator / np.add.outer(alphas, self.eigenvalues)
+
+    def _z(self, rows):
+        return self._basis[rows] if self._wide else self._features(rows) @ self._basis
+
+    def _features(self, rows):
+        q = torch.from_numpy(self._X[rows].astype(np.float64))
+        with torch.no_grad():
+            phi = self._elm.features(q.to(self._elm.input_center.device)).numpy(force=True)
+        return (phi - self._center) * self._root[rows, None]
+
+    def _residuals(self, Z, D, rows):
+        r = np.matmul(Z, D[:, :, None] * self._Zy)
+        return r if self._wide else self._y[rows] + r
+
+    def _refitted(self, out, asked, alphas):
+        """Return the same as `together` by the sums of the rows that stay: for many rows out."""
+        n_features = len(self._center)
+        scatter = np.diag(np.append(self.eigenvalues, np.zeros(self._y.shape[1])))
+        scatter[:n_features, n_features:] = self._Zy
+        total, weight = np.zeros(len(scatter)), self._n
+        for batch in gen_batches(len(out), self.rows_at_a_time(0)):
+            rows = out[batch]
+            z = np.hstack([self._z(rows), self._y[rows]])
+            scatter -= z.T @ z
+            total -= self._root[rows] @ z
+            weight -= np.sum(self._root[rows] ** 2)
+        mean = total / weight * self._intercept
+        scatter -= weight * np.outer(mean, mean)
+        eigenvalues, V = linalg.eigh(scatter[:n_features, :n_features])
+        shrunk = 1.0 / np.add.outer(alphas, np.maximum(eigenvalues, 0.0))
+        W = V @ (shrunk[:, :, None] * (V.T @ scatter[:n_features, n_features:]))
+        errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
+        for batch in gen_batches(len(asked), self.rows_at_a_time(len(alphas))):
+            root = self._root[asked[batch], None]
+            z, y = self._z(asked[batch]) / root, self._y[asked[batch]] / root
+            errors[:, batch] = y - mean[n_features:] - (z - mean[:n_features]) @ W
+        return errors

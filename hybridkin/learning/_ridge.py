@@ -1,0 +1,127 @@
+"""Ridge readouts from streamed statistics: sums in float64, exact to add, to merge, to solve."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import linalg
+from scipy.linalg.blas import dsyrk  # pyright: ignore
+from scipy.linalg.lapack import dpocon, dpotrf, dtrtri  # pyright: ignore
+from sklearn.utils import gen_batches
+
+from hybridkin.learning.network import READOUT
+
+
+class Statistics(NamedTuple):
+    """Total weight, mean, and scatter about the mean, of the rows [features, targets]."""
+
+    n: float
+    mean: np.ndarray
+    scatter: np.ndarray
+
+
+def accumulate(stats, elm, X, y, sample_weight, block_size):
+    """Return `stats` with the rows of `X`, `y` added, block by block.
+
+    A block is centred about its own mean. The step from the old mean to the block's enters as one
+    more row, so that all of it is one symmetric product per block, and exact.
+    """
+    n_features, device = len(elm.output_weights), elm.input_center.device
+    n, mean = stats.n, torch.tensor(stats.mean, device=device)
+    scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is kept up
+    buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
+    for rows in gen_batches(len(X), block_size):
+        q = torch.tensor(X[rows], dtype=torch.float64, device=device)
+        z = buffer[: len(q) + 1]
+        block = z[:-1]
+        elm._write_features(q, block[:, :n_features])
+        block[:, n_features:] = torch.tensor(y[rows], device=device)
+        if sample_weight is None:
+            n_block, mean_block = float(len(block)), block.mean(0)
+            block -= mean_block
+        else:
+            w = torch.tensor(sample_weight[rows], device=device)
+            n_block = w.sum().item()
+            mean_block = w @ block / n_block
+            block -= mean_block
+            block *= w.sqrt()[:, None]
+        step = mean_block - mean
+        torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
+        n += n_block
+        mean += step * (n_block / n)
+        if z.device.type == "cpu":  # half the work of a general product
+            c = dsyrk(1.0, z.T.numpy(), beta=1.0, c=scatter.numpy(), overwrite_c=True, lower=True)
+            scatter = torch.from_numpy(c)
+        else:
+            scatter.addmm_(z.T, z)
+    lower = np.tril(scatter.cpu().numpy())
+    return Statistics(n, mean.cpu().numpy(), lower + np.tril(lower, -1).T)
+
+
+def merge(a, b):
+    """Return the statistics of the rows of both (parallel variance formula)."""
+    n, step = a.n + b.n, b.mean - a.mean
+    scatter = a.scatter + b.scatter + np.outer(step, step) * (a.n / n * b.n)
+    return Statistics(n, a.mean + step * (b.n / n), scatter)
+
+
+def ridge(G, C, alpha):
+    """Return W = (G + alpha 1)^-1 C, R with R R' = (G + alpha 1)^-1, tr(R' G R), and the solver.
+
+    Where G + alpha 1 is singular, W is the solution of minimum norm, and R takes the eigenvalues
+    that rounding has swallowed at their rounding error: large, as there are no data.
+    """
+    A = G + alpha * np.eye(len(G))
+    eps = len(G) * np.finfo(np.float64).eps
+    # Unit diagonal: features of different units are not what makes a system singular.
+    root = np.sqrt(A.diagonal())[:, None]
+    root[root == 0] = 1.0
+    scaled = A / root / root.T
+    L, info = dpotrf(scaled, lower=True)
+    if info == 0 and dpocon(L, np.abs(scaled).sum(0).max(), uplo="L")[0] > eps:
+        W = linalg.cho_solve((L, True), C / root) / root
+        R = dtrtri(L, lower=True)[0].T / root
+        return W, R, len(G) - alpha * np.sum(R * R), "cholesky"
+    eigenvalues, V = linalg.eigh(G)
+    shifted = eigenvalues + alpha
+    cutoff = max(eps * shifted[-1], np.finfo(np.float64).tiny)
+    kept = shifted > cutoff
+    W = V[:, kept] @ ((V[:, kept].T @ C) / shifted[kept, None])
+    R = V / np.sqrt(np.maximum(shifted, cutoff))
+    return W, R, np.sum(eigenvalues[kept] / shifted[kept]), "eigh"
+
+
+def moments(stats, n_features, fit_intercept):
+    """Return the means, the features' Gram matrix, their products with the targets, and y'y.
+
+    They are centred for a readout with an intercept; else about the origin, with means of zero.
+    """
+    n, mean, scatter = stats
+    if not fit_intercept:
+        # Both terms are positive: going back from the mean to the origin cancels nothing.
+        scatter = scatter + n * np.outer(mean, mean)
+        mean = np.zeros_like(mean)
+    G, C = scatter[:n_features, :n_features], scatter[:n_features, n_features:]
+    return mean, G, C, scatter.diagonal()[n_features:]
+
+
+def fit_readout(stats, n_features, alpha, fit_intercept):
+    """Return the arrays of the readout (eq. 3), the noise variance (m,) and the solver.
+
+    The leverage is that of the smallest entry of `alpha`, a number or an array of shape (m,).
+    """
+    n, (mean, G, C, yy) = stats.n, moments(stats, n_features, fit_intercept)
+    alphas = np.broadcast_to(np.asarray(alpha, dtype=np.float64), yy.shape)
+    W, dof, solvers, R = np.empty(C.shape), np.empty(yy.shape), set(), None
+    for value in np.unique(alphas)[::-1]:
+        of = alphas == value
+        W[:, of], R, dof[of], solver = ridge(G, C[:, of], value)
+        solvers.add(solver)
+    # This form of the residual is stationary in W: rounding in W enters squared.
+    rss = yy - np.sum(W * (2 * C - G @ W), axis=0)
+    dof_left = n - dof - fit_intercept
+    resolved = dof_left > np.sqrt(np.finfo(np.float64).eps) * n
+    noise = np.maximum(rss, 0.0) / np.where(resolved, dof_left, np.nan)
+    mu, offset = mean[:n_features], np.float64(1 / n if fit_intercept else 0)
+    arrays = (W, mean[n_features:] - mu @ W, mu, R, offset)
+    return dict(zip(READOUT, arrays, strict=True)), noise, max(solvers)  # "eigh" if any

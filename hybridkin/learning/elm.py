@@ -1,0 +1,465 @@
+"""Extreme learning machine: a random hidden layer with a ridge readout."""
+
+import warnings
+from numbers import Integral, Real
+
+import numpy as np
+import torch
+from scipy import linalg
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
+from sklearn.utils import check_random_state, gen_batches
+from sklearn.utils._param_validation import Interval, StrOptions
+from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+
+from hybridkin.learning._ridge import Statistics, accumulate, fit_readout, merge
+from hybridkin.learning.network import ACTIVATIONS, ELM, LAYER, READOUT
+
+__all__ = ["ELM", "ELMRegressor"]
+
+DTYPES = (np.float64, np.float32)
+_BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
+
+
+def _scaling(X, sample_weight, input_scaling):
+    """Return center and scale (d,) that map the columns of `X` to about [-1, 1]."""
+    n_inputs, eps = X.shape[1], np.finfo(X.dtype).eps
+    if input_scaling is None:
+        return np.zeros(n_inputs), np.ones(n_inputs)
+    if isinstance(input_scaling, str):
+        bounds = np.array([X.min(axis=0), X.max(axis=0)], dtype=np.float64)
+    else:
+        bounds = np.asarray(input_scaling, dtype=np.float64)
+    shaped = bounds.shape == (2, n_inputs) and np.isfinite(bounds).all()
+    if not shaped or (bounds[0] > bounds[1]).any():
+        raise ValueError(
+            f"`input_scaling` given as bounds must be a finite array [low, high] of shape "
+            f"(2, {n_inputs}) with low <= high, got {bounds.tolist()} of shape {bounds.shape}; "
+            f'give the limits of each column of `X`, or use "minmax".'
+        )
+    low, high = bounds / 2  # halved first: the widest range must not overflow
+    center, scale = low + high, high - low
+    # A column that is constant up to rounding has no range to divide by.
+    constant = scale <= 4 * eps * np.abs(center)
+    scale = np.where(constant, 1.0, scale)
+    if isinstance(input_scaling, str) and input_scaling == "standard":
+        u = (X - center) / scale
+        mean = np.average(u, axis=0, weights=sample_weight)
+        std = np.sqrt(np.average((u - mean) ** 2, axis=0, weights=sample_weight))
+        center, scale = center + mean * scale, scale * np.where(constant, 1.0, std)
+    return center, scale
+
+
+def check_rows(estimator, X, y, sample_weight, reset=True):
+    """Return `X`, float64 `y`, the weights, and the rows of positive weight; None for all."""
+    checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
+    X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
+    kept = None
+    if sample_weight is not None:
+        sample_weight = _check_sample_weight(
+            sample_weight, X, dtype=np.float64, ensure_non_negative=True
+        )
+        if not sample_weight.all():
+            kept = np.flatnonzero(sample_weight)
+    return X, y.astype(np.float64, copy=False), sample_weight, kept
+
+
+def draw_layer(params, X, sample_weight):
+    """Return the hidden layer that an estimator's parameters ask for, without a readout."""
+    rng, shape = check_random_state(params.random_state), (params.n_hidden, X.shape[1])
+    W = rng.uniform(-params.weight_scale, params.weight_scale, shape)
+    b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
+    layer = (W, b, *_scaling(X, sample_weight, params.input_scaling))
+    n_features = params.n_hidden + params.direct_link * X.shape[1]
+    return _without_readout(dict(zip(LAYER, layer, strict=True)), params.activation, n_features)
+
+
+def _without_readout(layer, activation, n_features):
+    # No outputs: the features come from the one kernel there is.
+    shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
+    blank = {name: np.zeros(shape) for name, shape in zip(READOUT, shapes, strict=True)}
+    return ELM({**layer, **blank}, activation)
+
+
+def gather(stats, elm, X, y, sample_weight, block_size):
+    """Return the statistics `stats` (None: of no rows) with the rows of `X` and `y` added."""
+    n_features = len(elm.output_weights)
+    n_columns = n_features + y.shape[1]
+    if stats is None:
+        stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
+    block_size = block_size or max(1, _BLOCK_ELEMENTS // n_columns)
+    with torch.no_grad():
+        stats = accumulate(stats, elm, X, y, sample_weight, block_size)
+    if not np.isfinite(stats.scatter[:, :n_features]).all():
+        raise ValueError(
+            "`X` and `y` must give finite sums of products of features and targets in float64, "
+            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
+        )
+    return stats
+
+
+def device_named(name):
+    """Return the torch device of that name (None: the CPU), where float64 works."""
+    try:
+        device = torch.device("cpu" if name is None else name)
+        torch.zeros(1, dtype=torch.float64, device=device).item()
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
+        raise RuntimeError(
+            f"`device` must name a device on which torch computes in float64 here, got "
+            f"{str(name)!r}; use device=None for the CPU."
+        ) from error
+    return device
+
+
+class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Extreme learning machine: a fixed random hidden layer, a readout by ridge regression.
+
+    ``f(x) = W_out sigma(W u + b)`` with `u` the inputs mapped to [-1, 1], W and b drawn once, and
+    ``W_out = (H' H + alpha 1)^-1 H' T`` (eq. 3 of [1]_). The defaults are those of [1]_.
+
+    The state is the mean and the scatter about it of features and targets, in float64 whatever the
+    data: rows can be added (`partial_fit`), two models can be added (`merge`), exactly.
+
+    Parameters
+    ----------
+    n_hidden : int, default=100
+        Number of hidden neurons H.
+    alpha : float or array-like of shape (n_outputs,), default=0.1
+        Weight of the penalty on the readout (lambda of [1]_), for all outputs or for each. With 0 a
+        singular system is solved by the readout of minimum norm.
+    activation : {"logistic", "tanh", "sin"}, default="logistic"
+        Activation function sigma.
+    input_scaling : {"minmax", "standard"}, None or array of shape (2, n_inputs), default="minmax"
+        Affine map of the inputs: the training range to [-1, 1], the training mean and standard
+        deviation to 0 and 1, none, or the given bounds [low, high] [unit of X] to [-1, 1]. The
+        first call of `partial_fit` fixes it, so give bounds for a stream, or to merge.
+    weight_scale : float, default=1.0
+        W and b are uniform in [-weight_scale, weight_scale].
+    fit_intercept : bool, default=False
+        Whether to fit an output bias, which is not penalised.
+    direct_link : bool, default=False
+        Whether the scaled inputs are features too, after the hidden neurons.
+    block_size : int, default=None
+        Rows computed at a time; None means about 4 MB of features.
+    device : str or torch.device, default=None
+        Where to compute; None means the CPU. A model unpickled where it is missing uses the CPU.
+    random_state : int, RandomState instance or None, default=None
+        Draws W and b. Models to be merged need the same int.
+
+    Attributes
+    ----------
+    input_weights_, input_bias_ : ndarray of shape (n_hidden, n_inputs) and (n_hidden,)
+        Hidden layer W and b.
+    input_center_, input_scale_ : ndarray of shape (n_inputs,)
+        ``u = (x - input_center_) / input_scale_`` [unit of X].
+    output_weights_, intercept_ : ndarray of shape (n_features, n_outputs) and (n_outputs,)
+        Readout [unit of y]; `n_features` is `n_hidden`, plus `n_inputs` with a direct link.
+    leverage_center_, leverage_factor_, leverage_offset_ : ndarray of the shapes in `module_`
+        As of `module_`; of the smallest `alpha`, if each output has its own.
+    noise_variance_ : ndarray of shape (n_outputs,)
+        Residual sum of squares over ``n - tr(G (G + alpha 1)^-1) - fit_intercept`` [unit of y^2]; G
+        the features' Gram matrix, n the sum of the sample weights. NaN if that leaves nothing.
+    n_samples_seen_ : float
+        Sum of the sample weights so far.
+    solver_ : {"cholesky", "eigh"}
+        What solved for the readout: "eigh" if the system was singular.
+    module_ : nn.Module
+        The fitted network as a torch module q -> eps.
+    n_features_in_ : int
+        Number of inputs.
+    feature_names_in_ : ndarray of shape (n_inputs,)
+        Names of the columns, if `X` had any.
+
+    References
+    ----------
+    .. [1] Reinhart, R. F., & Steil, J. J. (2016). Hybrid mechanical and data-driven modeling
+       improves inverse kinematic control of a soft robot. Procedia Technology, 26.
+    .. [2] Huang, G.-B., Zhu, Q.-Y., & Siew, C.-K. (2006). Extreme learning machine: theory and
+       applications. Neurocomputing, 70, 489-501.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin.learning.elm import ELMRegressor
+    >>> q = np.random.default_rng(0).uniform(0.1, 0.3, (500, 3))
+    >>> error = 0.01 * np.sin(20 * q[:, :2])
+    >>> elm = ELMRegressor(alpha=1e-6, random_state=0).fit(q, error)
+    >>> round(elm.score(q, error), 2)
+    1.0
+    >>> elm.jacobian(q).shape
+    (500, 2, 3)
+    """
+
+    n_features_in_: int
+    feature_names_in_: np.ndarray
+    input_center_: np.ndarray
+    input_scale_: np.ndarray
+    output_weights_: np.ndarray
+
+    _parameter_constraints = {  # noqa: RUF012
+        "n_hidden": [Interval(Integral, 1, None, closed="left")],
+        "alpha": [Interval(Real, 0, None, closed="left"), "array-like"],
+        "activation": [StrOptions(set(ACTIVATIONS))],
+        "input_scaling": [StrOptions({"minmax", "standard"}), None, "array-like"],
+        "weight_scale": [Interval(Real, 0, None, closed="neither")],
+        "fit_intercept": ["boolean"],
+        "direct_link": ["boolean"],
+        "block_size": [Interval(Integral, 1, None, closed="left"), None],
+        "device": [str, torch.device, None],
+        "random_state": ["random_state"],
+    }
+
+    def __init__(
+        self,
+        n_hidden=100,
+        alpha=0.1,
+        *,
+        activation="logistic",
+        input_scaling="minmax",
+        weight_scale=1.0,
+        fit_intercept=False,
+        direct_link=False,
+        block_size=None,
+        device=None,
+        random_state=None,
+    ):
+        self.n_hidden = n_hidden
+        self.alpha = alpha
+        self.activation = activation
+        self.input_scaling = input_scaling
+        self.weight_scale = weight_scale
+        self.fit_intercept = fit_intercept
+        self.direct_link = direct_link
+        self.block_size = block_size
+        self.device = device
+        self.random_state = random_state
+
+    @_fit_context(prefer_skip_nested_validation=True)
+    def fit(self, X, y, sample_weight=None):
+        """Draw the hidden layer and fit the readout, forgetting earlier rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Targets.
+        sample_weight : array-like of shape (n_samples,), default=None
+            How often each row counts; a row of weight 0 is absent, from the range of `X` too.
+
+        Returns
+        -------
+        self : ELMRegressor
+            The fitted estimator.
+        """
+        return self._learn(X, y, sample_weight, first=True)
+
+    @_fit_context(prefer_skip_nested_validation=True)
+    def partial_fit(self, X, y, sample_weight=None, decay=1.0):
+        """Add rows to those already seen; the result is that of one `fit` to all of them.
+
+        The first call draws the hidden layer and fixes the input scaling, for good.
+
+        Parameters
+        ----------
+        X, y, sample_weight : array-like of the shapes as for `fit`
+            The new rows, as for `fit`.
+        decay : float, default=1.0
+            Factor in (0, 1] on the weights of all earlier rows, to follow a drift.
+
+        Returns
+        -------
+        self : ELMRegressor
+            The fitted estimator.
+        """
+        if not isinstance(decay, Real) or not 0.0 < decay <= 1.0:
+            raise ValueError(
+                f"`decay` must lie in (0, 1], got {decay!r}; 1 forgets nothing, 0.99 forgets a "
+                f"hundredth of what earlier rows count."
+            )
+        return self._learn(X, y, sample_weight, first=not hasattr(self, "module_"), decay=decay)
+
+    def merge(self, other):
+        """Add the rows that `other` has seen; the result is that of one `fit` to all of them.
+
+        Parameters
+        ----------
+        other : ELMRegressor
+            A model with the same hidden layer and input scaling; it is left as it is.
+
+        Returns
+        -------
+        self : ELMRegressor
+            The fitted estimator.
+        """
+        if not isinstance(other, ELMRegressor):
+            raise TypeError(f"`other` must be a fitted ELMRegressor, got {type(other).__name__}.")
+        check_is_fitted(self, "module_")
+        check_is_fitted(other, "module_")
+        for name in (*(f"{name}_" for name in LAYER), "_activation", "feature_names_in_"):
+            if not np.array_equal(getattr(self, name, ()), getattr(other, name, ())):
+                raise ValueError(
+                    f"`other` must have this model's hidden layer, input scaling and columns, but "
+                    f"its {name.strip('_')} differs; give both models the same int as "
+                    f"`random_state`, the same parameters, and bounds as `input_scaling`."
+                )
+        if self.output_weights_.shape != other.output_weights_.shape:
+            raise ValueError(
+                f"`other` must have output_weights_ of shape {self.output_weights_.shape}, got "
+                f"{other.output_weights_.shape}; fit both models with the same `direct_link` and "
+                f"the same columns of `y`."
+            )
+        stats = merge(self._stats, other._stats)
+        return self._solve(stats, len(self.output_weights_), device_named(self.device))
+
+    def predict(self, X, return_std=False):
+        """Return the prediction at `X`, in the dtype of `X`.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+        return_std : bool, default=False
+            Whether to return the standard deviation of a new measurement as well.
+
+        Returns
+        -------
+        y : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Predictions, one-dimensional if the targets were.
+        std : ndarray of the shape of y
+            Only if `return_std`: ``sqrt(noise_variance_ * (1 + leverage(X)))``, the posterior
+            predictive of the Bayesian ridge with prior ``N(0, noise_variance_ / alpha)``.
+        """
+        if not return_std:
+            return self._map(X, lambda elm, q: (elm(q),))[0]
+        y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)))
+        noise = self.noise_variance_ if y.ndim == 2 else self.noise_variance_[0]
+        std = np.sqrt(np.multiply.outer(1 + leverage, noise))
+        return y, std.astype(y.dtype)
+
+    def jacobian(self, X):
+        """Return the derivative of the prediction by the inputs, in closed form.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        J : ndarray of shape (n_samples, n_inputs) or (n_samples, n_outputs, n_inputs)
+            Jacobians [unit of y per unit of X]; gradients if the targets were one-dimensional.
+        """
+        return self._map(X, lambda elm, q: (elm.jacobian(q),))[0]
+
+    def predict_and_jacobian(self, X):
+        """Return ``predict(X), jacobian(X)`` for the price of one hidden layer.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        y, J : ndarray of their shapes
+            As from `predict` and `jacobian`.
+        """
+        return self._map(X, lambda elm, q: elm.forward_and_jacobian(q))
+
+    def leverage(self, X):
+        """Return ``phi' (G + alpha 1)^-1 phi``, at most 1 on the training rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        leverage : ndarray of shape (n_samples,)
+            Influence that a row of weight 1 would have had on its own prediction [-]. With an
+            intercept the features are centred, and 1 / n is added.
+        """
+        return self._map(X, lambda elm, q: (elm.leverage(q),))[0]
+
+    def _learn(self, X, y, sample_weight, first, decay=1.0):
+        X, y, sample_weight, kept = check_rows(self, X, y, sample_weight, reset=first)
+        if kept is not None:
+            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]  # pyright: ignore
+        device = device_named(self.device)
+        y_ndim, y = y.ndim, y.reshape(len(y), -1)
+        if first:
+            elm, stats = draw_layer(self, X, sample_weight).to(device), None
+        else:
+            layer = {name: getattr(self, f"{name}_") for name in LAYER}
+            elm = _without_readout(layer, self._activation, len(self.output_weights_)).to(device)
+            n_outputs = self.output_weights_.shape[1]
+            if y.shape[1] != n_outputs:
+                raise ValueError(
+                    f"`y` must have {n_outputs} columns as in earlier calls, got {y.shape[1]}; "
+                    f"call `fit` to start afresh."
+                )
+            n, mean, scatter = self._stats
+            stats, y_ndim = Statistics(decay * n, mean, decay * scatter), self._y_ndim
+        stats = gather(stats, elm, X, y, sample_weight, self.block_size)
+        self._activation, self._y_ndim = elm.activation, y_ndim
+        for name in LAYER:
+            setattr(self, f"{name}_", getattr(elm, name).numpy(force=True))
+        return self._solve(stats, len(elm.output_weights), device)
+
+    def _solve(self, stats, n_features, device):
+        n_outputs = len(stats.mean) - n_features
+        if np.ndim(self.alpha):
+            alpha = np.asarray(self.alpha, dtype=np.float64)
+            if alpha.shape != (n_outputs,) or not (np.isfinite(alpha) & (alpha >= 0)).all():
+                raise ValueError(
+                    f"`alpha` must be a number >= 0, or {n_outputs} of them, one for each column "
+                    f"of `y`, got {self.alpha!r}."
+                )
+        readout, self.noise_variance_, self.solver_ = fit_readout(
+            stats, n_features, self.alpha, self.fit_intercept
+        )
+        if self.solver_ == "eigh":
+            warnings.warn(
+                f"The system of {n_features} features is singular at alpha={self.alpha}; solved "
+                f"by its eigenvectors. Raise `alpha` or lower `n_hidden`.",
+                linalg.LinAlgWarning,
+                stacklevel=2,
+            )
+        self._stats, self.n_samples_seen_ = stats, stats.n
+        for name, array in readout.items():
+            setattr(self, f"{name}_", array)
+        self._build(device)
+        return self
+
+    def _build(self, device):
+        arrays = {name: getattr(self, f"{name}_") for name in LAYER + READOUT}
+        self.module_ = ELM(arrays, self._activation).to(device)
+
+    def _map(self, X, function):
+        """Return the arrays that `function(module, q)` gives, computed block by block."""
+        check_is_fitted(self, "module_")
+        X = np.asarray(validate_data(self, X, reset=False, dtype=DTYPES, order="C"))
+        elm, outputs = self.module_, ()
+        width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
+        with torch.no_grad():
+            for rows in gen_batches(len(X), self.block_size or max(1, _BLOCK_ELEMENTS // width)):
+                q = torch.tensor(X[rows], dtype=torch.float64, device=elm.input_center.device)
+                parts = function(elm, q)
+                outputs = outputs or [np.empty((len(X), *p.shape[1:]), X.dtype) for p in parts]
+                for array, part in zip(outputs, parts, strict=True):
+                    array[rows] = part.cpu().numpy()
+        return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
+
+    def __getstate__(self):
+        # Arrays only: the same bytes whatever the device, and readable where it is missing.
+        return {name: value for name, value in super().__getstate__().items() if name != "module_"}
+
+    def __setstate__(self, state):
+        super().__setstate__(state)
+        if hasattr(self, "_stats"):
+            try:
+                device = device_named(self.device)
+            except RuntimeError:
+                device = torch.device("cpu")
+            self._build(device)

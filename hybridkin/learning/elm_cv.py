@@ -1,0 +1,396 @@
+"""Extreme learning machine whose complexity is chosen by its errors on rows left out."""
+
+from itertools import product
+from numbers import Integral
+from typing import Any, NamedTuple
+
+import numpy as np
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
+from sklearn.model_selection import GroupKFold, LeaveOneGroupOut, check_cv
+from sklearn.utils import check_random_state, gen_batches
+from sklearn.utils._param_validation import Interval, StrOptions
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from hybridkin.learning._left_out import LeftOut
+from hybridkin.learning.elm import (
+    DTYPES,
+    ELMRegressor,
+    check_rows,
+    device_named,
+    draw_layer,
+    gather,
+)
+
+__all__ = ["ELMRegressorCV"]
+
+_AUTO_ALPHAS = np.logspace(-11, 2, 40)  # times the largest eigenvalue of the features' Gram matrix
+_ZOOM = (0.5, 1.0, 2.0, 4.0)  # weight scales tried with new input scales, times the best so far
+_WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
+_LEAST_RELEVANCE = 0.01
+_ROWS_OF_JACOBIANS = 10_000
+_SHARED = (
+    *("activation", "input_scaling", "fit_intercept", "direct_link", "block_size", "device"),
+)
+
+
+class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Extreme learning machine that chooses penalty, weight scale, size and input scales itself.
+
+    Every choice is made by the mean squared error on rows that were left out, each alone or by
+    groups. These errors are exact for the given hidden layer and input scales, and come from one
+    factorisation for the whole grid of penalties: no model is fitted twice.
+
+    With rounds of relevance, each input is then scaled by how much the derivative along it varies
+    over the training rows, so that inputs that do nothing, or act linearly, do not spend hidden
+    neurons; with a direct link the linear part costs none. A round is kept where the error falls.
+
+    Parameters
+    ----------
+    n_hidden : int or sequence of int, default=500
+        Numbers of hidden neurons to try.
+    alphas : "auto" or array-like of shape (n_alphas,), default="auto"
+        Penalties to try; "auto" takes 40, from 1e-11 to 100 times the largest eigenvalue of the
+        features' Gram matrix.
+    weight_scales : sequence of float, default=(0.1, 0.2, 0.4, 0.8, 1.6)
+        Ranges of the random weights to try.
+    cv : int, splitter or iterable of (train, test), default=None
+        Which rows are left out together. None: each group where `fit` is given groups, else each
+        row alone.
+    alpha_per_target : bool, default=False
+        Whether each output gets its own penalty.
+    relevance_rounds : int, default=5
+        How often at most the inputs are rescaled by their relevance.
+    max_hidden : int, default=2000
+        Up to so many neurons their number is doubled, as long as the error falls by 2 %. With 0
+        only `n_hidden` is tried: fewer neurons make a faster model.
+    activation, input_scaling, fit_intercept, direct_link, block_size, device, random_state
+        As for `ELMRegressor`. One hidden layer is drawn for all weight scales.
+
+    Attributes
+    ----------
+    best_params_ : dict
+        ``ELMRegressor(**best_params_).fit(X, y)`` is the chosen model.
+    best_estimator_ : ELMRegressor
+        The chosen model, fitted to all rows.
+    best_score_ : float
+        Minus its mean squared error on rows left out [unit of y^2]. Being chosen by it, it is a
+        little optimistic.
+    alpha_ : float or ndarray of shape (n_outputs,)
+        The chosen penalty.
+    left_out_errors_ : ndarray of the shape of y
+        Target minus prediction of each row without it, under the chosen parameters [unit of y].
+        The mean, if a row was left out more than once; NaN, if never or of weight 0.
+    cv_results_ : dict of ndarray
+        One row per candidate: n_hidden, weight_scale, relevance (n_inputs,), alphas and
+        mean_squared_error, (n_alphas,) or, with a penalty per target, (n_alphas, n_outputs).
+    module_ : ELM
+        The fitted network as a torch module.
+    n_features_in_ : int
+        Number of inputs.
+    feature_names_in_ : ndarray of shape (n_inputs,)
+        Names of the columns, if `X` had any.
+
+    See Also
+    --------
+    ELMRegressor : The network itself; takes further rows by `partial_fit`.
+
+    References
+    ----------
+    .. [1] Allen, D. M. (1974). The relationship between variable selection and data augmentation
+       and a method for prediction. Technometrics, 16, 125-127.
+
+    Examples
+    --------
+    >>> from sklearn.datasets import make_friedman1
+    >>> from hybridkin import ELMRegressorCV
+    >>> X, y = make_friedman1(300, noise=0.1, random_state=0)
+    >>> elm = ELMRegressorCV(n_hidden=100, random_state=0).fit(X, y)
+    >>> X_new, y_new = make_friedman1(1000, random_state=1)
+    >>> bool(elm.score(X_new, y_new) > 0.99)
+    True
+    """
+
+    _parameter_constraints = {  # noqa: RUF012
+        "n_hidden": [Interval(Integral, 1, None, closed="left"), "array-like"],
+        "alphas": [StrOptions({"auto"}), "array-like"],
+        "weight_scales": ["array-like"],
+        "cv": ["cv_object"],
+        "alpha_per_target": ["boolean"],
+        "relevance_rounds": [Interval(Integral, 0, None, closed="left")],
+        "max_hidden": [Interval(Integral, 0, None, closed="left")],
+        **{name: ELMRegressor._parameter_constraints[name] for name in (*_SHARED, "random_state")},
+    }
+
+    def __init__(
+        self,
+        n_hidden=500,
+        alphas="auto",
+        weight_scales=(0.1, 0.2, 0.4, 0.8, 1.6),
+        *,
+        cv=None,
+        alpha_per_target=False,
+        relevance_rounds=5,
+        max_hidden=2000,
+        activation="logistic",
+        input_scaling="minmax",
+        fit_intercept=True,
+        direct_link=True,
+        block_size=None,
+        device=None,
+        random_state=None,
+    ):
+        self.n_hidden = n_hidden
+        self.alphas = alphas
+        self.weight_scales = weight_scales
+        self.cv = cv
+        self.alpha_per_target = alpha_per_target
+        self.relevance_rounds = relevance_rounds
+        self.max_hidden = max_hidden
+        self.activation = activation
+        self.input_scaling = input_scaling
+        self.fit_intercept = fit_intercept
+        self.direct_link = direct_link
+        self.block_size = block_size
+        self.device = device
+        self.random_state = random_state
+
+    @_fit_context(prefer_skip_nested_validation=True)
+    def fit(self, X, y, sample_weight=None, groups=None):
+        """Choose the parameters by rows left out, and fit them to all rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Targets.
+        sample_weight : array-like of shape (n_samples,), default=None
+            How often each row counts. One repetition is left out at a time, or what there is of
+            it; with groups all of them.
+        groups : array-like of shape (n_samples,), default=None
+            Rows that belong together, such as those of one motion; they are left out together.
+
+        Returns
+        -------
+        self : ELMRegressorCV
+            The fitted estimator.
+        """
+        X, y, sample_weight, kept = check_rows(self, X, y, sample_weight)
+        n_rows, y_shape = len(y), y.shape
+        if kept is not None:
+            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]  # pyright: ignore
+        if len(y) < 2:
+            raise ValueError(
+                f"`X` must have at least 2 rows of positive weight, so that one can be left out, "
+                f"got n_samples={len(y)}; ELMRegressor needs no choice."
+            )
+        splits = _splits(self.cv, y_shape, groups, kept)
+        task = _Task(X, y, y.reshape(len(y), -1), sample_weight, splits, self)
+        seed = self.random_state
+        if not isinstance(seed, Integral):
+            seed = int(check_random_state(seed).randint(2**31))
+        shared = {name: getattr(self, name) for name in _SHARED} | {"random_state": seed}
+        sizes = _positive(self.n_hidden, "n_hidden", integer=True)
+        scales = _positive(self.weight_scales, "weight_scales")
+        untouched, tried = np.ones(X.shape[1]), []
+        for size, scale in product(sizes, scales):
+            params = {**shared, "n_hidden": int(size), "weight_scale": float(scale)}
+            tried.append(_candidate(params, untouched, task))
+        best = min(tried, key=lambda candidate: candidate.score)
+        for _ in range(self.relevance_rounds):
+            relevance, bounds = _relevance(best, task)
+            before = best
+            for zoom in _ZOOM:
+                scale = zoom * before.params["weight_scale"]
+                params = {**before.params, "weight_scale": scale, "input_scaling": bounds}
+                tried.append(_candidate(params, relevance, task))
+            best = min(best, *tried[-len(_ZOOM) :], key=lambda candidate: candidate.score)
+            if best is before:
+                break
+        while 2 * best.params["n_hidden"] <= self.max_hidden:
+            params = {**best.params, "n_hidden": 2 * best.params["n_hidden"]}
+            tried.append(_candidate(params, best.relevance, task))
+            if not tried[-1].score < _WORTH_GROWING * best.score:
+                break
+            best = tried[-1]
+        self.alpha_ = best.params["alpha"]
+        self.best_params_, self.best_score_ = best.params, -best.score
+        self.best_estimator_ = ELMRegressor(**best.params).fit(X, y, sample_weight)
+        errors = _left_out_errors(best, task)
+        if kept is not None:
+            among = errors
+            errors = np.full((n_rows, errors.shape[1]), np.nan)
+            errors[kept] = among
+        self.left_out_errors_ = errors.reshape(y_shape)
+        self.cv_results_ = {
+            "n_hidden": np.array([candidate.params["n_hidden"] for candidate in tried]),
+            "weight_scale": np.array([candidate.params["weight_scale"] for candidate in tried]),
+            "relevance": np.array([candidate.relevance for candidate in tried]),
+            "alphas": np.array([candidate.alphas for candidate in tried]),
+            "mean_squared_error": np.array([candidate.mse for candidate in tried]),
+        }
+        return self
+
+    @property
+    def module_(self):
+        """The fitted network as a torch module."""
+        return self._best().module_
+
+    def predict(self, X, return_std=False):
+        """Return the prediction at `X`, as `ELMRegressor.predict` does."""
+        return self._best().predict(self._checked(X), return_std)
+
+    def jacobian(self, X):
+        """Return the derivative by the inputs, as `ELMRegressor.jacobian` does."""
+        return self._best().jacobian(self._checked(X))
+
+    def predict_and_jacobian(self, X):
+        """Return both, as `ELMRegressor.predict_and_jacobian` does."""
+        return self._best().predict_and_jacobian(self._checked(X))
+
+    def leverage(self, X):
+        """Return the leverage, as `ELMRegressor.leverage` does."""
+        return self._best().leverage(self._checked(X))
+
+    def _best(self):
+        check_is_fitted(self, "best_estimator_")
+        return self.best_estimator_
+
+    def _checked(self, X):
+        return validate_data(self, X, reset=False, dtype=DTYPES)
+
+
+class _Task(NamedTuple):
+    """Rows of positive weight, and which of them are left out together (None: each alone)."""
+
+    X: np.ndarray
+    y: np.ndarray
+    targets: np.ndarray  # y with two dimensions
+    sample_weight: np.ndarray | None
+    splits: list | None
+    settings: ELMRegressorCV
+
+
+class _Candidate(NamedTuple):
+    """A hidden layer, its errors under every penalty, and the parameters of the best."""
+
+    params: dict
+    relevance: np.ndarray
+    alphas: np.ndarray
+    mse: np.ndarray  # (n_alphas,) or (n_alphas, n_outputs)
+    score: float
+    left_out: LeftOut
+
+
+def _candidate(params, relevance, task):
+    X, _, targets, sample_weight, splits, settings = task
+    asked = ELMRegressor(**params)
+    elm = draw_layer(asked, X, sample_weight).to(device_named(asked.device))
+    stats = gather(None, elm, X, targets, sample_weight, asked.block_size)
+    left_out = LeftOut(elm, stats, X, targets, sample_weight, asked.fit_intercept)
+    alphas = settings.alphas
+    if isinstance(alphas, str):
+        alphas = _AUTO_ALPHAS * (left_out.eigenvalues[-1] or 1.0)
+    else:
+        alphas = _positive(alphas, "alphas")
+    total, weight = np.zeros((len(alphas), targets.shape[1])), 0.0
+    for rows, errors in _errors(left_out, len(X), splits, alphas):
+        w = np.ones(len(rows)) if sample_weight is None else sample_weight[rows]
+        total += np.einsum("r, lrm -> lm", w, errors * errors)
+        weight += w.sum()
+    mse = np.where(np.isfinite(total), total / weight, np.inf)
+    if not settings.alpha_per_target:
+        mse = mse.mean(axis=1)
+    alpha, score = alphas[mse.argmin(axis=0)], float(mse.min(axis=0).mean())
+    params = {**params, "alpha": alpha if settings.alpha_per_target else float(alpha)}
+    return _Candidate(params, relevance, alphas, mse, score, left_out)
+
+
+def _errors(left_out, n_rows, splits, alphas):
+    """Yield rows left out and their errors (n_alphas, n_rows, n_outputs)."""
+    if splits is not None:
+        for out, asked in splits:
+            yield asked, left_out.together(out, asked, alphas)
+    else:
+        for batch in gen_batches(n_rows, left_out.rows_at_a_time(len(alphas))):
+            rows = np.arange(batch.start, batch.stop)
+            yield rows, left_out.each(rows, alphas)
+
+
+def _left_out_errors(best, task):
+    n_outputs = task.targets.shape[1]
+    alphas, columns = np.unique(
+        np.broadcast_to(best.params["alpha"], n_outputs), return_inverse=True
+    )
+    total, count = np.zeros(task.targets.shape), np.zeros((len(task.X), 1))
+    for rows, errors in _errors(best.left_out, len(task.X), task.splits, alphas):
+        total[rows] += errors[columns, :, np.arange(n_outputs)].T
+        count[rows] += 1
+    return total / np.where(count > 0, count, np.nan)
+
+
+def _relevance(best, task):
+    """Return how much the derivative along each input varies, at most 1, and bounds to match.
+
+    It is measured in the units in which the inputs were scaled at first.
+    """
+    model = ELMRegressor(**best.params).fit(task.X, task.targets, task.sample_weight)
+    scale = model.input_scale_ * best.relevance
+    total, squares, weight = 0.0, 0.0, 0.0
+    for batch in gen_batches(len(task.X), _ROWS_OF_JACOBIANS):
+        J = model.jacobian(task.X[batch]) * scale
+        w = np.ones(len(J)) if task.sample_weight is None else task.sample_weight[batch]
+        total = total + np.tensordot(w, J, 1)
+        squares, weight = squares + np.tensordot(w, J * J, 1), weight + w.sum()
+    spread = np.sqrt(np.maximum(squares / weight - (total / weight) ** 2, 0.0).sum(axis=0))
+    relevance = np.maximum(spread / (spread.max() or 1.0), _LEAST_RELEVANCE)
+    center, half = model.input_center_, scale / relevance
+    return relevance, np.array([center - half, center + half])
+
+
+def _splits(cv, y_shape, groups, kept):
+    """Return (rows out, rows asked) of every split, counted among the rows kept."""
+    if groups is None and cv is None:
+        return None
+    if groups is not None:
+        groups = np.asarray(groups)
+        if groups.shape != y_shape[:1]:
+            raise ValueError(
+                f"`groups` must have shape ({y_shape[0]},), one entry for each row of `X`, got "
+                f"{groups.shape}."
+            )
+        if len(np.unique(groups)) < 2:
+            raise ValueError(
+                "`groups` must name at least 2 groups, to leave one out, got 1; without `groups` "
+                "single rows are left out."
+            )
+        if cv is None:
+            cv = LeaveOneGroupOut()
+        elif isinstance(cv, Integral):
+            cv = GroupKFold(int(cv))
+    rows = np.zeros(y_shape[0])
+    splits = []
+    splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
+    for train, test in splitter.split(rows, rows, groups):
+        used, asked = rows.astype(bool), rows.astype(bool)
+        used[train], asked[test] = True, True
+        if (used & asked).any():
+            raise ValueError(
+                "`cv` must not test on rows that it trains on, but a split of its own does; use a "
+                "splitter of sklearn.model_selection."
+            )
+        if kept is not None:
+            used, asked = used[kept], asked[kept]
+        if asked.any():
+            splits.append((np.flatnonzero(~used), np.flatnonzero(asked)))
+    return splits
+
+
+def _positive(values, name, integer=False):
+    array = np.atleast_1d(np.asarray(values))
+    kind = np.integer if integer else np.number
+    fits = array.ndim == 1 and array.size and np.issubdtype(array.dtype, kind)
+    if not fits or not (np.isfinite(array) & (array > 0)).all():
+        what = "positive integers" if integer else "positive numbers"
+        raise ValueError(f"`{name}` must be one or more {what}, got {values!r}.")
+    return array

@@ -1,0 +1,220 @@
+"""A random hidden layer and its readout as a torch module, with closed-form derivatives."""
+
+import numpy as np
+import torch
+from scipy.special import expit
+from torch import nn
+
+from hybridkin._core.blocks import in_blocks
+from hybridkin._core.model import ForwardModel
+
+_BLOCK = 2**17  # numbers in the hidden layer of a block of rows: a megabyte, so that it stays near
+
+# name -> sigma(a), and sigma'(a) from a and s = sigma(a)
+ACTIVATIONS = {
+    "logistic": (torch.sigmoid, lambda a, s: torch.addcmul(s, s, s, value=-1)),
+    "tanh": (torch.tanh, lambda a, s: 1 - s * s),
+    "sin": (torch.sin, lambda a, s: torch.cos(a)),
+}
+NUMPY_ACTIVATIONS = {
+    "logistic": (expit, lambda a, s: s - s * s),
+    "tanh": (np.tanh, lambda a, s: 1 - s * s),
+    "sin": (np.sin, lambda a, s: np.cos(a)),
+}
+
+LAYER = ("input_weights", "input_bias", "input_center", "input_scale")
+READOUT = ("output_weights", "intercept")
+READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
+
+
+class ELM(ForwardModel):
+    """A fitted network ``eps = phi(q) @ output_weights + intercept`` as a torch module.
+
+    ``phi(q) = sigma(W u + b)`` with the scaled input ``u = (q - input_center) / input_scale``,
+    followed by `u` itself where there is a direct link. Buffers only; batch dimensions lead; twice
+    differentiable; it computes in the dtype and on the device of `q`.
+
+    Parameters
+    ----------
+    arrays : mapping of str to array
+        What the state dict holds, so ``ELM(elm.state_dict(), elm.activation)`` is a copy:
+
+        - input_weights (n_hidden, n_inputs), input_bias (n_hidden,): the hidden layer W, b;
+        - input_center, input_scale (n_inputs,): affine map of the inputs [unit of q];
+        - output_weights (n_features, n_outputs), intercept (n_outputs,): the readout [unit of
+          eps], where `n_features` is `n_hidden`, plus `n_inputs` with a direct link;
+        - leverage_center (n_features,), leverage_factor (n_features, n_features), leverage_offset
+          (): ``leverage = |(phi - leverage_center) @ leverage_factor|^2 + leverage_offset``.
+    activation : {"logistic", "tanh", "sin"}, default="logistic"
+        The function sigma.
+    """
+
+    input_weights: torch.Tensor
+    input_bias: torch.Tensor
+    input_center: torch.Tensor
+    input_scale: torch.Tensor
+    output_weights: torch.Tensor
+    intercept: torch.Tensor
+    leverage_center: torch.Tensor
+    leverage_factor: torch.Tensor
+    leverage_offset: torch.Tensor
+    tangent: torch.Tensor
+
+    def __init__(self, arrays, activation="logistic"):
+        super().__init__()
+        self.activation = activation
+        for name in LAYER + READOUT:
+            value = arrays[name]
+            if isinstance(value, torch.Tensor):
+                value = value.detach().clone()
+            else:  # copied at once, or a read-only array would warn
+                value = torch.tensor(value, dtype=torch.float64)
+            self.register_buffer(name, value)
+        self.n_actuators, self.n_outputs = len(self.input_center), len(self.intercept)
+        self.register_buffer("tangent", None, persistent=False)
+        _refresh_tangent(self)
+        self.register_load_state_dict_post_hook(_refresh_tangent)
+
+    def extra_repr(self):
+        """Return the layer sizes and the activation, for printing."""
+        (n_hidden, n_inputs), n_outputs = self.input_weights.shape, len(self.intercept)
+        return f"{n_inputs} -> {n_hidden} {self.activation} -> {n_outputs}"
+
+    def _hidden(self, q, out=None):
+        n_inputs = len(self.input_center)
+        if q.ndim == 0 or q.shape[-1] != n_inputs or not q.is_floating_point():
+            raise ValueError(
+                f"`q` must be a floating-point tensor of shape (..., {n_inputs}), got {q.dtype} of "
+                f"shape {tuple(q.shape)}; this ELM was fitted on {n_inputs} inputs."
+            )
+        # Folding the scaling into W and b would cancel digits where the range is narrow.
+        u = (q - self.input_center.to(q)) / self.input_scale.to(q)
+        W, b = self.input_weights.to(q), self.input_bias.to(q)
+        a = nn.functional.linear(u, W, b) if out is None else torch.addmm(b, u, W.T, out=out)
+        return u, a, ACTIVATIONS[self.activation][0](a, out=out)
+
+    def _write_features(self, q, out):
+        # In place: a large temporary per block would fragment the heap by hundreds of megabytes.
+        n_hidden = len(self.input_weights)
+        u, _, _ = self._hidden(q, out[:, :n_hidden])
+        if len(self.output_weights) > n_hidden:
+            out[:, n_hidden:] = u
+
+    def _features(self, u, s):
+        return torch.cat((s, u), -1) if len(self.output_weights) > s.shape[-1] else s
+
+    def _readout(self, u, s):
+        weights, intercept = self.output_weights.to(s), self.intercept.to(s)
+        return nn.functional.linear(self._features(u, s), weights.T, intercept)
+
+    def _slope(self, a, s):
+        slope = ACTIVATIONS[self.activation][1](a, s)
+        J = (self.tangent.to(s) @ slope.T).T.unflatten(-1, (len(self.intercept), -1))
+        if len(self.output_weights) > s.shape[-1]:
+            J = J + (self.output_weights[s.shape[-1] :].T / self.input_scale).to(s)
+        return J
+
+    def features(self, q):
+        """Return the features `phi`, shape (..., n_features), of `q`, shape (..., n_inputs)."""
+        u, _, s = self._hidden(q)
+        return self._features(u, s)
+
+    def forward(self, q):
+        """Return the output `eps`, shape (..., n_outputs), at `q`, shape (..., n_inputs)."""
+        u, _, s = self._hidden(q)
+        return self._readout(u, s)
+
+    def jacobian(self, q):
+        """Return ``J[..., i, j] = d eps_i / d q_j``, shape (..., n_outputs, n_inputs)."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q):
+        """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
+        x, J, _ = self.forward_jacobian_and(q, lambda features: features[..., :0])
+        return x, J
+
+    def forward_jacobian_and(self, q, function):
+        """Return ``forward(q), jacobian(q), function(features(q))``, the last of shape (..., k)."""
+
+        def rows(q):
+            u, a, s = self._hidden(q)
+            return self._readout(u, s), self._slope(a, s), function(self._features(u, s))
+
+        return in_blocks(rows, q, max(1, _BLOCK // len(self.input_weights)))
+
+    def leverage(self, q):
+        """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
+        r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
+        return (r * r).sum(-1) + self.leverage_offset.to(q)
+
+    def leverage_and_gradient(self, q):
+        """Return the leverage (...) and its derivative by `q` (..., n_inputs) in closed form."""
+        u, a, s = self._hidden(q)
+        factor = self.leverage_factor.to(q)
+        r = (self._features(u, s) - self.leverage_center.to(q)) @ factor
+        by_features = 2 * r @ factor.T
+        n_hidden = s.shape[-1]
+        by_a = by_features[..., :n_hidden] * ACTIVATIONS[self.activation][1](a, s)
+        gradient = by_a @ self.input_weights.to(q)
+        if by_features.shape[-1] > n_hidden:
+            gradient = gradient + by_features[..., n_hidden:]
+        return (r * r).sum(-1) + self.leverage_offset.to(q), gradient / self.input_scale.to(q)
+
+    def leverage_is_below(self, limit, features):
+        """Return where the leverage is certainly below `limit`, shape (...), bool.
+
+        In single precision, at half the price; what is close to the limit is left out.
+        """
+        center, factor = self.leverage_center.float(), self.leverage_factor.float()
+        single = features.float()
+        half = torch.addmm(-center @ factor, single, factor)
+        rounding = 8 * len(center) ** 0.5 * torch.finfo(torch.float32).eps * factor.norm()
+        bound = half.norm(dim=-1) + rounding * (single.norm(dim=-1) + center.norm())
+        return bound < (limit - self.leverage_offset).clamp(min=0.0).sqrt()
+
+    def numpy_function(self, limit=None):
+        """Return a NumPy function of one configuration, without torch's overhead.
+
+        It maps `q` of shape (n_inputs,) to ``eps`` (n_outputs,) and its Jacobian (n_outputs,
+        n_inputs), in float64. With a `limit` it also gives the leverage and, where that is above
+        the limit, its gradient (n_inputs,), else None. It keeps the present arrays.
+        """
+        names = (*LAYER, *READOUT, "tangent")
+        arrays = (getattr(self, name).detach().cpu().double().numpy().copy() for name in names)
+        W, b, center, scale, weights, intercept, mean, factor, offset, tangent = arrays
+        activation, derivative = NUMPY_ACTIVATIONS[self.activation]
+        readout, shape = weights.T.copy(), (len(intercept), len(center))
+        direct = weights[len(W) :].T / scale if len(weights) > len(W) else None
+
+        def function(q):
+            u = (q - center) / scale
+            a = W.dot(u) + b
+            s = activation(a)
+            slope = derivative(a, s)
+            phi = s if direct is None else np.concatenate((s, u))
+            x, J = readout.dot(phi) + intercept, tangent.dot(slope).reshape(shape)
+            if direct is not None:
+                J = J + direct
+            if limit is None:
+                return x, J
+            r = (phi - mean).dot(factor)
+            leverage, gradient = float(r.dot(r) + offset), None
+            if leverage > limit:
+                by_phi = 2.0 * factor.dot(r)
+                by_u = (by_phi[: len(s)] * slope).dot(W)
+                gradient = (by_u if direct is None else by_u + by_phi[len(s) :]) / scale
+            return x, J, leverage, gradient
+
+        return function
+
+    def numpy_leverage(self, limit):
+        """Return a NumPy function of one configuration: leverage, and its gradient or None."""
+        function = self.numpy_function(limit)
+        return lambda q: function(q)[2:]
+
+
+def _refresh_tangent(elm, incompatible_keys=None):
+    # J = T @ sigma' with T = w_out (x) w_in
+    w_in = elm.input_weights / elm.input_scale
+    w_out = elm.output_weights[: len(w_in)]
+    elm.tangent = (w_out.T[:, None] * w_in.T).flatten(0, 1)

@@ -1,0 +1,367 @@
+"""Fitted scikit-learn regressors as torch modules, with closed-form Jacobians where there are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process import kernels as gp
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import ElasticNet, LinearRegression, Ridge, RidgeCV
+from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from hybridkin._core.blocks import in_blocks
+from hybridkin._core.model import ForwardModel
+
+__all__ = ["AffineModule", "KernelModule", "PolynomialModule", "RegressorModule", "error_module"]
+
+_LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
+_KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
+
+
+def error_module(regressor: Any, q: Tensor) -> nn.Module:
+    """Return a fitted regressor as a torch module q (..., n) -> (..., m) with ``jacobian``.
+
+    Parameters
+    ----------
+    regressor : estimator
+        With a torch ``module_`` of its own; or a linear model, also on `PolynomialFeatures`, or a
+        `KernelRidge` or `GaussianProcessRegressor` with an RBF kernel, each also behind standard
+        or min-max scalers: in closed form. Else its ``predict`` is differenced.
+    q : Tensor of shape (N, n)
+        The rows that it was fitted on.
+    """
+    module = getattr(regressor, "module_", None)
+    if isinstance(module, nn.Module):
+        return module
+    steps: list[Any] = [regressor]
+    if isinstance(regressor, Pipeline):
+        steps = [step for _, step in regressor.steps]
+    center, scale = np.zeros(q.shape[1]), np.ones(q.shape[1])
+    while len(steps) > 1 and (found := _affine(steps[0])) is not None:
+        center, scale = center + scale * found[0], scale * found[1]
+        steps = steps[1:]
+    readout, polynomial = steps[-1], len(steps) == 2 and isinstance(steps[0], PolynomialFeatures)
+    if len(steps) == 1 and isinstance(readout, _LINEAR):
+        coef = np.atleast_2d(np.asarray(readout.coef_)) / scale
+        return AffineModule(coef, readout.intercept_ - coef @ center)
+    if polynomial and isinstance(readout, _LINEAR):
+        coef, intercept = np.asarray(readout.coef_), readout.intercept_
+        return PolynomialModule(steps[0].powers_, coef, intercept, center, scale)
+    if len(steps) == 1 and (expansion := _expansion(readout)) is not None:
+        rows, weights, widths, bias = expansion
+        return KernelModule(rows, weights, bias, center, scale, widths)
+    return RegressorModule(regressor, q)
+
+
+class AffineModule(ForwardModel):
+    """A fitted linear regressor as a torch module.
+
+    Parameters
+    ----------
+    coef : array-like of shape (m, n) or (n,)
+        Coefficients.
+    intercept : array-like of shape (m,) or float
+        Value at q = 0.
+    """
+
+    coef: Tensor
+    bias: Tensor
+
+    def __init__(self, coef: ArrayLike, intercept: ArrayLike) -> None:
+        super().__init__()
+        matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64).contiguous()
+        bias = torch.tensor(np.asarray(intercept), dtype=torch.float64)
+        self.register_buffer("coef", matrix)
+        self.register_buffer("bias", bias.expand(len(matrix)).clone())
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return coef q + bias, shape (..., m)."""
+        return q @ self.coef.to(q).mT + self.bias.to(q)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return the constant matrix for every row, shape (..., m, n)."""
+        coef = self.coef.to(q)
+        return coef.expand(*q.shape[:-1], *coef.shape)
+
+    def numpy_function(self) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
+        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
+        coef, bias = (part.cpu().double().numpy().copy() for part in (self.coef, self.bias))
+        return lambda q: (coef.dot(q) + bias, coef.copy())
+
+
+class PolynomialModule(ForwardModel):
+    """A polynomial ``coef @ phi(u) + intercept`` of ``u = (q - center) / scale``.
+
+    The derivative of a monomial is another one: the Jacobian is a second readout of the same
+    features.
+
+    Parameters
+    ----------
+    powers : array-like of int of shape (P, n)
+        Exponents of the monomials.
+    coef : array-like of shape (m, P) or (P,)
+        Their coefficients.
+    intercept : array-like of shape (m,) or float
+        Added to the sum.
+    center, scale : array-like of shape (n,)
+        Map of the inputs [unit of q].
+    """
+
+    powers: Tensor
+    readout: Tensor
+    slope: Tensor
+    center: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        powers: ArrayLike,
+        coef: ArrayLike,
+        intercept: ArrayLike,
+        center: ArrayLike,
+        scale: ArrayLike,
+    ) -> None:
+        super().__init__()
+        monomials = [tuple(map(int, row)) for row in np.asarray(powers)]
+        coef, n = np.atleast_2d(coef), np.asarray(powers).shape[1]
+        where: dict[tuple[int, ...], int] = {}
+        for monomial in [(0,) * n, *monomials, *_lowered(monomials)]:
+            where.setdefault(monomial, len(where))
+        readout, slope = np.zeros((len(where), len(coef))), np.zeros((len(where), len(coef), n))
+        readout[0] = intercept
+        for k, monomial in enumerate(monomials):
+            readout[where[monomial]] += coef[:, k]
+            for j, power in enumerate(monomial):
+                if power:
+                    slope[where[_lower(monomial, j)], :, j] += power * coef[:, k]
+        slope /= np.asarray(scale)
+        for name, array in (
+            ("readout", readout),
+            ("slope", slope.reshape(len(where), -1)),
+            ("center", center),
+            ("scale", scale),
+        ):
+            self.register_buffer(name, torch.tensor(np.asarray(array), dtype=torch.float64))
+        self.register_buffer("powers", torch.tensor(list(where)))
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the polynomial, shape (..., m)."""
+        return self._monomials(q) @ self.readout.to(q)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return its derivative, shape (..., m, n)."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return both for the price of one set of features."""
+        x, J = in_blocks(self._forward_and_jacobian, q)
+        return x, J
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        phi = self._monomials(q)
+        J = phi @ self.slope.to(q)
+        return phi @ self.readout.to(q), J.unflatten(-1, (-1, q.shape[-1]))
+
+    def _monomials(self, q: Tensor) -> Tensor:
+        u = (q - self.center.to(q)) / self.scale.to(q)
+        phi = torch.ones_like(u[..., :1]).expand(*u.shape[:-1], len(self.powers))
+        of_each = [torch.ones_like(u)]
+        for _ in range(int(self.powers.max())):
+            of_each.append(of_each[-1] * u)
+        table = torch.stack(of_each, dim=-1)
+        for j in range(u.shape[-1]):
+            phi = phi * table[..., j, :].index_select(-1, self.powers[:, j])
+        return phi
+
+
+class KernelModule(ForwardModel):
+    """A sum of Gaussians ``weights' exp(-|(u - u_i) / widths|^2 / 2) + bias`` at training rows.
+
+    Parameters
+    ----------
+    rows : array-like of shape (N, n)
+        Scaled inputs u_i of the training rows.
+    weights : array-like of shape (N, m)
+        Their weights.
+    bias : array-like of shape (m,) or float
+        Added to the sum.
+    center, scale : array-like of shape (n,)
+        ``u = (q - center) / scale`` [unit of q].
+    widths : array-like of shape (n,) or float
+        Widths of the Gaussians along each u.
+    """
+
+    rows: Tensor
+    weights: Tensor
+    tangent: Tensor
+    bias: Tensor
+    center: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        rows: ArrayLike,
+        weights: ArrayLike,
+        bias: ArrayLike,
+        center: ArrayLike,
+        scale: ArrayLike,
+        widths: ArrayLike,
+    ) -> None:
+        super().__init__()
+        at, heights = np.asarray(rows) / np.asarray(widths), np.asarray(weights)
+        tangent = heights[:, :, None] * at[:, None, :]
+        for name, array in (
+            ("rows", at),
+            ("weights", heights),
+            ("tangent", tangent.reshape(len(at), -1)),
+            ("bias", np.broadcast_to(bias, heights.shape[1])),
+            ("center", center),
+            ("scale", np.asarray(scale) * widths),
+        ):
+            self.register_buffer(name, torch.tensor(np.asarray(array), dtype=torch.float64))
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the sum, shape (..., m)."""
+        return in_blocks(self._forward, q, self._block)[0]
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return its derivative, shape (..., m, n)."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return both for the price of one kernel matrix."""
+        x, J = in_blocks(self._forward_and_jacobian, q, self._block)
+        return x, J
+
+    @property
+    def _block(self) -> int:
+        return max(1, _KERNEL_BLOCK // len(self.rows))
+
+    def _kernel(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        u, rows = (q - self.center.to(q)) / self.scale.to(q), self.rows.to(q)
+        squares = u.square().sum(-1, keepdim=True) + rows.square().sum(-1)
+        distances = (squares - 2.0 * (u @ rows.mT)).clamp(min=0.0)
+        return u, torch.exp(-0.5 * distances)
+
+    def _forward(self, q: Tensor) -> tuple[Tensor]:
+        return (self._kernel(q)[1] @ self.weights.to(q) + self.bias.to(q),)
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        u, kernel = self._kernel(q)
+        value = kernel @ self.weights.to(q)
+        towards = (kernel @ self.tangent.to(q)).unflatten(-1, (-1, q.shape[-1]))
+        J = (towards - value[..., None] * u[..., None, :]) / self.scale.to(q)
+        return value + self.bias.to(q), J
+
+
+class RegressorModule(ForwardModel):
+    """Any fitted scikit-learn regressor as a torch module, its Jacobian by central differences.
+
+    The step is the cube root of machine precision times the training range of each input, which
+    leaves a relative error near 1e-10 for smooth regressors. Trees are piecewise constant: their
+    Jacobian is zero almost everywhere.
+    """
+
+    def __init__(self, regressor: Any, q: Tensor) -> None:
+        super().__init__()
+        self.regressor = regressor
+        width = (q.amax(0) - q.amin(0)).numpy()
+        self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(width > 0, width, 1.0)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the regressor's prediction, shape (..., m)."""
+        return _Differenced.apply(q, self)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Return dx/dq, shape (..., m, n)."""
+        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
+        columns = []
+        for j, step in enumerate(self._step):
+            move = np.zeros(rows.shape[1])
+            move[j] = step
+            columns.append((self._predict(rows + move) - self._predict(rows - move)) / (2 * step))
+        J = torch.from_numpy(np.stack(columns, axis=-1)).to(q)
+        return J.reshape(*q.shape[:-1], *J.shape[1:])
+
+    def evaluate(self, q: Tensor) -> Tensor:
+        """Return the prediction outside any graph, shape (..., m)."""
+        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
+        x = torch.from_numpy(self._predict(rows)).to(q)
+        return x.reshape(*q.shape[:-1], x.shape[-1])
+
+    def _predict(self, rows: NDArray) -> NDArray:
+        return np.asarray(self.regressor.predict(rows), dtype=np.float64).reshape(len(rows), -1)
+
+
+class _Differenced(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, module: RegressorModule) -> Tensor:
+        ctx.save_for_backward(q)
+        ctx.module = module
+        return module.evaluate(q)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore
+        (q,) = ctx.saved_tensors
+        return (grad[..., None, :] @ ctx.module.jacobian(q))[..., 0, :], None
+
+
+def _affine(step: Any) -> tuple[Any, Any] | None:
+    """Return center and scale of a fitted scaler, u = (q - center) / scale."""
+    settings, fitted = step.get_params() if hasattr(step, "get_params") else {}, step
+    if isinstance(step, StandardScaler):
+        center = fitted.mean_ if settings["with_mean"] else 0.0
+        return center, fitted.scale_ if settings["with_std"] else 1.0
+    if isinstance(step, MinMaxScaler) and not settings["clip"]:
+        return -fitted.min_ / fitted.scale_, 1.0 / fitted.scale_
+    return None
+
+
+def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
+    """Return rows, weights, widths and bias of a regressor with a Gaussian kernel."""
+    kind = type(fitted)
+    if kind is KernelRidge and fitted.kernel == "rbf":
+        rows, weights = fitted.X_fit_, fitted.dual_coef_
+        gamma = fitted.gamma if fitted.gamma is not None else 1.0 / rows.shape[1]
+        return rows, weights.reshape(len(rows), -1), (2.0 * gamma) ** -0.5, 0.0
+    if kind is GaussianProcessRegressor and hasattr(fitted, "alpha_"):
+        found = _gaussian(fitted.kernel_)
+        if found is not None:
+            height, widths = found
+            rows = fitted.X_train_
+            weights = height * fitted.alpha_.reshape(len(rows), -1) * fitted._y_train_std
+            return rows, weights, widths, fitted._y_train_mean
+    return None
+
+
+def _gaussian(kernel: Any) -> tuple[float, Any] | None:
+    """Return height and widths of a kernel, if between different rows it is a Gaussian."""
+    if type(kernel) is gp.RBF:  # a Matern kernel is one to isinstance
+        return 1.0, kernel.length_scale
+    if isinstance(kernel, gp.Sum):
+        for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):
+            if isinstance(other, gp.WhiteKernel):
+                return _gaussian(one)
+    if isinstance(kernel, gp.Product):
+        for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):
+            found = _gaussian(one)
+            if isinstance(other, gp.ConstantKernel) and found is not None:
+                return other.constant_value * found[0], found[1]
+    return None
+
+
+def _lower(monomial: tuple[int, ...], j: int) -> tuple[int, ...]:
+    return (*monomial[:j], monomial[j] - 1, *monomial[j + 1 :])
+
+
+def _lowered(monomials: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
+    return [_lower(row, j) for row in monomials for j, power in enumerate(row) if power]

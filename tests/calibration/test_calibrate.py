@@ -1,0 +1,628 @@
+import math
+import re
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, RigidChain, calibrate, datasets
+from hybridkin.calibration._parameters import Problem, parameter_names
+
+# The plain chain makes most tips itself here: tendons pulled at random mean no slack.
+pytestmark = pytest.mark.filterwarnings("ignore:.* pull the tendons of a segment together")
+
+RADII = [0.100, 0.093, 0.079]
+THIRD = 2 * math.pi / 3
+ENTRY = {"turns": "angles", "tool": "offsets"}  # what an alias moves
+
+
+def planted_base():
+    base = torch.eye(4, dtype=torch.float64)
+    rotation = Rotation.from_rotvec([0.5, -1.2, 2.0]).as_matrix()
+    base[:3, :3] = torch.from_numpy(rotation)
+    base[:3, 3] = torch.tensor([0.3, -0.2, 1.0])
+    return base
+
+
+def uniform(rng, *shape):
+    return 2 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1
+
+
+def gauss(rng, *shape):
+    return torch.randn(*shape, generator=rng, dtype=torch.float64)
+
+
+def chambers(rng, n=100, n_actuators=9):
+    return 0.25 + 0.06 * uniform(rng, n, n_actuators)
+
+
+def tendons(rng, n=100, n_actuators=9):
+    return 0.003 * uniform(rng, n, n_actuators)
+
+
+def trunk(radii=RADII, **geometry):
+    return ConstantCurvatureChain(radii, **geometry)
+
+
+def tendon_robot(radii=(0.005, 0.0045, 0.004), lengths=(0.06, 0.07, 0.05), **geometry):
+    return ConstantCurvatureChain(radii, lengths=lengths, **geometry)
+
+
+def nominal_tendon_robot(**geometry):
+    return tendon_robot([0.0045] * 3, [0.06] * 3, **geometry)
+
+
+def arm(**geometry):
+    """Six joints at different places about different axes."""
+    places = np.array([[0, 0, 30], [10, 0, 5], [0, 5, 25], [8, 0, 20], [0, 0, 10], [5, 0, 0]])
+    axes = [[0, 0, 1], [0, 1, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0]]
+    origins = np.tile(np.eye(4), (6, 1, 1))
+    origins[:, :3, 3] = 0.01 * places
+    return RigidChain(origins, axes, **geometry)
+
+
+def rings(turns, clockwise=()):
+    """Angles of three actuators per segment; segments in `clockwise` run the other way round."""
+    steps = [-THIRD if k in clockwise else THIRD for k in range(len(turns))]
+    return [[turn + step * i for i in range(3)] for turn, step in zip(turns, steps, strict=True)]
+
+
+def difference(angles, others):
+    """Differences of angles, in [-pi, pi)."""
+    return (angles - others + math.pi).remainder(2 * math.pi) - math.pi
+
+
+# Truth, start, draw, parameters, and what the data leave open.
+ZEROS = [0.004, -0.002, 0.001, 0.003, 0.0, -0.005, 0.002, 0.002, -0.003]
+RESTS = [[0.1, -0.2], [0.3, 0.05], [-0.1, 0.15]]
+PLANTED = {
+    "tendons, routing base": (
+        tendon_robot(routing="base", angles=rings([0.1, 0.3, 0.8]), offsets=[0, 0, 0.02]),
+        nominal_tendon_robot(routing="base"),
+        tendons,
+        ("radii", "lengths", "turns", "tool"),
+    ),
+    "tendons, base": (
+        tendon_robot(offsets=[0, 0, 0.02], base=planted_base()),
+        nominal_tendon_robot(),
+        tendons,
+        ("radii", "lengths", "base", "tool"),
+    ),
+    "every angle": (
+        tendon_robot(angles=[[0.0, 2.0, 4.3], [0.3, 2.5, 4.4], [0.8, 3.0, 4.9]], routing="base"),
+        nominal_tendon_robot(routing="base"),
+        tendons,
+        ("radii", "lengths", "angles"),
+    ),
+    "rest bends": (
+        tendon_robot(rest_bends=RESTS, base=planted_base()),
+        nominal_tendon_robot(),
+        tendons,
+        ("radii", "lengths", "rest_bends", "base"),
+    ),
+    "actuator zeros": (
+        trunk(actuator_zeros=ZEROS),
+        trunk([0.09] * 3),
+        chambers,
+        ("radii", "actuator_zeros"),
+    ),
+    "offsets": (
+        trunk(offsets=[0.03, 0.02, 0.1]),
+        trunk([0.09] * 3),
+        chambers,
+        ("radii", "offsets"),
+    ),
+    "extensible": (
+        trunk(base=planted_base(), offsets=[0.0, 0.0, 0.12]),
+        trunk([0.11, 0.08, 0.09]),
+        chambers,
+        ("radii", "base", "tool"),
+    ),
+    "arm": (
+        arm(base=planted_base(), tool=[0.02, -0.03, 0.15]),
+        arm(),
+        lambda rng: uniform(rng, 100, 6),
+        ("base", "tool"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", PLANTED)
+def test_planted_geometry_is_recovered_from_exact_data(case, rng):
+    truth, start, draw, names = PLANTED[case]
+    before = {name: value.clone() for name, value in start.geometry().items()}
+    q = draw(rng)
+    result = calibrate(start, q, truth(q), names)
+    assert result.converged
+    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
+    for name, value in result.chain.geometry().items():
+        assert_close(value, truth.geometry()[name], rtol=0, atol=1e-9, msg=name)
+    assert all(result.identifiable[name].all() for name in names)
+    assert result.unidentified == ()
+    for name, value in start.geometry().items():
+        assert_close(value, before[name], rtol=0, atol=0)
+
+
+def test_a_common_turn_of_all_rings_is_a_turn_of_the_base(rng):
+    q = tendons(rng)
+    geometry = {"routing": "base", "offsets": [0.0, 0.0, 0.02], "base": planted_base()}
+    truth = tendon_robot(angles=rings([0.0, 0.3, 0.8]), **geometry)
+    start = nominal_tendon_robot(routing="base")
+    result = calibrate(start, q, truth(q), ("radii", "lengths", "turns", "base", "tool"))
+    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
+    for name in ("radii", "lengths", "offsets"):
+        assert_close(result.chain.geometry()[name], truth.geometry()[name], rtol=0, atol=1e-9)
+    turns = result.values["turns"]
+    known = difference(turns - turns[0], torch.tensor([0.0, 0.3, 0.8], dtype=torch.float64))
+    assert_close(known, torch.zeros(3).double(), rtol=0, atol=1e-9)
+    # The base has turned about its own axis to make up for it.
+    turned = result.chain.base @ rotation_about_z(turns[0]) @ torch.linalg.inv(truth.base)
+    assert_close(turned, torch.eye(4).double(), rtol=0, atol=1e-9)
+    assert not result.identifiable["turns"].any()
+    assert result.identifiable["radii"].all()
+
+
+def rotation_about_z(angle):
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.0, 0.0, float(angle)]).as_matrix())
+    return pose
+
+
+@pytest.mark.parametrize("lengths", [None, [0.06, 0.05]])
+def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
+    radii = [0.1, 0.08] if lengths is None else [0.005, 0.004]
+    draw, scale = (chambers, 1.0) if lengths is None else (tendons, 0.1)
+    q, zeros = draw(rng, n_actuators=8), scale * torch.tensor(ZEROS[:8]).double()
+    truth = trunk(radii, n_actuators=4, lengths=lengths, actuator_zeros=zeros)
+    start = trunk([1.1 * radii[0], 0.9 * radii[1]], n_actuators=4, lengths=lengths)
+    result = calibrate(start, q, truth(q), ("radii", "actuator_zeros"))
+    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
+    assert_close(result.chain.radii, truth.radii, rtol=0, atol=1e-9)
+    assert_close(result.chain.arc_offset, truth.arc_offset, rtol=0, atol=1e-9)
+    assert len(result.unidentified) == (2 if lengths is None else 4)
+    for sentence in result.unidentified:  # each about one segment alone, and its actuators
+        indices = {int(index) for index in re.findall(r"\[(\d)\]", sentence)}
+        assert indices <= {0, 1, 2, 3} or indices <= {4, 5, 6, 7}
+        assert "does not move the tips" in sentence
+
+
+def test_beyond_a_tip_along_the_robot_nothing_is_told(rng):
+    q = tendons(rng)
+    truth = tendon_robot(base=planted_base(), offsets=[0.01, 0.02, 0.0]).with_tip(1.5)
+    start = nominal_tendon_robot().with_tip(1.5)
+    result = calibrate(start, q, truth(q), ("radii", "lengths", "offsets", "base"))
+    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
+    assert_close(result.chain.radii[:2], truth.radii[:2], rtol=0, atol=1e-9)
+    assert_close(result.chain.lengths[:2], truth.lengths[:2], rtol=0, atol=1e-9)
+    assert_close(result.chain.offsets[0], truth.offsets[0], rtol=0, atol=1e-9)
+    assert_close(result.chain.base, truth.base, rtol=0, atol=1e-9)
+    unseen = {"radii[2]", "lengths[2]", "offsets[1]", "offsets[2]"}
+    assert {sentence.split(" ")[0] for sentence in result.unidentified} == unseen
+    assert float(result.chain.radii[2]) == pytest.approx(0.0045, rel=1e-9)
+
+
+KINDS = [
+    (lengths, routing, n, tip)
+    for lengths in (None, [0.06, 0.05])
+    for routing in ("segment", "base")
+    for n in (3, 4)
+    for tip in (2.0, 1.5, 1.0)
+]
+
+
+def any_robot(lengths, routing, n, tip, rng):
+    """A robot whose geometry is nowhere zero, and 7 configurations."""
+    scale = 1.0 if lengths is None else 0.05
+    chain = ConstantCurvatureChain(
+        scale * torch.tensor([0.1, 0.08]),
+        n_actuators=n,
+        angles=[(2 * math.pi / n) * torch.arange(n) + 0.2 * uniform(rng, n) for _ in range(2)],
+        lengths=lengths,
+        routing=routing,
+        offsets=[0.1 * scale, 0.2 * scale],
+        rest_bends=0.2 * uniform(rng, 2, 2),
+        actuator_zeros=0.01 * scale * uniform(rng, 2 * n),
+        base=planted_base(),
+    ).with_tip(tip)
+    draw = chambers if lengths is None else tendons
+    return chain, draw(rng, 7, 2 * n)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_derivatives_by_the_geometry(kind, rng):
+    chain, q = any_robot(*kind, rng)
+    for name, value in chain.geometry().items():
+        tangents = {name: torch.eye(value.numel()).double().reshape(-1, *value.shape)}
+        expected = torch.func.jacfwd(lambda v, n=name: chain.with_geometry(**{n: v})(q))(value)
+        J = chain.geometry_jacobian(q, tangents)
+        assert_close(J, expected.flatten(2), rtol=1e-9, atol=1e-11, msg=name)
+
+
+@pytest.mark.parametrize("aliases", [False, True])
+def test_derivatives_of_the_geometry_by_the_free_parameters(aliases, rng):
+    chain, q = any_robot([0.06, 0.05], "base", 3, 2.0, rng)
+    skipped = ("angles", "offsets") if aliases else ("turns", "tool")
+    names = tuple(name for name in parameter_names(chain) if name not in skipped)
+    problem = Problem.of(chain, names, {}, dict.fromkeys(names, 0.5))
+    theta = 0.3 * gauss(rng, len(problem.labels))
+    tangents = problem.tangents(theta)
+    for name, value in problem.moved(theta).geometry().items():
+        J = torch.func.jacfwd(lambda t, name=name: problem.moved(t).geometry()[name])(theta)
+        assert_close(tangents[name], J.movedim(-1, 0), rtol=1e-9, atol=1e-12, msg=name)
+        assert value.shape == tangents[name].shape[1:]
+    # Both together, which is what the search uses.
+    J = torch.func.jacfwd(lambda t: problem.moved(t)(q))(theta)
+    assert_close(problem.moved(theta).geometry_jacobian(q, tangents), J, rtol=1e-8, atol=1e-11)
+
+
+CLOCKWISE = [(0,), (1,), (0, 1), (2,), (0, 2), (0, 1, 2)]
+
+
+@pytest.mark.parametrize("clockwise", CLOCKWISE)
+@pytest.mark.parametrize("kind", ["chambers", "tendons"])
+def test_rings_that_run_the_other_way_round_are_found(kind, clockwise, rng):
+    S = 3 if 2 in clockwise else 2
+    if kind == "chambers":
+        q, lengths, radii, routing = chambers(rng, 100, 3 * S), None, RADII[:S], "segment"
+    else:
+        q, lengths, routing = tendons(rng, 100, 3 * S), [0.06, 0.07, 0.05][:S], "base"
+        radii = [0.005, 0.0045, 0.004][:S]
+    geometry = {"lengths": lengths, "routing": routing}
+    angles = rings([0.0] * S, clockwise)
+    truth = trunk(radii, angles=angles, base=planted_base(), **geometry)
+    start = trunk([1.1 * radius for radius in radii], **geometry)
+    result = calibrate(start, q, truth(q), ("radii", "turns", "base"))
+    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
+    assert_close(result.chain.radii, truth.radii, rtol=0, atol=1e-9)
+    found = result.chain.angles.unflatten(0, (S, 3))
+    steps = difference(found[:, 1], found[:, 0])
+    expected = [-THIRD if k in clockwise else THIRD for k in range(S)]
+    assert_close(steps, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+TURNS = [(90.0, 0.0), (180.0, 90.0), (120.0, -150.0), (0.0, 180.0)]
+TURNS += [(90.0, 180.0, -90.0), (0.0, 135.0, -100.0), (180.0, 0.0, 180.0), (100.0, 100.0, -170.0)]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+@pytest.mark.parametrize("turns", TURNS)
+def test_turns_of_the_rings_are_found_from_none(turns, noise, rng):
+    S, turns = len(turns), np.radians(turns)
+    q = chambers(rng, 100, 3 * S)
+    truth = trunk(RADII[:S], angles=rings(turns), base=planted_base())
+    x = truth(q) + noise * gauss(rng, 100, 3)
+    result = calibrate(trunk([0.09] * S), q, x, ("radii", "turns", "base"))
+    tolerance = max(1e-9, 3 * noise)
+    assert_close(result.chain(q), truth(q), rtol=0, atol=tolerance)
+    between = difference(result.values["turns"].diff(), torch.from_numpy(np.diff(turns)))
+    assert between.abs().max() < (1e-9 if noise == 0 else 0.02)
+
+
+def test_a_mirror_image_is_found_where_only_the_base_is_free_and_it_warns(rng):
+    q = chambers(rng)
+    truth = trunk(angles=rings([0.0] * 3, (0, 1, 2)), base=planted_base())
+    start = trunk([0.09] * 3)
+    with pytest.warns(UserWarning, match=r"run the other way round.*or list 'turns'"):
+        result = calibrate(start, q, truth(q), ("radii", "base"))
+    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
+    assert_close(result.chain.angles, -start.angles, rtol=0, atol=0)
+    assert_close(result.chain.radii, truth.radii, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("bend", [1.0, 0.1, 0.01])
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.02])
+@pytest.mark.parametrize("names", [("radii", "base"), ("radii", "turns", "base")])
+def test_a_right_handed_robot_stays_so(bend, noise, names, rng):
+    """Even where the robot hardly bends or the noise hides all; no warning is raised either."""
+    q = 0.25 + bend * (chambers(rng) - 0.25)
+    x = trunk(base=planted_base())(q) + noise * gauss(rng, 100, 3)
+    chain = calibrate(trunk([0.09] * 3), q, x, names).chain
+    steps = difference(chain.angles[1::3], chain.angles[::3])
+    assert_close(steps, torch.full((3,), THIRD).double(), rtol=0, atol=1e-6)
+
+
+def test_standard_errors_are_honest(rng):
+    q = chambers(rng)
+    truth = trunk(base=planted_base(), offsets=[0.0, 0.0, 0.12])
+    start = trunk([0.09] * 3, base=planted_base(), offsets=[0.0, 0.0, 0.1])
+    z = []
+    for _ in range(200):
+        x = truth(q) + 0.002 * gauss(rng, 100, 3)
+        result = calibrate(start, q, x, ("radii", "base", "tool"))
+        chain = result.chain
+        turned = (chain.base @ torch.linalg.inv(truth.base))[:3, :3].numpy()
+        turned = torch.from_numpy(Rotation.from_matrix(turned).as_rotvec())
+        moved = chain.base[:3, 3] - truth.base[:3, 3]
+        tool = (chain.offsets - truth.offsets)[-1:]
+        errors = torch.cat([chain.radii - truth.radii, turned, moved, tool])
+        z.append(errors / torch.cat([std.flatten() for std in result.std_errors.values()]))
+    z = torch.stack(z)  # (200, 10)
+    assert float((z.abs() < 3).double().mean()) > 0.99
+    assert 0.93 < float((z.abs() < 1.96).double().mean()) < 0.97
+    assert ((z.std(0) > 0.85) & (z.std(0) < 1.15)).all()  # too large errors fail as well
+    assert z.mean(0).abs().max() < 0.25
+
+
+def test_prior_keeps_what_the_data_do_not_tell(rng):
+    q = chambers(rng, 60)
+    q[:, 6:] = 0.25  # the last segment never bends: its radius cannot be seen
+    x = ConstantCurvatureChain(RADII)(q)
+    x = x + 0.001 * torch.randn(60, 3, generator=rng, dtype=torch.float64)
+    result = calibrate(ConstantCurvatureChain([0.09, 0.09, 0.09]), q, x, ("radii",))
+    assert result.identifiable["radii"].tolist() == [True, True, False]
+    assert abs(result.chain.radii[2] - 0.09) < 1e-6
+    assert "radii[2] +1 % does not move the tips: leave radii[2] out" in repr(result)
+
+
+def test_without_a_prior_what_the_data_do_not_tell_is_still_told_apart(rng):
+    q = chambers(rng, 60)
+    q[:, 6:] = 0.25
+    x = ConstantCurvatureChain(RADII)(q)
+    x = x + 0.001 * torch.randn(60, 3, generator=rng, dtype=torch.float64)
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    result = calibrate(nominal, q, x, ("radii",), prior=float("inf"))
+    assert result.identifiable["radii"].tolist() == [True, True, False]
+    assert (result.chain.radii[:2] - torch.tensor(RADII[:2])).abs().max() < 0.005
+
+
+def test_robust_loss_forgets_outliers(rng):
+    q = chambers(rng)
+    truth = ConstantCurvatureChain(RADII)
+    x = truth(q) + 0.001 * torch.randn(100, 3, generator=rng, dtype=torch.float64)
+    x[:8] += 0.3
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    plain, robust = (
+        (calibrate(nominal, q, x, ("radii",), loss=loss).chain.radii - truth.radii).abs().max()
+        for loss in ("linear", "cauchy")
+    )
+    assert robust < 0.001 < plain
+
+
+def test_weights_are_repetitions(rng):
+    q = chambers(rng, 40)
+    x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(40, 3, generator=rng).double()
+    weights = torch.arange(40) % 3
+    repeated = torch.arange(40).repeat_interleave(weights)
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    weighted = calibrate(nominal, q, x, sample_weight=weights)
+    expanded = calibrate(nominal, q[repeated], x[repeated])
+    assert_close(weighted.chain.radii, expanded.chain.radii, rtol=1e-7, atol=0)
+    assert_close(weighted.std_errors["base"], expanded.std_errors["base"], rtol=1e-4, atol=0)
+    assert weighted.rmse == pytest.approx(expanded.rmse, rel=1e-8)
+
+
+def test_bounds_hold(rng):
+    q = chambers(rng)
+    x = ConstantCurvatureChain(RADII)(q)
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    with pytest.warns(UserWarning, match=r"radii\[2\] ran into its lower bound"):
+        result = calibrate(nominal, q, x, ("radii",), bounds={"radii": (0.08, 0.095)})
+    assert result.chain.radii.max() <= 0.095 * (1 + 1e-12)
+
+
+def test_leaving_what_is_physical_warns(rng):
+    q = chambers(rng)
+    x = trunk(offsets=[0.0, 0.0, -0.08])(q)
+    with pytest.warns(UserWarning, match=r"left what is physical: tool became -80 mm\. Check"):
+        calibrate(trunk(), q, x, ("tool",))
+    with pytest.warns(UserWarning, match=r"offsets\[2\] became -80 mm"):
+        calibrate(trunk(), q, x, ("offsets",))
+    with pytest.warns(UserWarning, match=r"radii\[0\] went to 2 times its start.*the units"):
+        calibrate(trunk([0.05, 0.093, 0.079]), q, trunk()(q), ("radii",))
+    # The start is never wrong: a tool that was behind the end may stay there.
+    calibrate(trunk([0.09] * 3, offsets=[0.0, 0.0, -0.08]), q, x, ("radii", "tool"))
+
+
+MOVES = re.compile(r"(all )?([a-z_]+)(?:\[([^\]]+)\])? ([+-]\S+) (mm|deg|%)")
+SIZES = {"mm": 1e-3, "deg": math.pi / 180, "%": 0.01}
+
+
+def moved_as_told(chain, sentence, part):
+    """The chain, its geometry moved a part of what a sentence says, and the parameters it names."""
+    geometry = {name: value.clone() for name, value in chain.geometry().items()}
+    names = set()
+    for everything, name, index, size, unit in MOVES.findall(sentence):
+        names.add(name)
+        step = part * float(size) * SIZES[unit]
+        value = geometry[ENTRY.get(name, name)]
+        if name == "base":
+            axis = "xyz".index(index[-1])
+            turn = torch.from_numpy(Rotation.from_rotvec(step * np.eye(3)[axis]).as_matrix())
+            if index.startswith("rot"):
+                value[:3, :3] = turn @ value[:3, :3]
+            else:
+                value[axis, 3] += step
+        elif name == "tool":
+            value[-1] += step
+        elif everything:
+            value += step
+        else:
+            at = tuple("xy".index(i) if i in "xy" else int(i) for i in index.split(", "))
+            value[at] *= 1 + step if unit == "%" else 1.0
+            value[at] += 0.0 if unit == "%" else step
+    return chain.with_geometry(**geometry), names
+
+
+# Names, how far q varies (in common, each by itself), noise, and what a sentence must name.
+HARDLY_TOLD = {
+    # Longer and shorter but hardly bent: a longer tool is a base further back.
+    "tool or base": (("tool", "base"), (0.15, 0.005), 0.05, {"tool", "base"}),
+    "a last segment that hardly bends": (("radii",), (0.05, 0.0005), 0.02, {"radii"}),
+    "rest bends or zeros": (
+        ("rest_bends", "actuator_zeros"),
+        (0.0, 0.06),
+        0.003,
+        {"rest_bends", "actuator_zeros"},
+    ),
+    "turns or base": (("turns", "base"), (0.0, 0.06), 0.001, {"turns", "base"}),
+}
+
+
+@pytest.mark.parametrize("case", HARDLY_TOLD)
+def test_sentences_say_what_the_data_leave_open_and_what_it_would_move(case, rng):
+    names, (common, each), noise, expected = HARDLY_TOLD[case]
+    q = 0.25 + common * uniform(rng, 100, 1) + each * uniform(rng, 100, 9)
+    truth = trunk(offsets=[0.0, 0.0, 0.1])
+    x = truth(q) + noise * gauss(rng, 100, 3)
+    result = calibrate(truth, q, x, names)
+    assert 0 < len(result.unidentified) == int((result.singular_values < 10).sum())
+    named = []
+    for sentence in result.unidentified:
+        part = 1e-3  # so that all moves are small
+        moved, names = moved_as_told(result.chain, sentence, part)
+        rms = 1e3 / part * float((moved(q) - result.chain(q)).square().sum(-1).mean().sqrt())
+        found = re.search(r"moves the tips by (\S+) mm rms", sentence)
+        if found is None:
+            assert "does not move the tips" in sentence
+            assert rms < 0.03  # moves have three digits
+        elif " smaller" not in sentence:  # which have no sizes
+            assert rms == pytest.approx(float(found[1]), rel=0.06)
+        named.append(names)
+    assert expected in named
+
+
+def test_singular_values_and_standard_errors_tell_the_same(rng):
+    q = chambers(rng)
+    x = trunk()(q) + 0.005 * gauss(rng, 100, 3)
+    names = ("radii", "turns", "tool")
+    result = calibrate(trunk([0.09] * 3), q, x, names, prior={"radii": 0.2, "turns": 0.7})
+    flat = np.concatenate([np.ravel(result.std_errors[name]) for name in names])
+    units = np.concatenate([result.values["radii"], np.ones(3), [float(trunk([0.09] * 3).reach)]])
+    prior = np.repeat([0.2, 0.7, 0.5], [3, 3, 1])
+    np.testing.assert_allclose(flat, prior * units / result.narrowing, rtol=1e-9)
+    # The trace of the covariance in units of the prior, by parameters and by directions.
+    by_directions = (1.0 / (result.singular_values**2 + 1.0)).sum()
+    assert (result.narrowing**-2).sum() == pytest.approx(by_directions, rel=1e-9)
+    known = np.concatenate([np.ravel(result.identifiable[name]) for name in names])
+    assert (known == (result.narrowing > 10)).all()
+
+
+def test_lists_and_frames_of_pandas_do_as_well(rng):
+    """In full precision, and frames, whose arrays are read-only, without a word."""
+    chain, q = ConstantCurvatureChain(RADII), chambers(rng)
+    x = chain(q).detach().numpy()
+    start = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    q = q.numpy()
+    for kind in (np.ndarray.tolist, pytest.importorskip("pandas").DataFrame):
+        result = calibrate(start, kind(q), kind(x), ("radii",), prior=math.inf)
+        np.testing.assert_allclose(result.values["radii"], RADII, rtol=1e-8)
+
+
+def test_tips_in_millimetres_are_noticed(rng):
+    chain, q = nominal_tendon_robot(), tendons(rng)
+    with torch.no_grad():
+        x = chain(q)
+    with pytest.warns(UserWarning, match=r"`x` spans .* but the robot is only 0\.18 m long"):
+        calibrate(chain, q, 1000 * x, ("base",))
+    far = x + torch.tensor([40.0, 0.0, 0.0], dtype=torch.float64)  # a far frame is none
+    assert calibrate(chain, q, far, ("base",), prior=math.inf).rmse < 1e-6
+
+
+def test_numpy_in_numpy_out_and_groups(rng):
+    q = chambers(rng)
+    x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(100, 3, generator=rng).double()
+    groups = np.arange(100) // 10
+    result = calibrate(ConstantCurvatureChain(RADII), q.numpy(), x.numpy(), groups=groups)
+    assert isinstance(result.values["radii"], np.ndarray)
+    assert isinstance(result.std_errors["base"], np.ndarray)
+    assert result.correlations.shape == (9, 9) == (len(result.names),) * 2
+    np.testing.assert_allclose(np.diag(result.correlations), 1.0, rtol=1e-12)
+    assert result.rmse < result.cv_rmse < 1.5 * result.rmse
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parameters": ("radius",)}, "`parameters` must name different ones of .* mean 'radii'"),
+        ({"parameters": ("lengths",)}, "`parameters` must name different ones of"),
+        ({"parameters": ("radii", "radii")}, "`parameters` must name different ones of"),
+        ({"parameters": ()}, "`parameters` must name different ones of"),
+        ({"parameters": ("offsets", "tool")}, "leave 'tool' out"),
+        ({"parameters": ("turns", "radii", "angles")}, "leave 'turns' out"),
+        ({"loss": "l1"}, "`loss` must be one of"),
+        ({"prior": 0.0}, "`prior` must be positive"),
+        ({"prior": {"tool": 1.0}}, "`prior` must name only"),
+        ({"bounds": {"radii": (0.2, 0.1)}}, "low < high"),
+        ({"bounds": {"radii": (-0.2, 0.1)}}, "must not be negative"),
+        ({"bounds": {"tool": (0.0, 0.1)}}, "`bounds` must name only"),
+        ({"bounds": {"base": (0.0, 0.1)}}, "`bounds` cannot hold 'base'"),
+        ({"q": np.full((5, 9), 0.25)}, r"`x` must have shape \(5, 3\)"),
+        ({"q": np.full((10, 8), 0.25)}, r"`q` must have shape \(..., 9\)"),
+        ({"q": np.full((10, 9), np.nan)}, "`q` must be finite"),
+        ({"x": np.full((10, 3), np.inf)}, "`x` must be finite"),
+        ({"q": np.zeros((0, 9)), "x": np.zeros((0, 3))}, "at least one row"),
+        ({"groups": [1, 2]}, r"`groups` must have shape \(10,\)"),
+        ({"groups": [1] * 10}, "at least 2 motions"),
+        ({"sample_weight": [0] * 10}, "`sample_weight` must hold 10 non-negative"),
+    ],
+)
+def test_bad_input_says_what_is_needed(change, message):
+    arguments = {"q": np.full((10, 9), 0.25), "x": np.zeros((10, 3)), **change}
+    with pytest.raises(ValueError, match=message):
+        calibrate(ConstantCurvatureChain(RADII), **arguments)
+
+
+def test_an_arm_has_no_radii(rng):
+    q = uniform(rng, 10, 6)
+    with pytest.raises(ValueError, match=r"different ones of \['base', 'tool'\] for this chain"):
+        calibrate(arm(), q, arm()(q), ("radii",))
+
+
+def distances(chain, data):
+    with torch.no_grad():
+        return np.linalg.norm(chain(torch.from_numpy(data.q)).numpy() - data.x, axis=1)
+
+
+NAIVE = ("radii", "lengths", "angles", "base", "tool")
+
+
+def test_real_robot_of_three_cables_from_a_naive_start(data_home):
+    data = datasets.load_armlab(data_home)
+    start = ConstantCurvatureChain([0.01], lengths=[0.1])
+    with pytest.warns(UserWarning, match=r"lengths\[0\] ran into its lower bound"):
+        result = calibrate(start, data.q[::10], data.x[::10], NAIVE, loss="soft_l1")
+    assert distances(result.chain, data).mean() <= 0.0025
+    steps = difference(result.chain.angles.diff(), torch.tensor(-THIRD).double())
+    assert steps.abs().max() < 0.1  # its cables run clockwise
+    assert any("lengths[0]" in sentence and "tool" in sentence for sentence in result.unidentified)
+
+
+def test_real_nine_tendon_robot_from_a_naive_start(data_home):
+    data = datasets.load_ftdcr(data_home)
+    start = ConstantCurvatureChain([0.0045] * 3, lengths=[0.06, 0.0625, 0.064], routing="base")
+    result = calibrate(start, data.q[::3], data.x[::3], NAIVE, loss="soft_l1")
+    assert distances(result.chain, data).mean() <= 0.009
+
+
+def test_real_nine_tendon_robot(data_home):
+    data = datasets.load_ftdcr(data_home)
+    turns = (-3.03, -2.52, -2.01)
+    chain = ConstantCurvatureChain(
+        [0.0045] * 3,
+        lengths=[0.060, 0.0625, 0.064],
+        routing="base",
+        angles=[[turn + 2 * math.pi / 3 * i for i in range(3)] for turn in turns],
+    )
+    kept = np.array(["tendon" not in group for group in data.groups])
+    result = calibrate(chain, data.q[kept], data.x[kept], ("radii", "base", "tool"))
+    assert distances(result.chain, data)[kept].mean() < 0.006
+
+
+def test_tendons_that_contradict_each_other_are_told_once(rng):
+    truth = nominal_tendon_robot()
+    q = tendons(rng)
+    parts = q.unflatten(1, (3, 3))
+    balanced = (parts - parts.mean(2, keepdim=True)).flatten(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibrate(truth, balanced, truth(balanced), ("radii",))
+    balanced[7, 3:6] -= 0.003
+    balanced[9, :3] += 0.002
+    message = r"2 of 100 rows of `q` pull .* row 7, segment 2, 3 mm rms\. ElasticTendonChain"
+    with pytest.warns(UserWarning, match=message) as caught:
+        calibrate(truth, balanced, truth(balanced), ("radii",))
+    assert len(caught) == 1
+    assert caught[0].filename == __file__

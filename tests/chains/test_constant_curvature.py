@@ -1,0 +1,848 @@
+import copy
+import math
+import pickle
+
+import joblib
+import mpmath
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, datasets, jacobian
+from hybridkin._core.model import reverse_jacobian
+from hybridkin._core.stumpff import stumpff
+
+RADII = [0.100, 0.093, 0.079]
+THREE = 2 * math.pi / 3 * torch.arange(3, dtype=torch.float64)
+STRAIGHT = torch.full((9,), 0.25, dtype=torch.float64)
+
+
+def bha(**options):
+    return ConstantCurvatureChain(RADII, **options)
+
+
+def tendons(routing="base", **options):
+    options = {"offsets": [0.002, 0.003, 0.01], **options}
+    return ConstantCurvatureChain(
+        [0.0045, 0.005, 0.004], lengths=[0.06, 0.0625, 0.064], routing=routing, **options
+    )
+
+
+def random_q(rng, n=20, size=9, center=0.25, width=0.06):
+    return center + width * (2 * torch.rand(n, size, generator=rng, dtype=torch.float64) - 1)
+
+
+def rotation_z(angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def pose(rotation, position):
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = rotation, torch.as_tensor(position, dtype=torch.float64)
+    return matrix
+
+
+CHAINS = {
+    "chambers": (bha(offsets=[0.01, 0.0, 0.05]), 0.25, 0.06),
+    "tendons, own segment": (tendons("segment"), 0.0, 0.005),
+    "tendons, through": (tendons("base"), 0.0, 0.005),
+    "mixed": (
+        ConstantCurvatureChain(
+            [0.1, 0.08],
+            n_actuators=[4, 3],
+            routing="base",
+            base=pose(rotation_z(0.7), [0.1, 0.2, 0.3]),
+        ),
+        0.25,
+        0.06,
+    ),
+    "pre-curved": (
+        tendons(
+            rest_bends=[[0.2, -0.1], [0.0, 0.3], [-0.4, 0.0]],
+            actuator_zeros=1e-4 * np.arange(9),
+        ),
+        0.0,
+        0.005,
+    ),
+}
+each_chain = pytest.mark.parametrize(("chain", "center", "width"), CHAINS.values(), ids=CHAINS)
+
+
+SWITCH = 1.0  # [rad], where trigonometry takes over from the series
+BESIDE_SWITCH = [math.nextafter(SWITCH, 0.0), math.nextafter(SWITCH, 2.0)]
+
+
+@pytest.mark.parametrize(
+    "theta",
+    [0.0, 1e-12, 1e-4, 0.5, SWITCH, 2.0, math.pi, 4.0, 2 * math.pi, *BESIDE_SWITCH, 12.0, 1e3],
+)
+def test_stumpff_functions_against_mpmath(theta):
+    s = torch.tensor(theta**2, dtype=torch.float64)
+    with mpmath.workdps(120):
+        exact = mpmath.mpf(s.item())
+
+        angle = mpmath.sqrt(exact) or mpmath.mpf("1e-30")  # right to 60 digits at zero, too
+        c, f = mpmath.cos(angle), mpmath.sin(angle) / angle
+        g = (1 - c) / angle**2 if exact else mpmath.mpf("0.5")
+        c3 = (1 - f) / angle**2 if exact else mpmath.mpf(1) / 6
+        c4 = (0.5 - g) / angle**2 if exact else mpmath.mpf(1) / 24
+        expected = [float(value) for value in (c, f, g, c3, c4)]
+    assert_close(
+        torch.stack(list(stumpff(s))),
+        torch.tensor(expected, dtype=torch.float64),
+        rtol=4e-15,
+        atol=3e-15,
+    )
+
+
+def test_no_kink_where_trigonometry_takes_over():
+    steps = [math.nextafter(SWITCH, 0.0), SWITCH, math.nextafter(SWITCH, 2.0)]
+    beside = torch.tensor(steps, dtype=torch.float64).requires_grad_()
+    for value in stumpff(beside):
+        (first,) = torch.autograd.grad(value.sum(), beside, create_graph=True)
+        (second,) = torch.autograd.grad(first.sum(), beside, retain_graph=True)
+        for quantity, tolerance in ((value, 4e-16), (first, 4e-16), (second, 2e-15)):
+            assert quantity.diff().abs().max() < tolerance
+
+
+def textbook(q, radii, lengths, offsets):
+    """Return tip and rotation by Webster & Jones (2010): curvature, direction, Rz Ry Rz."""
+    position, rotation, before = np.zeros(3), np.eye(3), 0
+    for k, radius in enumerate(radii):
+        l1, l2, l3 = q[3 * k : 3 * k + 3]
+        bend = np.array([l2 + l3 - 2 * l1, mpmath.sqrt(3) * (l3 - l2)]) / (3 * radius)
+        length = (l1 + l2 + l3) / 3 if lengths is None else lengths[k]
+        if lengths is not None:  # these tendons have spent what the segments before took
+            bend, before = bend - before, bend
+        theta, phi = mpmath.hypot(*bend), mpmath.atan2(bend[1], bend[0])
+        c, s, cp, sp = mpmath.cos(theta), mpmath.sin(theta), mpmath.cos(phi), mpmath.sin(phi)
+        arc = np.array([0, 0, length])
+        if theta:
+            arc = length / theta * np.array([(1 - c) * cp, (1 - c) * sp, s])
+        z = np.array([[cp, -sp, 0], [sp, cp, 0], [0, 0, 1]])
+        turn = z @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ z.T
+        position = position + rotation @ (arc + offsets[k] * turn[:, 2])
+        rotation = rotation @ turn
+    return position, rotation
+
+
+def textbook_derivatives(q, *geometry):
+    """Return tip, Jacobian, angular Jacobian and second derivatives, by central differences.
+
+    With steps of 1e-20 and 100 digits each is right to 40 digits.
+    """
+    steps, h = np.diag([mpmath.mpf("1e-20")] * len(q)), mpmath.mpf("1e-20")
+    x, R = textbook(q, *geometry)
+    ahead, behind = ([textbook(q + sign * step, *geometry) for step in steps] for sign in (1, -1))
+    J = [(a[0] - b[0]) / (2 * h) for a, b in zip(ahead, behind, strict=True)]
+    spins = [(a[1] - b[1]) @ R.T / (2 * h) for a, b in zip(ahead, behind, strict=True)]
+    angular = [(spin[2, 1], spin[0, 2], spin[1, 0]) for spin in spins]
+    second = np.empty((len(q), len(q), 3), dtype=object)
+    for j, k in zip(*np.tril_indices(len(q)), strict=True):
+        move = steps[j] + steps[k]
+        corners = textbook(q + move, *geometry)[0] + textbook(q - move, *geometry)[0]
+        edges = ahead[j][0] + behind[j][0] + ahead[k][0] + behind[k][0]
+        second[j, k] = second[k, j] = (corners - edges + 2 * x) / (2 * h**2)
+    derivatives = (x, np.array(J).T, np.array(angular).T, second.T)
+    return [torch.from_numpy(np.array(v, dtype=float)) for v in derivatives]
+
+
+def within(bound, value, expected, noise=0.0):
+    """Tell whether all errors are below a part of the largest entry, or below a noise."""
+    scale = float(expected.abs().max())
+    return float((value.double() - expected).abs().max()) <= max(bound * scale, noise)
+
+
+BENDS = [
+    *(0.0, 1e-12, 1e-8, 1e-4, 0.1, 0.999999, 1.0, 1.000001),
+    *(1.5, 2.0, math.pi, 5.0, 2 * math.pi),
+]
+
+
+@pytest.mark.parametrize("theta", BENDS)
+@pytest.mark.parametrize("n_segments", [1, 3])
+@pytest.mark.parametrize("kind", ["chambers", "tendons"])
+def test_against_the_textbook_in_a_hundred_digits(kind, n_segments, theta):
+    """Errors are relative to the largest entry of x, of J, of the second derivatives."""
+    if kind == "chambers":
+        radii, lengths, offsets, center = RADII[:n_segments], None, [0.01, 0.0, 0.05], 0.25
+    else:
+        radii, offsets, center = [0.0045, 0.005, 0.004][:n_segments], [0.002, 0.003, 0.01], 0.0
+        lengths = [0.06, 0.0625, 0.064][:n_segments]
+    offsets = offsets[-n_segments:]
+    routing = "segment" if lengths is None else "base"
+    chain = ConstantCurvatureChain(radii, lengths=lengths, offsets=offsets, routing=routing)
+    toward = torch.tensor([0.3, 2.0, -1.1], dtype=torch.float64)[:n_segments, None]
+    bending = theta * torch.cat([toward.cos(), toward.sin()], 1)
+    bending = bending if lengths is None else bending.cumsum(0)
+    shorter = bending @ torch.stack([THREE.cos(), THREE.sin()]) * chain.radii[:, None]
+    q = (center - shorter).flatten()
+
+    with mpmath.workdps(100):
+        geometry = (None if p is None else [*map(mpmath.mpf, p)] for p in (radii, lengths, offsets))
+        expected = textbook_derivatives(np.array([*map(mpmath.mpf, q.tolist())]), *geometry)
+    x, J, angular, second = expected
+    hessians = [take(chain.jacobian)(q) for take in (torch.func.jacfwd, torch.func.jacrev)]
+
+    for value in (chain(q), chain.forward_and_jacobian(q)[0]):
+        assert within(4e-15, value, x)
+    for value in (chain.jacobian(q), chain.pose_jacobian(q)[:3]):
+        assert within(4e-15, value, J)
+    assert within(4e-15, chain.pose_jacobian(q)[3:], angular)
+    for value in hessians:
+        assert within(1e-13, value, second)
+    for value, reference, slope in zip(
+        chain.forward_and_jacobian(q.float()),
+        chain.forward_and_jacobian(q.float().double()),
+        (J, second),
+        strict=True,
+    ):
+        # After a full turn the tip is back at the base and its derivatives are small: what is left
+        # is the rounding of the bends in single precision, six units of it.
+        units = 6.0 if theta > math.pi else 0.0
+        noise = units * 0.5 * torch.finfo(value.dtype).eps * float((slope.abs() @ q.abs()).max())
+        assert within(1e-6, value, reference, noise)
+
+
+def test_absurd_bends_stay_finite():
+    """Lengths in millimetres taken for metres: hundreds of turns, but no overflow."""
+    q = 1000.0 * (0.25 + 0.06 * torch.linspace(-1, 1, 9, dtype=torch.float64))
+    x, J = bha().forward_and_jacobian(q.requires_grad_())
+    assert x.norm() < 750.0
+    assert torch.isfinite(J).all()
+    assert torch.isfinite(torch.autograd.grad(x.sum(), q)[0]).all()
+
+
+def test_quarter_circle():
+    radius, arc = 0.1, math.pi / 2
+    chain = ConstantCurvatureChain([radius])
+    length = 0.4
+    q = length - radius * arc * THREE.cos()
+    expected = torch.tensor([length / arc, 0.0, length / arc], dtype=torch.float64)
+    assert_close(chain(q), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_half_turn_of_a_tendon_robot():
+    chain = ConstantCurvatureChain([0.01], lengths=[0.2], offsets=[0.05])
+    q = -0.01 * math.pi * THREE.cos()
+    expected = torch.tensor([0.4 / math.pi, 0.0, -0.05], dtype=torch.float64)
+    assert_close(chain(q), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_three_chambers_match_the_textbook_bending(rng):
+    q = random_q(rng)
+    length, bending = bha().arcs(q)
+    l1, l2, l3 = q.unflatten(1, (3, 3)).unbind(-1)
+    radii = torch.tensor(RADII, dtype=torch.float64)
+    expected = torch.stack([l2 + l3 - 2 * l1, math.sqrt(3) * (l3 - l2)], -1) / (3 * radii[:, None])
+    assert_close(length, q.unflatten(1, (3, 3)).mean(-1), rtol=1e-14, atol=0)
+    assert_close(bending, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_through_going_tendons_read_the_sum_of_bendings(rng):
+    chain = tendons("base", offsets=0.0)
+    bending = torch.randn(3, 2, generator=rng, dtype=torch.float64)
+    angles = chain.angles.unflatten(0, (3, 3))
+    toward = torch.stack([angles.cos(), angles.sin()], -1)
+    q = -(chain.radii[:, None] * (toward * bending.cumsum(0)[:, None]).sum(-1)).flatten()
+    assert_close(chain.arcs(q)[1], bending, rtol=1e-12, atol=1e-12)
+
+
+def test_consistency_finds_the_broken_reading(rng):
+    chain = ConstantCurvatureChain([0.1, 0.08], n_actuators=[3, 4])
+    bending = 0.3 * torch.randn(2, 2, generator=rng, dtype=torch.float64)
+    toward = torch.stack([chain.angles.cos(), chain.angles.sin()], -1)
+    segment = torch.tensor([0, 0, 0, 1, 1, 1, 1])
+    q = 0.25 - chain.radii[segment] * (toward * bending[segment]).sum(-1)
+    assert_close(chain.consistency(q), torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-15)
+    q[5] += 0.01
+    # Four readings of three unknowns: a quarter of the error, with alternating sign, remains.
+    expected = torch.tensor([0.0, 0.0025], dtype=torch.float64)
+    assert_close(chain.consistency(q), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_contradictory_readings_by_segment():
+    chain = ConstantCurvatureChain([0.01, 0.02], lengths=[0.1, 0.1])
+    balanced = torch.tensor([-2.0, 1.0, 1.0], dtype=torch.float64)  # 1.41 rms
+    own = [
+        (balanced, False),
+        (0.0 * balanced, False),
+        (balanced + 0.4, False),  # 28 % of what bends
+        (100 * balanced + 5.0, False),
+        (balanced + 1.1, True),
+        (torch.tensor([-4.0, 0.0, 0.0]), True),
+        (torch.full((3,), 0.9), False),  # a common change below a tenth of the radius
+        (torch.full((3,), -1.1), True),
+    ]
+    for first, wrong in own:
+        q = 1e-3 * torch.cat([first.double(), 2.0 * balanced])
+        assert chain.contradictory(q).tolist() == [wrong, False]
+        swapped = 1e-3 * torch.cat([balanced, 2.0 * first.double()])  # of twice the radius
+        assert chain.contradictory(swapped).tolist() == [False, wrong]
+    zeros = 1e-3 * torch.tensor([2.0] * 3 + [0.0] * 3, dtype=torch.float64)
+    q = 1e-3 * torch.cat([balanced, balanced]) + zeros
+    assert chain.contradictory(q.expand(2, 1, 6)).tolist() == [[[True, False]]] * 2
+    assert not chain.with_geometry(actuator_zeros=zeros).contradictory(q).any()
+    assert not bha().contradictory(STRAIGHT + 0.1).any()
+
+
+def test_single_tendons_of_a_real_robot_contradict_and_balanced_ones_hardly(data_home):
+    data = datasets.load_ftdcr(data_home)
+    turns = (-3.03, -2.52, -2.01)
+    chain = ConstantCurvatureChain(
+        [0.0045] * 3,
+        lengths=[0.060, 0.0625, 0.064],
+        routing="base",
+        angles=[[turn + 2 * math.pi / 3 * i for i in range(3)] for turn in turns],
+    )
+    wrong = chain.contradictory(torch.from_numpy(data.q)).any(-1).numpy()
+    single = np.array(["tendon" in group for group in data.groups])
+    assert wrong[single].mean() > 0.95
+    assert wrong[~single].mean() < 0.05
+
+
+def test_rest_bends_add_to_the_arcs(rng):
+    q, rest = random_q(rng), 0.3 * torch.randn(3, 2, generator=rng, dtype=torch.float64)
+    plain, bent = bha(), bha(rest_bends=rest)
+    length, bending = bent.arcs(q)
+    assert_close(length, plain.arcs(q)[0], rtol=0, atol=1e-15)
+    assert_close(bending, plain.arcs(q)[1] + rest, rtol=0, atol=1e-15)
+    assert_close(bent.consistency(q), plain.consistency(q), rtol=0, atol=1e-15)
+
+
+def test_a_quarter_circle_at_rest():
+    chain = ConstantCurvatureChain([0.1], rest_bends=[[math.pi / 2, 0.0]])
+    expected = torch.tensor([0.8 / math.pi, 0.0, 0.8 / math.pi], dtype=torch.float64)
+    assert_close(chain(torch.full_like(THREE, 0.4)), expected, rtol=1e-14, atol=1e-16)
+
+
+@pytest.mark.parametrize("routing", ["segment", "base"])
+def test_actuator_zeros_are_read_too_much(routing, rng):
+    zeros = 1e-3 * torch.randn(9, generator=rng, dtype=torch.float64)
+    q, plain = random_q(rng, center=0.0, width=0.005), tendons(routing)
+    for value in (zeros, zeros.unflatten(0, (3, 3)).tolist()):
+        chain = tendons(routing, actuator_zeros=value)
+        x, J = chain.forward_and_jacobian(q + zeros)
+        assert_close((x, J), plain.forward_and_jacobian(q), rtol=1e-12, atol=1e-14)
+        assert_close(chain.consistency(q + zeros), plain.consistency(q), rtol=0, atol=1e-15)
+    common = tendons(routing, actuator_zeros=0.001)
+    assert_close(common(q + 0.001), plain(q), rtol=1e-12, atol=1e-14)
+
+
+def test_gradcheck_of_rest_bends_and_zeros(rng):
+    chain, q = CHAINS["pre-curved"][0], random_q(rng, 2, center=0.0, width=0.005)
+
+    def tip_and_jacobian(rest_bends, actuator_zeros):
+        chain_there = chain.with_geometry(rest_bends=rest_bends, actuator_zeros=actuator_zeros)
+        return chain_there.forward_and_jacobian(q)
+
+    for scale in (0.0, 1.0):
+        rest, zeros = (
+            (scale * chain.geometry()[name]).requires_grad_()
+            for name in ("rest_bends", "actuator_zeros")
+        )
+        assert torch.autograd.gradcheck(tip_and_jacobian, (rest, zeros))
+
+
+@pytest.mark.parametrize("routing", ["segment", "base"])
+def test_a_common_pull_of_tendons_is_inconsistent(routing):
+    chain = tendons(routing)
+    q = torch.tensor([0.0] * 3 + [-0.004] * 3 + [0.0] * 3, dtype=torch.float64)
+    expected = torch.tensor([0.0, 0.004, 0.0], dtype=torch.float64)
+    assert_close(chain.consistency(q.expand(2, 9)), expected.expand(2, 3), rtol=1e-9, atol=1e-12)
+    assert_close(chain(q), chain(0.0 * q), rtol=1e-12, atol=1e-15)
+
+
+def test_shorter_chamber_is_on_the_side_the_tip_goes_to():
+    q = STRAIGHT.clone()
+    q[0] -= 0.02
+    assert bha()(q)[0] > 0.01
+
+
+def test_singular_values_of_three_equal_straight_segments():
+    J = ConstantCurvatureChain([0.03] * 3).jacobian(torch.full((9,), 0.1, dtype=torch.float64))
+    expected = torch.tensor([8.050764858994132, 8.050764858994132, 1.0], dtype=torch.float64)
+    assert_close(torch.linalg.svdvals(J), expected, rtol=1e-14, atol=0)
+
+
+@each_chain
+def test_gradcheck_at_straight_and_beside_it(chain, center, width, rng):
+    size = chain.n_actuators
+    for spread in (0.0, 1e-9, width):
+        q = random_q(rng, 2, size, center, spread).requires_grad_()
+        assert torch.autograd.gradcheck(chain, q)
+        assert torch.autograd.gradgradcheck(chain, q)
+
+
+@each_chain
+def test_closed_form_jacobian_is_that_of_autograd(chain, center, width, rng):
+    for spread in (0.0, 1e-9, width):
+        q = random_q(rng, 10, chain.n_actuators, center, spread)
+        x, J = chain.forward_and_jacobian(q)
+        x_reverse, J_reverse = reverse_jacobian(chain.forward, q)
+        assert_close(x, x_reverse, rtol=1e-15, atol=1e-15)
+        assert_close(J, J_reverse, rtol=1e-13, atol=1e-13 * float(J.abs().max()))
+
+
+@each_chain
+def test_jacobian_against_central_differences(chain, center, width, rng):
+    q = torch.cat(
+        [
+            random_q(rng, 5, chain.n_actuators, center, width),
+            torch.full((1, chain.n_actuators), center, dtype=torch.float64),
+        ]
+    )
+    J = chain.jacobian(q)
+    step = 1e-3 * float(chain.radii.mean())
+    # Richardson's rule on two central differences: the error is of fourth order in the step.
+    columns = []
+    for j in range(chain.n_actuators):
+        move = torch.zeros_like(q[0])
+        move[j] = step
+        near = (chain(q + move) - chain(q - move)) / (2 * step)
+        far = (chain(q + 2 * move) - chain(q - 2 * move)) / (4 * step)
+        columns.append((4 * near - far) / 3)
+    assert (torch.stack(columns, -1) - J).abs().max() / J.abs().max() < 1e-8
+
+
+@each_chain
+def test_pose_jacobian_turns_the_tip_frame(chain, center, width, rng):
+    q = random_q(rng, 5, chain.n_actuators, center, width)
+    step = 1e-6 * width
+    J = chain.pose_jacobian(q)
+    assert_close(J[:, :3], chain.jacobian(q), rtol=1e-13, atol=1e-13)
+    frame = chain.poses(q)[:, -1, :3, :3]
+    for j in range(chain.n_actuators):
+        move = torch.zeros_like(q[0])
+        move[j] = step
+        ahead, behind = (chain.poses(q + m)[:, -1, :3, :3] for m in (move, -move))
+        spin = (ahead - behind) / (2 * step) @ frame.mT
+        angular = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], -1)
+        scale = J[:, 3:].abs().max()
+        assert_close(angular / scale, J[:, 3:, j] / scale, rtol=0, atol=1e-7)
+
+
+@each_chain
+def test_poses_backbone_and_tip_agree(chain, center, width, rng):
+    q = random_q(rng, 4, chain.n_actuators, center, width)
+    poses, points = chain.poses(q), chain.backbone(q, n_points=7)
+    assert points.shape == (4, chain.n_segments * 7 + 1, 3)
+    assert_close(poses[:, -1, :3, 3], chain(q), rtol=1e-13, atol=1e-14)
+    assert_close(points[:, -1], chain(q), rtol=1e-13, atol=1e-14)
+    assert_close(points[:, ::7], poses[..., :3, 3], rtol=1e-13, atol=1e-14)
+    rotations = poses[..., :3, :3]
+    eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
+    assert_close(rotations.mT @ rotations, eye, rtol=0, atol=1e-14)
+
+
+def test_backbone_has_the_segments_length(rng):
+    q = random_q(rng, 3)
+    points = bha().backbone(q, n_points=400)
+    length = points.diff(dim=1).norm(dim=-1).sum(-1)
+    assert_close(length, q.mean(-1) * 3, rtol=1e-5, atol=0)
+
+
+def test_splitting_a_segment_changes_nothing(rng):
+    q = random_q(rng, 5, 3)
+    whole = ConstantCurvatureChain([0.1])
+    halves = ConstantCurvatureChain([0.1, 0.1])
+    x, J = halves.forward_and_jacobian(torch.cat([q, q], 1) / 2)
+    expected = whole.forward_and_jacobian(q)
+    assert_close((x, J.unflatten(2, (2, 3)).mean(2)), expected, rtol=1e-13, atol=1e-14)
+    # Tendons that also run through the first half read the whole bend.
+    q = 0.1 * (q - q.mean(1, keepdim=True))
+    whole = ConstantCurvatureChain([0.01], lengths=[0.1])
+    halves = ConstantCurvatureChain([0.01, 0.01], lengths=[0.05, 0.05], routing="base")
+    assert_close(halves(torch.cat([q / 2, q], 1)), whole(q), rtol=1e-13, atol=1e-14)
+
+
+def test_permuting_actuators_with_their_angles_changes_nothing(rng):
+    q = random_q(rng, 5)
+    order = [2, 0, 1]
+    angles = [2 * math.pi / 3 * i for i in order]
+    permuted = bha(angles=angles)
+    assert_close(
+        permuted(q.unflatten(1, (3, 3))[..., order].flatten(1)), bha()(q), rtol=1e-13, atol=1e-14
+    )
+
+
+def test_turning_the_actuators_turns_the_tip(rng):
+    q = random_q(rng, 5)
+    turned = bha(angles=[0.4 + 2 * math.pi / 3 * i for i in range(3)])
+    assert_close(turned(q), bha()(q) @ rotation_z(0.4).mT, rtol=1e-13, atol=1e-14)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), turns=st.integers(0, 2), spread=st.sampled_from([1.0, 1e-6]))
+def test_a_third_of_a_turn_permutes_the_actuators(seed, turns, spread):
+    rng = torch.Generator().manual_seed(seed)
+    turn = rotation_z(turns * 2 * math.pi / 3)
+    both_ways = torch.block_diag(turn, turn)
+    for chain, center, width in (CHAINS["chambers"], CHAINS["tendons, through"]):
+        q = random_q(rng, 3, center=center, width=spread * width)
+        passed_on = q.unflatten(1, (3, 3)).roll(turns, 2).flatten(1)
+        J = chain.pose_jacobian(passed_on).unflatten(2, (3, 3)).roll(-turns, 3).flatten(2)
+        expected = both_ways @ chain.pose_jacobian(q)
+        assert_close(chain(passed_on), chain(q) @ turn.mT, rtol=0, atol=1e-14)
+        assert_close(J / J.abs().max(), expected / J.abs().max(), rtol=0, atol=1e-14)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), spread=st.sampled_from([1.0, 1e-6]))
+def test_mirrored_actuators_mirror_the_robot(seed, spread):
+    rng = torch.Generator().manual_seed(seed)
+    flip = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)  # in the x-z plane
+    options = {"radii": [0.01, 0.008], "n_actuators": [4, 3], "lengths": [0.1, 0.08]}
+    angles = [[0.1, 1.5, 3.5, 5.0], [0.0, 2.0, 4.5]]
+    rest = torch.randn(2, 2, generator=rng, dtype=torch.float64)
+    mirrored_rest = rest * torch.tensor([1.0, -1.0], dtype=torch.float64)
+    chain = ConstantCurvatureChain(**options, angles=angles, rest_bends=rest, routing="base")
+    angles = [[-angle for angle in row] for row in angles]
+    mirrored = ConstantCurvatureChain(
+        **options, angles=angles, rest_bends=mirrored_rest, routing="base"
+    )
+    q = random_q(rng, 3, 7, 0.0, 0.01 * spread)
+    J, expected = mirrored.pose_jacobian(q), chain.pose_jacobian(q)
+    assert_close(mirrored(q), chain(q) * flip, rtol=0, atol=1e-14)
+    # Angular velocities turn the other way round.
+    expected = expected * torch.cat([flip, -flip])[:, None]
+    assert_close(J / J.abs().max(), expected / J.abs().max(), rtol=0, atol=1e-14)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), more=st.floats(-0.1, 1.0))
+def test_a_common_length_keeps_the_bends(seed, more):
+    rng = torch.Generator().manual_seed(seed)
+    q, chain = random_q(rng, 3), CHAINS["chambers"][0]
+    (length, bending), (longer, as_before) = chain.arcs(q), chain.arcs(q + more)
+    assert_close(longer, length + more, rtol=0, atol=1e-15)
+    assert_close(as_before, bending, rtol=0, atol=5e-14)
+    # At given bends the tip is linear in the lengths.
+    twice = chain(q + 2 * more) - chain(q)
+    assert_close(twice, 2 * (chain(q + more) - chain(q)), rtol=0, atol=5e-14)
+
+
+def test_base_moves_everything(rng):
+    q = random_q(rng, 5)
+    base = pose(rotation_z(1.0), [1.0, -2.0, 0.5])
+    moved = bha(base=base)
+    expected = bha()(q) @ base[:3, :3].mT + base[:3, 3]
+    assert_close(moved(q), expected, rtol=1e-14, atol=1e-14)
+    assert_close(moved.jacobian(q), base[:3, :3] @ bha().jacobian(q), rtol=1e-14, atol=1e-14)
+    assert_close(moved.poses(q), base @ bha().poses(q), rtol=1e-14, atol=1e-14)
+
+
+def test_change_of_units(rng):
+    q = random_q(rng, 5)
+    with pytest.warns(UserWarning, match="millimetres"):
+        in_mm = ConstantCurvatureChain([100.0, 93.0, 79.0])
+    assert_close(in_mm(1000 * q), 1000 * bha()(q), rtol=1e-13, atol=1e-11)
+    assert_close(in_mm.jacobian(1000 * q), bha().jacobian(q), rtol=1e-13, atol=1e-13)
+
+
+def test_float32_keeps_its_dtype_and_accuracy(rng):
+    q = random_q(rng, 100)
+    x, J = bha().forward_and_jacobian(q.float())
+    assert x.dtype == J.dtype == torch.float32
+    reference, J_reference = bha().forward_and_jacobian(q.float().double())
+    assert_close(x.double(), reference, rtol=0, atol=1e-6)
+    assert_close(J.double(), J_reference, rtol=0, atol=1e-5)
+
+
+def test_no_nan_near_straight():
+    spread = 10.0 ** torch.arange(-16, -1, dtype=torch.float64)
+    q = 0.25 + spread[:, None] * torch.tensor([0.0, 1.0, -0.5] * 3, dtype=torch.float64)
+    for dtype in (torch.float64, torch.float32):
+        x, J = bha().forward_and_jacobian(q.to(dtype))
+        assert torch.isfinite(x).all()
+        assert torch.isfinite(J).all()
+
+
+def test_common_length_change_moves_the_tip():
+    straight, longer = bha()(STRAIGHT), bha()(STRAIGHT + 0.01)
+    expected = torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
+    assert_close(longer - straight, expected, rtol=1e-12, atol=1e-15)
+
+
+@settings(max_examples=30, deadline=None)
+@given(lead=st.lists(st.integers(0, 3), max_size=3), single=st.booleans())
+def test_any_batch_shape(lead, single):
+    q = torch.full((*lead, 9), 0.25, dtype=torch.float32 if single else torch.float64)
+    chain = bha()
+    assert chain(q).shape == (*lead, 3)
+    assert chain.jacobian(q).shape == (*lead, 3, 9)
+    assert chain.pose_jacobian(q).shape == (*lead, 6, 9)
+    assert chain.poses(q).shape == (*lead, 4, 4, 4)
+    assert chain.backbone(q, 5).shape == (*lead, 16, 3)
+    length, bending = chain.arcs(q)
+    assert length.shape == (*lead, 3)
+    assert bending.shape == (*lead, 3, 2)
+
+
+def test_batch_equals_loop_and_nan_stays_in_its_row(rng):
+    q = random_q(rng, 6)
+    chain = bha()
+    assert_close(chain(q), torch.stack([chain(row) for row in q]), rtol=0, atol=1e-15)
+    spoilt = q.clone()
+    spoilt[2, 4] = torch.nan
+    x = chain(spoilt)
+    kept = [0, 1, 3, 4, 5]
+    assert torch.isnan(x[2]).all()
+    assert_close(x[kept], chain(q)[kept], rtol=0, atol=1e-15)
+
+
+def test_functional_transforms(rng):
+    q = random_q(rng, 4)
+    chain = bha()
+    J = torch.func.vmap(torch.func.jacrev(chain))(q)
+    assert_close(J, chain.jacobian(q), rtol=1e-13, atol=1e-13)
+    hessian = torch.func.vmap(torch.func.hessian(chain))(STRAIGHT[None])
+    assert torch.isfinite(hessian).all()
+    state = {"base": pose(torch.eye(3), [0.0, 0.0, 1.0])}
+    lifted = torch.func.functional_call(chain, state, (q,))
+    assert_close(lifted[:, 2], chain(q)[:, 2] + 1.0, rtol=1e-14, atol=0)
+
+
+def test_blocks_of_rows_are_as_one(rng):
+    """More rows than a block has: under every transform what one pass would give."""
+    chain, q = bha(), random_q(rng, 4097)
+    both, one = chain.forward_and_jacobian, torch.ones((), dtype=torch.float64)
+    expected = chain._forward_and_jacobian(q)
+    two = torch.stack([q, 0.9 * q])
+    assert_close(both(q), expected, rtol=0, atol=1e-14)
+    assert_close(torch.func.vmap(both)(two), both(two), rtol=0, atol=1e-14)
+    compiled = torch.compile(both, backend="eager", fullgraph=True)
+    assert_close(compiled(q), expected, rtol=0, atol=1e-14)
+    with torch.no_grad():
+        assert_close(both(q.clone().requires_grad_()), expected, rtol=0, atol=1e-14)
+
+    def of_scale(function):
+        return lambda scale: function(scale * q)[1].sum((0, 1))
+
+    for take in (torch.func.jacrev, torch.func.jacfwd):
+        slopes = [take(of_scale(f))(one) for f in (both, chain._forward_and_jacobian)]
+        assert_close(*slopes, rtol=1e-11, atol=1e-9)
+        slopes = [torch.func.vmap(take(of_scale(both)))(one[None])[0], slopes[1]]
+        assert_close(*slopes, rtol=1e-11, atol=1e-9)
+    q.requires_grad_()
+    slopes = [torch.autograd.grad(f(q)[1].sum(), q)[0] for f in (both, chain._forward_and_jacobian)]
+    assert_close(*slopes, rtol=1e-11, atol=1e-9)
+    empty = both(q.new_empty(2, 0, 9))
+    assert [tuple(part.shape) for part in empty] == [(2, 0, 3), (2, 0, 3, 9)]
+
+
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+def test_compiled(backend, rng):
+    chain, q = tendons(), random_q(rng, 3, center=0.0, width=0.005)
+    for function in (chain.forward, chain.forward_and_jacobian):
+        compiled = torch.compile(function, backend=backend, fullgraph=True)
+        assert_close(compiled(q), function(q), rtol=0, atol=1e-14)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@each_chain
+def test_on_a_cuda_device(chain, center, width, rng):
+    q = random_q(rng, 5000, chain.n_actuators, center, width)
+    for there in (chain, copy.deepcopy(chain).cuda()):  # the geometry follows q
+        x, J = there.forward_and_jacobian(q.cuda())
+        assert x.is_cuda
+        assert J.is_cuda
+        expected = chain.forward_and_jacobian(q)
+        assert_close((x.cpu(), J.cpu()), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
+    q = random_q(rng, 4)
+    chain = bha()
+    before = chain.radii.clone()
+
+    def tip(radii):
+        return chain.with_geometry(radii=radii)(q)
+
+    radii = chain.radii.clone().requires_grad_()
+    assert torch.autograd.gradcheck(tip, radii)
+    assert_close(chain.radii, before, rtol=0, atol=0)
+    with pytest.raises(ValueError, match="lengths"):
+        chain.with_geometry(lengths=radii)
+
+
+@each_chain
+def test_pickle_copy_and_hash(chain, center, width, rng):
+    q = random_q(rng, 3, chain.n_actuators, center, width)
+    for twin in (pickle.loads(pickle.dumps(chain)), copy.deepcopy(chain)):
+        assert_close(twin(q), chain(q), rtol=0, atol=0)
+        assert joblib.hash(twin) == joblib.hash(chain)
+    assert_close(chain.float()(q).double(), chain(q).double(), rtol=0, atol=0)
+    chain.double()
+
+
+PARTS = [0.3, 1.0, 1.5, 2.0, 2.75, 3.0]
+
+
+@pytest.mark.parametrize("at", PARTS)
+@pytest.mark.parametrize("name", ["chambers", "tendons, through", "pre-curved"])
+def test_another_tip_lies_on_the_backbone(name, at, rng):
+    whole, center, width = CHAINS[name]
+    chain, q = whole.with_tip(at), random_q(rng, 4, 9, center, width)
+    x, J = chain.forward_and_jacobian(q)
+    assert_close(x, chain(q), rtol=0, atol=1e-15)
+    if at == int(at):
+        expected = whole.poses(q)[:, int(at)]
+        assert_close(x, expected[:, :3, 3], rtol=0, atol=2e-15)
+    else:
+        # The first n - 1 of n points of a segment lie on its arc.
+        points = whole.backbone(q, n_points=20)
+        assert_close(x, points[:, round(20 * at)], rtol=0, atol=2e-15)
+    _, J_reverse = reverse_jacobian(chain.forward, q)
+    assert_close(J, J_reverse, rtol=1e-13, atol=1e-13 * float(J.abs().max()))
+    J_pose = chain.pose_jacobian(q)
+    assert_close(J_pose[:, :3], J, rtol=1e-13, atol=1e-13)
+    later = J_pose[..., 3 * math.ceil(at) :]
+    assert_close(later, torch.zeros_like(later), rtol=0, atol=1e-15 * float(J_pose.abs().max()))
+    for own, others in zip(chain.arcs(q), whole.arcs(q), strict=True):
+        assert torch.equal(own, others)
+    assert torch.equal(chain.poses(q), whole.poses(q))
+    assert torch.equal(chain.backbone(q), whole.backbone(q))
+
+
+def test_the_last_tip_is_the_chain_itself(rng):
+    chain, q = tendons(), random_q(rng, 4, center=0.0, width=0.005)
+    same = chain.with_tip(1.5).with_tip(3)
+    assert torch.equal(same(q), chain(q))
+    assert torch.equal(same.pose_jacobian(q), chain.pose_jacobian(q))
+    assert repr(same) == repr(chain)
+    assert "tip at 1.5" in repr(chain.with_tip(1.5))
+    assert chain.tip_at == 3.0
+
+
+def test_another_tip_survives_copies(rng):
+    chain, q = tendons().with_tip(1.5), random_q(rng, 4, center=0.0, width=0.005)
+    for twin in (
+        pickle.loads(pickle.dumps(chain)),
+        copy.deepcopy(chain),
+        chain.with_geometry(radii=chain.radii.clone()),
+    ):
+        assert twin.tip_at == 1.5
+        assert torch.equal(twin.jacobian(q), chain.jacobian(q))
+    assert joblib.hash(chain) != joblib.hash(tendons())
+
+
+def test_another_tip_has_its_own_transform(rng):
+    pytest.importorskip("pytorch_kinematics")
+    whole, q = tendons(), random_q(rng, 4, center=0.0, width=0.005)
+    for at in PARTS:
+        chain = whole.with_tip(at)
+        matrix = chain.tip_transform(q).get_matrix()
+        assert_close(matrix[:, :3, 3], chain(q), rtol=0, atol=2e-15)
+        if at == int(at):
+            assert_close(matrix, whole.poses(q)[:, int(at)], rtol=0, atol=2e-15)
+        angular, frame = chain.pose_jacobian(q)[:, 3:], matrix[:, :3, :3]
+        for j, move in enumerate(1e-8 * torch.eye(9, dtype=torch.float64)):
+            ahead, behind = (chain.tip_transform(q + m).get_matrix() for m in (move, -move))
+            spin = (ahead - behind)[:, :3, :3] / 2e-8 @ frame.mT
+            spin = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], -1)
+            scale = angular.abs().max()
+            assert_close(spin / scale, angular[..., j] / scale, rtol=0, atol=1e-7)
+
+
+FUNCTIONS = {
+    **{name: chain for name, (chain, _, _) in CHAINS.items()},
+    "tool and base": bha(offsets=[0, 0, 0.1], base=pose(rotation_z(0.7), [0.1, 0.2, 0.3])),
+    "another tip": tendons().with_tip(1.5),
+    "single precision": tendons(dtype=torch.float32),
+}
+
+
+@pytest.mark.parametrize("chain", FUNCTIONS.values(), ids=FUNCTIONS)
+def test_numpy_function_is_the_chain(chain, rng):
+    tip_and_jacobian = chain.numpy_function()
+    center = 0.25 if chain.lengths is None else 0.0
+    widest = 4.0 * float(chain.radii.mean())  # [m], several full turns
+    for width in (0.0, 1e-12, 1e-6, 0.1 * widest, widest):
+        q = random_q(rng, 1, chain.n_actuators, center, width)[0].numpy()
+        before = q.copy()
+        x, J = tip_and_jacobian(q)
+        expected = chain.forward_and_jacobian(torch.from_numpy(q))
+        assert x.shape == (3,)
+        assert J.shape == (3, chain.n_actuators)
+        for value, tensor in zip((x, J), expected, strict=True):
+            assert value.dtype == np.float64
+            assert within(4e-15, torch.from_numpy(value), tensor)
+        np.testing.assert_array_equal(q, before)
+
+
+def test_transform3d_both_ways(rng):
+    transforms = pytest.importorskip("pytorch_kinematics").transforms
+    base = transforms.Transform3d(matrix=pose(rotation_z(0.3), [0.1, 0.0, 0.2])[None])
+    chain = bha(base=base)
+    q = random_q(rng, 3)
+    assert_close(chain.tip_transform(q).get_matrix()[:, :3, 3], chain(q), rtol=1e-13, atol=1e-14)
+
+
+def test_reverse_mode_jacobian_of_any_module(rng):
+    q = random_q(rng, 3)
+    assert_close(
+        jacobian(lambda q: q.sin() @ torch.ones(9, 2, dtype=q.dtype), q),
+        q.cos()[:, None].expand(3, 2, 9),
+        rtol=1e-14,
+        atol=0,
+    )
+    assert_close(jacobian(bha(), q), bha().jacobian(q), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ConstantCurvatureChain([0.1, -0.1]), "`radii` must be positive"),
+        (lambda: ConstantCurvatureChain([[0.1]]), r"`radii` must have shape \(S,\)"),
+        (lambda: ConstantCurvatureChain([0.1, float("nan")]), "`radii` must be finite"),
+        (lambda: ConstantCurvatureChain(["a"]), "`radii` must be numeric"),
+        (lambda: bha(n_actuators=2), "at least 3 on every segment"),
+        (lambda: bha(n_actuators=[3, 3]), "`n_actuators` must be one number or 3 numbers"),
+        (lambda: bha(angles=[0.0, 0.0, 0.0]), "`angles` must tell the bending"),
+        (lambda: bha(angles=[[0.0, 2.0, 4.0]] * 2), "`angles` must hold"),
+        (lambda: bha(lengths=[0.1, 0.1]), r"`lengths` must have shape \(3,\)"),
+        (lambda: bha(lengths=[0.1, 0.1, 0.0]), "`lengths` must be positive"),
+        (lambda: bha(routing="through"), "`routing` must be one of"),
+        (lambda: bha(offsets=[0.0]), r"`offsets` must have shape \(3,\)"),
+        (lambda: bha(rest_bends=[0.0, 1.0]), r"`rest_bends` must have shape \(3, 2\)"),
+        (lambda: bha(rest_bends=math.nan), "`rest_bends` must be finite"),
+        (lambda: bha(actuator_zeros=[0.0]), r"`actuator_zeros` must have shape \(9,\)"),
+        (lambda: bha().with_tip(0), r"`at` must lie in \(0, 3\]"),
+        (lambda: bha().with_tip(3.01), r"`at` must lie in \(0, 3\]"),
+        (lambda: bha().with_tip(math.nan), r"`at` must lie in \(0, 3\]"),
+        (lambda: bha(base=np.eye(3)), r"`base` must be one pose of shape \(4, 4\)"),
+        (lambda: bha(base=2 * np.eye(4)), "`base` must hold a rotation"),
+        (lambda: bha()(torch.zeros(4, 6, dtype=torch.float64)), r"`q` must have shape \(..., 9\)"),
+        (lambda: bha().backbone(STRAIGHT, 0), "`n_points` must be at least 1"),
+        (lambda: bha().check_actuators(STRAIGHT - 0.25), "positive actuator lengths"),
+        (lambda: bha().check_actuators(STRAIGHT * torch.nan), "must be finite"),
+    ],
+)
+def test_bad_input_says_what_is_needed(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_wrong_types_say_what_to_do():
+    with pytest.raises(TypeError, match="torch tensor"):
+        bha()(np.zeros(9))
+    with pytest.raises(TypeError, match="floating"):
+        bha()(torch.zeros(9, dtype=torch.int64))
+
+
+def test_angles_in_degrees_are_noticed():
+    degrees = [0.0, 120.0, 240.0]
+    for kind in (ConstantCurvatureChain, ElasticTendonChain):
+        with pytest.warns(UserWarning, match="reach 240, which looks like degrees"):
+            kind([0.005], lengths=[0.1], angles=degrees)
+        assert kind([0.005], lengths=[0.1], angles=np.radians(degrees)).n_actuators == 3
+
+
+def test_lengths_in_millimetres_are_noticed():
+    with pytest.warns(UserWarning, match="millimetres"):
+        bha().check_actuators(1000 * STRAIGHT)

@@ -1,0 +1,616 @@
+import copy
+import math
+import pickle
+
+import joblib
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+from torch.testing import assert_close
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    InverseKinematics,
+    calibrate,
+)
+from hybridkin.chains import _slack
+from hybridkin.chains import elastic_tendons as tendons
+from hybridkin.chains._arcs import levers, reading_matrix
+
+RADII, LENGTHS = [0.0045, 0.005, 0.004], [0.06, 0.0625, 0.064]
+SQUARED = np.square(RADII)
+
+
+def robot(**options):
+    """Return a robot that is not symmetric anywhere."""
+    options = {
+        "offsets": [0.002, 0.003, 0.01],
+        "tendon_zeros": 3e-4 * np.arange(9) - 5e-4,
+        "rest_bends": [[0.2, -0.1], [0.0, 0.3], [-0.4, 0.0]],
+        "angles": [[0.0, 2.0, 4.3], [0.4, 2.6, 4.5], [-0.6, 1.4, 3.7]],
+        "bending_stiffness": [0.2, 0.1, 0.05] * SQUARED,
+        "axial_stiffness": [3.0, 10.0, 1.0],
+        **options,
+    }
+    return ElasticTendonChain(RADII, LENGTHS, **options)
+
+
+def random_q(rng, n=20, size=9, width=0.005):
+    return width * (2 * torch.rand(n, size, generator=rng, dtype=torch.float64) - 1)
+
+
+def change_of_shape(chain, q):
+    """Return the length changes, x- and y-bendings of all segments (N, 3 S)."""
+    length, bending = chain.arcs(q)
+    return torch.cat([length - chain.lengths, *bending.unbind(-1)], dim=-1)
+
+
+def least_energy(chain, q):
+    """Return the shapes of least energy by bounded least squares, slackness as an unknown."""
+    at = levers(chain.radii, chain.angles, chain.actuators_per_segment)
+    B = reading_matrix(at, chain.actuators_per_segment, chain.routing, True).numpy()
+    bending = chain.bending_stiffness
+    root = torch.cat([chain.axial_stiffness, bending, bending]).sqrt().numpy()
+    rest = np.concatenate([np.zeros(chain.n_segments), *chain.rest_bends.T.numpy()])
+    n, m = B.shape
+    unit = np.concatenate([np.ones(chain.n_segments), *[1 / chain.radii.numpy()] * 2])
+    matrix = np.block([[np.diag(root * unit), np.zeros((m, n))], [B * unit, np.eye(n)]])
+    low = np.concatenate([np.full(m, -np.inf), np.zeros(n)])
+    shapes = []
+    for row in q.numpy():
+        target = np.concatenate([root * rest, row - chain.tendon_zeros.numpy()])
+        # In units of the largest target, or the solver's tolerance would be met too early.
+        size = np.abs(target).max() or 1.0
+        found = lsq_linear(matrix, target / size, (low, np.inf), method="bvls", tol=1e-15)
+        shapes.append(unit * found.x[:m] * size)
+    return torch.tensor(np.array(shapes))
+
+
+ROBOTS = {
+    "through": robot(),
+    "own segment": robot(routing="segment"),
+    "soft": ElasticTendonChain(RADII, LENGTHS),
+    "pre-tensioned": ElasticTendonChain(RADII, LENGTHS, tendon_zeros=0.002),
+    "uneven": ElasticTendonChain(
+        RADII[:2],
+        LENGTHS[:2],
+        n_tendons=[2, 4],
+        angles=[[0.0, 2.0], [0.1, 1.5, 3.0, 4.4]],
+        tendon_zeros=[[1e-3, 0.0], [0.0, 2e-3, 0.0, -1e-3]],
+        base=[[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.2], [0.0, 0.0, 1.0, 0.3], [0, 0, 0, 1]],
+    ),
+    "sixteen tendons": ElasticTendonChain(
+        [*RADII, 0.003], [*LENGTHS, 0.05], n_tendons=4, rest_bends=0.1, tendon_zeros=1e-3
+    ),
+}
+each_robot = pytest.mark.parametrize("chain", ROBOTS.values(), ids=ROBOTS)
+
+
+@each_robot
+def test_the_shape_has_the_least_energy(chain, rng):
+    n = chain.n_actuators
+    wide = torch.cat([random_q(rng, 60, n, width) for width in (1e-4, 2e-3, 5e-3, 0.02)])
+    pulled = -torch.eye(n, dtype=torch.float64) * 0.01
+    q = torch.cat([wide, pulled, 0.0 * wide[:1], 0 * wide[:2] + 0.01, 0 * wide[:2] - 0.01])
+    assert chain.slack(q).double().mean() > 0.1
+    assert_close(change_of_shape(chain, q), least_energy(chain, q), rtol=0, atol=1e-9)
+
+
+@each_robot
+def test_forces_balance_where_it_rests(chain, rng):
+    q = random_q(rng, 200, chain.n_actuators)
+    shape, tension = change_of_shape(chain, q), chain.tensions(q)
+    at = levers(chain.radii, chain.angles, chain.actuators_per_segment)
+    B = reading_matrix(at, chain.actuators_per_segment, chain.routing, True)
+    stretch = shape @ B.T - q + chain.tendon_zeros
+    assert_close(tension, stretch.relu(), rtol=0, atol=1e-15)
+    assert torch.equal(chain.slack(q) & (tension > 0), torch.zeros_like(tension > 0))
+    bending = chain.bending_stiffness
+    stiffness = torch.cat([chain.axial_stiffness, bending, bending])
+    rest = torch.cat([0 * chain.lengths, *chain.rest_bends.T])
+    moments = stiffness * (shape - rest) + tension @ B
+    scale = torch.cat([1 + 0 * chain.radii, chain.radii, chain.radii])
+    assert_close(moments / scale, 0 * moments, rtol=0, atol=1e-14)
+
+
+WAYS = [(_slack, "_WHOLE_STEPS"), (_slack, "_MANY"), (tendons, "_TABLE")]
+
+
+@pytest.mark.parametrize(("room", "limit"), WAYS)
+def test_every_way_to_find_the_taut_tendons_agrees(room, limit, monkeypatch, rng):
+    chain, q = robot(), random_q(rng, 500)
+    expected, taut = change_of_shape(chain, q), chain.slack(q)
+    monkeypatch.setattr(room, limit, 0)
+    chain = robot()
+    assert torch.equal(chain.slack(q), taut)
+    assert_close(change_of_shape(chain, q), expected, rtol=0, atol=1e-12)
+    J = chain.jacobian(q)
+    monkeypatch.undo()
+    assert_close(J, chain.jacobian(q), rtol=0, atol=1e-12 * float(J.abs().max()))
+
+
+@pytest.mark.parametrize("name", ["through", "soft", "pre-tensioned", "uneven"])
+@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 3e-6)])
+def test_single_precision_leaves_what_is_too_close(name, dtype, rounding, monkeypatch, rng):
+    chain, n = ROBOTS[name], ROBOTS[name].n_actuators
+    monkeypatch.setattr(_slack, "_MANY", math.inf)
+    q = torch.cat([random_q(rng, 100, n, width) for width in (0.0, 1e-9, 1e-5, 5e-3, 5.0)])
+
+    def stretches(q):
+        shape = change_of_shape(chain, q.double())
+        return shape @ chain._elasticity().readings.T - q + chain.tendon_zeros
+
+    # Onto the kinks and a hair beside them: a tendon at the length where it starts to pull.
+    stretch, kink = stretches(q), q.clone()
+    first = stretch.where(stretch < 0, -torch.inf).argmax(-1, keepdim=True)
+    kink.scatter_add_(1, first, stretch.gather(1, first).clamp(max=0.0))
+    q = torch.cat([q, *(kink + hair for hair in (0.0, 1e-9, -1e-9, 1e-12, -1e-12))]).to(dtype)
+    size = q.abs().amax(-1, keepdim=True) + chain.tendon_zeros.abs().amax()
+    clear = stretches(q).abs() > rounding * size
+    clear[:100] = True  # q = 0: even a tendon just about to pull
+    assert clear[:500].float().mean() > 0.9
+    expected, pull = chain.slack(q), chain.tensions(q)
+    spoilt = q.clone()
+    spoilt[::7, 0], spoilt[1::7, 1] = torch.nan, torch.inf
+    monkeypatch.setattr(_slack, "_MANY", 0)
+    for steps in (5, 50):
+        monkeypatch.setattr(_slack, "_ROUGH_STEPS", steps)
+        assert torch.equal(chain.slack(q)[clear], expected[clear])
+        assert ((chain.tensions(q) - pull).abs() <= rounding * size).all()
+        sound = spoilt.isfinite().all(-1)
+        assert torch.equal(chain.tensions(spoilt)[sound], chain.tensions(q)[sound])
+        assert torch.isnan(chain(spoilt)[::7]).all()
+
+
+def test_one_tendon_pulled_by_hand():
+    radius, bending, axial, pull = 0.005, 2e-6, 4.0, 0.003
+    chain = ElasticTendonChain([radius], [0.1], bending_stiffness=bending, axial_stiffness=axial)
+    q = torch.tensor([-pull, 0.01, 0.01], dtype=torch.float64)
+    assert chain.slack(q).tolist() == [False, True, True]
+    tension = pull / (1 + 1 / axial + radius**2 / bending)
+    assert_close(chain.tensions(q), torch.tensor([tension, 0.0, 0.0]).double(), rtol=1e-6, atol=0)
+    length, bend = chain.arcs(q)
+    assert float(length) == pytest.approx(0.1 - tension / axial, rel=1e-13)
+    assert_close(bend[0], torch.tensor([radius * tension / bending, 0.0]).double())
+
+
+def test_a_common_pull_shortens_and_pretension_grows():
+    chain = ElasticTendonChain([0.005], [0.1], axial_stiffness=1.5, tendon_zeros=0.001)
+    q = torch.full((3,), -0.002, dtype=torch.float64)
+    length, bend = chain.arcs(q)
+    assert float(length) == pytest.approx(0.1 - 3 * 0.003 / (3 + 1.5), rel=1e-13)
+    assert_close(bend, torch.zeros_like(bend), rtol=0, atol=1e-15)
+    assert_close(chain.tensions(q), torch.full_like(q, 0.001), rtol=1e-12, atol=0)
+    more = chain.with_geometry(tendon_zeros=chain.tendon_zeros + 0.001)
+    assert (more.tensions(q) > chain.tensions(q)).all()
+
+
+def test_slack_tendons_hang(rng):
+    chain, q = robot(), random_q(rng, 200)
+    looser = q + 0.01 * chain.slack(q)  # however far
+    assert_close(chain(looser), chain(q), rtol=0, atol=1e-15)
+    assert_close(chain.tensions(looser), chain.tensions(q), rtol=0, atol=1e-15)
+    idle = chain.slack(q)[:, None].expand(-1, 3, -1)
+    assert (chain.jacobian(q)[idle] == 0).all()
+    loose = torch.full((9,), 0.1, dtype=torch.float64)
+    assert chain.slack(loose).all()
+    assert_close(chain.arcs(loose), (chain.lengths, chain.rest_bends), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("routing", ["segment", "base"])
+def test_taut_and_soft_is_the_plain_chain(routing, rng):
+    turns = 2 * math.pi / 3 * np.arange(3) + np.array([[0.3], [1.0], [-0.5]])
+    options = {"angles": turns, "routing": routing, "offsets": [0.002, 0.003, 0.01]}
+    q = random_q(rng, 50)
+    for zeros, axial in ((0.02, 30.0), (0.05, 100.0)):
+        chain = ElasticTendonChain(
+            RADII,
+            LENGTHS,
+            tendon_zeros=zeros,
+            axial_stiffness=axial,
+            bending_stiffness=1e-14 * SQUARED,
+            **options,
+        )
+        assert not chain.slack(q).any()
+        length, bending = chain.arcs(q)
+        plain = ConstantCurvatureChain(RADII, lengths=LENGTHS, **options)
+        assert_close(bending, plain.arcs(q)[1], rtol=0, atol=1e-9)
+        expected = [
+            plain.with_geometry(lengths=own)(row) for own, row in zip(length, q, strict=True)
+        ]
+        assert_close(chain(q), torch.stack(expected), rtol=0, atol=1e-9)
+
+
+def test_soft_by_default_and_near_the_plain_chain(rng):
+    plain = ConstantCurvatureChain(RADII, lengths=LENGTHS, routing="base")
+    q = random_q(rng, 50).unflatten(1, (3, 3))
+    q = (q - q.mean(-1, keepdim=True)).flatten(1)
+    bends = plain.arcs(q)[1]
+    for zeros, part in ((0.0, 0.08), (1e-3, 0.02)):
+        chain = ElasticTendonChain(RADII, LENGTHS, tendon_zeros=zeros)
+        assert (chain.arcs(q)[1] - bends).norm() < part * bends.norm()
+
+
+def test_tendons_may_be_renamed_and_the_robot_turned(rng):
+    chain, q = robot(base=None), random_q(rng, 20)
+    order = torch.tensor([2, 0, 1, 3, 5, 4, 8, 7, 6])
+    renamed = chain.with_geometry(
+        angles=chain.angles[order], tendon_zeros=chain.tendon_zeros[order]
+    )
+    assert_close(renamed(q[:, order]), chain(q), rtol=0, atol=1e-14)
+    assert_close(renamed.tensions(q[:, order]), chain.tensions(q)[:, order], rtol=0, atol=1e-16)
+    c, s = math.cos(0.7), math.sin(0.7)
+    turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
+    turned = chain.with_geometry(angles=chain.angles + 0.7, rest_bends=chain.rest_bends @ turn.T)
+    expected = torch.cat([chain(q)[:, :2] @ turn.T, chain(q)[:, 2:]], dim=1)
+    assert_close(turned(q), expected, rtol=0, atol=1e-14)
+
+
+def test_change_of_units(rng):
+    q, chain = random_q(rng, 20), robot()
+    units = {"radii": 1e3, "lengths": 1e3, "offsets": 1e3, "tendon_zeros": 1e3}
+    units["bending_stiffness"] = 1e6
+    geometry = chain.geometry()
+    in_mm = chain.with_geometry(**{name: unit * geometry[name] for name, unit in units.items()})
+    assert_close(in_mm(1e3 * q), 1e3 * chain(q), rtol=1e-12, atol=1e-11)
+    assert_close(in_mm.tensions(1e3 * q), 1e3 * chain.tensions(q), rtol=0, atol=1e-12)
+
+
+@each_robot
+def test_jacobian_against_central_differences(chain, rng):
+    q, step = random_q(rng, 100, chain.n_actuators), 1e-6
+    moves = step * torch.eye(chain.n_actuators, dtype=torch.float64)
+    beside = [chain.slack(q[:, None] + sign * moves) for sign in (2, 1, -1, -2)]
+    smooth = torch.stack(beside).eq(chain.slack(q)[:, None]).flatten(2).all(-1).all(0)
+    q = q[smooth]
+    assert len(q) > 30
+    J, at = chain.jacobian(q), q[:, None]
+    near = (chain(at + moves) - chain(at - moves)) / (2 * step)
+    far = (chain(at + 2 * moves) - chain(at - 2 * moves)) / (4 * step)
+    expected = ((4 * near - far) / 3).mT
+    assert_close(J, expected, rtol=0, atol=1e-7 * float(J.abs().max()))
+
+
+@each_robot
+def test_closed_form_jacobians_are_those_of_autograd(chain, rng):
+    q = random_q(rng, 10, chain.n_actuators)
+    x, J = chain.forward_and_jacobian(q)
+    assert_close(x, chain(q), rtol=0, atol=1e-15)
+    J_pose, tolerance = chain.pose_jacobian(q), 1e-12 * float(J.abs().max())
+    assert_close(J_pose[:, :3], J, rtol=0, atol=tolerance)
+    for take in (torch.func.jacrev, torch.func.jacfwd):
+        assert_close(torch.func.vmap(take(chain))(q), J, rtol=0, atol=tolerance)
+    frame = chain.poses(q)[:, -1, :3, :3]
+    slope = torch.func.vmap(torch.func.jacrev(lambda row: chain.poses(row)[-1, :3, :3]))(q)
+    spin = torch.einsum("nabj,ncb->njac", slope, frame)
+    spin = torch.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], dim=1)
+    assert_close(J_pose[:, 3:], spin, rtol=0, atol=1e-11 * float(spin.abs().max()))
+    second = [
+        torch.func.vmap(take(chain.jacobian))(q[:3])
+        for take in (torch.func.jacrev, torch.func.jacfwd)
+    ]
+    assert_close(*second, rtol=0, atol=1e-12 * float(second[0].abs().max()))
+
+
+@pytest.mark.parametrize("name", ["through", "pre-tensioned", "sixteen tendons"])
+def test_gradcheck(name, rng):
+    chain = ROBOTS[name]
+    q = random_q(rng, 2, chain.n_actuators).requires_grad_()
+    assert torch.autograd.gradcheck(chain, q)
+    assert torch.autograd.gradgradcheck(chain, q)
+    assert torch.autograd.gradcheck(chain.tensions, q)
+
+
+def test_at_a_kink_the_derivative_is_the_taut_side():
+    chain = ElasticTendonChain(RADII, LENGTHS)
+    straight, ones = torch.zeros(9, dtype=torch.float64), torch.ones(9, dtype=torch.float64)
+    assert not chain.slack(straight).any()
+    assert_close(chain.tensions(straight), straight, rtol=0, atol=0)
+    pulled = (chain(straight) - chain(straight - 1e-6 * ones)) / 1e-6
+    assert_close(chain.jacobian(straight) @ ones, pulled, rtol=1e-6, atol=1e-8)
+
+
+@each_robot
+def test_geometry_jacobian_is_that_of_autograd(chain, rng):
+    q = random_q(rng, 6, chain.n_actuators)
+    for name, value in chain.geometry().items():
+        P = value.numel()
+        tangents = torch.eye(P, dtype=torch.float64).reshape(P, *value.shape)
+        J = chain.geometry_jacobian(q, {name: tangents})
+        expected = torch.func.jacfwd(lambda v: chain.with_geometry(**{name: v})(q))(value)  # noqa: B023
+        assert_close(J, expected.flatten(2), rtol=0, atol=1e-10 * float(expected.abs().max()))
+    both = {"radii": chain.radii[None], "tendon_zeros": torch.ones(1, chain.n_actuators).double()}
+    each = [chain.geometry_jacobian(q, {name: value}) for name, value in both.items()]
+    J = chain.geometry_jacobian(q, both)
+    assert_close(J, sum(each), rtol=0, atol=1e-12 * float(J.abs().max()))
+
+
+def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
+    chain, q = robot(), random_q(rng, 3)
+    before = {name: value.clone() for name, value in chain.geometry().items()}
+    expected = chain(q)
+    for name in ("radii", "angles", "lengths", "rest_bends", "axial_stiffness", "offsets"):
+        value = (1.01 * before[name]).requires_grad_()
+        assert torch.autograd.gradcheck(
+            lambda value: chain.with_geometry(**{name: value}).forward_and_jacobian(q),  # noqa: B023
+            value,
+        )
+    radii = torch.stack([chain.radii, 1.1 * chain.radii])
+    tips = torch.func.vmap(lambda own: chain.with_geometry(radii=own)(q))(radii)
+    assert_close(tips[0], expected, rtol=0, atol=1e-13)
+    assert_close(tips[1], chain.with_geometry(radii=radii[1])(q), rtol=0, atol=1e-13)
+    both = torch.func.vmap(lambda own, row: chain.with_geometry(radii=own)(row))(radii, q[:2])
+    assert_close(both[0], expected[0], rtol=0, atol=1e-13)
+    assert_close(chain.geometry(), before, rtol=0, atol=0)
+    with pytest.raises(ValueError, match="stiffness"):
+        chain.with_geometry(stiffness=radii[0])
+
+
+def test_what_is_kept_follows_the_geometry(rng):
+    chain, q = robot(), random_q(rng, 5)
+    with torch.inference_mode():
+        before = chain(q)
+    leaf = q.clone().requires_grad_()
+    assert_close(torch.autograd.grad(chain(leaf)[:, 0].sum(), leaf)[0], chain.jacobian(q)[:, 0])
+    table = chain._table
+    assert chain.with_geometry(base=chain.base.clone(), lengths=chain.lengths)._table is table
+    for _ in range(2):
+        chain(q)
+    assert chain._table is table
+    twin = robot(tendon_zeros=0.0)
+    expected = twin(q)
+    chain.load_state_dict(twin.state_dict())
+    assert_close(chain(q), expected, rtol=0, atol=1e-14)
+    chain.tendon_zeros.copy_(robot().tendon_zeros)
+    assert_close(chain(q), before, rtol=0, atol=1e-14)
+    swapped = torch.func.functional_call(chain, {"tendon_zeros": twin.tendon_zeros}, (q,))
+    assert_close(swapped, expected, rtol=0, atol=1e-14)
+    assert_close(chain(q), before, rtol=0, atol=1e-14)
+    zeros = chain.tendon_zeros.clone().requires_grad_()
+    learning = chain.with_geometry(tendon_zeros=zeros)
+    with torch.no_grad():
+        learning(q)
+    for _ in range(2):  # nothing of a graph is kept
+        learning(q).sum().backward()
+    slope = chain.geometry_jacobian(q, {"tendon_zeros": torch.eye(9, dtype=torch.float64)})
+    assert_close(zeros.grad, 2 * slope.sum((0, 1)), rtol=1e-10, atol=1e-10)
+
+
+def test_blocks_of_rows_are_as_one(rng):
+    chain, q = robot(), random_q(rng, 9000)
+    x, J = chain.forward_and_jacobian(q)
+    assert_close((chain(q), x), 2 * (chain._forward(q)[0],), rtol=0, atol=1e-14)
+    assert_close(J, chain._forward_and_jacobian(q)[1], rtol=0, atol=1e-14)
+    one = torch.ones((), dtype=torch.float64)
+    slope = torch.func.jacfwd(lambda scale: chain(scale * q).sum(0))(one)
+    assert_close(slope, (J @ q[..., None]).sum((0, 2)), rtol=1e-10, atol=1e-10)
+
+
+@settings(max_examples=20, deadline=None)
+@given(lead=st.lists(st.integers(0, 3), max_size=3), single=st.booleans())
+def test_any_batch_shape(lead, single):
+    dtype = torch.float32 if single else torch.float64
+    q, chain = torch.full((*lead, 9), -1e-3, dtype=dtype), ROBOTS["through"]
+    for value, shape in (
+        (chain(q), (3,)),
+        (chain.jacobian(q), (3, 9)),
+        (chain.pose_jacobian(q), (6, 9)),
+        (chain.tensions(q), (9,)),
+        (chain.poses(q), (4, 4, 4)),
+        (chain.backbone(q, 5), (16, 3)),
+        (chain.geometry_jacobian(q, {"lengths": torch.eye(3)}), (3, 3)),
+    ):
+        assert value.shape == (*lead, *shape)
+        assert value.dtype == dtype
+    assert chain.slack(q).shape == q.shape
+    assert chain.slack(q).dtype == torch.bool
+
+
+@each_robot
+def test_batch_equals_loop_and_nan_stays_in_its_row(chain, rng):
+    q = random_q(rng, 6, chain.n_actuators)
+    assert_close(chain(q), torch.stack([chain(row) for row in q]), rtol=0, atol=1e-14)
+    spoilt = q.clone()
+    spoilt[2, 4], spoilt[3, 1] = torch.nan, torch.inf
+    x = chain(spoilt)
+    assert torch.isnan(x[2]).all()
+    kept = [0, 1, 4, 5]
+    assert_close(x[kept], chain(q)[kept], rtol=0, atol=1e-14)
+
+
+@each_robot
+def test_single_precision(chain, rng):
+    widths = (0.0, 1e-9, 1e-5, 1e-3, 5e-3, 0.05)
+    q = torch.cat([random_q(rng, 100, chain.n_actuators, width) for width in widths]).float()
+    for there in (chain, copy.deepcopy(chain).float()):
+        x, J = there.forward_and_jacobian(q)
+        assert x.dtype == J.dtype == torch.float32
+        assert torch.isfinite(x).all()
+        assert torch.isfinite(J).all()
+        assert_close(x[:-100].double(), chain(q.double())[:-100], rtol=0, atol=1e-5)
+        same = (there.slack(q) == chain.slack(q.double())).all(-1)
+        same[-100:] = False  # twenty turns
+        assert same.sum() > 300
+        expected = chain.jacobian(q.double())[same]
+        assert_close(J[same].double(), expected, rtol=0, atol=1e-4 * float(expected.abs().max()))
+
+
+def test_absurd_displacements_end(rng):
+    """Millimetres taken for metres, and a robot of almost no stiffness: slow, but it ends."""
+    feather = robot(bending_stiffness=1e-13 * SQUARED, axial_stiffness=1e-9)
+    for chain in (robot(), feather):
+        for dtype in (torch.float64, torch.float32):
+            x = chain(random_q(rng, 50, width=5.0).to(dtype))
+            assert torch.isfinite(x).all()
+
+
+@each_robot
+def test_pickle_copy_and_hash(chain, rng):
+    q, fresh = random_q(rng, 3, chain.n_actuators), copy.deepcopy(chain)
+    x = chain(q)
+    assert joblib.hash(fresh) == joblib.hash(chain)
+    for twin in (pickle.loads(pickle.dumps(chain)), copy.deepcopy(chain)):
+        assert_close(twin(q), x, rtol=0, atol=0)
+    assert set(chain.state_dict()) == set(chain.geometry())
+
+
+def test_another_tip(rng):
+    whole, q = robot(), random_q(rng, 4)
+    for at in (0.3, 1.0, 1.5, 3.0):
+        chain = whole.with_tip(at)
+        x, J = chain.forward_and_jacobian(q)
+        if at == int(at):
+            assert_close(x, whole.poses(q)[:, int(at), :3, 3], rtol=0, atol=1e-15)
+        else:
+            assert_close(x, whole.backbone(q)[:, round(20 * at)], rtol=0, atol=1e-15)
+        expected = torch.func.vmap(torch.func.jacrev(chain))(q)
+        assert_close(J, expected, rtol=0, atol=1e-12 * float(J.abs().max()))
+        tangents = torch.eye(9, dtype=torch.float64)
+        slope = chain.geometry_jacobian(q, {"angles": tangents})
+        expected = torch.func.jacfwd(lambda v: chain.with_geometry(angles=v)(q))(chain.angles)  # noqa: B023
+        assert_close(slope, expected, rtol=0, atol=1e-11 * float(slope.abs().max()))
+    assert repr(whole) == "ElasticTendonChain(3 segments, 9 actuators, routing 'base')"
+    assert "tip at 0.3" in repr(whole.with_tip(0.3))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@each_robot
+def test_on_a_cuda_device(chain, rng):
+    q = random_q(rng, 5000, chain.n_actuators)
+    expected = chain.forward_and_jacobian(q)
+    for there in (chain, copy.deepcopy(chain).cuda()):
+        x, J = there.forward_and_jacobian(q.cuda())
+        assert x.is_cuda
+        assert_close((x.cpu(), J.cpu()), expected, rtol=1e-9, atol=1e-11)
+
+
+def logged(truth, rng, n=300):
+    """Return displacements that let tendons go slack, and the tips."""
+    q = random_q(rng, n)
+    share = truth.slack(q).double().mean()
+    assert 0.1 < share < 0.9
+    return q, truth(q)
+
+
+PLANTED = ("rest_bends", "bending_stiffness", "axial_stiffness", "tendon_zeros")
+
+
+def test_calibration_finds_stiffness_rest_bends_and_zeros(rng):
+    truth = robot()
+    q, x = logged(truth, rng)
+    geometry = truth.geometry()
+    start = truth.with_geometry(
+        rest_bends=0 * geometry["rest_bends"],
+        bending_stiffness=0.65 * geometry["bending_stiffness"],
+        axial_stiffness=1.5 * geometry["axial_stiffness"],
+        tendon_zeros=0 * geometry["tendon_zeros"] + 5e-4,
+    )
+    result = calibrate(start, q, x, PLANTED)
+    for name in PLANTED:
+        assert result.identifiable[name].all()
+        scale = float(geometry[name].abs().max())
+        assert_close(result.values[name] / scale, geometry[name] / scale, rtol=0, atol=1e-6)
+
+
+def test_calibration_turns_the_rings(rng):
+    truth = robot()
+    q, x = logged(truth, rng)
+    start = truth.with_geometry(angles=truth.angles + 0.8)
+    result = calibrate(start, q, x, ("base", "angles", *PLANTED, "tool"))
+    assert result.rmse < 1e-8
+    new = random_q(rng, 50)
+    assert_close(result.chain(new), truth(new), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ElasticTendonChain([0.1, -0.1], [1.0, 1.0]), "`radii` must be positive"),
+        (lambda: robot(n_tendons=[3, 3]), "`n_tendons` must be one number or 3 numbers"),
+        (lambda: robot(n_tendons=0), "`n_tendons` must be at least 1 on every segment"),
+        (lambda: robot(n_tendons=30, angles=None, tendon_zeros=0.0), "at most 62 in all, got 90"),
+        (lambda: robot(angles=[[0.0, 2.0, 4.0]] * 2), "`angles` must hold"),
+        (lambda: ElasticTendonChain(RADII, LENGTHS[:2]), r"`lengths` must have shape \(3,\)"),
+        (lambda: robot(routing="through"), "`routing` must be one of"),
+        (lambda: robot(bending_stiffness=0.0), "`bending_stiffness` must be positive"),
+        (lambda: robot(axial_stiffness=[1.0, 1.0]), r"`axial_stiffness` must have shape \(3,\)"),
+        (lambda: robot(axial_stiffness=math.nan), "`axial_stiffness` must be finite"),
+        (lambda: robot(tendon_zeros=[0.0]), r"`tendon_zeros` must have shape \(9,\)"),
+        (lambda: robot()(torch.zeros(4, 6)), r"`q` must have shape \(..., 9\)"),
+        (lambda: robot().check_actuators(torch.full((9,), torch.nan)), "must be finite"),
+    ],
+)
+def test_bad_input_says_what_is_needed(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_displacements_in_millimetres_are_noticed():
+    with pytest.warns(UserWarning, match="millimetres"):
+        robot().check_actuators(torch.full((9,), 5.0))
+
+
+def test_taut_posture_keeps_tendons_taut_and_leaves_the_tip_alone(rng):
+    chain = ElasticTendonChain([0.005] * 3, [0.06] * 3, tendon_zeros=0.0005)
+    q = 0.004 * (2.0 * torch.rand(30, 9, dtype=torch.float64, generator=rng) - 1.0)
+    target = chain(q)
+    assert chain.slack(q).any(-1).float().mean() > 0.5
+    ik = InverseKinematics(chain, q_pref=chain.taut_posture(2e-4), q_min=-0.02, q_max=0.02)
+    for solution in (ik.solve(target, q0=q), ik.solve(target)):
+        assert (solution.error < 1e-4).all()
+        assert (chain.tensions(solution.q).amin(-1) > 1.5e-4).float().mean() > 0.9
+    # A step with the posture moves the tip no further than one without, to first order.
+    steps = [
+        InverseKinematics(chain, q_pref=posture, limits="off").step(q, target).dq
+        for posture in (None, chain.taut_posture(2e-4))
+    ]
+    assert (chain.jacobian(q) @ (steps[1] - steps[0])[..., None]).abs().max() < 1e-12
+    assert (steps[1] - steps[0]).norm(dim=-1).mean() > 1e-6
+    with pytest.raises(ValueError, match="stretch >= 0"):
+        chain.taut_posture(-1.0)
+
+
+@pytest.mark.parametrize("width", [1e-6, 1e-4, 1e-3])
+def test_smoothed_tension_balances_and_has_no_kinks(rng, width):
+    chain, q = robot(smoothing=width), random_q(rng, 100)
+    shape, pull, share, _ = chain._balance(q)
+    readings, _, stiffness, rest, zeros = chain._elasticity()
+    stretch = shape @ readings.T - q + zeros
+    assert_close(pull, 0.5 * (stretch + (stretch**2 + width**2).sqrt()))
+    forces = stiffness * (shape - rest) + pull @ readings
+    assert forces.abs().max() < 1e-14 * pull.abs().max()
+    assert_close(chain.slack(q), share < 0.5)
+    by_autograd = torch.func.vmap(torch.func.jacrev(chain))(q)
+    assert_close(chain.jacobian(q), by_autograd, rtol=0, atol=1e-11)
+    tangents = {
+        name: torch.randn(2, *value.shape, generator=rng, dtype=torch.float64)
+        for name, value in chain.geometry().items()
+    }
+
+    def moved(theta):
+        changes = {name: torch.tensordot(theta, part, 1) for name, part in tangents.items()}
+        return chain.with_geometry(
+            **{name: value + changes[name] for name, value in chain.geometry().items()}
+        )(q[:5])
+
+    expected = torch.func.jacfwd(moved)(torch.zeros(2, dtype=torch.float64))
+    assert_close(chain.geometry_jacobian(q[:5], tangents), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_smoothing_fades_into_the_exact_model(rng):
+    q = random_q(rng, 200)
+    errors = [
+        (robot(smoothing=width)(q) - robot()(q)).norm(dim=-1).max() for width in (1e-4, 1e-6, 1e-8)
+    ]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+    assert errors[2] < 1e-7
+    chain = robot(smoothing=5e-4)
+    corner = torch.zeros(9, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradgradcheck(chain, corner, eps=1e-7, atol=1e-2, rtol=1e-3)
+    assert copy.deepcopy(chain).with_tip(1.5).smoothing == 5e-4
+    with pytest.raises(ValueError, match="`smoothing`"):
+        robot(smoothing=-1.0)

@@ -1,0 +1,226 @@
+import runpy
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, PlayOperator, fit_play
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "plot_slack_tendons.py"
+ROWS = st.integers(1, 12).flatmap(
+    lambda T: arrays(np.float64, (T, 3), elements=st.floats(-0.01, 0.01))
+)
+WIDTHS = st.one_of(
+    st.floats(0.0, 0.01), arrays(np.float64, 3, elements=st.floats(0.0, 0.01)).map(np.array)
+)
+CHECKS = settings(max_examples=50, deadline=None)
+
+
+def close(a, b):
+    assert_close(torch.as_tensor(a), torch.as_tensor(b), rtol=0.0, atol=1e-15)
+
+
+def test_play_by_hand():
+    q = np.array([[0.0], [0.1], [1.0], [0.75], [0.5], [0.25], [2.0]])
+    y, state = PlayOperator(0.5).apply(q)
+    close(y.ravel(), np.array([0.0, 0.0, 0.75, 0.75, 0.75, 0.5, 1.75]))
+    close(state.command, np.array([2.0]))
+    close(state.effective, np.array([1.75]))
+
+
+@CHECKS
+@given(q=ROWS)
+def test_no_width_is_the_identity(q):
+    close(PlayOperator(0.0).apply(q)[0], q)
+    close(PlayOperator(0.0).command(q)[0], q)
+
+
+@CHECKS
+@given(q=ROWS, width=WIDTHS, repeats=st.integers(2, 4))
+def test_speed_does_not_matter(q, width, repeats):
+    """A command held, or reached in smaller steps, leads to the same."""
+    play = PlayOperator(width)
+    y, _ = play.apply(q)
+    close(play.apply(np.repeat(q, repeats, axis=0))[0][::repeats], y)
+    parts = np.linspace(0.0, 1.0, repeats + 1)[1:, None]
+    ways = [a + parts * (b - a) for a, b in pairwise(q)]
+    slow = np.concatenate([q[:1], *ways])
+    close(play.apply(slow)[0][::repeats], y)
+
+
+@CHECKS
+@given(q=ROWS, width=WIDTHS, more=st.floats(0.0, 0.01))
+def test_more_command_is_never_less_effect(q, width, more):
+    play = PlayOperator(width)
+    push = more * np.linspace(0.0, 1.0, q.size).reshape(q.shape)
+    assert (play.apply(q + push)[0] >= play.apply(q)[0] - 1e-15).all()
+
+
+@CHECKS
+@given(q=ROWS, width=WIDTHS)
+def test_effect_stays_within_half_the_width(q, width):
+    y, _ = PlayOperator(width).apply(q)
+    assert (np.abs(y - q) <= np.asarray(width) / 2 + 1e-15).all()
+
+
+@CHECKS
+@given(q=ROWS, width=WIDTHS)
+def test_a_larger_swing_wipes_out_the_past(q, width):
+    play = PlayOperator(width)
+    end = np.array([[0.05] * 3, [-0.05] * 3, [0.0] * 3])
+    close(play.apply(np.concatenate([q, end]))[0][-3:], play.apply(end, play.apply(q)[1])[0])
+    close(play.apply(np.concatenate([q, end]))[1].effective, play.apply(end)[1].effective)
+
+
+@CHECKS
+@given(q=ROWS, width=WIDTHS, data=st.data())
+def test_chunks_with_the_state_carried_are_the_whole(q, width, data):
+    play, at = PlayOperator(width), data.draw(st.integers(1, len(q)))
+    for run in (play.apply, play.command):
+        whole, end = run(q)
+        first, state = run(q[:at])
+        kept = [part.copy() for part in state]
+        second, last = run(q[at:], state)
+        close(np.concatenate([first, second]), whole)
+        close(np.stack(last), np.stack(end))
+        close(np.stack(state), np.stack(kept))  # what was handed over is left as it was
+
+
+@CHECKS
+@given(past=ROWS, y=ROWS, width=WIDTHS)
+def test_commanding_is_the_inverse(past, y, width):
+    play = PlayOperator(width)
+    _, state = play.apply(past)
+    for before in (None, state):
+        q, sent = play.command(y, before)
+        reached, state = play.apply(q, before)
+        close(reached, y)
+        close(np.stack(state), np.stack(sent))
+
+
+def test_a_resting_tendon_keeps_its_command():
+    y = np.array([[0.0], [1.0], [1.0], [0.5], [0.5]])
+    close(PlayOperator(0.5).command(y)[0].ravel(), np.array([0.0, 1.25, 1.25, 0.25, 0.25]))
+
+
+def test_motions_start_afresh_wherever_their_rows_lie(rng):
+    q = torch.randn(30, 4, generator=rng, dtype=torch.float64)
+    groups = np.array(["b", "a", "c"])[np.arange(30) % 3]
+    play = PlayOperator([0.0, 0.1, 1.0, 2.0])
+    y = play.apply_by_group(q, groups)
+    for name in "abc":
+        assert_close(y[groups == name], play.apply(q[groups == name])[0])
+    close(play.apply_by_group(q.numpy(), groups), y)
+
+
+def test_type_and_dtype_are_kept_and_gradients_flow():
+    play = PlayOperator(0.2)
+    q = torch.tensor([[0.0], [1.0], [0.95]], requires_grad=True)
+    y, state = play.apply(q)
+    assert y.dtype == state.effective.dtype == torch.float32
+    assert_close(torch.autograd.grad(y.sum(), q)[0].ravel(), torch.tensor([1.0, 2.0, 0.0]))
+    y, state = play.apply(np.zeros((2, 1), np.float32))
+    assert isinstance(state.command, np.ndarray)
+    assert y.dtype == state.command.dtype == np.float32
+    assert play.apply([[0], [1]])[0].dtype == np.float64
+
+
+def test_no_rows_leave_the_state_alone():
+    play = PlayOperator(0.2)
+    _, state = play.apply(np.ones((3, 2)))
+    y, after = play.apply(np.ones((0, 2)), state)
+    assert y.shape == (0, 2)
+    close(np.stack(after), np.stack(state))
+
+
+@pytest.mark.parametrize("width", [-1.0, np.nan, np.inf, [[0.1]], [0.1, -0.1]])
+def test_width_must_be_a_play(width):
+    with pytest.raises(ValueError, match="`width` must be"):
+        PlayOperator(width)
+
+
+def test_bad_rows_and_states_are_named():
+    play, two = PlayOperator([0.1, 0.1]), np.zeros((3, 2))
+    for q, message in [
+        (np.zeros((3, 3)), r"`q` must have shape \(T, 2\), got \(3, 3\)"),
+        (np.zeros(2), r"`q` must have shape"),
+        (two + np.nan, "`q` must be finite"),
+        (two[:0], "`q` must hold at least one row"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            play.apply(q)
+    with pytest.raises(ValueError, match=r"`state` must hold vectors of shape \(2,\)"):
+        play.apply(two, PlayOperator(0.1).apply(np.zeros((1, 3)))[1])
+    with pytest.raises(ValueError, match="`groups` must have shape"):
+        play.apply_by_group(two, np.zeros(2))
+
+
+def log_of(width, noise):
+    rng = np.random.default_rng(0)
+    truth = ConstantCurvatureChain([0.005], lengths=[0.1])
+    groups = np.repeat(np.arange(10), 15)
+    size, turn = rng.uniform(0.002, 0.006, 10)[groups], rng.uniform(0.0, 6.0, 10)[groups]
+    swing = size * np.tile(np.sin(np.linspace(0.0, 6.0, 15)), 10)
+    q = swing[:, None] * np.cos(turn[:, None] - np.array([0.0, 2.1, 4.2]))
+    with torch.no_grad():
+        x = truth(torch.as_tensor(PlayOperator(width).apply_by_group(q, groups))).numpy()
+    return truth, q, x + noise * rng.standard_normal(x.shape), groups
+
+
+def test_play_in_a_log_is_found():
+    truth, q, x, groups = log_of(0.2e-3, 1e-4)
+    start = truth.with_geometry(radii=truth.radii * 1.2)
+    fit = fit_play(start, q, x, groups, parameters=("radii",))
+    assert fit.kept
+    assert fit.width == 0.2e-3
+    assert fit.gain > fit.gain_std_error
+    assert np.argmin(fit.cv_rmse) == 3
+    assert fit.cv_rmse.shape == fit.widths.shape == (5,)
+    assert fit.play.width == fit.width
+    assert_close(fit.result.chain.radii, truth.radii, rtol=1e-2, atol=0.0)
+    as_torch = fit_play(
+        start, torch.as_tensor(q), torch.as_tensor(x), groups, parameters=("radii",)
+    )
+    close(as_torch.cv_rmse, fit.cv_rmse)
+
+
+def test_no_play_is_kept_where_there_is_none():
+    truth, q, x, groups = log_of(0.0, 1e-3)
+    fit = fit_play(truth, q, x, groups, (0.1e-3, 0.4e-3), ("radii",), loss="soft_l1")
+    assert not fit.kept
+    assert fit.width == 0.0
+    close(fit.widths, np.array([0.0, 0.1e-3, 0.4e-3]))
+
+
+def test_one_motion_is_too_few():
+    truth, q, x, _ = log_of(0.0, 0.0)
+    with pytest.raises(ValueError, match="at least 2 motions"):
+        fit_play(truth, q, x, np.zeros(len(q)))
+
+
+def test_example_shows_what_slack_costs(data_home, monkeypatch):
+    monkeypatch.setenv("HYBRIDKIN_DATA", str(data_home))
+    space = runpy.run_path(str(EXAMPLE))
+    data, results = space["data"], space["found"]["5 folds"]
+    assert sorted(np.concatenate([test for test, _ in results])) == [*range(len(data.q))]
+    plain, elastic = (
+        1e3
+        * np.mean(
+            [np.linalg.norm(one[name] - data.x[test], axis=1).mean() for test, one in results]
+        )
+        for name in ("plain", "elastic")
+    )
+    assert elastic < 4.2
+    assert elastic < 0.6 * plain
+
+
+def test_example_says_when_the_recording_is_absent(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
+    runpy.run_path(str(EXAMPLE))
+    assert "Skipped: ftdcr_v4/train.csv is not part of hybridkin" in capsys.readouterr().out

@@ -1,0 +1,527 @@
+import copy
+import math
+import pickle
+
+import joblib
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from hybridkin import HybridForwardModel, InverseKinematics, RigidChain, calibrate
+from hybridkin._core.model import reverse_jacobian
+
+Z = [0.0, 0.0, 1.0]
+
+# Seven revolute joints and one prismatic, a fixed one before, between and after them, a branch.
+URDF = """<?xml version="1.0" encoding="utf-8"?>
+<robot name="arm">
+  <link name="world"/><link name="base"/><link name="l1"/><link name="l2"/><link name="l3"/>
+  <link name="l4"/><link name="plate"/><link name="l5"/><link name="l6"/><link name="l7"/>
+  <link name="l8"/><link name="flange"/><link name="camera"/>
+  <joint name="mount" type="fixed"><parent link="world"/><child link="base"/>
+    <origin xyz="0.1 -0.2 0.3" rpy="0.1 0.2 -0.3"/></joint>
+  <joint name="j1" type="revolute"><parent link="base"/><child link="l1"/>
+    <origin xyz="0 0 0.33"/><axis xyz="0 0 1"/>
+    <limit lower="-2.8" upper="2.7" effort="1" velocity="1"/></joint>
+  <joint name="j2" type="continuous"><parent link="l1"/><child link="l2"/>
+    <origin xyz="0.01 0 0" rpy="-1.5707963 0 0"/><axis xyz="0 0 2"/></joint>
+  <joint name="j3" type="prismatic"><parent link="l2"/><child link="l3"/>
+    <origin xyz="0 -0.3 0" rpy="1.5707963 0 0.4"/><axis xyz="0.6 0 0.8"/>
+    <limit lower="0" upper="0.4" effort="1" velocity="1"/></joint>
+  <joint name="j4" type="revolute"><parent link="l3"/><child link="l4"/>
+    <origin xyz="0.08 0 0" rpy="1.57 0 0"/><axis xyz="0 1 0"/>
+    <limit effort="1" velocity="1"/></joint>
+  <joint name="screws" type="fixed"><parent link="l4"/><child link="plate"/>
+    <origin xyz="0 0 0.05" rpy="0 0.3 0"/></joint>
+  <joint name="j5" type="revolute"><parent link="plate"/><child link="l5"/>
+    <origin xyz="-0.08 0.38 0" rpy="-1.57 0 0"/><axis xyz="0 0 1"/></joint>
+  <joint name="j6" type="revolute"><parent link="l5"/><child link="l6"/>
+    <origin rpy="1.57 0 0"/><axis xyz="-1 0 0"/></joint>
+  <joint name="j7" type="revolute"><parent link="l6"/><child link="l7"/>
+    <origin xyz="0.09 0 0" rpy="1.57 0 0"/><axis xyz="0 0.28 0.96"/></joint>
+  <joint name="j8" type="revolute"><parent link="l7"/><child link="l8"/>
+    <origin xyz="0 0 0.1"/><axis xyz="1 0 0"/></joint>
+  <joint name="weld" type="fixed"><parent link="l8"/><child link="flange"/>
+    <origin xyz="0 0.02 0.1" rpy="0 0 0.7"/></joint>
+  <joint name="bracket" type="fixed"><parent link="l4"/><child link="camera"/></joint>
+</robot>
+"""
+
+# Anchors beside the bodies' origins, a reference angle, two joints in one body.
+MJCF = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="pedestal" pos="0.1 0.2 0.3" euler="0.1 0.2 0.3">
+      <body name="upper" pos="0 0 0.1">
+        <joint name="turn" axis="0 0 1" pos="0.05 0 0" range="-2 2.5" limited="true"/>
+        <geom size="0.01"/>
+        <body name="lower" pos="0.2 0 0" euler="0 0.5 0">
+          <joint name="slide" type="slide" axis="1 0 1" ref="0.1"/>
+          <joint name="lift" axis="0 1 0" pos="-0.02 0 0.03" ref="0.4"/>
+          <geom size="0.01"/>
+          <body name="hand" pos="0 0 0.3">
+            <joint name="wrist" axis="1 0.2 0"/>
+            <geom size="0.01"/>
+            <site name="fingertip" pos="0.01 0.02 0.1" euler="0 0 0.3"/>
+          </body>
+        </body>
+      </body>
+    </body>
+    <body name="ball"><freejoint/><geom size="0.01"/>
+      <body name="pin"><joint name="pin"/><geom size="0.01"/></body></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def translation(x, y, z):
+    matrix = np.eye(4)
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def planar(**options):
+    origins = [np.eye(4), translation(0.3, 0.0, 0.0)]
+    return RigidChain(origins, [Z, Z], **{"tool": [0.2, 0.0, 0.0], **options})
+
+
+def arm(**options):
+    return RigidChain.from_urdf(URDF, "flange", **options)
+
+
+def random_q(rng, n=20, size=8):
+    return 2 * torch.rand(n, size, generator=rng, dtype=torch.float64) - 1
+
+
+def random_pose(rng):
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = torch.linalg.qr(torch.randn(3, 3, generator=rng, dtype=torch.float64))[0]
+    matrix[:3, :3] *= torch.linalg.det(matrix[:3, :3])
+    matrix[:3, 3] = torch.randn(3, generator=rng, dtype=torch.float64)
+    return matrix
+
+
+def test_planar_arm_in_closed_form(rng):
+    q = random_q(rng, size=2)
+    a, b = q[:, 0], q.sum(1)
+    zero = torch.zeros_like(a)
+    elbow = 0.3 * torch.stack([a.cos(), a.sin(), zero], -1)
+    tip = elbow + 0.2 * torch.stack([b.cos(), b.sin(), zero], -1)
+    x, J = planar().forward_and_jacobian(q)
+    columns = [torch.stack([-v[:, 1], v[:, 0], zero], -1) for v in (tip, tip - elbow)]
+    assert_close(x, tip, rtol=0, atol=1e-15)
+    assert_close(J, torch.stack(columns, -1), rtol=0, atol=1e-15)
+    angular = torch.tensor(Z, dtype=torch.float64)[:, None].expand(len(q), 3, 2)
+    assert_close(planar().pose_jacobian(q)[:, 3:], angular, rtol=0, atol=1e-15)
+
+
+def test_a_gantry_is_the_identity(rng):
+    q = random_q(rng, size=3)
+    gantry = RigidChain(np.stack([np.eye(4)] * 3), np.eye(3), kinds=["prismatic"] * 3)
+    x, J = gantry.forward_and_jacobian(q)
+    assert_close(x, q, rtol=0, atol=0)
+    assert_close(J, torch.eye(3, dtype=torch.float64).expand_as(J), rtol=0, atol=0)
+    assert_close(gantry.pose_jacobian(q)[:, 3:], torch.zeros_like(J), rtol=0, atol=0)
+
+
+def test_a_full_turn_changes_nothing(rng):
+    q = random_q(rng)
+    turn = torch.full_like(q, 2 * math.pi)
+    turn[:, 2] = 0.0  # the prismatic joint
+    assert_close(arm()(q + turn), arm()(q), rtol=0, atol=1e-14)
+
+
+def test_urdf_against_pytorch_kinematics(rng):
+    kinematics = pytest.importorskip("pytorch_kinematics")
+    serial = kinematics.build_serial_chain_from_urdf(URDF.encode(), "flange")
+    serial = serial.to(dtype=torch.float64)
+    q = random_q(rng, 300)
+    J, T = serial.jacobian(q, ret_eef_pose=True)
+    # It reads files in single precision.
+    for chain in (arm(), RigidChain.from_chain(serial)):
+        assert_close(chain(q), T[:, :3, 3], rtol=0, atol=2e-6)
+        assert_close(chain.tip_transform(q).get_matrix(), T, rtol=0, atol=2e-6)
+        assert_close(chain.pose_jacobian(q), J, rtol=0, atol=2e-6)
+        assert chain.names == tuple(serial.get_joint_parameter_names())
+    links = serial.forward_kinematics(q, end_only=False)
+    expected = torch.stack([links[f"l{k}"].get_matrix() for k in range(1, 8)], 1)
+    assert_close(arm().poses(q)[:, 1:-1], expected, rtol=0, atol=2e-6)
+
+
+def test_urdf_is_read_to_double_precision():
+    assert arm().origins[1, 0, 3].item() == 0.01
+    rotation = arm().origins[2, :3, :3]
+    turn, tilt = math.cos(0.4), 1.5707963
+    expected = [turn * math.cos(tilt), -turn * math.sin(tilt)]
+    assert_close(rotation[1, 1:], torch.tensor(expected, dtype=torch.float64), rtol=0, atol=3e-16)
+
+
+def test_urdf_limits_and_names():
+    chain = arm()
+    inf = math.inf
+    low = torch.tensor([-2.8, -inf, 0.0] + [-inf] * 5, dtype=torch.float64)
+    high = torch.tensor([2.7, inf, 0.4] + [inf] * 5, dtype=torch.float64)
+    assert_close(chain.q_min, low, rtol=0, atol=0)
+    assert_close(chain.q_max, high, rtol=0, atol=0)
+    assert chain.kinds == ("revolute", "revolute", "prismatic", *["revolute"] * 5)
+    assert chain.names == tuple(f"j{k}" for k in range(1, 9))
+
+
+def test_urdf_axis_defaults_to_x():
+    text = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">
+    <parent link="a"/><child link="b"/></joint></robot>"""
+    chain = RigidChain.from_urdf(text, "b", tool=[0.0, 1.0, 0.0])
+    x = chain(torch.tensor([math.pi / 2], dtype=torch.float64))
+    assert_close(x, torch.tensor(Z, dtype=torch.float64), rtol=0, atol=1e-15)
+
+
+def test_part_of_a_urdf_from_a_file(tmp_path, rng):
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF, encoding="utf-8")
+    q = random_q(rng)
+    lower = RigidChain.from_urdf(path, "plate")
+    upper = RigidChain.from_urdf(str(path), "flange", root_link="plate")
+    assert (lower.n_actuators, upper.n_actuators) == (4, 4)
+    joined = lower.poses(q[:, :4])[:, -1] @ upper.poses(q[:, 4:])[:, -1]
+    assert_close(joined, arm().poses(q)[:, -1], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("end", "tool"), [("fingertip", [0.0, 0.0, 0.0]), ("hand", [0.1, 0, 0.2])])
+def test_mjcf_against_mujoco(end, tool, rng):
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(MJCF)
+    data = mujoco.MjData(model)
+    chain = RigidChain.from_mjcf(MJCF, end, tool=tool)
+    assert chain.names == ("turn", "slide", "lift", "wrist")
+    for q in random_q(rng, 5, 4):
+        data.qpos[:4] = q.numpy()
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        place = data.site(end) if end == "fingertip" else data.body(end)
+        rotation = place.xmat.reshape(3, 3)
+        x = place.xpos + rotation @ tool
+        linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, linear, angular, x, model.body("hand").id)
+        J = np.concatenate([linear, angular])[:, :4]
+        assert_close(chain(q).numpy(), x, rtol=0, atol=1e-14)
+        assert_close(chain.poses(q)[-1, :3, :3].numpy(), rotation, rtol=0, atol=1e-14)
+        assert_close(chain.pose_jacobian(q).numpy(), J, rtol=0, atol=1e-14)
+
+
+def test_part_of_an_mjcf_from_a_file(tmp_path, rng):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text(MJCF, encoding="utf-8")
+    q = random_q(rng, 5, 4)
+    lower = RigidChain.from_mjcf(path, "upper")
+    upper = RigidChain.from_mjcf(path, "hand", root_link="upper")
+    joined = lower.poses(q[:, :1])[:, -1] @ upper.poses(q[:, 1:])[:, -1]
+    whole = RigidChain.from_mjcf(path, "hand")
+    assert_close(joined, whole.poses(q)[:, -1], rtol=0, atol=1e-14)
+    assert_close(whole.q_min, torch.tensor([-2.0] + [-math.inf] * 3, dtype=torch.float64))
+    assert RigidChain.from_mjcf(path, "pin", root_link="ball").names == ("pin",)
+
+
+@pytest.mark.parametrize("rows", [3, 200], ids=["few rows", "many rows"])
+def test_derivatives(rows, rng):
+    chain, q = arm(tool=[0.1, 0.02, 0.2], base=random_pose(rng)), random_q(rng, rows)
+    x, J = chain.forward_and_jacobian(q)
+    x_reverse, J_reverse = reverse_jacobian(chain.forward, q)
+    assert_close(x, x_reverse, rtol=0, atol=4e-15)
+    assert_close(J, J_reverse, rtol=0, atol=4e-15)
+    assert_close(chain.pose_jacobian(q)[:, :3], J, rtol=0, atol=0)
+    assert_close(torch.func.vmap(torch.func.jacrev(chain))(q), J, rtol=0, atol=4e-15)
+    vmapped = torch.func.vmap(chain.forward_and_jacobian)(q)
+    assert_close(vmapped, (x, J), rtol=0, atol=4e-15)
+
+
+@pytest.mark.parametrize("rows", [2, 65], ids=["few rows", "many rows"])
+def test_gradcheck(rows, rng):
+    chain, q = arm(tool=[0.1, 0.02, 0.2]), random_q(rng, rows)
+    q[0] = 0.0
+
+    def both_ends(ends):
+        return chain.forward_and_jacobian(torch.cat([ends[:1], q[1:-1], ends[1:]]))
+
+    ends = q[[0, -1]].requires_grad_()
+    assert torch.autograd.gradcheck(both_ends, ends)
+    assert torch.autograd.gradcheck(chain, ends)
+    assert torch.autograd.gradgradcheck(chain, ends)
+
+
+def test_angular_jacobian_turns_the_tip_frame(rng):
+    chain, q = arm(base=random_pose(rng)), random_q(rng, 5)
+    frame, angular = chain.poses(q)[:, -1, :3, :3], chain.pose_jacobian(q)[:, 3:]
+    slope = torch.func.vmap(torch.func.jacfwd(lambda q: chain.poses(q)[-1, :3, :3]))(q)
+    spin = slope.permute(0, 3, 1, 2) @ frame[:, None].mT
+    expected = torch.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], 1)
+    assert_close(angular, expected, rtol=0, atol=4e-15)
+
+
+@pytest.mark.parametrize("n", [1, 5, 300])
+def test_pose_and_jacobian_is_the_last_pose(rng, n):
+    chain = RigidChain.from_urdf(URDF, "camera")
+    q = 0.3 * torch.rand(n, chain.n_actuators, generator=rng, dtype=torch.float64)
+    pose, J = chain.pose_and_jacobian(q)
+    assert_close(pose, chain.poses(q)[:, -1], rtol=0, atol=1e-13)
+    assert_close(J, chain.pose_jacobian(q), rtol=0, atol=0)
+    assert_close(chain.pose_and_jacobian(q[0])[0], pose[0])
+
+
+def test_poses_and_backbone_agree(rng):
+    chain, q = arm(tool=[0.1, 0.02, 0.2], base=random_pose(rng)), random_q(rng, 4)
+    poses, points = chain.poses(q), chain.backbone(q, n_points=3)
+    assert_close(poses[:, 0], chain.base.expand(4, 4, 4), rtol=0, atol=0)
+    assert_close(poses[:, -1, :3, 3], chain(q), rtol=0, atol=4e-15)
+    assert_close(points[:, :-6:3], poses[:, :-1, :3, 3], rtol=0, atol=4e-15)
+    assert_close(points[:, -1], chain(q), rtol=0, atol=4e-15)
+    bends = points.diff(dim=1).diff(dim=1)
+    corners = torch.arange(2, bends.shape[1], 3)
+    straight = torch.ones(bends.shape[1], dtype=torch.bool).index_fill(0, corners, value=False)
+    assert bends[:, straight].abs().max() < 1e-14
+    assert chain.backbone(q).shape == (4, 10, 3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(lead=st.lists(st.integers(0, 9), max_size=3), single=st.booleans())
+def test_any_batch_shape(lead, single):
+    q = torch.full((*lead, 2), 0.5, dtype=torch.float32 if single else torch.float64)
+    chain = planar()
+    shapes = {
+        (3,): chain(q),
+        (3, 2): chain.jacobian(q),
+        (6, 2): chain.pose_jacobian(q),
+        (3, 4, 4): chain.poses(q),
+        (10, 3): chain.backbone(q, 3),
+    }
+    for shape, value in shapes.items():
+        assert value.shape == (*lead, *shape)
+        assert value.dtype == q.dtype
+
+
+def test_batch_equals_loop_across_blocks_and_nan_stays_in_its_row(rng):
+    chain, q = arm(), random_q(rng, 5000)
+    before = q.clone()
+    x, J = chain.forward_and_jacobian(q)
+    some = [0, 1, 2500, 4095, 4096, 4999]
+    for row in some:
+        assert_close(chain.forward_and_jacobian(q[row]), (x[row], J[row]), rtol=0, atol=4e-15)
+    assert_close(q, before, rtol=0, atol=0)
+    q[3, 4] = torch.nan
+    spoilt, J_spoilt = chain.forward_and_jacobian(q)
+    assert torch.isnan(spoilt[3]).all()
+    assert_close(spoilt[some], x[some], rtol=0, atol=0)
+    assert_close(J_spoilt[some], J[some], rtol=0, atol=0)
+
+
+def test_float32_keeps_its_dtype_and_accuracy(rng):
+    q = random_q(rng, 100).float()
+    x, J = arm().forward_and_jacobian(q)
+    assert x.dtype == J.dtype == torch.float32
+    reference, J_reference = arm().forward_and_jacobian(q.double())
+    assert_close(x.double(), reference, rtol=0, atol=1e-6)
+    assert_close(J.double(), J_reference, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("rows", [3, 200], ids=["few rows", "many rows"])
+def test_compiled(rows, rng):
+    chain, q = arm(), random_q(rng, rows)
+    compiled = torch.compile(chain.forward_and_jacobian, backend="eager", fullgraph=True)
+    assert_close(compiled(q), chain.forward_and_jacobian(q), rtol=0, atol=1e-15)
+
+
+def test_base_and_tool_move_what_they_should(rng):
+    q, base, tool = random_q(rng), random_pose(rng), [0.1, -0.2, 0.3]
+    plain, moved = arm(), arm(base=base)
+    assert_close(moved(q), plain(q) @ base[:3, :3].mT + base[:3, 3], rtol=0, atol=1e-14)
+    assert_close(moved.jacobian(q), base[:3, :3] @ plain.jacobian(q), rtol=0, atol=1e-14)
+    assert_close(moved.poses(q), base @ plain.poses(q), rtol=0, atol=1e-14)
+    end = plain.poses(q)[:, -1]
+    reached = end[:, :3, :3] @ torch.tensor(tool, dtype=torch.float64) + end[:, :3, 3]
+    assert_close(arm(tool=tool)(q), reached, rtol=0, atol=1e-14)
+    assert_close(plain.reach + math.hypot(*tool), arm(tool=tool).reach, rtol=1e-14, atol=0)
+
+
+def test_reach_bounds_the_tip(rng):
+    chain, q = arm(tool=[0.0, 0.0, 0.5]), 3 * random_q(rng, 200)
+    q[:, 2].clamp_(0.0, 0.4)  # the prismatic joint, within its limits
+    assert (chain(q).norm(dim=1) <= chain.reach).all()
+    assert_close(planar().reach, torch.tensor(0.5, dtype=torch.float64), rtol=1e-14, atol=0)
+    point = RigidChain(np.eye(4)[None], [Z])
+    assert_close(point.reach, torch.tensor(1.0, dtype=torch.float64), rtol=0, atol=0)
+
+
+def test_with_geometry_is_differentiable_and_leaves_the_arm(rng):
+    chain, q = arm(), random_q(rng, 4)
+
+    def tip_and_jacobian(base, tool):
+        return chain.with_geometry(base=base, tool=tool).forward_and_jacobian(q)
+
+    tool = torch.tensor([0.1, 0.0, 0.2], dtype=torch.float64)
+    assert_close(chain.with_geometry(tool=tool)(q), arm(tool=tool)(q), rtol=0, atol=0)
+    given = (random_pose(rng).requires_grad_(), tool.requires_grad_())
+    assert torch.autograd.gradcheck(tip_and_jacobian, given)
+    assert_close(chain(q), arm()(q), rtol=0, atol=0)
+    with pytest.raises(ValueError, match="`radii` is not part"):
+        chain.with_geometry(radii=tool)
+    with pytest.raises(ValueError, match=r"`tool` must have shape \(3,\)"):
+        chain.with_geometry(tool=tool[:2])
+
+
+def test_pickle_copy_and_hash(rng):
+    chain, q = arm(), random_q(rng, 3)
+    for twin in (pickle.loads(pickle.dumps(chain)), copy.deepcopy(chain), arm()):
+        assert_close(twin(q), chain(q), rtol=0, atol=0)
+        assert joblib.hash(twin) == joblib.hash(chain)
+    assert joblib.hash(arm(tool=[0.0, 0.0, 0.1])) != joblib.hash(chain)
+    assert chain.float().carriers.dtype == torch.float32
+    assert_close(chain(q), arm()(q), rtol=0, atol=1e-6)
+
+
+def test_pytorch_kinematics_rotations_become_orthonormal():
+    kinematics = pytest.importorskip("pytorch_kinematics")
+    serial = kinematics.build_serial_chain_from_urdf(URDF.encode(), "flange")
+    rotation = RigidChain.from_chain(serial).origins[:, :3, :3]
+    eye = torch.eye(3, dtype=torch.float64).expand_as(rotation)
+    assert_close(rotation.mT @ rotation, eye, rtol=0, atol=2e-15)
+
+
+def test_inverse_kinematics_reaches_what_can_be_reached(rng):
+    chain = arm(tool=[0.0, 0.0, 0.1])
+    low = torch.tensor([-2.8, -2.0, 0.0, -2.0, -2.8, -2.0, -2.8, -2.0], dtype=torch.float64)
+    high = torch.where(chain.slides, 0.4, -low)
+    targets = chain(low + (high - low) * torch.rand(50, 8, generator=rng, dtype=torch.float64))
+    ik = InverseKinematics(chain, q_min=low, q_max=high)
+    found = ik.solve(targets, tol=1e-6, max_iter=100, restarts=5, random_state=0)
+    assert_close(chain(found.q), targets, rtol=0, atol=1e-4)
+    assert ((found.q >= low) & (found.q <= high)).all()
+
+
+def sagging(q):
+    """A cable-driven arm whose true tips hang below the rigid model's."""
+    x = arm()(q)
+    sag = 0.01 * torch.cos(q[:, 1]) + 0.005 * torch.sin(q[:, 3])
+    return torch.stack([x[:, 0], x[:, 1] + 0.004 * q[:, 0], x[:, 2] - sag], -1)
+
+
+def test_a_hybrid_learns_the_sag_of_an_arm_and_is_inverted(rng):
+    q, unseen = random_q(rng, 600), 0.8 * random_q(rng, 100)
+    model = HybridForwardModel(arm(), random_state=0).fit(q.numpy(), sagging(q).numpy())
+
+    def rmse(x):
+        return float(np.sqrt(((x - sagging(unseen).numpy()) ** 2).sum(1).mean()))
+
+    learned = rmse(model.predict(unseen.numpy()))
+    assert learned < 0.2 * rmse(model.predict_mechanical(unseen.numpy()))
+    J = reverse_jacobian(model.module_, unseen)[1]
+    assert_close(model.jacobian(unseen.numpy()), J.numpy(), rtol=0, atol=1e-12)
+    targets = torch.as_tensor(model.predict(unseen.numpy()))
+    ik = InverseKinematics(model, q_min=-1.0, q_max=1.0)
+    found = ik.solve(targets, max_iter=100, restarts=5, random_state=0)
+    assert_close(model.module_(found.q), targets, rtol=0, atol=1e-4)
+
+
+def test_calibration_finds_the_base(rng):
+    q, base = random_q(rng, 60), torch.eye(4, dtype=torch.float64)
+    base[:3, :3] = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -0.2, 0.1], [0.2, 0.0, 0.3], [-0.1, -0.3, 0.0]], dtype=torch.float64)
+    )
+    base[:3, 3] = torch.tensor([0.05, -0.1, 0.2])
+    result = calibrate(arm(), q, arm(base=base)(q), ("base",))
+    assert_close(result.values["base"], base, rtol=0, atol=1e-8)
+    assert_close(result.chain(q), arm(base=base)(q), rtol=0, atol=1e-8)
+
+
+LINKS = '<robot name="r"><link name="a"/><link name="b"/>{}</robot>'
+JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>'
+MIMIC = LINKS.format(JOINT.format("revolute", '<mimic joint="k"/>'))
+CIRCLE = LINKS.format(
+    JOINT.format("fixed", "")
+    + '<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint>'
+)
+EYES = np.stack([np.eye(4)] * 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: RigidChain(EYES, [Z]), r"`origins` must have shape \(1, 4, 4\), got \(2, 4, 4\)"),
+        (lambda: RigidChain(2 * EYES, [Z, Z]), r"`origins\[0\]` must hold a rotation"),
+        (lambda: RigidChain(EYES, [[0, 0]]), r"`axes` must have shape \(n, 3\)"),
+        (lambda: RigidChain(EYES, [Z, [0, 0, 0]]), "`axes` must hold at least one axis"),
+        (lambda: RigidChain(EYES, [Z, ["a", 0, 0]]), "`axes` must be numeric"),
+        (lambda: RigidChain(EYES, [Z, [math.nan, 0, 0]]), "`axes` must be finite"),
+        (lambda: planar(kinds=["revolute"]), "`kinds` must hold 2 of"),
+        (lambda: planar(kinds=["revolute", "ball"]), "`kinds` must hold 2 of"),
+        (lambda: planar(names=["a"]), "`names` must hold 2 names"),
+        (lambda: planar(q_min=[1, 1], q_max=[2, 0]), "`q_min` must not exceed `q_max`"),
+        (lambda: planar(q_min=[0, math.nan]), "`q_min` must be finite"),
+        (lambda: planar(tool=[0.1]), r"`tool` must have shape \(3,\)"),
+        (lambda: planar(tool=[0, 0, math.inf]), "`tool` must be finite"),
+        (lambda: planar(base=np.eye(3)), r"`base` must be one pose of shape \(4, 4\)"),
+        (lambda: planar(tip=2 * np.eye(4)), "`tip` must hold a rotation"),
+        (
+            lambda: planar()(torch.zeros(4, 3)),
+            r"`q` must have shape \(..., 2\), .* 2 moving joints",
+        ),
+        (lambda: planar().backbone(torch.zeros(2), 0), "`n_points` must be at least 1"),
+        (lambda: planar().check_actuators(torch.tensor([[0, math.nan]])), "`q` must be finite"),
+        (lambda: RigidChain.from_urdf("<robot", "a"), "must be a valid URDF"),
+        (
+            lambda: RigidChain.from_urdf(URDF, "flang"),
+            "`end_link` 'flang' .* did you mean 'flange'",
+        ),
+        (lambda: arm(root_link="?"), "`root_link` '[?]' is not in the robot; it has"),
+        (lambda: arm(root_link="camera"), "`root_link` must lead to 'flange', but 'camera'"),
+        (lambda: RigidChain.from_urdf(URDF, "base"), "must have a moving joint"),
+        (
+            lambda: RigidChain.from_urdf(LINKS.format(JOINT.format("floating", "")), "b"),
+            "joint 'j' is floating",
+        ),
+        (lambda: RigidChain.from_urdf(CIRCLE, "b"), "must have a moving joint"),
+        (lambda: RigidChain.from_urdf(MIMIC, "b"), "joint 'j' mimics 'k'"),
+    ],
+)
+def test_bad_input_says_what_is_needed(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("text", "end", "root", "message"),
+    [
+        ("<mujoco>", "hand", None, "must be a valid MJCF"),
+        (MJCF, "hant", None, "`end_link` 'hant' .* did you mean 'hand'"),
+        (MJCF, "hand", "hend", "`root_link` 'hend' .* did you mean 'hand'"),
+        (MJCF, "hand", "ball", "`root_link` must lead to 'hand', but 'ball'"),
+        (MJCF, "pedestal", None, "must have a moving joint"),
+        (MJCF, "pin", None, "of body 'ball' is free or a ball"),
+    ],
+)
+def test_bad_mjcf_says_what_is_needed(text, end, root, message):
+    pytest.importorskip("mujoco")
+    with pytest.raises(ValueError, match=message):
+        RigidChain.from_mjcf(text, end, root_link=root)
+
+
+def test_missing_files_and_branching_chains():
+    kinematics = pytest.importorskip("pytorch_kinematics")
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.urdf"):
+        RigidChain.from_urdf("nowhere.urdf", "flange")
+    with pytest.raises(ValueError, match="'l4' has 2 children"):
+        RigidChain.from_chain(kinematics.build_chain_from_urdf(URDF.encode()))
+
+
+def test_degrees_and_millimetres_are_noticed():
+    slider = planar(kinds=["revolute", "prismatic"])
+    with pytest.warns(UserWarning, match="degrees"):
+        slider.check_actuators(torch.tensor([[90.0, 0.1]]))
+    with pytest.warns(UserWarning, match="millimetres"):
+        slider.check_actuators(torch.tensor([[0.9, 100.0]]), "X")
+    with pytest.warns(UserWarning, match="millimetres"):
+        RigidChain.from_urdf(URDF.replace("0.33", "330"), "flange")
+    slider.check_actuators(torch.tensor([[-6.0, 0.1]]))

@@ -1,0 +1,718 @@
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import least_squares
+
+from hybridkin import ConstantCurvatureChain
+from hybridkin.chains.robots import bionic_handling_assistant
+from hybridkin.datasets import (
+    _trunk,
+    check_log,
+    load_armlab,
+    load_asl_trunk,
+    load_csv,
+    load_ftdcr,
+    load_log,
+    load_trunk,
+    make_trunk,
+    paper_protocol,
+    paper_split,
+)
+
+SMALL = {"n_segment": 2, "n_random": 4, "random_state": 5}
+
+
+@pytest.fixture
+def sim():
+    pytest.importorskip("mujoco", reason="the simulated trunk needs hybridkin[sim]")
+    from hybridkin.simulation import TrunkPlant
+
+    return TrunkPlant
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(_trunk, "CHUNK", 3)
+
+
+# the protocol
+
+
+def test_protocol_has_the_papers_counts_and_bounds():
+    q, part = paper_protocol(random_state=0)
+    assert q.shape == (2000, 9)
+    assert np.bincount(part).tolist() == [500, 500, 500, 500]
+    assert q.min() >= 0.19
+    assert q.max() <= 0.31
+    segments = q.reshape(-1, 3, 3)
+    for s in range(3):
+        held = np.delete(segments[part == s], s, axis=1)
+        assert np.abs(held - 0.20).max() <= 0.005
+        moving = segments[part == s][:, s]
+        assert_allclose(moving.mean(axis=0), 0.25, atol=0.01)
+        assert_allclose(moving.std(axis=0), 0.12 / np.sqrt(12), rtol=0.1)
+    free = q[part == 3]
+    assert_allclose(free.std(axis=0), 0.12 / np.sqrt(12), rtol=0.1)
+    assert np.abs(np.corrcoef(free.T) - np.eye(9)).max() < 0.2
+
+
+def test_protocol_is_seeded():
+    assert_array_equal(paper_protocol(3)[0], paper_protocol(np.random.default_rng(3))[0])
+    assert (paper_protocol(3)[0] != paper_protocol(4)[0]).all()
+
+
+@pytest.mark.parametrize("bad", [{"low": 0.4}, {"jitter": -1.0}, {"hold": np.nan}])
+def test_protocol_needs_a_range(bad):
+    with pytest.raises(ValueError, match="`low` < `high`"):
+        paper_protocol(**bad)
+
+
+def test_protocol_needs_whole_numbers():
+    with pytest.raises(ValueError, match="`n_segment` must be an integer"):
+        paper_protocol(n_segment=1.5)
+
+
+# the shipped data
+
+
+def test_shipped_data_are_the_protocol():
+    data = load_trunk()
+    target, part = paper_protocol(data.parameters["random_state"])
+    assert_array_equal(data.part, part)
+    assert_array_equal(data.row, np.arange(2000))
+    assert_allclose(data.q_target, target, rtol=0, atol=1e-15)
+    noise = data.q - data.q_target
+    assert_allclose(noise.std(axis=0), 1e-3, rtol=0.1)
+    assert_allclose(noise.mean(axis=0), 0, atol=1e-4)
+    assert np.isfinite(data.x).all()
+    assert data.groups is None
+    assert data.units == {"q": "m", "x": "m"}
+    assert "simulated" in data.DESCR
+    assert "Reinhart" in data.citation
+
+
+def test_shipped_data_return_X_y():
+    q, x = load_trunk(return_X_y=True)
+    assert_array_equal(q, load_trunk().q)
+    assert_array_equal(x, load_trunk().x)
+
+
+def test_shipped_rows_are_reproduced_by_the_plant(sim):
+    data = load_trunk()
+    plant, seed = sim(**data.parameters["plant"]), data.parameters["random_state"]
+    for row in (0, 499, 500, 1000, 1499, 1500, 1999):
+        q, pose = plant.settle(data.q_target[row], random_state=[seed, _trunk.NOISE, row])
+        assert_allclose(q, data.q[row], rtol=0, atol=1e-7)
+        assert_allclose(pose[:3, 3], data.x[row], rtol=0, atol=1e-7)
+
+
+def test_shipped_data_break_constant_curvature_as_the_papers_trunk_does():
+    q, x = map(torch.as_tensor, load_trunk(return_X_y=True))
+
+    def error(radii):
+        return (ConstantCurvatureChain(radii)(q) - x).numpy()
+
+    radii = least_squares(lambda r: error(r).ravel(), [0.1, 0.093, 0.079]).x
+    distance = np.linalg.norm(error(radii), axis=1)
+    assert 0.02 < distance.mean() < 0.03  # paper: 0.025
+    assert 0.07 < distance.max() < 0.12  # paper: 0.093
+
+
+def test_paper_split():
+    data = load_trunk()
+    train, test = paper_split(data, random_state=0)
+    assert (len(train), len(test)) == (1900, 100)
+    assert_array_equal(np.sort(np.concatenate([train, test])), np.arange(2000))
+    assert (data.part[test] == 3).all()
+    assert np.bincount(data.part[train]).tolist() == [500, 500, 500, 400]
+    assert_array_equal(paper_split(data.part, 0)[1], test)
+    assert (paper_split(data, random_state=1)[1] != test).any()
+
+
+@pytest.mark.parametrize("n_test", [0, 501])
+def test_paper_split_needs_enough_random_rows(n_test):
+    with pytest.raises(ValueError, match="`n_test` must be 1 to 500"):
+        paper_split(load_trunk(), n_test=n_test)
+
+
+def test_paper_split_needs_parts():
+    with pytest.raises(ValueError, match="has no parts"):
+        paper_split(type("Data", (), {"part": None})())
+
+
+# making data
+
+
+def test_make_trunk_follows_the_plant(sim):
+    data = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0, tilt=0.1)
+    plant = sim(tilt=0.1)
+    assert data.parameters["plant"]["tilt"] == 0.1
+    for q_target, q, x in zip(data.q_target, data.q, data.x, strict=True):
+        assert_allclose(q, q_target, atol=1e-8)
+        assert_allclose(x, plant(q_target), atol=1e-8)
+
+
+def test_make_trunk_noise_leaves_the_truth_alone(sim):
+    clean = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0)
+    noisy = make_trunk(**SMALL, cable_noise=1e-3, mocap_noise=5e-4)
+    assert_array_equal(clean.q_target, noisy.q_target)
+    assert_allclose((noisy.q - clean.q).std(), 1e-3, rtol=0.3)
+    assert_allclose((noisy.x - clean.x).std(), 5e-4, rtol=0.4)
+
+
+def test_result_does_not_depend_on_processes(sim, small_chunks):
+    alone, shared = make_trunk(**SMALL), make_trunk(**SMALL, n_jobs=2)
+    assert_allclose(shared.q, alone.q, rtol=0, atol=1e-9)
+    assert_allclose(shared.x, alone.x, rtol=0, atol=1e-9)
+
+
+def test_resumed_equals_uninterrupted(sim, small_chunks, tmp_path):
+    path, calls = tmp_path / "trunk.npz", []
+
+    def interrupt(done, total):
+        calls.append((done, total))
+        if done >= 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_trunk(**SMALL, checkpoint=path, progress=interrupt)
+    assert calls == [(0, 10), (3, 10), (6, 10)]
+    calls.clear()
+    resumed = make_trunk(**SMALL, checkpoint=path, progress=lambda *call: calls.append(call))
+    assert calls == [(6, 10), (9, 10), (10, 10)]
+    whole = make_trunk(**SMALL)
+    assert_allclose(resumed.q, whole.q, rtol=0, atol=1e-12)
+    assert_allclose(resumed.x, whole.x, rtol=0, atol=1e-12)
+    assert [file.name for file in tmp_path.iterdir()] == ["trunk.npz"]
+    # A complete checkpoint is the data.
+    assert_array_equal(make_trunk(**SMALL, checkpoint=path).x, resumed.x)
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"random_state": 6}, "random_state"),
+        ({"n_random": 5}, "protocol"),
+        ({"cable_noise": 0.0}, "cable_noise"),
+        ({"tilt": 0.0}, "tilt"),
+        ({"q_target": np.full((2, 9), 0.25)}, "q_target"),
+    ],
+)
+def test_resuming_another_run_raises(sim, tmp_path, change, name):
+    path = tmp_path / "trunk.npz"
+    make_trunk(n_segment=0, n_random=1, random_state=5, checkpoint=path)
+    with pytest.raises(ValueError, match=f"was made with another .*{name}"):
+        make_trunk(**{**SMALL, "n_segment": 0, "n_random": 1, **change}, checkpoint=path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not an npz", b"PK\x03\x04 cut short"])
+def test_a_foreign_checkpoint_is_not_overwritten(sim, tmp_path, content):
+    path = tmp_path / "precious.txt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="must be a file written by make_trunk"):
+        make_trunk(**SMALL, checkpoint=path)
+    assert path.read_bytes() == content
+
+
+def test_checkpoint_needs_a_seed(sim, tmp_path):
+    path = tmp_path / "trunk.npz"
+    make_trunk(n_segment=0, n_random=1, random_state=5, checkpoint=path)
+    with pytest.raises(ValueError, match="`random_state` must be an integer to resume"):
+        make_trunk(n_segment=0, n_random=1, checkpoint=path)
+
+
+def test_unseeded_runs_keep_their_seed(sim):
+    data = make_trunk(n_segment=0, n_random=1)
+    again = make_trunk(n_segment=0, n_random=1, random_state=data.parameters["random_state"])
+    assert_allclose(again.x, data.x, rtol=0, atol=1e-12)
+    json.dumps(data.parameters)
+
+
+@pytest.fixture
+def stubborn(sim, monkeypatch):
+    """A plant that does not settle where the first chamber is long."""
+    from hybridkin.simulation import NotSettledError
+
+    class Stubborn(sim):
+        def settle(self, q_target, **kwargs):
+            if q_target[0] > 0.25:
+                raise NotSettledError("Not settled: stubborn.")
+            return super().settle(q_target, **kwargs)
+
+    monkeypatch.setattr(_trunk, "TrunkPlant", Stubborn)
+
+
+def test_rows_that_do_not_settle_are_drawn_again(stubborn):
+    with pytest.warns(UserWarning, match="did not settle and were drawn again"):
+        data = make_trunk(n_segment=2, n_random=12, random_state=0)
+    assert np.bincount(data.part).tolist() == [2, 2, 2, 12]
+    assert data.q_target[:, 0].max() <= 0.25
+    assert_array_equal(data.row, np.arange(18))
+    first_draw, _ = paper_protocol(0, n_segment=2, n_random=12)
+    failed = {row for row, _, _ in data.failed}
+    assert failed == set(np.flatnonzero(first_draw[:, 0] > 0.25).tolist())
+    kept = np.setdiff1d(np.arange(18), list(failed))
+    assert_array_equal(data.q_target[kept], first_draw[kept])
+
+
+def test_given_rows_that_do_not_settle_are_left_out(stubborn):
+    q_target = np.full((4, 9), 0.24)
+    q_target[2] = 0.26
+    with pytest.warns(UserWarning, match="1 configurations did not settle and were left out"):
+        data = make_trunk(q_target, random_state=0)
+    assert data.row.tolist() == [0, 1, 3]
+    assert data.part is None
+    ((row, target, message),) = data.failed
+    assert row == 2
+    assert_array_equal(target, q_target[2])
+    assert "stubborn" in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"q_target": np.full((2, 8), 0.25)}, r"shape \(n_samples, 9\), got \(2, 8\)"),
+        ({"q_target": np.full((2, 9), 250.0)}, r"2 rows are not, the first row 0"),
+        ({"q_target": np.full((2, 9), np.nan)}, r"2 rows are not"),
+        ({"random_state": -1}, "`random_state` must be an integer >= 0"),
+        ({"cable_noise": -1.0}, "`cable_noise` must be"),
+        ({"stiffness": 1.0}, "must be among .*bending_stiffness.*got stiffness"),
+    ],
+)
+def test_make_trunk_bad_input(sim, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_trunk(**arguments)
+
+
+# CSV logs
+
+
+@pytest.fixture
+def log(tmp_path):
+    def write(text, name="log.csv", encoding="utf-8"):
+        path = tmp_path / name
+        path.write_text(text, encoding=encoding)
+        return path
+
+    return write
+
+
+HEADER = "time,run,a,b,c,X,Y,Z\n"
+COLUMNS = {"q": ["a", "b", "c"], "x": ["X", "Y", "Z"]}
+
+
+def test_csv_reads_units_signs_groups_and_time(log):
+    path = log(HEADER + "0.5,one,1,2,3,10,20,30\n1.5,two,4,5,6,40,50,60\n")
+    data = load_csv(
+        path,
+        **COLUMNS,
+        groups="run",
+        time="time",
+        q_unit="cm",
+        x_unit="mm",
+        q_sign=[-1, 1, 1],
+    )
+    assert_allclose(data.q, [[-0.01, 0.02, 0.03], [-0.04, 0.05, 0.06]])
+    assert_allclose(data.x, [[0.01, 0.02, 0.03], [0.04, 0.05, 0.06]])
+    assert data.groups.tolist() == ["one", "two"]
+    assert data.time.tolist() == [0.5, 1.5]
+    assert data.line.tolist() == [2, 3]
+    assert data.units == {"q": "m", "x": "m"}
+
+
+def test_csv_angles_and_unitless(log):
+    path = log(HEADER + "0,r,90,180,-90,1,2,3\n")
+    assert_allclose(load_csv(path, **COLUMNS, q_unit="deg").q, [[np.pi / 2, np.pi, -np.pi / 2]])
+    data = load_csv(path, **COLUMNS, q_unit="1")
+    assert_allclose(data.q, [[90, 180, -90]])
+    assert data.units["q"] == "1"
+
+
+def test_csv_with_byte_order_mark_semicolons_blanks_and_empty_lines(log):
+    text = "a; b;c;X;Y;Z\n1;2;3; 1;2;3\n\n4;5;6;1;2;3\n"
+    path = log(text, encoding="utf-8-sig")
+    q, x = load_csv(path, **COLUMNS, q_unit="1", delimiter=";", return_X_y=True)
+    assert_allclose(q, [[1, 2, 3], [4, 5, 6]])
+    assert_allclose(x, [[1, 2, 3], [1, 2, 3]])
+
+
+def test_csv_invalid_rows_are_counted_or_dropped(log):
+    rows = "0,r,1,1,1,1,1,1\n0,r,nan,1,1,1,1,1\n0,r,1,1,1,1,,1\n0,r,1,1,1,inf,1,1\n0,r,1,1,1\n"
+    path = log(HEADER + rows)
+    with pytest.raises(ValueError, match=r"4 of 5 rows .* line 3, 4, 5, 6; .*drop_invalid=True"):
+        load_csv(path, **COLUMNS)
+    data = load_csv(path, **COLUMNS, groups="run", drop_invalid=True)
+    assert data.q.shape == (1, 3)
+    assert data.line.tolist() == [2]
+    assert data.groups.tolist() == ["r"]
+    path = log(HEADER + "0,r,nan,1,1,1,1,1\n")
+    with pytest.raises(ValueError, match="no valid row left"):
+        load_csv(path, **COLUMNS, drop_invalid=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        (HEADER + "0,r,1,x1,1,1,1,1\n", {}, r"Line 2 .* column 'b': .* got 'x1'"),
+        (HEADER + "0,r,1,1,1,1,1,1,9\n", {}, r"Line 2 .* 9 cells, the header 8"),
+        (HEADER, {}, "a header but no rows"),
+        ("", {}, "is empty"),
+        (HEADER, {"x": ["x", "Y", "Z"]}, r"no column 'x' .* did you mean 'X'\?"),
+        (HEADER, {"groups": "runs"}, r"no column 'runs' .* did you mean 'run'\?"),
+        (HEADER.replace(",", ";"), {}, "check `delimiter`"),
+        ("a,a,b,c,X,Y,Z\n", {}, "Column 'a' occurs 2 times"),
+        (HEADER, {"x": ["X", "Y"]}, "`x` must name 3 columns, got 2"),
+        (HEADER, {"q": []}, "`q` must be column names"),
+        (HEADER, {"q": ["a", "a"]}, "`q` names a column twice"),
+        (HEADER, {"q_unit": "inch"}, "`q_unit` must be one of"),
+        (HEADER, {"x_unit": "deg"}, "`x_unit` must be one of"),
+        (HEADER, {"q_sign": 2}, "`q_sign` must be 1 or -1"),
+        (HEADER, {"q_sign": [1, -1]}, "`q_sign` must be 1 or -1"),
+    ],
+)
+def test_csv_errors(log, text, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        load_csv(log(text), **{**COLUMNS, **arguments})
+
+
+def test_csv_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is none at"):
+        load_csv(tmp_path / "absent.csv", **COLUMNS)
+
+
+@pytest.mark.parametrize("row", ["0,r,1,1,1,100,200,300\n", "0,r,1,1,1,0,0,0\n0,r,1,1,1,9,0,0\n"])
+def test_csv_millimetres_in_a_metre_field_warn(log, row):
+    with pytest.warns(UserWarning, match="x_unit='mm'"):
+        load_csv(log(HEADER + row), **COLUMNS, q_unit="mm")
+
+
+def test_logs_of_every_format_hold_the_same(tmp_path):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    table = np.arange(24.0).reshape(4, 6) + 0.5
+    runs = np.array(["one", "one", "two", "two"])
+    text = "".join(
+        f"{';'.join(map(str, row))};{run}\n" for row, run in zip(table, runs, strict=True)
+    )
+    (tmp_path / "log.csv").write_text("a;b;c;X;Y;Z;run\n" + text)
+    np.savez(tmp_path / "log.npz", pulls=table[:, :3], X=table[:, 3], YZ=table[:, 4:], run=runs)
+    frame = pd.DataFrame(table, columns=[*"abcXYZ"]).assign(run=runs)
+    frame.to_parquet(tmp_path / "log.parquet")
+    options = {"q_unit": "mm", "x_unit": "mm", "q_sign": -1}
+    csv = load_log(tmp_path / "log.csv", [*"abc"], [*"XYZ"], "run", **options)
+    assert_allclose(csv.q, -1e-3 * table[:, :3])
+    parquet = load_log(tmp_path / "log.parquet", [*"abc"], [*"XYZ"], "run", **options)
+    npz = load_log(tmp_path / "log.npz", "pulls", ["X", "YZ"], "run", **options)
+    assert npz.q_names == ["pulls[0]", "pulls[1]", "pulls[2]"]
+    assert npz.x_names == ["X", "YZ[0]", "YZ[1]"]
+    for other in (parquet, npz):
+        assert_array_equal(other.q, csv.q)
+        assert_array_equal(other.x, csv.x)
+        assert other.groups.tolist() == csv.groups.tolist() == runs.tolist()
+        assert other.line.tolist() == [0, 1, 2, 3]
+    swapped = load_log(
+        tmp_path / "log.npz", ["pulls[2]", "pulls[0]"], ["X", "YZ"], q_unit="1", x_unit="mm"
+    )
+    assert_array_equal(swapped.q, table[:, [2, 0]])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"q": np.ones((3, 3)), "x": np.ones((2, 3))}, "must be equally long"),
+        ({"q": np.ones((3, 3)), "x": np.ones((3, 2))}, "`x` must name 3 columns"),
+        ({"q": np.ones((3, 3)), "tip": np.ones((3, 3))}, "There is no column 'x'"),
+        ({"q": np.full((3, 3), "a"), "x": np.ones((3, 3))}, "must hold numbers"),
+        ({"q": np.ones((0, 3)), "x": np.ones((0, 3))}, "has no rows"),
+        ({"q": np.full((3, 3), None), "x": np.ones((3, 3))}, "not an npz file of plain arrays"),
+    ],
+)
+def test_npz_errors(tmp_path, arrays, message):
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(ValueError, match=message):
+        load_log(tmp_path / "log.npz", ["q"], ["x"])
+
+
+def test_files_that_are_none_are_told(tmp_path, monkeypatch):
+    for name in ("log.npz", "log.csv", "log.parquet"):
+        (tmp_path / name).write_bytes(b"\xff\x00PAR1 no log")
+    with pytest.raises(ValueError, match="not an npz file"):
+        load_log(tmp_path / "log.npz", ["q"], ["x"])
+    with pytest.raises(ValueError, match="not a text file in UTF-8"):
+        load_log(tmp_path / "log.csv", ["q"], ["x", "y", "z"])
+    with pytest.raises(FileNotFoundError, match="there is none at"):
+        load_log(tmp_path / "absent.npz", ["q"], ["x"])
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas pyarrow"):
+        load_log(tmp_path / "log.parquet", ["q"], ["x"])
+
+
+# what is wrong with a log
+
+
+def tendon_log(n_motions=8, n=30, **truth):
+    """A simulated log of a robot of two segments, without noise but for the tracker's."""
+    rng = np.random.default_rng(0)
+    chain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], **truth)
+    u = np.stack([np.cos(np.arange(3) * 2 * np.pi / 3), np.sin(np.arange(3) * 2 * np.pi / 3)])
+    q = []
+    for _ in range(n_motions):
+        first, second = (0.003 * (rng.standard_normal((2, 2)) @ u).ravel() for _ in range(2))
+        s = np.linspace(0.0, 4.0, n)[:, None]
+        q.append(np.sin(s) * first + 0.5 * np.sin(2 * s) * second)
+    q = np.concatenate(q)
+    x = chain(torch.from_numpy(q)).numpy() + 1e-5 * rng.standard_normal((len(q), 3))
+    time = np.linspace(0.0, 24.0, len(q))
+    return {"q": q, "x": x, "groups": np.repeat(np.arange(n_motions), n), "time": time}
+
+
+CHAIN = ConstantCurvatureChain([0.0055, 0.0055], lengths=[0.11, 0.09])
+
+
+def found(log, **options):
+    return {(f.kind, f.severity): f for f in check_log(log, **options).findings}
+
+
+def test_a_clean_log_passes():
+    report = check_log(tendon_log(), chain=CHAIN)
+    assert report.findings == ()
+    assert report.ok
+    assert "240 rows, 8 motions, 6 actuators, 24 s" in str(report)
+    assert "nothing to object to" in str(report)
+
+
+def test_frozen_tip():
+    log = tendon_log()
+    log["x"][70:85] = log["x"][70]
+    finding = found(log)["frozen tip", "error"]
+    assert finding.rows.tolist() == [*range(70, 85)]
+    assert "rows 70-84" in finding.message
+    assert "--drop-frozen" in finding.advice
+    # At rest the tip may well be still.
+    log = tendon_log()
+    log["q"][70:85], log["x"][70:85] = log["q"][70], log["x"][70]
+    assert not any(kind == "frozen tip" for kind, _ in found(log))
+
+
+def test_one_frozen_coordinate_and_a_frozen_actuator():
+    log = tendon_log()
+    log["x"][70:85, 1] = log["x"][70, 1]
+    finding = found(log)["frozen tip", "warning"]
+    assert "'x[1]'" in finding.message
+    assert finding.rows.tolist() == [*range(70, 85)]
+    log = tendon_log()
+    log["q"][70:85, 4] = log["q"][70, 4]
+    finding = found(log)["frozen actuator", "warning"]
+    assert "'q[4]'" in finding.message
+    assert finding.rows.tolist() == [*range(70, 85)]
+
+
+def test_actuators_that_rest_by_command_are_not_frozen():
+    log = tendon_log()
+    log["q"][60:120, 3:] = 0.0
+    log["q"][180:240, :3] = 0.0
+    assert not any(kind == "frozen actuator" for kind, _ in found(log))
+
+
+def test_invalid_rows():
+    log = tendon_log()
+    log["x"][[3, 4, 90], 2] = np.nan
+    log["q"][10, 0] = np.inf
+    finding = found(log)["invalid", "error"]
+    assert "4 of 240 rows" in finding.message
+    assert "rows 3-4, 10, 90" in finding.message
+    assert finding.rows.tolist() == [3, 4, 10, 90]
+
+
+def test_columns_that_never_change():
+    log = tendon_log()
+    log["q"][:, 2] = 0.001
+    log["x"][:, 0] = 0.0
+    report = check_log(log)
+    messages = [f.message for f in report.warnings if f.kind == "constant"]
+    assert [("never move: 'q[2]'" in messages[0]), ("never change: 'x[0]'" in messages[1])]
+    log["x"][:] = 0.0
+    assert ("constant", "error") in found(log)
+
+
+def test_duplicates_and_same_commands():
+    log = tendon_log()
+    for name in ("q", "x"):
+        log[name][200:203] = log[name][20:23]
+    finding = found(log)["duplicates", "warning"]
+    assert finding.rows.tolist() == [200, 201, 202]
+    assert "3 of them in another motion" in finding.message
+    log = tendon_log()
+    log["q"][120:], log["x"][120:] = log["q"][:120], log["x"][:120] + np.array([3e-4, 0, 0])
+    finding = found(log)["same command", "note"]
+    assert "scatters by 0.21 mm rms" in finding.message  # 0.3 / sqrt(2), and all start at 0
+
+
+def test_jumps():
+    log = tendon_log()
+    log["x"][100] += [0.15, 0.0, 0.0]
+    finding = found(log)["jumps", "warning"]
+    assert finding.rows.tolist() == [100, 101]
+    assert "soft_l1" in finding.advice
+
+
+def test_times():
+    log = tendon_log()
+    log["time"][100:] += 5.0
+    log["time"][[40, 41]] = log["time"][[41, 40]]
+    messages = [f.message for f in check_log(log).warnings]
+    assert "do not increase at 1 rows (row 41)" in messages[0]
+    assert "1 gaps in time within a motion, up to 5.1 s" in messages[1]
+    assert "(row 100)" in messages[1]
+
+
+def test_motions():
+    log = tendon_log()
+    assert "--groups" in found({**log, "groups": None})["motions", "warning"].advice
+    few = found({**log, "groups": np.arange(240) // 100})["motions", "warning"]
+    assert "3 motions are few" in few.message
+    alone = found({**log, "groups": np.arange(240)})["motions", "warning"]
+    assert "random split" in alone.message
+    assert ("rows", "warning") in found({name: value[:20] for name, value in log.items()})
+
+
+@pytest.mark.parametrize(
+    ("q", "x", "units", "advice"),
+    [
+        (1e3, 1e3, {"q": "m", "x": "m"}, ['q_unit = "mm"', 'x_unit = "mm"']),
+        (1e2, 1.0, {"q": "m", "x": "mm"}, ['q_unit = "cm"']),
+        (1.0, 1e3, {"q": "mm", "x": "m"}, ['x_unit = "mm"']),
+        (1e-3, 1e-3, {"q": "mm", "x": "mm"}, ['q_unit = "m"', 'x_unit = "m"']),
+        (1.0, 1e-2, {"q": "mm", "x": "mm"}, ["`x_unit`"]),
+    ],
+)
+def test_units_that_cannot_be(q, x, units, advice):
+    log = tendon_log()
+    log |= {"q": q * log["q"], "x": x * log["x"], "file_units": units}
+    report = check_log(log, chain=CHAIN)
+    assert [f.kind for f in report.errors] == ["units"] * len(advice)
+    for finding, wanted in zip(report.errors, advice, strict=True):
+        assert wanted in finding.advice
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm"])
+def test_units_of_chambers(unit):
+    data, scale = load_trunk(), {"mm": 1e3, "cm": 1e2}[unit]
+    log = {"q": scale * data.q, "x": scale * data.x}
+    report = check_log(log, chain=bionic_handling_assistant())
+    for name, finding in zip("qx", report.errors, strict=True):
+        assert f'{name}_unit = "{unit}"' in finding.advice
+    changes = check_log({"q": data.q - 0.25, "x": data.x}, chain=bionic_handling_assistant())
+    assert "give `length`" in changes.errors[0].advice
+
+
+def test_a_wrong_sign_is_told():
+    log = tendon_log()
+    flipped = {**log, "q": -log["q"]}
+    finding = found(flipped, chain=CHAIN, base_is_free=False, q_sign=1)["sign", "warning"]
+    assert "set q_sign = -1" in finding.advice
+    # A half turn of a free base makes up for it where all tendons are taut.
+    assert check_log(flipped, chain=CHAIN).findings == ()
+    released = {**log, "q": np.abs(log["q"])}
+    assert "only ever lengthened" in found(released, chain=CHAIN)["sign", "warning"].message
+
+
+@pytest.mark.parametrize("base_is_free", [True, False])
+def test_clockwise_numbering_is_told(base_is_free):
+    turned = np.negative([2 * np.pi / 3 * np.arange(3)] * 2)
+    log = tendon_log(angles=turned)
+    finding = found(log, chain=CHAIN, base_is_free=base_is_free)["numbering", "warning"]
+    assert "clockwise = true" in finding.advice
+    assert check_log(tendon_log(), chain=CHAIN, base_is_free=base_is_free).ok
+
+
+def test_a_model_that_explains_nothing_is_told():
+    log = tendon_log()
+    log["q"] = np.random.default_rng(1).permutation(log["q"])
+    finding = found(log, chain=CHAIN)["geometry", "warning"]
+    assert "order of the columns" in finding.advice
+
+
+def test_check_says_what_it_needs():
+    with pytest.raises(ValueError, match=r"q of shape \(N, n\)"):
+        check_log({"q": np.ones((3, 3)), "x": np.ones((2, 3))})
+    with pytest.raises(ValueError, match="must have 6 actuators"):
+        check_log({"q": np.ones((3, 3)), "x": np.ones((3, 3))}, chain=CHAIN)
+
+
+def test_a_report_is_json(log):
+    data = load_csv(
+        log(HEADER + "0,r,1,2,3,1,2,3\n1,r,1,nan,3,1,2,3\n"), **COLUMNS, drop_invalid=True
+    )
+    record = json.loads(json.dumps(check_log(data).to_dict()))
+    assert record["n_rows"] == 1
+    assert any("(line 3)" in finding["message"] for finding in record["findings"])
+
+
+# recordings of real robots
+
+
+@pytest.mark.parametrize("load", [load_ftdcr, load_armlab, load_asl_trunk])
+def test_absent_recordings_name_their_source(load, tmp_path, monkeypatch):
+    monkeypatch.delenv("HYBRIDKIN_DATA", raising=False)
+    with pytest.raises(FileNotFoundError, match=r"github.com/.* commit .* MIT.*`data_home`"):
+        load()
+    with pytest.raises(FileNotFoundError, match=r"there is no .*HYBRIDKIN_DATA"):
+        load(tmp_path)
+    monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match="there is no"):
+        load()
+
+
+def test_ftdcr(data_home):
+    data = load_ftdcr(data_home)
+    assert data.q.shape == (1620, 9)
+    assert data.x.shape == (1620, 3)
+    assert not any(label.endswith("_hold") for label in data.groups)
+    assert any(label.endswith("_hold") for label in data.pattern_label)
+    # Pulled is shortened; the first motion pulls the first tendon.
+    first = data.groups == "rep1_tendon0_id4_pull"
+    assert data.q[first].min() == data.q[first, 0].min() < -0.003
+    assert 0.15 < np.median(np.linalg.norm(data.x, axis=1)) < 0.25
+    assert (np.diff(data.time) > 0).all()
+    assert "MIT" in data.source
+    pulls = load_ftdcr(data_home, subset="tendon_pull")
+    assert_array_equal(pulls.q, data.q[: len(pulls.q)])
+    assert_array_equal(load_ftdcr(data_home, return_X_y=True)[1], data.x)
+    with pytest.raises(ValueError, match="`subset` must be one of"):
+        load_ftdcr(data_home, subset="test")
+
+
+def test_armlab(data_home):
+    data = load_armlab(data_home)
+    assert data.q.shape == (24019, 3)
+    assert data.q.max() == 0
+    assert data.q.min() == -0.01
+    assert (data.q.max(axis=1) == 0).all()
+    assert 0.2 < np.linalg.norm(data.x, axis=1).mean() < 0.4
+    # A line holds one coordinate of the raster.
+    for group in (0, 50, 101, 150):
+        rows = data.q[data.groups == group]
+        column = 1 if group <= 100 else 0
+        assert len(np.unique(rows[:, column])) == 1
+    assert data.groups.max() <= 200
+
+
+def test_asl_trunk(data_home):
+    data = load_asl_trunk(data_home)
+    assert data.q.shape == (2170, 6)
+    assert data.disks.shape == (2170, 3, 3)
+    assert_array_equal(data.x, data.disks[:, 2])
+    assert set(data.groups) <= set(range(len(data.run_names)))
+    assert data.units["q"] == "1"
+
+
+def test_data_home_comes_from_the_environment(data_home, monkeypatch, tmp_path):
+    shutil.copytree(data_home / "asl_trunk_static", tmp_path / "asl_trunk_static")
+    monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
+    assert len(load_asl_trunk().q) == 2170

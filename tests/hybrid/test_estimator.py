@@ -1,0 +1,471 @@
+import copy
+import pickle
+import warnings
+
+import joblib
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
+from sklearn.ensemble import RandomForestRegressor
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import LinearRegression
+from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, PolynomialFeatures
+from sklearn.utils.estimator_checks import parametrize_with_checks
+from torch.testing import assert_close
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    ELMRegressor,
+    HybridForwardModel,
+    IKStatus,
+    InverseKinematics,
+    datasets,
+    jacobian,
+    robots,
+)
+from hybridkin.ik.trajectories import figure_eight
+
+
+class SmallSum(torch.nn.Module):
+    """A mechanical model of any number of actuators and one output."""
+
+    def forward(self, q):
+        return 0.01 * q.sum(-1, keepdim=True)
+
+
+def expected_failures(estimator):
+    if estimator.mechanical_model is None:
+        return {}
+    failures = {"check_regressor_multioutput": "this mechanical model has one output"}
+    if isinstance(estimator.error_model, str):
+        failures["check_regressors_train"] = "a mechanical model alone learns nothing"
+    return failures
+
+
+@parametrize_with_checks(
+    [
+        HybridForwardModel(),
+        HybridForwardModel(error_model=LinearRegression()),
+        HybridForwardModel(SmallSum()),
+        HybridForwardModel(SmallSum(), KernelRidge(), guard="box"),
+        HybridForwardModel(SmallSum(), "drop"),
+    ],
+    expected_failed_checks=expected_failures,
+)
+def test_scikit_learn_contract(estimator, check):
+    check(estimator)
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Tips of a chain plus a smooth error, in 12 motions."""
+    rng = np.random.default_rng(0)
+    q = 0.25 + 0.06 * rng.uniform(-1, 1, (360, 9))
+    x = robots.bionic_handling_assistant()(torch.from_numpy(q)).numpy()
+    x += 0.02 * np.sin(20 * q[:, :3]) + 0.05 * (q[:, 3:6] - 0.25) + [0.01, 0.0, -0.02]
+    x += 0.0005 * rng.standard_normal(x.shape)
+    return q, x, np.repeat(np.arange(12), 30)
+
+
+def bha():
+    return robots.bionic_handling_assistant()
+
+
+def error_of(model, q, x):
+    return np.linalg.norm(model.predict(q) - x, axis=1).mean()
+
+
+def quadratic():
+    return make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression())
+
+
+def test_the_sum_of_the_paper(log):
+    q, x, _ = log
+    elm = ELMRegressor(random_state=0)
+    model = HybridForwardModel(bha(), elm, guard=None).fit(q, x)
+    tips = bha()(torch.from_numpy(q)).numpy()
+    expected = tips + elm.fit(q, x - tips).predict(q)
+    assert_allclose(model.predict(q), expected, rtol=0, atol=1e-12)
+    assert_allclose(model.predict_mechanical(q), tips, rtol=0, atol=1e-15)
+    assert_allclose(
+        model.predict_mechanical(q) + model.predict_error(q), model.predict(q), atol=1e-14
+    )
+
+
+def test_learning_the_error_helps_on_other_motions(log):
+    q, x, groups = log
+    train = groups < 9
+    mechanical = HybridForwardModel(bha(), "drop").fit(q[train], x[train])
+    hybrid = HybridForwardModel(bha(), random_state=0).fit(q[train], x[train])
+    data_driven = HybridForwardModel(random_state=0).fit(q[train], x[train])
+    errors = [error_of(m, q[~train], x[~train]) for m in (hybrid, mechanical, data_driven)]
+    assert errors[0] < 0.5 * min(errors[1:])
+
+
+@pytest.mark.parametrize("guard", ["leverage", "box", None])
+@pytest.mark.parametrize(
+    "error_model",
+    [
+        None,
+        "drop",
+        LinearRegression(),
+        quadratic(),
+        KernelRidge(kernel="rbf", gamma=10.0, alpha=1e-3),
+        GaussianProcessRegressor(alpha=1e-4),
+    ],
+    ids=["elm", "drop", "linear", "quadratic", "kernel ridge", "gaussian process"],
+)
+def test_jacobian_is_that_of_the_whole_sum(log, error_model, guard):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), error_model, guard=guard, random_state=0).fit(q, x)
+    # inside the domain, at its edge, and far outside, where the guard is at work
+    points = 0.25 + np.outer([0.5, 1.05, 1.6, 3.0], q[0] - 0.25)
+    prediction, J = model.predict_and_jacobian(points)
+    assert_array_equal(prediction, model.predict(points))
+    assert_array_equal(J, model.jacobian(points))
+    step = 1e-5
+    moves = step * np.eye(9)
+    columns = [(model.predict(points + m) - model.predict(points - m)) / (2 * step) for m in moves]
+    assert_allclose(np.stack(columns, -1), J, rtol=0, atol=1e-6 * np.abs(J).max())
+    reverse = jacobian(lambda q: model.module_(q), torch.from_numpy(points)).numpy()
+    assert_allclose(reverse, J, rtol=0, atol=1e-7 * np.abs(J).max())
+
+
+def test_guard_leaves_the_training_rows_and_falls_back_to_mechanics(log):
+    q, x, _ = log
+    far = 0.25 + 40.0 * (q - 0.25)
+    for guard in ("leverage", "box"):
+        model = HybridForwardModel(bha(), LinearRegression(), guard=guard).fit(q, x)
+        free = HybridForwardModel(bha(), LinearRegression(), guard=None).fit(q, x)
+        assert model.in_domain(q).all()
+        assert_allclose(model.predict(q), free.predict(q), rtol=0, atol=1e-15)
+        assert not model.in_domain(far).any()
+        assert np.abs(model.predict_error(far)).max() < 0.01 * np.abs(free.predict_error(far)).max()
+        assert free.in_domain(far).all()
+
+
+def test_guard_is_smooth(log):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), random_state=0).fit(q, x)
+    line = 0.25 + torch.linspace(0.9, 3.0, 9, dtype=torch.float64)[:, None] * (
+        torch.from_numpy(q[:1]) - 0.25
+    )
+    assert torch.autograd.gradcheck(model.module_, line.requires_grad_())
+    assert torch.autograd.gradgradcheck(model.module_, line[::4].detach().requires_grad_())
+
+
+def test_calibration_happens_inside_fit(log):
+    q, x, groups = log
+    nominal = ConstantCurvatureChain([0.12, 0.12, 0.12])
+    truth = bha()(torch.from_numpy(q)).numpy()
+    model = HybridForwardModel(nominal, "drop", calibrate="default").fit(q, truth)
+    assert_allclose(model.mechanical_model_.radii, bha().radii, rtol=0, atol=1e-9)
+    assert_allclose(nominal.radii, [0.12] * 3)
+    assert model.calibration_.cv_rmse is None
+    nominal = ConstantCurvatureChain([0.10, 0.10, 0.10])
+    model = HybridForwardModel(nominal, "drop", calibrate=("radii",)).fit(q, x, groups=groups)
+    assert model.calibration_.cv_rmse > model.calibration_.rmse
+
+
+def test_cross_validation_and_search_by_groups(log):
+    q, x, groups = log
+    model = HybridForwardModel(bha(), ELMRegressor(random_state=0))
+    scores = cross_val_score(model, q, x, cv=GroupKFold(5), groups=groups)
+    assert scores.shape == (5,)
+    assert scores.min() > 0.99
+    search = GridSearchCV(
+        model,
+        {"error_model__alpha": [1e-4, 1e-1, 1e3], "guard": ["leverage", None]},
+        cv=GroupKFold(3),
+        n_jobs=2,
+    ).fit(q, x, groups=groups)
+    assert search.best_params_["error_model__alpha"] < 1e3
+    default = GridSearchCV(HybridForwardModel(bha()), {"error_model__alpha": [1e-2, 1e3]})
+    assert default.fit(q, x).best_params_ == {"error_model__alpha": 1e-2}
+
+
+def test_pipeline_in_other_units(log):
+    q, x, _ = log
+    metres = FunctionTransformer(lambda q: q / 1000.0)
+    pipeline = Pipeline([("metres", metres), ("model", HybridForwardModel(bha(), random_state=0))])
+    expected = HybridForwardModel(bha(), random_state=0).fit(q, x).predict(q)
+    assert_allclose(pipeline.fit(1000 * q, x).predict(1000 * q), expected, rtol=0, atol=1e-9)
+
+
+def test_clone_pickle_and_hash(log):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), ELMRegressor(random_state=0)).fit(q, x)
+    fresh = clone(model)
+    assert not hasattr(fresh, "module_")
+    assert joblib.hash(fresh) == joblib.hash(clone(model))
+    for twin in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        assert_array_equal(twin.predict(q), model.predict(q))
+        assert joblib.hash(twin) == joblib.hash(model)
+
+
+def test_float32_in_float32_out(log):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), random_state=0).fit(q.astype(np.float32), x)
+    prediction, J = model.predict_and_jacobian(q.astype(np.float32))
+    assert prediction.dtype == J.dtype == np.float32
+    reference = HybridForwardModel(bha(), random_state=0).fit(q, x).predict(q)
+    assert_allclose(prediction, reference, rtol=0, atol=1e-5)
+
+
+def test_a_tree_has_no_slope_but_predicts(log):
+    q, x, _ = log
+    forest = RandomForestRegressor(10, random_state=0)
+    model = HybridForwardModel(bha(), forest, guard=None).fit(q, x)
+    assert_allclose(model.jacobian(q[:5]), bha().jacobian(torch.from_numpy(q[:5])), atol=1e-12)
+    assert error_of(model, q, x) < error_of(HybridForwardModel(bha(), "drop").fit(q, x), q, x)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: HybridForwardModel(bha(), coupling="both"), "`coupling` must be one of"),
+        (lambda: HybridForwardModel(bha(), guard="ball"), "`guard` must be one of"),
+        (lambda: HybridForwardModel(bha(), "cubic"), "`error_model` must be an estimator"),
+        (lambda: HybridForwardModel(None, "drop"), "`mechanical_model` must be given"),
+        (lambda: HybridForwardModel(bha(), calibrate=("radius",)), "`parameters` must name"),
+    ],
+)
+def test_bad_settings(log, make, message):
+    with pytest.raises(ValueError, match=message):
+        make().fit(*log[:2])
+
+
+def test_bad_data(log):
+    q, x, _ = log
+    with pytest.raises(TypeError, match="must be a torch module"):
+        HybridForwardModel(lambda q: q).fit(q, x)
+    with pytest.raises(ValueError, match=r"`X` must have shape \(..., 9\)"):
+        HybridForwardModel(bha()).fit(q[:, :6], x)
+    with pytest.raises(ValueError, match="`y` must have 3 columns"):
+        HybridForwardModel(bha()).fit(q, x[:, :2])
+    with pytest.raises(ValueError, match="positive actuator lengths"):
+        HybridForwardModel(bha()).fit(q - 0.25, x)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        HybridForwardModel(bha()).fit(1000 * q, x)
+    assert any("millimetres" in str(w.message) for w in caught)
+
+
+SLACK = ".* pull the tendons of a segment together"
+
+
+@pytest.fixture(scope="module")
+def slack_log():
+    """Tips of an elastic backbone whose tendons are pulled one by one or let go, in 12 motions."""
+    rng = np.random.default_rng(1)
+    truth = ElasticTendonChain(
+        [0.005] * 2,
+        [0.1, 0.1],
+        bending_stiffness=1e-6,
+        axial_stiffness=[2.0, 3.0],
+        rest_bends=[[0.1, -0.1], [0.0, 0.1]],
+        tendon_zeros=-2e-4,
+    )
+    q = 0.004 * rng.uniform(-1, 1, (240, 6))
+    x = truth(torch.from_numpy(q)).numpy() + 2e-4 * rng.standard_normal((240, 3))
+    return q, x, np.repeat(np.arange(12), 20)
+
+
+def elastic():
+    return ElasticTendonChain([0.005] * 2, [0.1, 0.1])
+
+
+@pytest.mark.filterwarnings(f"ignore:{SLACK}")
+def test_slack_is_better_known_than_learned(slack_log):
+    q, x, groups = slack_log
+    train = groups < 9
+    plain = ConstantCurvatureChain([0.005] * 2, lengths=[0.1, 0.1], routing="base")
+    errors = [
+        error_of(
+            HybridForwardModel(chain, calibrate=("base", *names), random_state=0).fit(
+                q[train], x[train]
+            ),
+            *(q[~train], x[~train]),
+        )
+        for chain, names in (
+            (plain, ("radii", "lengths", "rest_bends")),
+            (elastic(), ("rest_bends", "bending_stiffness", "axial_stiffness", "tendon_zeros")),
+        )
+    ]
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 0.001
+
+
+def test_elastic_chain_as_the_mechanical_model(slack_log):
+    q, x, _ = slack_log
+    model = HybridForwardModel(elastic(), calibrate="default", random_state=0).fit(q, x)
+    assert set(model.calibration_.values) == set(elastic().default_parameters)
+    named = HybridForwardModel(elastic(), "drop", calibrate=("base", "angles")).fit(q, x)
+    assert set(named.calibration_.values) == {"base", "angles"}
+    assert model.in_domain(q).all()
+    assert not model.in_domain(40 * q).all()
+    points = np.concatenate([q[:3], 1.6 * q[:3]])  # inside the domain and beyond
+    J = model.jacobian(points)
+    moves = 1e-7 * np.eye(6)
+    columns = [(model.predict(points + m) - model.predict(points - m)) / 2e-7 for m in moves]
+    assert_allclose(np.stack(columns, -1), J, rtol=0, atol=1e-5 * np.abs(J).max())
+
+
+def test_the_plain_chain_tells_of_slack_once_per_call(slack_log):
+    q, x, _ = slack_log
+    chain = ConstantCurvatureChain([0.005] * 2, lengths=[0.1, 0.1], routing="base")
+    fitted = None
+    for error_model, calibrated in ((None, ()), ("drop", ("base",))):
+        model = HybridForwardModel(chain, error_model, calibrate=calibrated, random_state=0)
+        with pytest.warns(UserWarning, match=SLACK) as caught:
+            fitted = model.fit(q, x)
+        assert len(caught) == 1
+    for name in ("predict", "predict_mechanical", "jacobian", "predict_and_jacobian"):
+        with pytest.warns(UserWarning, match=r"\d+ of 240 rows of `X` .* mm rms") as caught:
+            getattr(fitted, name)(q)
+        assert len(caught) == 1
+    fitted.in_domain(q)
+    fitted.predict_error(q)
+    parts = q.reshape(-1, 2, 3)
+    fitted.predict((parts - parts.mean(2, keepdims=True)).reshape(q.shape))
+
+
+@pytest.mark.parametrize("alpha", [0.1, 1e-6])
+def test_guard_in_single_precision_never_errs(alpha):
+    """Rows that the screening lets pass are inside; the sum is that of value and weight."""
+    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, ELMRegressor(alpha=alpha, random_state=0)).fit(data.q, data.x)
+    module = model.module_
+    rng = np.random.default_rng(0)
+    low, high = data.q.min(0), data.q.max(0)
+    wide = low + (high - low) * rng.uniform(-0.7, 1.7, (4000, 9))
+    q = torch.from_numpy(np.concatenate([data.q, wide]))
+    passed = module.guard.is_inside(module.error.features(q))
+    inside = module.in_domain(q)
+    assert not (passed & ~inside).any()
+    assert (passed & inside).sum() > 0.5 * inside.sum()
+    assert (~inside).any()
+    x, J = module.forward_and_jacobian(q)
+    assert_close(x, module(q), rtol=0, atol=1e-12)
+    expected = torch.func.vmap(torch.func.jacrev(module))(q[::50])
+    assert_close(J[::50], expected, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("guard", ["leverage", "box"])
+@pytest.mark.parametrize(
+    "error_model",
+    [
+        ELMRegressor(alpha=1e-9, random_state=0),
+        make_pipeline(MinMaxScaler(), PolynomialFeatures(3), LinearRegression()),
+    ],
+    ids=["elm", "cubic"],
+)
+def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
+    """An optimiser looks for the longest correction in and far out of the box."""
+    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
+    q, x = data.q[::6], data.x[::6]
+    module = HybridForwardModel(chain, error_model, guard=guard).fit(q, x).module_
+    rows = torch.from_numpy(q)
+    longest = module.error_part(rows).norm(dim=-1).max()
+    low, high = rows.amin(0), rows.amax(0)
+    free = HybridForwardModel(chain, error_model, guard=None).fit(q, x).module_
+    worst = {}
+    for name, model in (("guarded", module), ("free", free)):
+        generator = torch.Generator().manual_seed(0)
+        u = 4.0 * torch.rand(200, 9, generator=generator, dtype=torch.float64) - 1.5
+        u.requires_grad_()
+        optimiser = torch.optim.Adam([u], lr=0.05)
+        for _ in range(60):
+            loss = -model.error_part(low + (high - low) * u).square().sum()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        worst[name] = model.error_part(low + (high - low) * u).norm(dim=-1).max()
+    assert worst["free"] > 5 * longest
+    assert worst["guarded"] <= (1.5 + 1e-12) * longest
+    # Beyond the largest, value and Jacobian of the sum are still each other's.
+    at = (low + (high - low) * u).detach()[:20]
+    assert_close(module.forward_and_jacobian(at)[0], module(at), rtol=0, atol=1e-9)
+    reverse = torch.func.vmap(torch.func.jacrev(module))(at)
+    assert_close(module.jacobian(at), reverse, rtol=1e-6, atol=1e-6 * float(reverse.abs().max()))
+
+
+@pytest.mark.parametrize("kind", ["leverage", "box"])
+@pytest.mark.parametrize(
+    "error_model",
+    [
+        ELMRegressor(random_state=0),
+        ELMRegressor(alpha=1e-4, direct_link=True, activation="tanh", random_state=0),
+        LinearRegression(),
+    ],
+    ids=["elm", "linked", "linear"],
+)
+def test_weight_and_its_derivative(kind, error_model):
+    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
+    guard = HybridForwardModel(chain, error_model, guard=kind).fit(data.q, data.x).module_.guard
+    rng = np.random.default_rng(0)
+    away = rng.uniform(-0.2, 0.2, (40, 9)) * np.linspace(0, 1, 40)[:, None]
+    q = torch.from_numpy(data.q[:40] + away)
+    weight, slope = guard.weight_and_jacobian(q)
+    assert_close(weight, guard(q))
+    assert ((weight > 0.01) & (weight < 0.99)).any()
+    assert_close(slope, torch.func.vmap(torch.func.jacrev(guard))(q), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("settings", "groups", "message"),
+    [
+        ({"calibrate": True}, None, "`calibrate` must be a sequence of names.*got True"),
+        ({"calibrate": "radii"}, None, "`calibrate` must be a sequence of names.*got 'radii'"),
+        ({}, np.zeros(3), r"`groups` must have shape \(20,\), one entry for each row.*got \(3,\)"),
+    ],
+)
+def test_settings_and_groups_are_checked(settings, groups, message):
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
+    chain = robots.bionic_handling_assistant()
+    with pytest.raises(ValueError, match=message):
+        HybridForwardModel(chain, "linear", **settings).fit(q, q[:, :3], groups=groups)
+
+
+def test_tips_in_millimetres_are_noticed_without_a_calibration():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
+    chain = robots.bionic_handling_assistant()
+    x = 1e3 * chain(torch.from_numpy(q)).numpy()
+    with pytest.warns(UserWarning, match="`y` spans .* works in metres"):
+        HybridForwardModel(chain, "linear").fit(q, x)
+
+
+def test_rows_that_cannot_be_written_to_are_read_without_a_word():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
+    q.flags.writeable = False
+    chain = robots.bionic_handling_assistant()
+    x = chain(torch.from_numpy(q.copy())).numpy()
+    HybridForwardModel(chain, "linear", calibrate="default").fit(q, x)
+
+
+@pytest.mark.parametrize(
+    "error_model", [KernelRidge(kernel="rbf", gamma=1e4, alpha=1e-3), None, "quadratic"]
+)
+def test_a_log_of_balanced_tendons_is_not_left_by_common_pulls(error_model):
+    """Nothing tells what a common pull does; that must be no way out for an inverse."""
+    chain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], routing="base")
+    rng = np.random.default_rng(0)
+    balanced = rng.uniform(-0.004, 0.004, (300, 2, 3))
+    q = (balanced - balanced.mean(axis=2, keepdims=True)).reshape(-1, 6)
+    x = chain(torch.from_numpy(q)).numpy() + 0.002 * np.sin(800.0 * q[:, :3])
+    model = HybridForwardModel(chain, error_model, random_state=0).fit(q, x)
+    assert model.in_domain(q).all()
+    pulled = np.repeat([[1e-4, 4e-3]], 6, axis=0).T
+    assert model.in_domain(pulled).tolist() == [True, False]
+    ik = InverseKinematics(model, q_min=-0.02, q_max=0.02, q_pref=0.0, dt=0.02)
+    track = ik.track(figure_eight((0.0, 0.0, 0.195), (0.03, 0.02), duration=5.0, dt=0.02))
+    assert (track.status == IKStatus.CONVERGED).all()
+    # A network has some slope in every direction; the others have none where nothing is known.
+    most = 1.5e-3 if error_model is None else 2e-4
+    assert np.abs(track.q.reshape(-1, 2, 3).mean(axis=2)).max() < most

@@ -1,0 +1,586 @@
+"""Hybrid models of the whole pose."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+from sklearn.base import clone
+from sklearn.ensemble import RandomForestRegressor
+from sklearn.linear_model import LinearRegression, Ridge
+from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
+from torch.testing import assert_close
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    ELMRegressor,
+    ELMRegressorCV,
+    HybridForwardModel,
+    InverseKinematics,
+    RigidChain,
+    load_model,
+    robots,
+    save_model,
+)
+from hybridkin.hybrid._pose import rotation
+from hybridkin.ik._realtime import Controller
+from hybridkin.ik.solver import IKStatus
+from hybridkin.ik.tasks import PoseTask, rotation_vector
+
+STRAIGHT = torch.full((1, 9), 0.25, dtype=torch.float64)
+
+
+def bha(base=None):
+    chain = robots.bionic_handling_assistant()
+    if base is None:
+        return chain
+    return chain.with_geometry(base=torch.as_tensor(base, dtype=torch.float64))
+
+
+def end(chain, q):
+    return chain.poses(torch.as_tensor(q))[..., -1, :, :].numpy()
+
+
+def rows_of(T):
+    return np.concatenate([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec()], axis=1)
+
+
+def moved(T, way, turn):
+    """Poses moved by ways, their frames turned by rotation vectors in the measuring frame."""
+    T = T.copy()
+    T[:, :3, 3] += way
+    T[:, :3, :3] = Rotation.from_rotvec(turn).as_matrix() @ T[:, :3, :3]
+    return T
+
+
+def actuators(n, seed=0, spread=0.05):
+    return 0.25 + spread * np.random.default_rng(seed).uniform(-1, 1, (n, 9))
+
+
+def log_of(q, base=None):
+    """Poses with errors in position and orientation that vary smoothly over the box."""
+    way = 0.3 * (q[:, :3] - 0.25) + 0.05 * np.sin(15 * (q[:, 3:6] - 0.24))
+    turn = 3.0 * (q[:, 3:6] - 0.22) + 0.3 * np.cos(15 * (q[:, 6:] - 0.25))
+    T = moved(end(bha(), q), way, turn)
+    return rows_of(T if base is None else base @ T)
+
+
+def quadratic():
+    return make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression())
+
+
+def pose_model(error_model=None, base=None, **options):
+    return HybridForwardModel(bha(base), error_model, output="pose", random_state=0, **options)
+
+
+@pytest.fixture(scope="module")
+def log():
+    q = actuators(300)
+    return q, log_of(q)
+
+
+@pytest.fixture(scope="module")
+def fitted(log):
+    return pose_model(quadratic()).fit(*log)
+
+
+def degrees(a, b):
+    """Angles between the orientations of two sets of rows."""
+    turn = Rotation.from_rotvec(a[:, 3:]) * Rotation.from_rotvec(b[:, 3:]).inv()
+    return np.degrees(turn.magnitude())
+
+
+def millimetres(a, b):
+    return 1e3 * np.linalg.norm(a[:, :3] - b[:, :3], axis=1)
+
+
+# ---------------------------------------------------------------- rotations
+
+
+def turns(rng):
+    axis = torch.nn.functional.normalize(
+        torch.randn(300, 3, generator=rng, dtype=torch.float64), dim=1
+    )
+    angle = torch.cat([torch.logspace(-12, 0, 150), torch.linspace(1.0, math.pi, 150)]).double()
+    return angle[:, None].clamp(max=math.pi) * axis
+
+
+def test_exp_and_log_undo_each_other_from_zero_to_a_half_turn(rng):
+    phi = torch.cat([turns(rng)[:-1], torch.zeros(1, 3, dtype=torch.float64)])
+    R, _ = rotation(phi)
+    assert_close(
+        R, torch.from_numpy(Rotation.from_rotvec(phi.numpy()).as_matrix()), rtol=0, atol=2e-15
+    )
+    assert_close(rotation_vector(R), phi, rtol=1e-12, atol=1e-15)
+    half = math.pi * torch.eye(3, dtype=torch.float64)
+    found = rotation_vector(rotation(half)[0])
+    assert (found.norm(dim=1) <= math.pi).all()
+    assert_close(rotation(found)[0], rotation(half)[0], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-160, 1e-9, 1e-3, 1.0, 2.0, math.pi, 6.0])
+def test_rotations_are_smooth(angle):
+    phi = angle * torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+    phi.requires_grad_()
+    assert torch.autograd.gradcheck(lambda phi: rotation(phi), phi)
+    assert torch.autograd.gradgradcheck(lambda phi: rotation(phi), phi)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 3.0, math.pi])
+def test_gradients_of_the_logarithm_are_finite_and_right(angle):
+    start = angle * torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+    phi = start.clone().requires_grad_()
+    J = torch.autograd.functional.jacobian(lambda phi: rotation_vector(rotation(phi)[0]), phi)
+    assert torch.isfinite(J).all()
+    if angle < math.pi:  # there it jumps
+        assert_close(J, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+def test_left_jacobian_gives_the_angular_velocity(rng):
+    phi, step = turns(rng), torch.randn(300, 3, generator=rng, dtype=torch.float64)
+    h = 1e-5
+    ahead, behind = rotation(phi + h * step)[0], rotation(phi - h * step)[0]
+    omega = rotation_vector(ahead @ behind.mT) / (2 * h)
+    assert_close((rotation(phi)[1] @ step[..., None])[..., 0], omega, rtol=0, atol=1e-8)
+
+
+# ---------------------------------------------------------------- what is learned
+
+
+def test_a_planted_error_is_recovered():
+    q = actuators(400)
+    way, turn = 0.3 * (q[:, :3] - 0.24), 3.0 * (q[:, 3:6] - 0.23)
+    y = rows_of(moved(end(bha(), q), way, turn))
+    model = pose_model(LinearRegression(), guard=None).fit(q, y)
+    new = actuators(100, seed=1)
+    expected = np.column_stack([0.3 * (new[:, :3] - 0.24), 3.0 * (new[:, 3:6] - 0.23)])
+    assert_allclose(model.predict_error(new), expected, rtol=0, atol=1e-12)
+    planted = moved(end(bha(), new), expected[:, :3], expected[:, 3:])
+    assert_allclose(model.module_.pose(torch.from_numpy(new)).numpy(), planted, rtol=0, atol=1e-12)
+    assert_allclose(model.predict(new), rows_of(planted), rtol=0, atol=1e-11)
+    assert_allclose(model.predict_mechanical(new), rows_of(end(bha(), new)), rtol=0, atol=1e-11)
+
+
+def test_the_regressor_learns_metres_a_radian_as_the_reach(log):
+    q, y = log
+    model = pose_model(LinearRegression(), guard=None).fit(q, y)
+    T, reach = end(bha(), q), float(bha().reach)
+    turn = Rotation.from_rotvec(y[:, 3:]) * Rotation.from_matrix(T[:, :3, :3]).inv()
+    errors = np.column_stack([y[:, :3] - T[:, :3, 3], reach * turn.as_rotvec()])
+    coef = LinearRegression().fit(q, errors).coef_
+    assert_allclose(model.error_model_.coef_, coef, rtol=0, atol=1e-10)
+
+
+def test_parts_compose_to_the_prediction(fitted, log):
+    q = np.concatenate([log[0][:20], actuators(20, seed=3, spread=0.3)])
+    mechanical, error = fitted.predict_mechanical(q), fitted.predict_error(q)
+    turn = Rotation.from_rotvec(error[:, 3:]) * Rotation.from_rotvec(mechanical[:, 3:])
+    answer = fitted.predict(q)
+    assert_allclose(answer[:, :3], mechanical[:, :3] + error[:, :3], rtol=0, atol=1e-14)
+    R = Rotation.from_rotvec(answer[:, 3:]).as_matrix()
+    assert_allclose(R, turn.as_matrix(), rtol=0, atol=1e-12)
+    assert (np.linalg.norm(answer[:, 3:], axis=1) <= math.pi).all()
+    x = fitted.module_(torch.from_numpy(q))
+    assert_allclose(x.numpy(), answer[:, :3], rtol=0, atol=1e-14)
+    assert_close(fitted.module_.mechanical_part(torch.from_numpy(q)), bha()(torch.from_numpy(q)))
+
+
+@pytest.mark.parametrize("error_model", [None, quadratic()])
+def test_turning_the_measuring_frame_turns_the_answers(log, error_model):
+    q, _ = log
+    base = np.eye(4)
+    base[:3, :3] = Rotation.from_rotvec([0.5, -2.0, 1.2]).as_matrix()
+    base[:3, 3] = [0.3, -0.2, 1.0]
+    new = torch.from_numpy(np.concatenate([q[:20], actuators(20, seed=4, spread=0.2)]))
+    modules = [
+        pose_model(error_model, frame).fit(q, log_of(q, frame)).module_ for frame in (None, base)
+    ]
+    here, there = (module.pose(new) for module in modules)
+    frame = torch.from_numpy(base)
+    assert_close(there, frame @ here, rtol=0, atol=1e-9)
+    here, there = (module.pose_jacobian(new) for module in modules)
+    turned = torch.cat([frame[:3, :3] @ here[:, :3], frame[:3, :3] @ here[:, 3:]], dim=1)
+    assert_close(there, turned, rtol=0, atol=1e-7)
+
+
+def test_pose_errors_of_a_trunk_fall_far_below_those_of_its_model():
+    # The real trunk: other radii, its end plate tilted, and twisted more the more it is bent.
+    rng = np.random.default_rng(5)
+    truth = ConstantCurvatureChain([0.106, 0.090, 0.082], offsets=[0.0, 0.0, 0.0])
+
+    def measured(q):
+        T = end(truth, q)
+        tilt = Rotation.from_rotvec([0.08, -0.05, 0.0])
+        twist = Rotation.from_rotvec(np.outer(0.15 + 4.0 * (q[:, 1] - q[:, 5]), [0, 0, 1]))
+        T[:, :3, :3] = T[:, :3, :3] @ (tilt * twist).as_matrix()
+        noise = rng.standard_normal((2, len(q), 3))
+        return rows_of(moved(T, 5e-4 * noise[0], np.radians(0.2) * noise[1]))
+
+    train, test = actuators(500, seed=6), actuators(500, seed=7)
+    model = pose_model(ELMRegressorCV(random_state=0)).fit(train, measured(train))
+    y = measured(test)
+    hybrid, alone = model.predict(test), model.predict_mechanical(test)
+    assert millimetres(alone, y).mean() > 10.0
+    assert degrees(alone, y).mean() > 10.0
+    assert millimetres(hybrid, y).mean() < 1.8
+    assert degrees(hybrid, y).mean() < 0.9
+
+
+def test_half_turns_do_no_harm():
+    base = np.diag([1.0, -1.0, -1.0, 1.0])  # a robot that hangs
+    q = actuators(300, spread=0.01)
+    y = log_of(q, base)
+    assert (np.linalg.norm(y[:, 3:], axis=1) > 2.4).all()
+    y[::2, 3:] *= 1.0 - 2.0 * math.pi / np.linalg.norm(y[::2, 3:], axis=1)[:, None]  # the same
+    model = pose_model(quadratic(), base).fit(q, y)
+    answer = model.predict(q)
+    assert np.isfinite(answer).all()
+    assert (np.linalg.norm(answer[:, 3:], axis=1) <= math.pi).all()
+    assert degrees(answer, y).max() < 0.05
+    hanging = pose_model("drop", base).fit(q, y)
+    assert_allclose(
+        np.linalg.norm(hanging.predict(STRAIGHT.numpy())[:, 3:]), math.pi, rtol=0, atol=1e-12
+    )
+
+
+def test_calibration_looks_at_the_positions():
+    true = bha().with_geometry(radii=torch.tensor([0.106, 0.090, 0.082]).double())
+    q = actuators(200)
+    y = rows_of(end(true, q))
+    model = pose_model("drop", calibrate=("radii",)).fit(q, y)
+    assert_allclose(model.mechanical_model_.radii.numpy(), true.radii.numpy(), rtol=1e-6)
+    assert_allclose(model.predict(q), y, rtol=0, atol=1e-6)
+    assert model.error_model_ is None
+    assert not model.predict_error(q).any()
+
+
+# ---------------------------------------------------------------- Jacobians
+
+
+def cases(log):
+    """Rows that are straight, bent, at the edge of the domain and far from it."""
+    far = torch.from_numpy(actuators(12, seed=8, spread=0.25))
+    edge = torch.from_numpy(actuators(12, seed=9, spread=0.09))
+    return torch.cat([STRAIGHT, torch.from_numpy(log[0][:10]), edge, far])
+
+
+def models(log):
+    yield pose_model("drop")
+    yield pose_model(ELMRegressor(random_state=0))
+    yield pose_model(quadratic())
+    yield pose_model(quadratic(), guard="box")
+    yield pose_model(quadratic(), guard=None)
+
+
+@pytest.mark.parametrize("kind", range(6))
+def test_pose_jacobian_is_the_derivative(log, kind):
+    model = [*models(log), pose_model(quadratic())][kind].fit(*log)
+    if kind == 5:
+        model.partial_fit(log[0][:20], log[1][:20] + 0.02)
+    if kind == 2:
+        model.module_.guard.largest *= 0.6  # so that some are shortened where they are trusted
+    module, q = model.module_, cases(log)
+    T, J = module.pose(q), module.pose_jacobian(q)
+    if kind in (1, 2, 3, 5):
+        weight = module.error_weight(q)
+        assert weight.min() < 0.1
+        assert module.in_domain(q)[1:11].all()
+        assert ((weight > 0.1) & (weight < 0.9)).any()
+    if kind == 2:
+        long = module.guard.is_long(module.guard(q) * module.error(q))
+        assert (long & module.in_domain(q)).any()
+    # Central differences.
+    h = 1e-6
+    for k in range(9):
+        step = h * torch.eye(9, dtype=torch.float64)[k]
+        ahead, behind = module.pose(q + step), module.pose(q - step)
+        linear = (ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * h)
+        angular = rotation_vector(ahead[:, :3, :3] @ behind[:, :3, :3].mT) / (2 * h)
+        assert_close(J[:, :, k], torch.cat([linear, angular], dim=1), rtol=0, atol=1e-6)
+    # Reverse mode.
+    leaf = q.clone().requires_grad_()
+    by_reverse = torch.stack(
+        [
+            torch.autograd.grad(module.pose(leaf)[:, i, j].sum(), leaf)[0]
+            for i in range(3)
+            for j in range(4)
+        ],
+        dim=1,
+    ).reshape(-1, 3, 4, 9)
+    spin = torch.einsum("nijk,nlj->nilk", by_reverse[:, :, :3], T[:, :3, :3])  # dR R^T
+    angular = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], dim=1)
+    assert_close(J, torch.cat([by_reverse[:, :, 3], angular], dim=1), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", range(5))
+def test_position_part_is_that_of_the_pose(log, kind):
+    module, q = [*models(log)][kind].fit(*log).module_, cases(log)
+    x, J = module.forward_and_jacobian(q)
+    assert_close(x, module.pose(q)[:, :3, 3], rtol=0, atol=1e-14)
+    assert_close(J, module.pose_jacobian(q)[:, :3], rtol=0, atol=1e-12)
+    assert_close(module.jacobian(q), J)
+    function = module.numpy_function()
+    for row, tip, slope in zip(q.numpy(), x.numpy(), J.numpy(), strict=True):
+        found = function(row)
+        assert_allclose(found[0], tip, rtol=0, atol=1e-12)
+        assert_allclose(found[1], slope, rtol=0, atol=1e-10)
+
+
+def test_estimator_and_module_agree(fitted, log):
+    q = torch.from_numpy(log[0][:30])
+    y, J = fitted.predict_and_jacobian(q.numpy())
+    assert y.shape == (30, 6)
+    assert J.shape == (30, 6, 9)
+    assert_allclose(fitted.predict(q.numpy()), y, rtol=0, atol=0)
+    assert_allclose(fitted.jacobian(q.numpy()), fitted.module_.pose_jacobian(q).numpy(), atol=1e-15)
+    row, slope = fitted.numpy_function()(q[3].numpy())
+    assert_allclose(row, y[3], rtol=0, atol=1e-14)
+    assert_allclose(slope, J[3], rtol=0, atol=1e-12)
+    assert fitted.in_domain(q.numpy()).shape == fitted.error_weight(q.numpy()).shape == (30,)
+
+
+def test_shapes_lead_and_rows_stand_alone(fitted):
+    module = fitted.module_
+    q = torch.from_numpy(actuators(12, spread=0.15)).reshape(3, 4, 9)
+    T, J = module.pose(q), module.pose_jacobian(q)
+    assert T.shape == (3, 4, 4, 4)
+    assert J.shape == (3, 4, 6, 9)
+    assert_close(module.pose(q[1, 2]), T[1, 2], rtol=0, atol=1e-14)
+    assert_close(module.pose_jacobian(q[1, 2]), J[1, 2], rtol=0, atol=1e-12)
+    assert module.pose(q[:0]).shape == (0, 4, 4, 4)
+    assert module.pose_jacobian(q[:0]).shape == (0, 4, 6, 9)
+    assert module.n_actuators == 9
+
+
+def test_the_guard_bounds_position_and_orientation(fitted, log):
+    q = actuators(3000, seed=10, spread=0.6)
+    reach, largest = float(bha().reach), float(fitted.module_.guard.largest)
+    errors = fitted.predict_error(q) * np.repeat([1.0, reach], 3)
+    assert np.linalg.norm(errors, axis=1).max() <= 1.5 * largest
+    away = q[fitted.error_weight(q) < 1e-6]
+    assert len(away)
+    assert_allclose(fitted.predict(away), fitted.predict_mechanical(away), rtol=0, atol=1e-5)
+
+
+def test_single_precision(fitted, log):
+    q = cases(log)
+    T, J = fitted.module_.pose(q), fitted.module_.pose_jacobian(q)
+    single = q.float()
+    assert fitted.module_(single).dtype == torch.float32
+    assert_close(fitted.module_.pose(single), T.float(), rtol=0, atol=2e-5)
+    assert_close(fitted.module_.pose_jacobian(single), J.float(), rtol=2e-3, atol=2e-3)
+    assert fitted.predict(single.numpy()).dtype == np.float32
+
+
+# ---------------------------------------------------------------- other robots
+
+
+def test_a_point_on_the_backbone_can_be_steered():
+    q = actuators(100)
+    chain = bha().with_tip(2.5)
+    T = chain.tip_transform(torch.from_numpy(q)).get_matrix().numpy()
+    y = rows_of(moved(T, np.array([0.01, 0, 0]), np.array([0, 0, 0.2])))
+    model = HybridForwardModel(chain, LinearRegression(), output="pose", guard=None).fit(q, y)
+    assert_allclose(model.predict(q), y, rtol=0, atol=1e-10)
+    rows = torch.from_numpy(q).reshape(4, 25, 9)
+    assert_close(model.module_.pose(rows)[..., :3, 3], model.module_(rows), rtol=0, atol=1e-13)
+    _, J = model.module_.forward_and_jacobian(rows)
+    assert_close(model.module_.pose_jacobian(rows)[..., :3, :], J, rtol=0, atol=1e-12)
+
+
+def arm():
+    origins = np.tile(np.eye(4), (3, 1, 1))
+    origins[1:, 0, 3] = 0.3
+    return RigidChain(origins, [[0, 0, 1], [0, 1, 0], [1, 0, 0]], tool=[0.2, 0, 0])
+
+
+def tendons():
+    return ElasticTendonChain([0.01, 0.01], [0.1, 0.1])
+
+
+@pytest.mark.parametrize(("chain", "spread"), [(arm(), 0.8), (tendons(), 0.002)])
+def test_all_kinds_of_chains(chain, spread):
+    q = spread * np.random.default_rng(0).uniform(-1, 1, (200, chain.n_actuators))
+    T = end(chain, q)
+    way = 0.1 / spread * np.array([0.2, 0.1, -0.1]) * q[:, :1]
+    turn = 0.2 / spread * q[:, :3]
+    y = rows_of(moved(T, way, turn))
+    model = HybridForwardModel(chain, Ridge(1e-12), output="pose", guard="box").fit(q, y)
+    found = model.predict(q)
+    assert millimetres(found, y).max() < 1e-3
+    assert degrees(found, y).max() < 1e-3
+
+
+class Turntable(torch.nn.Module):
+    """A mechanical model of a user's own, without a reach."""
+
+    def poses(self, q):
+        phi = torch.cat([torch.zeros_like(q[..., :1]), q], dim=-1)
+        T = torch.nn.functional.pad(rotation(phi)[0], (0, 1, 0, 1))
+        T = T + torch.diag(torch.tensor([0.0, 0.0, 0.0, 1.0])).to(q)
+        return T[..., None, :, :]
+
+    def pose_jacobian(self, q):
+        phi = torch.cat([torch.zeros_like(q[..., :1]), q], dim=-1)
+        angular = rotation(phi)[1][..., 1:]
+        return torch.cat([torch.zeros_like(angular), angular], dim=-2)
+
+    def forward(self, q):
+        return torch.zeros_like(torch.cat([q, q[..., :1]], dim=-1))
+
+
+def test_a_mechanical_model_of_ones_own():
+    q = np.random.default_rng(0).uniform(-1, 1, (80, 2))
+    T = Turntable().poses(torch.from_numpy(q))[:, -1].numpy()
+    errors = q @ np.array([[0.1, 0.0, 0.0, 0.2, 0.0, 0.0], [0.0, 0.0, 0.1, 0.0, 0.0, 0.3]])
+    y = rows_of(moved(T, errors[:, :3], errors[:, 3:]))
+    model = HybridForwardModel(Turntable(), LinearRegression(), output="pose").fit(q, y)
+    assert_allclose(model.predict_error(q), errors, rtol=0, atol=1e-12)
+    assert_allclose(model.predict(q), y, rtol=0, atol=1e-11)
+
+
+# ---------------------------------------------------------------- in use
+
+
+def test_inverse_kinematics_of_the_position(fitted):
+    ik = InverseKinematics(fitted, q_min=0.1, q_max=0.4)
+    target = fitted.module_(torch.from_numpy(actuators(10, seed=11, spread=0.03)))
+    solution = ik.solve(target, tol=1e-8)
+    assert solution.converged.all()
+    assert_close(fitted.module_(solution.q), target, rtol=0, atol=1e-8)
+    controller = Controller(ik, np.full(9, 0.25))
+    for _ in range(40):
+        controller.step(target[0].numpy())
+    assert controller.error < 1e-4
+
+
+def test_inverse_kinematics_of_the_pose(fitted):
+    q = torch.from_numpy(actuators(10, seed=12, spread=0.03))
+    target = fitted.module_.pose(q)
+    solution = InverseKinematics(PoseTask(fitted), q_min=0.1, q_max=0.4).solve(
+        target, q0=q + 0.01, tol=(1e-7, 1e-6)
+    )
+    assert (solution.status == IKStatus.CONVERGED).all()
+    assert_close(fitted.module_.pose(solution.q), target, rtol=0, atol=1e-6)
+    # The chain alone takes the same configurations to other frames.
+    alone = fitted.mechanical_model_.poses(solution.q)[:, -1, :3, :3]
+    assert (rotation_vector(alone @ target[:, :3, :3].mT).norm(dim=1) > 0.1).all()
+
+
+def test_a_change_of_the_robot_is_followed(log):
+    q, y = log
+    model = pose_model(quadratic()).fit(q, y)
+    before = model.module_
+    new = actuators(200, seed=13)
+    base = np.eye(4)
+    base[:3, :3] = Rotation.from_rotvec([0.0, 0.05, 0.0]).as_matrix()
+    y_new, rest = log_of(new, base), actuators(50, seed=14)
+    y_rest = log_of(rest, base)
+    stale = model.predict(rest)
+    model.partial_fit(new, y_new, decay=1.0, alpha=1e-3)
+    assert millimetres(model.predict(rest), y_rest).mean() < 0.2 * millimetres(stale, y_rest).mean()
+    assert degrees(model.predict(rest), y_rest).mean() < 0.2 * degrees(stale, y_rest).mean()
+    assert before.drift is None
+    assert model.module_.drift is not None
+    alone = pose_model("drop").fit(q, y)
+    alone.partial_fit(q, y, decay=1.0)
+    assert (
+        degrees(alone.predict(q), y).mean() < 0.5 * degrees(alone.predict_mechanical(q), y).mean()
+    )
+
+
+@pytest.mark.parametrize(
+    "error_model", ["drop", LinearRegression(), ELMRegressor(random_state=0)], ids=str
+)
+@pytest.mark.parametrize("changed", [False, True])
+def test_models_come_back_from_disk(log, tmp_path, error_model, changed):
+    q, y = log
+    model = pose_model(error_model, calibrate=("base",)).fit(q, y)
+    if changed:
+        model.partial_fit(q[:30], y[:30] + 0.01)
+    save_model(model, tmp_path / "pose.safetensors")
+    found = load_model(tmp_path / "pose.safetensors")
+    new = actuators(40, seed=15, spread=0.15)
+    assert found.output == "pose"
+    assert_allclose(found.predict(new), model.predict(new), rtol=0, atol=1e-12)
+    assert_allclose(found.jacobian(new), model.jacobian(new), rtol=0, atol=1e-9)
+    found.partial_fit(q[:5], y[:5])
+    model.partial_fit(q[:5], y[:5])
+    assert_allclose(found.predict(new), model.predict(new), rtol=0, atol=1e-12)
+
+
+def test_files_of_another_output_are_damaged(log, tmp_path):
+    q, y = log
+    positions = HybridForwardModel(bha(), LinearRegression()).fit(q, y[:, :3])
+    positions.output = "pose"
+    save_model(positions, tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match="damaged"):
+        load_model(tmp_path / "model.safetensors")
+
+
+def test_scikit_learn_tools(log):
+    q, y = log
+    model = pose_model(LinearRegression())
+    assert clone(model).output == "pose"
+    scores = cross_val_score(model, q, y, cv=3)
+    assert (scores > 0.9).all()
+    fitted = model.fit(q, y)
+    assert fitted.score(q, y) > 0.9
+    again = pickle.loads(pickle.dumps(fitted))
+    assert_allclose(again.predict(q), fitted.predict(q), rtol=0, atol=0)
+    search = GridSearchCV(model, {"error_model": ["drop", LinearRegression()]}, cv=3).fit(q, y)
+    assert search.best_params_["error_model"] != "drop"
+    weights = np.r_[np.ones(150), np.zeros(150)]
+    half = clone(model).fit(q, y, sample_weight=weights)
+    assert_allclose(half.predict(q), clone(model).fit(q[:150], y[:150]).predict(q), atol=1e-9)
+
+
+def test_any_regressor_with_six_outputs(log):
+    q, y = log
+    model = pose_model(RandomForestRegressor(20, random_state=0)).fit(q, y)
+    assert (
+        degrees(model.predict(q), y).mean() < 0.5 * degrees(model.predict_mechanical(q), y).mean()
+    )
+
+
+class TipOnly(torch.nn.Module):
+    def forward(self, q):
+        return q[..., :3]
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "match"),
+    [
+        ({"output": "frame"}, ValueError, "'position' or 'pose'"),
+        ({"mechanical_model": TipOnly()}, TypeError, "pose_jacobian.*TipOnly"),
+        ({"mechanical_model": None}, TypeError, "pose_jacobian.*NoneType"),
+        ({"coupling": "serial"}, ValueError, "'parallel'.*ELMRegressorCV"),
+        ({"error_model": "auto"}, ValueError, "'parallel'.*ELMRegressorCV"),
+        ({"error_model": "quadratic"}, ValueError, "'parallel'.*ELMRegressorCV"),
+        ({"coverage": 0.9}, ValueError, r"`coverage` must be None.*y\[:, :3\]"),
+    ],
+)
+def test_errors_name_the_way_out(log, options, kind, match):
+    with pytest.raises(kind, match=match):
+        pose_model().set_params(**options).fit(*log)
+
+
+@pytest.mark.parametrize("columns", [3, 7])
+@pytest.mark.parametrize("names", [(), ("base",)])
+def test_rows_must_hold_six_numbers(log, columns, names):
+    q, y = log
+    y = np.resize(y, (len(q), columns)) if columns > 6 else y[:, :columns]
+    with pytest.raises(ValueError, match=r"`y` must have shape \(N, 6\).*output='position'"):
+        pose_model(calibrate=names).fit(q, y)
+
+
+def test_a_single_column_is_no_pose(log):
+    q, y = log
+    with pytest.raises(ValueError, match=r"`y` must have shape \(N, 6\)"):
+        pose_model().fit(q, y[:, 0])

@@ -1,0 +1,229 @@
+import copy
+import pickle
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
+from hybridkin.hybrid._features import Features
+from hybridkin.hybrid._linearised import basis
+from hybridkin.hybrid._pose_features import PoseFeatures
+from hybridkin.hybrid._readout_fit import fit_serial
+from hybridkin.hybrid._serial import SerialModule, coordinates, tip_and_columns
+
+TURNED = torch.tensor(
+    [[0.0, -1.0, 0.0, 0.3], [0.6, 0.0, -0.8, 0.1], [0.8, 0.0, 0.6, -0.2], [0.0, 0.0, 0.0, 1.0]],
+    dtype=torch.float64,
+)
+
+
+def elastic(**options):
+    stiffness = dict(bending_stiffness=[4e-7, 3e-7, 2e-7], axial_stiffness=5.0)
+    options = dict(routing="base", tendon_zeros=0.001, **stiffness, **options)
+    return ElasticTendonChain([0.005] * 3, [0.06, 0.05, 0.04], offsets=0.005, **options)
+
+
+ROBOTS = {
+    "trunk": lambda: (robots.bionic_handling_assistant(), 0.25, 0.05),
+    "turned trunk, steered at 1.5": lambda: (
+        robots.bionic_handling_assistant().with_geometry(base=TURNED).with_tip(1.5),
+        *(0.25, 0.05),
+    ),
+    "one segment of chambers": lambda: (ConstantCurvatureChain([0.03], base=TURNED), 0.2, 0.05),
+    "cables": lambda: (
+        ConstantCurvatureChain([0.01] * 3, lengths=[0.1, 0.08, 0.06], offsets=[0.01, 0.0, 0.02]),
+        *(0.0, 0.005),
+    ),
+    "one segment of cables": lambda: (ConstantCurvatureChain([0.01], lengths=[0.1]), 0.0, 0.005),
+    "elastic tendons": lambda: (elastic(), 0.0, 0.002),
+    "smoothed tendons": lambda: (elastic(smoothing=1e-4), 0.0, 0.002),
+}
+every_robot = pytest.mark.parametrize("robot", ROBOTS)
+
+
+def uniform(rng, *shape):
+    return 2.0 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1.0
+
+
+def rows_of(robot, rng, n):
+    """Return a chain and rows: the first straight, or nearly, the second beside it."""
+    chain, middle, width = ROBOTS[robot]()
+    move = width * uniform(rng, n, chain.n_actuators)
+    move[0] = 0.0
+    move[1] *= 1e-6
+    return chain, middle + move
+
+
+def features_of(chain, q):
+    return PoseFeatures.of_range(q, chain)
+
+
+def central_differences(function, q, step=1e-6):
+    moves = step * torch.eye(q.shape[-1]).to(q)
+    return torch.stack([(function(q + m) - function(q - m)) / (2 * step) for m in moves], -1)
+
+
+def expected_features(chain, q):
+    """Return axes and moments from the poses of the chain, by vector products."""
+    poses = torch.linalg.solve(chain.base, chain.poses(q))
+    R, p = poses[..., :3, :3], poses[..., :3, 3] / chain.reach
+    lever = p[..., -1:, :] - p
+    parts = [torch.ones_like(q[..., :1]), Features.of_range(q)(q)[..., 1:], lever[..., 0, :]]
+    for s in range(1, chain.n_segments + 1):
+        axes = R[..., s, :, :].mT
+        parts.append(axes.flatten(-2))
+        if s < chain.n_segments:
+            moments = torch.linalg.cross(axes, lever[..., s, None, :].expand_as(axes), dim=-1)
+            parts.append(moments.flatten(-2))
+    return torch.cat(parts, -1)
+
+
+@every_robot
+def test_values_are_axes_and_moments_of_the_poses(robot, rng):
+    chain, q = rows_of(robot, rng, 30)
+    phi = features_of(chain, q)(q)
+    S = chain.n_segments
+    assert phi.shape == (30, 1 + chain.n_actuators + 9 * S + 3 + 9 * (S - 1))
+    assert_close(phi, expected_features(chain, q), atol=1e-13, rtol=0)
+    assert phi.abs().max() < 2.0
+
+
+def test_a_moment_of_weight_is_a_readout(rng):
+    # The moment of a weight at the end about the end of segment 1, in the frame there.
+    chain, q = rows_of("trunk", rng, 20)
+    g = torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64)
+    poses = torch.linalg.solve(chain.base, chain.poses(q))
+    R, lever = poses[:, 1, :3, :3], poses[:, -1, :3, 3] - poses[:, 1, :3, 3]
+    moment = (R.mT @ torch.linalg.cross(lever, g.expand(20, 3))[..., None])[..., 0]
+    phi = features_of(chain, q)(q)[:, 10 + 3 + 9 : 10 + 3 + 18]
+    assert_close(chain.reach * (phi.unflatten(1, (3, 3)) @ g), moment)
+
+
+@every_robot
+def test_slope(robot, rng):
+    chain, q = rows_of(robot, rng, 40)
+    features = features_of(chain, q)
+    weights = uniform(rng, 5, features(q).shape[1])
+    value, slope = features.readout(q, weights)
+    assert_close(value, features(q) @ weights.mT, atol=1e-12, rtol=0)
+    # Taut or slack, an elastic tendon has a kink: no difference may reach across it.
+    step = 1e-9 if robot == "elastic tendons" else 1e-6
+    numeric = central_differences(lambda q: features(q) @ weights.mT, q, step)
+    kink = ((numeric - slope).abs() > 1e-3 * slope.abs().max()).flatten(1).any(1)
+    assert not kink.any() or (robot == "elastic tendons" and kink.sum() <= 2)
+    assert_close(
+        slope[~kink], numeric[~kink], atol=10 * 1e-14 / step * slope.abs().max(), rtol=1e-6
+    )
+    exact = [
+        torch.autograd.functional.jacobian(lambda q: features(q) @ weights.mT, row) for row in q
+    ]
+    assert_close(slope, torch.stack(exact), atol=1e-10, rtol=1e-9)
+
+
+@every_robot
+def test_derivatives_by_autograd(robot, rng):
+    chain, q = rows_of(robot, rng, 3)
+    features = features_of(chain, q)
+    weights = uniform(rng, 2, features(q).shape[1]).requires_grad_()
+    q = q[1:].requires_grad_()
+    options = dict(eps=1e-8, atol=1e-3, rtol=1e-3)
+    assert torch.autograd.gradcheck(features, q, **options)
+    assert torch.autograd.gradcheck(features.readout, (q, weights), **options)
+
+
+@every_robot
+def test_batches_equal_loops(robot, rng):
+    chain, q = rows_of(robot, rng, 12)
+    features = features_of(chain, q)
+    weights = uniform(rng, 4, features(q).shape[1])
+    value, slope = features.readout(q, weights)
+    many = q.unflatten(0, (3, 4))
+    assert_close(features(many), features(q).unflatten(0, (3, 4)))
+    for part, whole in zip(features.readout(many, weights), (value, slope), strict=True):
+        assert_close(part, whole.unflatten(0, (3, 4)))
+    assert_close(features(q[7]), features(q)[7])
+    for part, whole in zip(features.readout(q[7], weights), (value, slope), strict=True):
+        assert_close(part, whole[7])
+    long = q.repeat(500, 1)
+    assert_close(features.readout(long, weights)[1], slope.repeat(500, 1, 1))
+    assert_close(features(long), features(q).repeat(500, 1))
+
+
+@pytest.mark.parametrize("robot", ["trunk", "cables", "elastic tendons"])
+def test_planted_correction_is_found(robot, rng):
+    chain, q = rows_of(robot, rng, 700)
+    features = features_of(chain, q)
+    z = coordinates(chain, q, "coordinates")[0]
+    moved = tip_and_columns(chain, z, "coordinates")[1].square().sum(1).mean(0).sqrt()
+    # What features that are all but the same say against each other, no fit takes up.
+    kept = basis(features(q[:500]), features.n_linear, 1000)
+    weights = 0.003 * uniform(rng, len(moved), kept.shape[1]) @ kept.mT / (0.1 + moved[:, None])
+    truth = SerialModule(chain, features, weights)
+    fit = fit_serial(chain, features, q[:500], truth(q[:500]), alphas=(1e-10, 1e-10))
+    size = (truth(q) - chain(q)).norm(dim=1).mean()
+    assert size > 1e-3
+    assert (fit.module(q) - truth(q)).norm(dim=1).max() < 1e-6 * size
+    x, J = fit.module.forward_and_jacobian(q[:9])
+    assert_close(x, fit.module(q[:9]))
+    near = central_differences(fit.module, q[:9])
+    assert_close(J, near, atol=1e-7, rtol=1e-5)
+
+
+def test_turning_the_base_turns_nothing(rng):
+    chain, q = rows_of("trunk", rng, 20)
+    turned = chain.with_geometry(base=TURNED)
+    assert_close(features_of(turned, q)(q), features_of(chain, q)(q), atol=0, rtol=0)
+
+
+def test_size_of_the_robot_changes_nothing(rng):
+    q = 0.2 + 0.03 * uniform(rng, 10, 6)
+    small = ConstantCurvatureChain([0.03, 0.02], offsets=0.01)
+    large = ConstantCurvatureChain([0.3, 0.2], offsets=0.1)
+    assert_close(features_of(small, q)(q), features_of(large, 10 * q)(10 * q))
+
+
+@every_robot
+def test_single_precision(robot, rng):
+    chain, q = rows_of(robot, rng, 30)
+    features = features_of(chain, q)
+    weights = uniform(rng, 4, features(q).shape[1])
+    value, slope = features.readout(q, weights)
+    single = copy.deepcopy(features).float()
+    assert features.center.dtype == torch.float64
+    for kind in (features, single):
+        assert kind(q.float()).dtype == torch.float32
+        assert_close(kind(q.float()).double(), features(q), atol=1e-4, rtol=0)
+        value_single, slope_single = kind.readout(q.float(), weights.float())
+        assert value_single.dtype == slope_single.dtype == torch.float32
+        assert_close(value_single.double(), value, atol=1e-3, rtol=0)
+        if robot != "elastic tendons":  # which may lie beside a kink
+            assert_close(slope_single.double(), slope, atol=3e-4 * slope.abs().max(), rtol=0)
+
+
+@every_robot
+def test_a_bad_row_stays_alone(robot, rng):
+    chain, q = rows_of(robot, rng, 9)
+    features = features_of(chain, q)
+    weights = uniform(rng, 3, features(q).shape[1])
+    broken = q.clone()
+    broken[4, 1] = float("nan")
+    others = torch.arange(9) != 4
+    assert_close(features(broken)[others], features(q)[others])
+    assert features(broken)[4].isnan().any()
+    good, new = features.readout(q, weights), features.readout(broken, weights)
+    for part, part_new in zip(good, new, strict=True):
+        assert_close(part_new[others], part[others])
+    assert new[0][4].isnan().all()
+
+
+def test_copies_and_states(rng):
+    chain, q = rows_of("trunk", rng, 20)
+    features = features_of(chain, q)
+    blank = copy.deepcopy(features)
+    for buffer in blank.buffers():
+        buffer.zero_()
+    assert_close(chain(q), ROBOTS["trunk"]()[0](q))
+    blank.load_state_dict(features.state_dict())
+    assert_close(blank(q), features(q), atol=0, rtol=0)
+    assert_close(pickle.loads(pickle.dumps(features))(q), features(q), atol=0, rtol=0)

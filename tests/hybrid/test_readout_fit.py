@@ -1,0 +1,518 @@
+import copy
+import pickle
+from math import inf
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, robots
+from hybridkin._core.model import reverse_jacobian
+from hybridkin.hybrid._features import Features, HiddenFeatures, QuadraticFeatures
+from hybridkin.hybrid._linearised import Linearised, basis, choose, design, members_of
+from hybridkin.hybrid._readout_fit import _Problem, fit_serial
+from hybridkin.hybrid._serial import SerialModule, coordinates, tip_and_columns
+
+ARM = """
+<robot name="arm">
+  <link name="base"/><link name="upper"/><link name="lower"/><link name="tool"/>
+  <joint name="yaw" type="revolute"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 0.1"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
+  </joint>
+  <joint name="pitch" type="revolute"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
+  </joint>
+  <joint name="slide" type="prismatic"><parent link="lower"/><child link="tool"/>
+    <origin xyz="0 0 0.3"/><axis xyz="1 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/>
+  </joint>
+</robot>
+"""
+
+
+class Wave(torch.nn.Module):
+    """A module without a Jacobian of its own."""
+
+    n_actuators = 4
+
+    def forward(self, q):
+        return torch.stack(
+            [q[..., 0].sin() + q[..., 3], q[..., 1] * q[..., 2], q.square().sum(-1)], -1
+        )
+
+
+def uniform(rng, *shape):
+    return 2.0 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1.0
+
+
+def trunk():
+    return robots.bionic_handling_assistant(), 0.25, 0.05
+
+
+def tendons():
+    options = dict(routing="base", bending_stiffness=[4e-7, 3e-7, 2e-7], axial_stiffness=5.0)
+    chain = ElasticTendonChain([0.005] * 3, [0.06, 0.06, 0.06], tendon_zeros=0.001, **options)
+    return chain, 0.0, 0.002
+
+
+ROBOTS = {
+    "trunk": trunk,
+    "middle of the trunk": lambda: (trunk()[0].with_tip(1.5), 0.25, 0.05),
+    "cables": lambda: (ConstantCurvatureChain([0.01], lengths=[0.1]), 0.0, 0.005),
+    "tendons": tendons,
+    "arm": lambda: (RigidChain.from_urdf(ARM, "tool"), 0.3, 0.5),
+    "wave": lambda: (Wave(), 0.0, 1.0),
+}
+
+
+def some_features(kind, q, rng):
+    if kind == "hidden":
+        shape = 12, q.shape[1]
+        return HiddenFeatures.of_range(q, uniform(rng, *shape), uniform(rng, 12))
+    return {"linear": Features, "quadratic": QuadraticFeatures}[kind].of_range(q)
+
+
+def rows_of(robot, rng, n):
+    chain, middle, width = ROBOTS[robot]()
+    return chain, middle + width * uniform(rng, n, chain.n_actuators)
+
+
+def disturbed(chain, q, rng, size=0.02, noise=0.0):
+    """Return a chain whose coordinates are off, each by some `size` at the tip [m], and its log."""
+    features = QuadraticFeatures.of_range(q)
+    z = coordinates(chain, q, "coordinates")[0]
+    moved = tip_and_columns(chain, z, "coordinates")[1].square().sum(1).mean(0).sqrt()
+    weights = size * uniform(rng, len(moved), features(q).shape[1]) / (1.0 + moved[:, None])
+    truth = SerialModule(chain, features, weights)
+    x = truth(q)
+    return truth, x + noise * torch.randn(x.shape, generator=rng, dtype=x.dtype)
+
+
+def central_differences(function, q, step=1e-6):
+    columns = []
+    for j in range(q.shape[-1]):
+        move = torch.zeros_like(q)
+        move[..., j] = step
+        columns.append((function(q + move) - function(q - move)) / (2 * step))
+    return torch.stack(columns, -1)
+
+
+@pytest.mark.parametrize("kind", ["linear", "quadratic", "hidden"])
+def test_slopes_of_features(kind, rng):
+    q = 0.25 + 0.1 * uniform(rng, 40, 5)
+    features = some_features(kind, q, rng)
+    weights = uniform(rng, 2, features(q).shape[1])
+    value, slope = features.readout(q, weights)
+    assert_close(value, features(q) @ weights.mT)
+    assert_close(
+        slope, central_differences(lambda q: features(q) @ weights.mT, q), atol=1e-7, rtol=0
+    )
+    assert_close(features(q[3]), features(q)[3])
+
+
+def test_quadratic_features_span_all_monomials(rng):
+    q = uniform(rng, 60, 3)
+    u = (q - q.amin(0)) / (q.amax(0) - q.amin(0)) * 2 - 1
+    monomials = [torch.ones(60).double(), *u.T]
+    monomials += [u[:, i] * u[:, j] for i in range(3) for j in range(i, 3)]
+    phi = QuadraticFeatures.of_range(q)(q)
+    assert phi.shape == (60, 10)
+    assert_close(
+        phi @ torch.linalg.lstsq(phi, torch.stack(monomials, 1)).solution, torch.stack(monomials, 1)
+    )
+
+
+def test_constant_inputs_are_features_without_harm(rng):
+    q = uniform(rng, 30, 3)
+    q[:, 1] = 0.7
+    assert torch.isfinite(QuadraticFeatures.of_range(q)(q)).all()
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("kind", ["quadratic", "hidden"])
+@pytest.mark.parametrize("place", ["coordinates", "tip"])
+def test_jacobian(robot, kind, place, rng):
+    chain, q = rows_of(robot, rng, 20)
+    features = some_features(kind, q, rng)
+    shape = coordinates(chain, q, place)[0].shape[1], features(q).shape[1]
+    module = SerialModule(chain, features, 0.003 * uniform(rng, *shape), place=place)
+    x, J = module.forward_and_jacobian(q)
+    assert_close(x, module(q))
+    assert_close(J, reverse_jacobian(module, q)[1], atol=1e-9, rtol=1e-9)
+    assert_close(J, module.jacobian(q.reshape(4, 5, -1)).flatten(0, 1))
+    assert_close(x[3], module(q[3]))
+    if robot != "tendons":  # a difference may reach across where a tendon goes slack
+        assert_close(J, central_differences(module, q), atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("robot", ["trunk", "cables", "arm"])
+def test_planted_correction_is_recovered(robot, rng):
+    chain, q = rows_of(robot, rng, 500)
+    truth, x = disturbed(chain, q, rng)
+    fit = fit_serial(chain, QuadraticFeatures.of_range(q), q, x, alphas=(1e-9, 1e-9))
+    q_new = rows_of(robot, rng, 200)[1].clamp(q.amin(0), q.amax(0))
+    assert (chain(q_new) - truth(q_new)).norm(dim=1).mean() > 1e-3
+    assert_close(fit.module(q_new), truth(q_new), atol=1e-5, rtol=0)
+
+
+def test_planted_linear_correction_is_recovered_by_linear_features(rng):
+    chain, q = rows_of("trunk", rng, 100)
+    features = Features.of_range(q)
+    weights = 0.01 * uniform(rng, 9, 10)
+    truth = SerialModule(chain, features, weights)
+    fit = fit_serial(chain, features, q, truth(q), alphas=(1e-10, 1e-10))
+    assert fit.gradient < 1e-6
+    assert_close(fit.module.weights, weights, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("robot", ["trunk", "tendons", "arm"])
+@pytest.mark.parametrize("kind", ["linear", "quadratic", "hidden"])
+def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
+    chain, q = rows_of(robot, rng, 80)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    weight = torch.rand(80, generator=rng, dtype=torch.float64)
+    fit = fit_serial(
+        chain, some_features(kind, q, rng), q, x, sample_weight=weight, alphas=(0.03, 0.3)
+    )
+    assert fit.gradient < 1e-7
+    # By autograd, in the problem's own variables, and no neighbour is better.
+    problem = _Problem(chain, fit.module.features, q, x, weight, "coordinates")
+    penalty = problem.penalty((0.03, 0.3))
+    readout, _ = problem.minimum(problem.nothing, penalty)
+
+    def objective(readout):
+        z = problem.z + problem.units * (problem.phi @ readout.mT)
+        distance = (x - tip_and_columns(chain, z, "coordinates")[0]).square().sum(1)
+        return (weight * distance).sum() + (penalty * readout.square()).sum()
+
+    gradient = torch.func.grad(objective)
+    assert gradient(readout).norm() < 1e-7 * gradient(problem.nothing).norm()
+    for _ in range(3):
+        move = 1e-3 * uniform(rng, *readout.shape)
+        assert objective(readout + move) > objective(readout)
+
+
+def ridge(rng, n=30, m=3, C=4, K=7):
+    linear = Linearised(uniform(rng, n, m, C), uniform(rng, n, K), uniform(rng, n, m))
+    penalty = torch.rand(K, generator=rng, dtype=torch.float64) + 0.1
+    penalty[2] = inf
+    return linear, penalty
+
+
+def solved(linear, penalty, rows):
+    """The plain ridge solution of some rows, from scratch."""
+    A = design(linear.J, linear.phi)[rows].flatten(0, 1)
+    kept = torch.isfinite(penalty).repeat(linear.J.shape[2])
+    weights = torch.zeros(A.shape[1], dtype=A.dtype)
+    A = A[:, kept]
+    size = penalty.repeat(linear.J.shape[2])[kept].diag()
+    weights[kept] = torch.linalg.solve(A.mT @ A + size, A.mT @ linear.y[rows].flatten())
+    return weights.reshape(linear.J.shape[2], -1)
+
+
+def test_optimum_of_the_linearised_problem(rng):
+    linear, penalty = ridge(rng)
+    expected = solved(linear, penalty, torch.arange(30))
+    assert_close(linear.solve(penalty), expected, atol=1e-12, rtol=1e-10)
+    assert (expected[:, 2] == 0).all()
+
+
+@pytest.mark.parametrize("sizes", [None, [1] * 30, [3] * 10, [2, 28], [15, 14, 1]])
+def test_rows_left_out_equal_fits_without_them(sizes, rng):
+    linear, penalty = ridge(rng)
+    groups = (
+        torch.arange(30)
+        if sizes is None
+        else torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
+    )
+    groups = groups[torch.randperm(30, generator=rng)]
+    found = linear.left_out(penalty, None if sizes is None else members_of(groups))
+    for label in groups.unique():
+        out = groups == label
+        expected = linear.residual(solved(linear, penalty, ~out))[out]
+        assert_close(found[out], expected, atol=1e-10, rtol=1e-10)
+
+
+def test_rows_left_out_of_the_whole_fit(rng):
+    chain, q = rows_of("trunk", rng, 60)
+    x = disturbed(chain, q, rng, size=0.002, noise=0.002)[1]
+    features = QuadraticFeatures.of_range(q)
+    fit = fit_serial(chain, features, q, x, alphas=(0.3, 3.0))
+    weight = torch.ones(60, dtype=torch.float64)
+    for row in (0, 17):
+        weight[row] = 0.0
+        other = fit_serial(chain, features, q, x, alphas=(0.3, 3.0), sample_weight=weight)
+        weight[row] = 1.0
+        left = x[row] - other.module(q[row])
+        # Scales of the coordinates and the basis change a little with the row.
+        assert_close(torch.from_numpy(fit.residual[row]), left, atol=2e-4, rtol=0.05)
+        assert torch.isnan(torch.from_numpy(other.residual[row])).all()
+
+
+def test_posterior_equals_the_inverse(rng):
+    linear, penalty = ridge(rng)
+    factor, noise = linear.posterior(penalty, 90.0)
+    kept = torch.isfinite(penalty)
+    A = design(linear.J, linear.phi[:, kept]).flatten(0, 1)
+    inverse = torch.linalg.inv(A.mT @ A + penalty[kept].repeat(4).diag())
+    flat = factor[:, kept].flatten(0, 1)
+    assert_close(flat @ flat.mT, inverse)
+    squares = linear.residual(linear.solve(penalty)).square().sum()
+    assert_close(noise, squares / (90.0 - (A @ inverse @ A.mT).trace()))
+
+
+def test_leverage_and_covariance(rng):
+    chain, q = rows_of("trunk", rng, 150)
+    x = disturbed(chain, q, rng, noise=0.004)[1]
+    module = fit_serial(chain, Features.of_range(q), q, x, alphas=(1e-3, inf)).module
+    leverage = module.leverage(q)
+    assert ((leverage > 0) & (leverage < 1)).all()
+    # About 90 weights share 450 numbers.
+    assert_close(3 * leverage.sum(), torch.tensor(90.0).double(), atol=2.0, rtol=0)
+    far = q.mean(0) + 4.0 * (q - q.mean(0))
+    assert (module.leverage(far) > leverage).double().mean() > 0.95
+    covariance = module.tip_covariance(q)
+    assert_close(covariance.diagonal(dim1=1, dim2=2).mean(1) / module.noise_variance, leverage)
+
+
+def test_noise_variance_is_that_of_the_noise(rng):
+    chain, q = rows_of("trunk", rng, 600)
+    truth, x = disturbed(chain, q, rng, noise=0.003)
+    fit = fit_serial(chain, QuadraticFeatures.of_range(q), q, x)
+    assert_close(fit.module.noise_variance.sqrt().item(), 0.003, atol=3e-4, rtol=0)
+    # The posterior knows how far off the model is: two thirds within one deviation, about.
+    error = (fit.module(q) - truth(q)) / fit.module.tip_covariance(q).diagonal(
+        dim1=1, dim2=2
+    ).sqrt()
+    assert 0.5 < error.square().mean() < 1.5
+
+
+@pytest.mark.parametrize("place", ["coordinates", "tip"])
+def test_no_correction_is_the_mechanical_model(place, rng):
+    chain, q = rows_of("trunk", rng, 40)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    features = QuadraticFeatures.of_range(q)
+    fit = fit_serial(chain, features, q, x, place=place, alphas=(inf, inf))
+    assert_close(fit.module(q), chain(q))
+    assert_close(fit.module.jacobian(q), chain.jacobian(q))
+    assert_close(torch.from_numpy(fit.residual), x - chain(q))
+    assert (fit.module.leverage(q) == 0).all()
+    near = fit_serial(chain, features, q, x, place=place, alphas=(1e12, 1e12))
+    assert_close(near.module(q), chain(q), atol=1e-9, rtol=0)
+    linear = fit_serial(chain, features, q, x, place=place, alphas=(0.1, inf))
+    plain = fit_serial(chain, Features.of_range(q), q, x, place=place, alphas=(0.1, 1.0))
+    assert_close(linear.module(q), plain.module(q), atol=1e-9, rtol=0)
+
+
+def test_at_the_tip_it_is_ridge_regression_on_the_error(rng):
+    chain, q = rows_of("trunk", rng, 50)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    features = Features.of_range(q)
+    fit = fit_serial(chain, features, q, x, place="tip", alphas=(0.5, inf))
+    phi = features(q)
+    expected = torch.linalg.solve(phi.mT @ phi + 0.5 * torch.eye(10), phi.mT @ (x - chain(q)))
+    assert_close(fit.module.weights, expected.mT)
+    assert_close(
+        fit.module.leverage(q),
+        (phi @ torch.linalg.solve(phi.mT @ phi + 0.5 * torch.eye(10), phi.mT)).diagonal(),
+    )
+
+
+def test_pure_noise_chooses_no_correction(rng):
+    chain, q = rows_of("trunk", rng, 120)
+    x = chain(q) + 0.005 * torch.randn(120, 3, generator=rng, dtype=torch.float64)
+    fit = fit_serial(chain, QuadraticFeatures.of_range(q), q, x)
+    assert (fit.module(q) - chain(q)).norm(dim=1).mean() < 5e-4
+    assert fit.scores[inf, inf] <= 1.01 * min(fit.scores.values())
+
+
+def test_choice_is_never_worse_than_nothing_on_rows_left_out(rng):
+    chain, q = rows_of("tendons", rng, 24)
+    for size in (0.003, 0.01, 0.03):
+        x = disturbed(chain, q, rng, size=size, noise=0.01)[1]
+        groups = torch.arange(24) // 6
+        fit = fit_serial(chain, QuadraticFeatures.of_range(q), q, x, groups=groups)
+        left = torch.from_numpy(fit.residual)
+        assert left.norm() <= (1 + 1e-9) * (x - chain(q)).norm()
+
+
+def test_choice_is_no_worse_than_its_parts(rng):
+    chain, q = rows_of("trunk", rng, 120)
+    truth, x = disturbed(chain, q, rng, noise=0.004)
+    features = QuadraticFeatures.of_range(q)
+    fit = fit_serial(chain, features, q, x)
+    chosen = fit.scores[fit.alphas]
+    assert chosen <= 1.001 * min(fit.scores.values())
+    assert chosen < fit.scores[inf, inf]
+    linear = fit_serial(chain, Features.of_range(q), q, x)
+    error = lambda model: (model(q) - truth(q)).norm(dim=1).mean()  # noqa: E731
+    assert error(fit.module) < 1.05 * min(error(linear.module), error(chain))
+
+
+def shaken(truth, q, rng):
+    """Return tips of actuators that were elsewhere by 1 mm, measured with 0.5 mm of noise."""
+    moved = truth(q + 1e-3 * torch.randn(q.shape, generator=rng, dtype=q.dtype))
+    return moved + 5e-4 * torch.randn(moved.shape, generator=rng, dtype=q.dtype)
+
+
+def test_noise_of_the_actuators_is_told_from_that_of_the_tip(rng):
+    chain, q = rows_of("trunk", rng, 1500)
+    problem = _Problem(chain, Features.of_range(q), q, q[:, :3], torch.ones(len(q)).double(), "tip")
+    assert 0.1 < problem.likeliest_ratio(shaken(chain, q, rng) - chain(q)) < 0.6  # 0.25
+    assert problem.likeliest_ratio(1e-3 * uniform(rng, 1500, 3)) > 100.0
+
+
+def test_noise_of_the_actuators_is_allowed_for(rng):
+    errors = []
+    for _ in range(4):
+        chain, q = rows_of("trunk", rng, 400)
+        truth = disturbed(chain, q, rng, size=0.01)[0]
+        x, features = shaken(truth, q, rng), QuadraticFeatures.of_range(q)
+        alphas = (1e-3, 1e-3)
+        fits = [
+            fit_serial(chain, features, q, x, alphas=alphas, noise_ratio=ratio)
+            for ratio in (0.25, inf)
+        ]
+        errors.append([(fit.module(q) - truth(q)).norm(dim=1).mean() for fit in fits])
+        chosen = fit_serial(chain, features, q, x)
+        assert (chosen.module(q) - truth(q)).norm(dim=1).mean() < 1.05 * errors[-1][0]
+    allowed, ignored = torch.tensor(errors).mean(0)
+    assert allowed < 0.9 * ignored
+
+
+def test_rows_left_out_with_noise_of_the_actuators(rng):
+    chain, q = rows_of("trunk", rng, 60)
+    x = disturbed(chain, q, rng, size=0.002, noise=0.002)[1]
+    options = {"alphas": (0.3, 3.0), "noise_ratio": 0.5}
+    fit = fit_serial(chain, Features.of_range(q), q, x, **options)
+    assert fit.noise_ratio == 0.5
+    assert fit.gradient < 1e-8
+    weight = torch.ones(60, dtype=torch.float64)
+    weight[3] = 0.0
+    other = fit_serial(chain, Features.of_range(q), q, x, sample_weight=weight, **options)
+    left = x[3] - other.module(q[3])
+    assert_close(torch.from_numpy(fit.residual[3]), left, atol=2e-4, rtol=0.05)
+
+
+def test_whitened_residuals_are_those_of_noise_of_unit_level(rng):
+    chain, q = rows_of("tendons", rng, 40)
+    weight = 1.0 + uniform(rng, 40).abs()
+    args = Features.of_range(q), q, chain(q) + 0.01, weight
+    problem = _Problem(chain, *args, "coordinates").in_noise(0.3)
+    J = chain.jacobian(q)
+    covariance = J @ J.mT + 0.3 * torch.eye(3, dtype=q.dtype)
+    W = problem.whitening
+    spherical = W @ covariance @ W.mT
+    level = spherical[0, 0, 0]
+    assert_close(spherical, level * torch.eye(3, dtype=q.dtype).expand(40, -1, -1))
+    mean = (weight[:, None, None] * covariance).diagonal(dim1=1, dim2=2).sum() / (3 * weight.sum())
+    assert_close(level, mean)
+    residual = 0.01 * uniform(rng, 40, 3)
+    whitened = (W @ (weight.sqrt()[:, None] * residual)[..., None])[..., 0]
+    assert_close(problem.in_metres(whitened), residual)
+
+
+def test_choice_finds_the_least_of_a_bowl():
+    scores = lambda pair: 1.0 + (pair[0] - 0.1) ** 2 + (1.0 / pair[1] - 0.1) ** 2  # noqa: E731
+    found, tried = choose(scores)
+    assert_close(found, (0.1, 10.0))
+    assert len(tried) < 50
+    assert choose(lambda pair: 1.0)[0] == (inf, inf)
+
+
+def test_basis_keeps_the_linear_features_and_separates_the_others(rng):
+    phi = torch.cat([uniform(rng, 50, 4), uniform(rng, 50, 6).abs()], 1)
+    turned = phi @ basis(phi, 4, 100)
+    assert_close(turned[:, :4], phi[:, :4])
+    inner = turned.mT @ turned
+    assert inner[:4, 4:].abs().max() < 1e-10
+    assert_close(inner[4:, 4:], inner[4:, 4:].diagonal().diag(), atol=1e-10, rtol=0)
+    assert (phi[:8] @ basis(phi[:8], 4, 100)).shape == (8, 8)
+    assert (phi @ basis(phi, 4, 2)).shape == (50, 6)
+
+
+@pytest.mark.parametrize("place", ["coordinates", "tip"])
+def test_weights_are_repeats(place, rng):
+    chain, q = rows_of("trunk", rng, 40)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    times = torch.randint(0, 4, (40,), generator=rng)
+    features = QuadraticFeatures.of_range(q)
+    a = fit_serial(chain, features, q, x, place=place, sample_weight=times, alphas=(0.1, 1.0))
+    q_many, x_many = q.repeat_interleave(times, 0), x.repeat_interleave(times, 0)
+    groups = torch.arange(40).repeat_interleave(times)
+    b = fit_serial(chain, features, q_many, x_many, place=place, groups=groups, alphas=(0.1, 1.0))
+    assert_close(a.module.weights, b.module.weights, atol=1e-9, rtol=1e-6)
+    assert_close(a.module.noise_variance, b.module.noise_variance)
+    left = torch.from_numpy(a.residual).repeat_interleave(times, 0)
+    assert_close(left, torch.from_numpy(b.residual), atol=1e-9, rtol=1e-6)
+
+
+def test_turning_the_frame_turns_the_model(rng):
+    chain, q = rows_of("trunk", rng, 60)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    R = torch.linalg.qr(uniform(rng, 3, 3)).Q
+    R = R * R.det()
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, :3] = R @ chain.base[:3, :3]
+    base[:3, 3] = R @ chain.base[:3, 3]
+    turned = chain.with_geometry(base=base)
+    features = QuadraticFeatures.of_range(q)
+    a = fit_serial(chain, features, q, x, alphas=(0.1, 1.0)).module
+    b = fit_serial(turned, features, q, x @ R.mT, alphas=(0.1, 1.0)).module
+    assert_close(a(q) @ R.mT, b(q), atol=1e-8, rtol=0)
+    assert_close(a.leverage(q), b.leverage(q), atol=1e-7, rtol=0)
+
+
+def test_a_bad_row_stays_alone(rng):
+    chain, q = rows_of("trunk", rng, 12)
+    module = SerialModule(chain, QuadraticFeatures.of_range(q), 0.01 * uniform(rng, 9, 55))
+    x, J = module.forward_and_jacobian(q)
+    broken = q.clone()
+    broken[5, 2] = float("nan")
+    x_new, J_new = module.forward_and_jacobian(broken)
+    others = torch.arange(12) != 5
+    assert_close(x_new[others], x[others])
+    assert_close(J_new[others], J[others])
+    assert torch.isnan(x_new[5]).all()
+
+
+def test_single_precision(rng):
+    chain, q = rows_of("trunk", rng, 100)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    fit = fit_serial(chain, QuadraticFeatures.of_range(q), q.float(), x.float(), alphas=(0.1, 1.0))
+    x_single, J_single = fit.module.forward_and_jacobian(q.float())
+    assert x_single.dtype == J_single.dtype == torch.float32
+    x_double, J_double = fit.module.forward_and_jacobian(q)
+    assert_close(x_single.double(), x_double, atol=2e-6, rtol=0)
+    assert_close(J_single.double(), J_double, atol=5e-5, rtol=1e-5)
+    assert_close(
+        fit.module.leverage(q.float()).double(), fit.module.leverage(q), atol=1e-4, rtol=1e-3
+    )
+    assert_close(copy.deepcopy(fit.module).float()(q.float()), x_single, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["linear", "quadratic", "hidden"])
+def test_state_dict_holds_all(kind, rng):
+    chain, q = rows_of("trunk", rng, 60)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    module = fit_serial(chain, some_features(kind, q, rng), q, x, alphas=(0.1, 1.0)).module
+    blank = copy.deepcopy(module)
+    for buffer in blank.buffers():
+        buffer.zero_()
+    blank.load_state_dict(module.state_dict())
+    for name in ("forward", "jacobian", "leverage", "tip_covariance"):
+        assert_close(getattr(blank, name)(q), getattr(module, name)(q), atol=0, rtol=0)
+    assert_close(pickle.loads(pickle.dumps(module))(q), module(q), atol=0, rtol=0)
+
+
+def test_derivatives_by_autograd(rng):
+    chain, q = rows_of("trunk", rng, 2)
+    module = SerialModule(chain, QuadraticFeatures.of_range(q), 0.01 * uniform(rng, 9, 55))
+    assert torch.autograd.gradcheck(module, q.requires_grad_())
+    assert torch.autograd.gradgradcheck(module, q)
+    assert torch.autograd.gradcheck(module.jacobian, q)
+
+
+def test_place_must_be_known(rng):
+    chain, q = rows_of("trunk", rng, 5)
+    with pytest.raises(ValueError, match="`place` must be one of"):
+        SerialModule(chain, Features.of_range(q), torch.zeros(9, 10), place="base")

@@ -1,0 +1,570 @@
+"""Tasks beyond the tip's position, weights, secondary objectives, directions, derivatives."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
+
+from hybridkin import HybridForwardModel, RigidChain, datasets, robots
+from hybridkin.ik._box import directed_step, largest_scale, strict_box_step
+from hybridkin.ik._gram import apply_columns, apply_rows, damped_solve, null_projection, row_gram
+from hybridkin.ik.solver import IKStatus, InverseKinematics
+from hybridkin.ik.tasks import (
+    PointsTask,
+    PoseTask,
+    PositionTask,
+    PrioritizedTask,
+    StackedTask,
+    away_from_limits,
+    downhill,
+    rotation_vector,
+)
+
+CHAIN = robots.bionic_handling_assistant()
+LIMITS = {"q_min": 0.1, "q_max": 0.4}
+
+
+def randn(rng, *shape):
+    return torch.randn(*shape, generator=rng, dtype=torch.float64)
+
+
+def uniform(rng, low, high, *shape):
+    return low + (high - low) * torch.rand(*shape, generator=rng, dtype=torch.float64)
+
+
+class Linear(torch.nn.Module):
+    def __init__(self, A):
+        super().__init__()
+        self.register_buffer("A", A)
+
+    def forward(self, q):
+        return q @ self.A.T
+
+
+def pose(chain, q):
+    return chain.poses(q)[..., -1, :, :]
+
+
+# ---------------------------------------------------------------- solvers of any number of rows
+
+
+@pytest.mark.parametrize("m", [1, 2, 6, 8])
+def test_solves_and_projections_of_any_number_of_rows(rng, m):
+    J = randn(rng, 60, m, 9)
+    if m > 1:
+        J[::3, -1] = J[::3, 0] + 1e-3 * J[::3, -1]
+    gram = row_gram(J)
+    exact = torch.linalg.svdvals(J)
+    assert_close(gram.sigma_max, exact[:, 0], rtol=1e-12, atol=0.0)
+    assert ((gram.sigma_min - exact[:, -1]).abs() <= 1e-7 * exact[:, 0]).all()
+    v, p = randn(rng, 60, m), randn(rng, 60, 9)
+    G = J @ J.mT + 1e-3 * torch.eye(m, dtype=torch.float64)
+    assert_close(damped_solve(gram, v, 1e-3), torch.linalg.solve(G, v), rtol=1e-7, atol=1e-9)
+    z = null_projection(J, gram, p)
+    assert apply_rows(J, z).abs().max() < 1e-12
+    assert_close(null_projection(J, gram, z), z, rtol=0.0, atol=1e-12)  # N N = N
+
+
+@pytest.mark.parametrize("m", [1, 2, 4, 6])
+def test_reachable_tasks_of_any_number_of_rows_are_reached_in_the_box(rng, m):
+    J = randn(rng, 100, m, 9)
+    inside = uniform(rng, -1.0, 1.0, 100, 9)
+    box = -torch.ones(100, 9, dtype=torch.float64), torch.ones(100, 9, dtype=torch.float64)
+    v, zero = apply_rows(J, inside), torch.zeros(100, dtype=torch.float64)
+    z = 2.0 * null_projection(J, row_gram(J), randn(rng, 100, 9))
+    dq = strict_box_step(J, v, z, *box, zero)
+    assert ((dq >= box[0]) & (dq <= box[1])).all()
+    assert apply_rows(J, dq - inside).norm(dim=-1).max() < 1e-8
+
+
+# ---------------------------------------------------------------- the largest scale
+
+
+def planted(rng, m, n, N):
+    """Return problems whose scale is known: s v on the facet of a normal y, both drawn."""
+    J, y = randn(rng, N, m, n), randn(rng, N, m)
+    lower, upper = -uniform(rng, 0.1, 1.0, N, n), uniform(rng, 0.1, 1.0, N, n)
+    g = apply_columns(J, y)
+    flat = torch.arange(n) < m - 1  # these columns lie in the facet
+    J = J - (y / y.square().sum(-1, keepdim=True))[..., None] * torch.where(flat, g, 0.0)[:, None]
+    g = torch.where(flat, 0.0, g)
+    vertex = torch.where(g > 0.0, upper, lower)
+    dq = torch.where(flat, 0.5 * (lower + upper), vertex)
+    scale = uniform(rng, 0.05, 0.95, N)
+    return J, apply_rows(J, dq) / scale[:, None], lower, upper, scale, dq
+
+
+@pytest.mark.parametrize(("m", "n"), [(1, 4), (2, 5), (3, 9), (3, 4), (6, 9)])
+def test_planted_saturation_has_the_planted_scale(rng, m, n):
+    J, v, lower, upper, scale, dq = planted(rng, m, n, 100)
+    found, _ = largest_scale(J, v, lower, upper)
+    assert_close(found, scale, rtol=1e-10, atol=0.0)
+    step, again = directed_step(J, v, torch.zeros_like(lower), lower, upper)
+    assert_close(again, found)
+    assert ((step >= lower) & (step <= upper)).all()
+    assert_close(apply_rows(J, step), scale[:, None] * v, rtol=0.0, atol=1e-9)
+    assert_close(step, dq, rtol=0.0, atol=1e-6)  # there is no other
+
+
+@pytest.mark.parametrize(("m", "n"), [(2, 5), (3, 9), (6, 9), (5, 3)])
+def test_scale_is_the_optimum_of_the_linear_program(rng, m, n):
+    N = 60
+    J = randn(rng, N, m, n)
+    J[::5, -1] = J[::5, 0]  # a direction is lost
+    lower, upper = -uniform(rng, 0.0, 1.0, N, n), uniform(rng, 0.0, 1.0, N, n)
+    lower[::7, 0], upper[::4, 1] = -torch.inf, 0.0
+    v = apply_rows(J, uniform(rng, 0.2, 2.0, N, 1) * randn(rng, N, n))
+    found, _ = largest_scale(J, v, lower, upper)
+    options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    for k in range(N):
+        optimum = linprog(
+            np.r_[np.zeros(n), -1.0],
+            A_eq=np.c_[J[k].numpy(), -v[k].numpy()],
+            b_eq=np.zeros(m),
+            bounds=[*zip(lower[k].tolist(), upper[k].tolist(), strict=True), (0.0, 1.0)],
+            method="highs-ds",
+            options=options,
+        )
+        assert abs(found[k] - optimum.x[-1]) < 1e-8
+    assert 0.2 * N < (found < 1.0).sum() <= N
+
+
+def test_direction_mode_keeps_the_direction_where_least_squares_bends_it(rng):
+    q = uniform(rng, 0.2, 0.3, 50, 9)
+    x, J = CHAIN.forward_and_jacobian(q)
+    wanted = 0.1 * randn(rng, 50, 3)
+    speed = {"dq_max": 1.0, "dt": 0.01, **LIMITS}
+    step = InverseKinematics(CHAIN, mode="direction", **speed).step(q, x + wanted)
+    moved = apply_rows(J, step.dq)
+    assert_close(moved, step.scale[:, None] * wanted, rtol=0.0, atol=1e-10)
+    assert (step.dq.abs() <= 0.01).all()
+    assert ((step.scale > 0.0) & (step.scale < 1.0)).sum() > 40
+    bent = InverseKinematics(CHAIN, **speed).step(q, x + wanted)
+    nearer = (apply_rows(J, bent.dq) - wanted).norm(dim=-1) <= (moved - wanted).norm(dim=-1) + 1e-9
+    assert nearer.all()
+    along = torch.nn.functional.cosine_similarity(apply_rows(J, bent.dq), wanted)
+    assert along.min() < 0.99
+    small = InverseKinematics(CHAIN, mode="direction", **speed).step(q, x + 1e-6 * wanted)
+    assert_close(small.scale, torch.ones(50, dtype=torch.float64))
+    q[0, 0] = 0.41  # from outside the limits there is a way back only
+    back = InverseKinematics(CHAIN, mode="direction", **speed).step(q[0], x[0])
+    assert_close(back.dq[0], torch.tensor(-0.01, dtype=torch.float64), rtol=0.0, atol=1e-15)
+
+
+# ---------------------------------------------------------------- weights
+
+
+def test_weights_say_what_a_motion_costs(rng):
+    A, q, target, q_pref = (randn(rng, *shape) for shape in ((3, 7), (7,), (3,), (7,)))
+    weights = uniform(rng, 0.1, 10.0, 7)
+    ik = InverseKinematics(Linear(A), q_pref=q_pref, beta=100.0, weights=weights)
+    dq = ik.step(q, target).dq
+    # argmin |W^(1/2) (q + dq - q_pref)| with A (q + dq) = target
+    B = torch.diag(1.0 / weights) @ A.T
+    expected = q_pref + B @ torch.linalg.solve(A @ B, target - A @ q_pref)
+    assert_close(q + dq, expected, rtol=0.0, atol=1e-12)
+    assert_close(ik.solve(target, q).q, expected, rtol=0.0, atol=1e-9)
+    free = InverseKinematics(Linear(A), weights=weights).step(q, target).dq
+    assert_close(free, B @ torch.linalg.solve(A @ B, target - A @ q), rtol=0.0, atol=1e-12)
+    # A change of units of q with the weights that belong to it changes nothing.
+    unit = uniform(rng, 0.1, 10.0, 7)
+    low, high = -uniform(rng, 0.1, 0.5, 7), uniform(rng, 0.1, 0.5, 7)
+    plain = InverseKinematics(Linear(A), q_min=low, q_max=high)
+    scaled = InverseKinematics(
+        Linear(A / unit), q_min=low * unit, q_max=high * unit, weights=unit**-2
+    )
+    far = 3.0 * target
+    start = 0.5 * (low + high)
+    assert_close(
+        scaled.step(start * unit, far).dq / unit, plain.step(start, far).dq, rtol=0.0, atol=1e-9
+    )
+    for bad in (0.0, -1.0, np.inf, [1.0, 2.0]):
+        with pytest.raises(ValueError, match=r"weights"):
+            InverseKinematics(CHAIN, weights=bad)
+
+
+def test_limits_hold_to_the_last_bit_with_weights_and_directions(rng):
+    weights = uniform(rng, 0.1, 10.0, 9)
+    for mode in ("least_squares", "direction"):
+        ik = InverseKinematics(CHAIN, weights=weights, mode=mode, dq_max=3.0, **LIMITS)
+        q = uniform(rng, 0.1, 0.4, 100, 9)
+        for _ in range(5):
+            dq = ik.step(q, randn(rng, 100, 3)).dq
+            assert (dq.abs() <= 0.03).all()
+            q = q + dq
+            assert ((q >= 0.1) & (q <= 0.4)).all()
+
+
+# ---------------------------------------------------------------- tasks
+
+
+def test_rotation_vector_is_the_logarithm_up_to_half_turns(rng):
+    axis = torch.nn.functional.normalize(randn(rng, 400, 3), dim=-1)
+    angle = torch.cat([10.0 ** uniform(rng, -12, 0, 200, 1), uniform(rng, 1.0, np.pi, 200, 1)])
+    R = torch.from_numpy(Rotation.from_rotvec((angle * axis).numpy()).as_matrix())
+    assert_close(rotation_vector(R), angle * axis, rtol=1e-12, atol=1e-15)
+    half = np.pi * torch.cat([axis, torch.eye(3, dtype=torch.float64)])
+    found = rotation_vector(torch.from_numpy(Rotation.from_rotvec(half.numpy()).as_matrix()))
+    assert_close(found.norm(dim=-1), half.norm(dim=-1), rtol=0.0, atol=1e-7)
+    assert_close((found * half).sum(-1).abs(), half.square().sum(-1), rtol=1e-7, atol=0.0)
+    eye = torch.eye(3, dtype=torch.float64).requires_grad_()
+    (slope,) = torch.autograd.grad(rotation_vector(eye)[0], eye)
+    assert torch.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("radian", [0.05, 1.0])
+def test_pose_error_falls_as_its_jacobian_says(rng, radian):
+    task = PoseTask(CHAIN, radian=radian)
+    q = uniform(rng, 0.2, 0.3, 20, 9)
+    dq = 1e-6 * randn(rng, 20, 9)
+    T, J = task.evaluate(q)
+    assert_close(T, pose(CHAIN, q))
+    change = task.difference(task.evaluate(q - dq)[0], task.evaluate(q + dq)[0])
+    assert_close(change, 2.0 * apply_rows(J, dq), rtol=0.0, atol=1e-13)
+    target = pose(CHAIN, uniform(rng, 0.2, 0.3, 20, 9))
+    ends = [task.difference(task.evaluate(p)[0], target) for p in (q - dq, q + dq)]
+    slope = 0.25 * (ends[1].square().sum(-1) - ends[0].square().sum(-1))
+    e = task.difference(T, target)  # exact also far from the target: the logarithm is the axis
+    assert_close(slope, -(e * apply_rows(J, dq)).sum(-1), rtol=1e-5, atol=1e-13)
+
+
+@pytest.mark.parametrize("chain", [CHAIN, CHAIN.with_tip(2.5)], ids=["tip", "on the backbone"])
+def test_poses_are_reached_to_two_tolerances(rng, chain):
+    q = uniform(rng, 0.2, 0.3, 200, 9)
+    target = chain.tip_transform(q).get_matrix()
+    solution = InverseKinematics(PoseTask(chain), **LIMITS).solve(
+        chain.tip_transform(q), tol=(1e-6, 1e-4)
+    )
+    assert solution.x.shape == (200, 4, 4)
+    if chain is CHAIN:
+        assert solution.converged.double().mean() >= 0.98
+    e = PoseTask(chain, radian=1.0).difference(solution.x, target)[solution.converged]
+    assert e[:, :3].norm(dim=-1).max() <= 1e-6
+    assert e[:, 3:].norm(dim=-1).max() <= 1e-4
+    assert_close(solution.x, chain.tip_transform(solution.q).get_matrix(), rtol=0.0, atol=1e-14)
+
+
+def test_a_pose_path_is_followed_to_second_order_with_numpy(rng, rigid):
+    start, end = uniform(rng, 0.3, 1.2, 2, 7)
+    phase = np.sin(np.linspace(0.0, np.pi, 101))[:, None]
+    errors = []
+    for every in (2, 1):
+        q = start.numpy() + phase[::every] * (end - start).numpy()
+        path = pose(rigid, torch.from_numpy(q)).numpy()
+        ik = InverseKinematics(PoseTask(rigid), dt=0.01 * every, beta=0.0)
+        track = ik.track(path, q0=q[0])
+        assert isinstance(track.q, np.ndarray)
+        assert track.x.shape == path.shape
+        errors.append(track.error[5:].max())
+    assert 1.7 < np.log2(errors[0] / errors[1]) < 2.3
+
+
+def test_a_hybrid_takes_its_orientation_from_its_chain(rng):
+    class Shifted(torch.nn.Module):
+        n_actuators = 9
+
+        def forward(self, q):
+            return CHAIN(q) + 0.01
+
+    q = uniform(rng, 0.22, 0.28, 20, 9)
+    target = pose(CHAIN, q)
+    target[:, :3, 3] += 0.01
+    task = PoseTask(Shifted(), orientation=CHAIN)
+    solution = InverseKinematics(task, **LIMITS).solve(target)
+    assert solution.converged.all()
+    assert (task.difference(solution.x, target).norm(dim=-1) <= 1e-4).all()
+    with pytest.raises(TypeError, match="`orientation`"):
+        PoseTask(Shifted())
+
+
+def test_a_rigid_arm_reaches_poses_within_its_limits(rng, rigid):
+    q = uniform(rng, -2.5, 2.5, 300, 7)
+    ik = InverseKinematics(PoseTask(rigid), q_min=-2.6, q_max=2.6)
+    solution = ik.solve(pose(rigid, q), restarts=10, random_state=0)
+    assert solution.converged.double().mean() >= 0.99
+    assert ((solution.q >= -2.6) & (solution.q <= 2.6)).all()
+
+
+@pytest.fixture
+def rigid():
+    origins = np.stack([np.eye(4)] * 7)
+    origins[:, 2, 3] = 0.15
+    return RigidChain(origins, [[0, 0, 1], [0, 1, 0]] * 3 + [[0, 0, 1]], tool=[0.0, 0.0, 0.1])
+
+
+def test_poses_in_hostile_and_empty_batches(rng):
+    ik = InverseKinematics(PoseTask(CHAIN), **LIMITS)
+    target = pose(CHAIN, uniform(rng, 0.2, 0.3, 4, 9))
+    clean = ik.solve(target)
+    target[1, 0, 3], target[2, 1, 1] = torch.nan, torch.inf
+    spoilt = ik.solve(target)
+    assert spoilt.status.tolist() == [0, IKStatus.INVALID_INPUT, IKStatus.INVALID_INPUT, 0]
+    assert_close(spoilt.q[[0, 3]], clean.q[[0, 3]], rtol=0.0, atol=1e-12)
+    step = ik.step(clean.q, target)
+    assert (step.dq[1:3] == 0.0).all()
+    assert ik.solve(target[:0]).x.shape == (0, 4, 4)
+    assert ik.step(clean.q[:0], target[:0]).dq.shape == (0, 9)
+    single = ik.solve(pose(CHAIN, clean.q[0]).float(), tol=1e-3)
+    assert single.q.dtype == torch.float32
+    assert single.converged
+    with pytest.raises(ValueError, match="rotations"):
+        ik.solve(torch.ones(4, 4, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"shape \(..., 4, 4\)"):
+        ik.solve(np.zeros(3))
+
+
+def test_points_along_the_backbone(rng):
+    task = PointsTask(CHAIN, [1.5, 3.0])
+    q = uniform(rng, 0.2, 0.3, 100, 9)
+    target = torch.stack([CHAIN.with_tip(1.5)(q), CHAIN(q)], dim=1)
+    solution = InverseKinematics(task, **LIMITS).solve(target)
+    assert solution.converged.double().mean() >= 0.99
+    assert_close(solution.x[:, 1], CHAIN(solution.q), rtol=0.0, atol=1e-14)
+    one = InverseKinematics(task, **LIMITS).solve(target[0].numpy())
+    assert one.x.shape == (2, 3)
+    with pytest.raises(TypeError, match="with_tip"):
+        PointsTask(Linear(randn(rng, 3, 9)), [1.0])
+
+
+def conflict(rng, n):
+    q, other = uniform(rng, 0.22, 0.28, n, 9), uniform(rng, 0.22, 0.28, n, 9)
+    tip, elbow = CHAIN(q), CHAIN.with_tip(2.0)(other)
+    elbow[:, 2] += 0.5  # out of reach
+    return tip, elbow
+
+
+def test_weights_trade_conflicting_tasks(rng):
+    tip, elbow = conflict(rng, 40)
+    sizes = []
+    for weight in (0.1, 1.0, 10.0):
+        task = StackedTask(CHAIN, CHAIN.with_tip(2.0), weights=[1.0, weight])
+        solution = InverseKinematics(task, **LIMITS).solve(task.join(tip, elbow), max_iter=200)
+        pairs = zip(task.split(solution.x), (tip, elbow), strict=True)
+        sizes.append([float((a - b).norm(dim=-1).mean()) for a, b in pairs])
+    (tip_light, elbow_light), (tip_even, elbow_even), (tip_heavy, elbow_heavy) = sizes
+    assert tip_light < tip_even < tip_heavy
+    assert elbow_light > elbow_even > elbow_heavy
+
+
+def test_the_second_task_never_costs_the_first(rng):
+    tip, elbow = conflict(rng, 40)
+    task = PrioritizedTask(CHAIN, CHAIN.with_tip(2.0))
+    ik = InverseKinematics(task, **LIMITS)
+    solution = ik.solve(task.join(tip, elbow))
+    x, second = task.split(solution.x)
+    assert (x - tip).norm(dim=-1).max() <= 1e-4
+    assert not solution.converged.any()
+    alone = InverseKinematics(CHAIN, **LIMITS).solve(tip)
+    without = (CHAIN.with_tip(2.0)(alone.q) - elbow).norm(dim=-1)
+    assert ((second - elbow).norm(dim=-1) <= without + 1e-4).all()
+    assert (second - elbow).norm(dim=-1).mean() < 0.9 * without.mean()
+    # Both together where both can be had.
+    q = uniform(rng, 0.22, 0.28, 40, 9)
+    both = ik.solve(task.join(CHAIN(q), CHAIN.with_tip(2.0)(q)))
+    assert both.converged.all()
+
+
+def test_prioritized_step_is_the_textbook_law_and_strict_at_limits(rng):
+    A = randn(rng, 5, 9)
+    task = PrioritizedTask(PositionTask(Linear(A[:3])), PositionTask(Linear(A[3:]), size=2))
+    q, target, q_pref = randn(rng, 9), randn(rng, 5), randn(rng, 9)
+    ik = InverseKinematics(task, q_pref=q_pref, beta=100.0)
+    assert_close(A @ (q + ik.step(q, target).dq), target, rtol=0.0, atol=1e-11)
+    # Rows in conflict: the second asks for what contradicts the first.
+    A[3] = A[0] + A[1]
+    task = PrioritizedTask(PositionTask(Linear(A[:3])), PositionTask(Linear(A[3:]), size=2))
+    dq = InverseKinematics(task, q_pref=q_pref, beta=100.0, damping=0.0).step(q, target).dq
+    assert_close(A[:3] @ (q + dq), target[:3], rtol=0.0, atol=1e-11)
+    assert_close(A[4] @ (q + dq), target[4], rtol=0.0, atol=1e-9)
+    # In a box: the first as near as without the second one.
+    rows = {"q_min": -0.3, "q_max": 0.3, "q_pref": 0.0}
+    q, target = uniform(rng, -0.3, 0.3, 200, 9), randn(rng, 200, 5)
+    target[:100, :3] = apply_rows(A[:3].expand(100, -1, -1), uniform(rng, -0.25, 0.25, 100, 9))
+    both = InverseKinematics(task, **rows).step(q, target).dq
+    alone = InverseKinematics(Linear(A[:3]), **rows).step(q, target[:, :3]).dq
+    first = A[:3].expand(200, -1, -1)
+    assert apply_rows(first, both - alone)[:100].norm(dim=-1).max() < 1e-7
+    assert apply_rows(first, both - alone).norm(dim=-1).max() < 1e-3
+    assert ((q + both >= -0.3) & (q + both <= 0.3)).all()
+
+
+# ---------------------------------------------------------------- models
+
+
+def test_pairs_of_functions_for_torch_and_for_numpy(rng):
+    A = randn(rng, 3, 7)
+    target, q = randn(rng, 5, 3), randn(rng, 5, 7)
+    expected = InverseKinematics(Linear(A)).solve(target, q).q
+    B = A.numpy()
+
+    def f(q):
+        assert isinstance(q, np.ndarray)
+        return q @ B.T
+
+    def J(q):
+        return np.broadcast_to(B, (*q.shape[:-1], 3, 7))
+
+    by_numpy = InverseKinematics((f, J)).solve(target, q).q
+    pair = (lambda q: q @ A.T, lambda q: A.expand(*q.shape[:-1], 3, 7))
+    by_torch = InverseKinematics(pair).solve(target, q).q
+    assert_close(by_numpy, expected, rtol=0.0, atol=1e-10)
+    assert_close(by_torch, expected, rtol=0.0, atol=1e-10)
+    with pytest.raises(TypeError, match="two callables"):
+        InverseKinematics((f, None))
+    with pytest.raises(ValueError, match="twice differentiable"):
+        InverseKinematics((f, J)).solve(target, q, differentiable=True)
+
+
+# ---------------------------------------------------------------- secondary objectives
+
+
+def test_distance_from_limits_and_a_users_gradient(rng):
+    target = CHAIN(uniform(rng, 0.15, 0.35, 50, 9))
+    start = InverseKinematics(CHAIN, beta=0.0, **LIMITS).solve(
+        target, uniform(rng, 0.1, 0.4, 50, 9)
+    )
+    away = InverseKinematics(CHAIN, q_pref=away_from_limits(0.1, 0.4), **LIMITS)
+    solution = away.solve(target, start.q)
+
+    def crowding(q):
+        return ((q - 0.25) / 0.15).pow(4).sum(-1)
+
+    done = start.converged & solution.converged
+    assert done.sum() > 45
+    assert (crowding(solution.q) <= crowding(start.q) + 1e-12)[done].all()
+    assert crowding(solution.q)[done].mean() < 0.7 * crowding(start.q)[done].mean()
+    # A quadratic cost: the minimum on a linear model is known.
+    A, S, c = randn(rng, 3, 7), randn(rng, 7, 7), randn(rng, 7)
+    S = torch.eye(7, dtype=torch.float64) + 0.05 * S @ S.T
+    linear = InverseKinematics(Linear(A), q_pref=downhill(lambda q: (q - c) @ S, 0.5))
+    x = randn(rng, 3)
+    K = torch.cat([torch.cat([S, A.T], 1), torch.cat([A, torch.zeros(3, 3).double()], 1)])
+    expected = torch.linalg.solve(K, torch.cat([S @ c, x]))[:7]
+    assert_close(linear.solve(x, randn(rng, 7)).q, expected, rtol=0.0, atol=1e-2)
+
+
+def test_answers_do_not_depend_on_the_start(rng):
+    target = CHAIN(uniform(rng, 0.2, 0.3, 200, 9))
+    ik = InverseKinematics(CHAIN, **LIMITS)
+    cold, warm = ik.solve(target).q, ik.solve(target, uniform(rng, 0.2, 0.3, 200, 9)).q
+    apart = (cold - warm).norm(dim=-1)
+    assert apart.quantile(0.95) < 1e-5
+
+
+# ---------------------------------------------------------------- the error model's domain
+
+
+def test_the_solver_stays_in_the_domain_of_a_hybrid_where_it_can(rng):
+    data = datasets.load_trunk()
+    model = HybridForwardModel(CHAIN, random_state=0).fit(data.q, data.x)
+    target = torch.from_numpy(model.predict(data.q[::10]))
+    anywhere = uniform(rng, 0.1, 0.4, len(target), 9)
+    # A posture that pulls out of the domain, and starts that mostly lie outside.
+    ik = InverseKinematics(model, q_pref=0.35, **LIMITS)
+    solution = ik.solve(target, anywhere)
+    inside = model.module_.in_domain(solution.q)
+    assert solution.converged.double().mean() >= 0.98
+    assert_close(solution.converged, inside & (solution.error <= 1e-4))
+    # Without the way in most of them leave it, and say so.
+    bare = InverseKinematics(Unguided(model.module_), q_pref=0.35, **LIMITS)
+    blind = bare.solve(target, anywhere)
+    assert (blind.status == IKStatus.OUT_OF_DOMAIN).double().mean() > 0.5
+    # Restarts look for others.
+    again = bare.solve(target, anywhere, restarts=2, random_state=0)
+    assert again.converged.sum() > blind.converged.sum()
+
+
+class Unguided(torch.nn.Module):
+    """A model that tells where it is at home, but not the way there."""
+
+    def __init__(self, module):
+        super().__init__()
+        self.module = module
+        self.in_domain, self.n_actuators = module.in_domain, 9
+
+    def forward_and_jacobian(self, q):
+        return self.module.forward_and_jacobian(q)
+
+    def forward(self, q):
+        return self.module(q)
+
+
+# ---------------------------------------------------------------- derivatives of solve
+
+
+def uneven(q):
+    """Return the gradient of a cost with another curvature for every actuator."""
+    return torch.linspace(0.5, 1.5, 9).to(q) * (q - 0.22) + 5.0 * (q - 0.22) ** 3
+
+
+def finite_differences(ik, target, q, h=1e-5, **options):
+    columns = []
+    for k in range(target.shape[-1]):
+        step = torch.zeros_like(target)
+        step[..., k] = h
+        ends = [
+            ik.solve(moved.requires_grad_(), q, differentiable=True, **options).q.detach()
+            for moved in (target + step, target - step)
+        ]
+        columns.append((ends[0] - ends[1]) / (2.0 * h))
+    return torch.stack(columns, dim=-1)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"weights": np.arange(1.0, 10.0)}, {"q_pref": downhill(uneven, 0.5)}],
+    ids=["posture", "weights", "gradient"],
+)
+def test_derivatives_of_the_solution_against_finite_differences(rng, settings):
+    target = CHAIN(uniform(rng, 0.18, 0.32, 20, 9)).requires_grad_()
+    ik = InverseKinematics(CHAIN, **LIMITS, **settings)
+    solution = ik.solve(target, differentiable=True, tol=1e-8)
+    assert solution.converged.all()
+    assert solution.error.max() < 1e-12
+    rows = [
+        torch.autograd.grad(column.sum(), target, retain_graph=True)[0]
+        for column in solution.q.unbind(-1)
+    ]
+    slope = torch.stack(rows, dim=-2)
+    expected = finite_differences(ik, target.detach(), None, tol=1e-8)
+    assert_close(slope, expected, rtol=0.0, atol=1e-5)
+
+
+def test_derivatives_with_held_actuators_and_by_the_models_parameters(rng):
+    q = uniform(rng, 0.2, 0.3, 9)
+    target = CHAIN(q)
+    free = InverseKinematics(CHAIN, q_pref=0.2, **LIMITS).solve(target).q
+    low = [0.1] * 8 + [float(free[8]) + 0.02]  # the posture pulls against this limit
+    ik = InverseKinematics(CHAIN, q_min=low, q_max=0.4, q_pref=0.2)
+    moving = target.clone().requires_grad_()
+    solution = ik.solve(moving, differentiable=True, tol=1e-8)
+    assert solution.limit_margin == 0.0
+    rows = [torch.autograd.grad(part, moving, retain_graph=True)[0] for part in solution.q.unbind()]
+    slope = torch.stack(rows)
+    assert (slope[8] == 0.0).all()
+    expected = finite_differences(ik, target, None, tol=1e-8)
+    assert_close(slope, expected, rtol=0.0, atol=1e-5)
+    radii = CHAIN.radii.clone().requires_grad_()
+    chain = CHAIN.with_geometry(radii=radii)
+    found = InverseKinematics(chain, **LIMITS).solve(moving, differentiable=True, tol=1e-8).q
+    (by_radii,) = torch.autograd.grad(found[0], radii)
+
+    def first(r):
+        solver = InverseKinematics(CHAIN.with_geometry(radii=r), **LIMITS)
+        again = solver.solve(target.clone().requires_grad_(), differentiable=True, tol=1e-8)
+        return again.q.detach()[0]
+
+    h = 1e-6 * torch.eye(3, dtype=torch.float64)
+    expected = torch.stack([first(radii.detach() + d) - first(radii.detach() - d) for d in h])
+    assert_close(by_radii, expected / 2e-6, rtol=1e-5, atol=1e-5)
+
+
+def test_rows_that_have_not_converged_get_no_derivatives(rng):
+    far = torch.tensor([[0.0, 0.0, 9.0]], dtype=torch.float64, requires_grad=True)
+    solution = InverseKinematics(CHAIN, **LIMITS).solve(far, differentiable=True)
+    (slope,) = torch.autograd.grad(solution.q.sum(), far)
+    assert (slope == 0.0).all()
+    with pytest.raises(ValueError, match="torch tensor"):
+        InverseKinematics(CHAIN, **LIMITS).solve(np.zeros(3), differentiable=True)

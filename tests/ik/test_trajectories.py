@@ -1,0 +1,163 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hybridkin.ik.trajectories import Trajectory, figure_eight, from_csv, line, min_jerk, spiral
+
+CENTER = np.array([0.1, -0.2, 0.7])
+
+
+def test_min_jerk_starts_and_ends_at_rest():
+    h = 1e-4
+    s = np.array([0.0, h, 2 * h, 1 - 2 * h, 1 - h, 1.0])
+    way = min_jerk(s)
+    assert way[0] == 0.0
+    assert way[-1] == 1.0
+    assert min_jerk(0.5) == 0.5
+    assert_allclose(min_jerk(0.25), 10 / 64 - 15 / 256 + 6 / 1024)
+    assert way[1] < 11 * h**3  # no linear, no quadratic part
+    assert 1.0 - way[-2] < 11 * h**3
+    assert (np.diff(min_jerk(np.linspace(0, 1, 1000))) > 0).all()
+    assert_array_equal(min_jerk([-1.0, 2.0]), [0.0, 1.0])
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -2, 0), (1, 1, 1)])
+def test_figure_eight_lies_in_its_plane_and_fills_its_size(normal):
+    path = figure_eight(CENTER, (0.4, 0.2), duration=8.0, normal=normal, timing="uniform")
+    offset = path.x - CENTER
+    assert_allclose(offset @ np.array(normal), 0.0, atol=1e-15)
+    assert_array_equal(path.x[0], path.x[-1])
+    assert_array_equal(path.x[0], CENTER)
+    assert_allclose(path.x[400], CENTER, atol=1e-15)  # crosses itself half way
+    across = offset[200] / np.linalg.norm(offset[200])
+    up = np.cross(np.array(normal) / np.linalg.norm(normal), across)
+    assert_allclose(np.ptp(offset @ across), 0.4)
+    assert_allclose(np.ptp(offset @ up), 0.2)
+    u, w = offset @ across / 0.2, offset @ up / 0.1
+    assert_allclose(w**2, 4 * u**2 * (1 - u**2), atol=1e-14)  # Gerono's lemniscate
+
+
+def test_figure_eight_in_the_horizontal_plane_is_wide_along_x():
+    path = figure_eight(CENTER, (0.4, 0.2))
+    assert_allclose(np.ptp(path.x, axis=0), [0.4, 0.2, 0.0], rtol=1e-3, atol=1e-15)
+
+
+def test_spiral_radius_angle_and_rise():
+    path = spiral(CENTER, (0.05, 0.15), rise=0.1, turns=2.0, duration=4.0, timing="uniform")
+    offset = path.x - CENTER
+    share = path.t / 4.0
+    assert_allclose(np.hypot(offset[:, 0], offset[:, 1]), 0.05 + 0.1 * share)
+    assert_allclose(offset[:, 2], 0.1 * share, atol=1e-15)
+    angle = np.unwrap(np.arctan2(offset[:, 1], offset[:, 0]))
+    assert_allclose(angle, 4.0 * np.pi * share, atol=1e-12)
+    circle = spiral(CENTER, 0.1, turns=-1.0)
+    assert_allclose(np.linalg.norm(circle.x - CENTER, axis=1), 0.1)
+    assert circle.x[1, 1] < CENTER[1]  # clockwise
+
+
+@pytest.mark.parametrize("timing", ["min_jerk", "uniform"])
+def test_line_is_straight_and_meets_its_ends(timing):
+    start, end = CENTER, np.array([0.3, 0.1, 0.9])
+    path = line(start, end, duration=1.0, dt=0.1, timing=timing)
+    assert_array_equal(path.x[[0, -1]], [start, end])
+    assert_allclose(np.cross(path.x - start, end - start), 0.0, atol=1e-16)
+    assert_allclose(path.t, np.arange(11) * 0.1)
+    steps = np.linalg.norm(np.diff(path.x, axis=0), axis=1)
+    assert np.ptp(steps) < 1e-15 if timing == "uniform" else steps[0] < 0.1 * steps[5]
+
+
+@pytest.mark.parametrize("path", [figure_eight(CENTER), spiral(CENTER), line(CENTER, -CENTER)])
+def test_paths_start_and_end_at_rest(path):
+    speed = np.linalg.norm(np.diff(path.x, axis=0), axis=1) / np.diff(path.t)
+    assert max(speed[0], speed[-1]) < 1e-3 * speed.max()
+
+
+def test_laps_join_without_a_jump_or_a_repeated_time():
+    lap = figure_eight(CENTER, duration=1.0, timing="uniform")
+    laps = lap.repeated(3)
+    assert len(laps) == 301
+    assert_allclose(np.diff(laps.t), 0.01)
+    assert_array_equal(laps.x[100:201], lap.x)
+    assert_allclose(laps.duration, 3.0)
+    with pytest.raises(ValueError, match="only a closed path"):
+        line(CENTER, -CENTER).repeated(2)
+    with pytest.raises(ValueError, match="`n_laps`"):
+        lap.repeated(0)
+
+
+def test_trajectory_is_checked_frozen_and_its_own():
+    t, x = np.arange(3.0), np.zeros((3, 3))
+    path = Trajectory(t, x)
+    x[0] = 1.0
+    assert_array_equal(path.x, 0.0)
+    with pytest.raises(AttributeError):
+        path.t = t
+    assert repr(path) == "Trajectory(3 points, 2 s, 0 x 0 x 0 m)"
+    with pytest.raises(ValueError, match=r"`x` must have shape \(T, 3\)"):
+        Trajectory(t, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"`t` must have shape \(3,\)"):
+        Trajectory(t[:2], np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="first: row 1"):
+        Trajectory(t, [[0, 0, 0], [0, np.nan, 0], [0, 0, 0]])
+    with pytest.raises(ValueError, match=r"must increase.*row 2"):
+        Trajectory([0.0, 1.0, 1.0], np.zeros((3, 3)))
+
+
+def test_paths_in_millimetres_are_noticed(tmp_path):
+    file = tmp_path / "path.csv"
+    file.write_text("t,x,y,z\n0,0,0,200\n1,10,0,200\n")
+    with pytest.warns(UserWarning, match="looks like millimetres"):
+        figure_eight([0.0, 0.0, 200.0], (40.0, 20.0))
+    with pytest.warns(UserWarning, match="read a file with unit='mm'"):
+        from_csv(file)
+    assert from_csv(file, unit="mm").x[0, 2] == 0.2  # and says nothing: warnings are errors
+
+
+def test_csv_with_and_without_times(tmp_path):
+    file = tmp_path / "path.csv"
+    file.write_text("# recorded\nt,x,y,z\n0.0,1,2,3\n0.5,4,5,6\n\n")
+    path = from_csv(file, unit="mm")
+    assert_array_equal(path.t, [0.0, 0.5])
+    assert_allclose(path.x, [[1e-3, 2e-3, 3e-3], [4e-3, 5e-3, 6e-3]])
+    file.write_text("1;2;3\n4;5;6\n")
+    path = from_csv(file, dt=0.25, delimiter=";")
+    assert_array_equal(path.t, [0.0, 0.25])
+    assert_array_equal(path.x, [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "message"),
+    [
+        ("1,2,3\n", {}, "rows of 4 columns"),
+        ("0,1,2,3\n", {"dt": 0.1}, "rows of 3 columns"),
+        ("t,x,y,z\n0,1,two,3\n", {}, r"must hold numbers in 4 columns \(t, x, y, z\)"),
+        ("t,x,y,z\n0,1,2,3\n1,2\n", {}, "must hold numbers"),
+        ("t,x,y,z\n", {}, "rows of 4 columns"),
+        ("0,1,2,3\n", {"unit": "inch"}, "`unit` must be one of"),
+        ("1,2,3\n", {"dt": -1.0}, "`dt` must be positive"),
+    ],
+)
+def test_bad_files_say_what_was_needed(tmp_path, text, settings, message):
+    file = tmp_path / "path.csv"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        from_csv(file, **settings)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: figure_eight([0, 0]), "`center` must be 3 finite numbers"),
+        (lambda: figure_eight(CENTER, (0.1, 0.0)), "`size` must be two numbers, positive"),
+        (lambda: figure_eight(CENTER, normal=(0, 0, 0)), "`normal` must not be zero"),
+        (lambda: figure_eight(CENTER, duration=0.0), "`duration` must be positive"),
+        (lambda: spiral(CENTER, (-0.1, 0.1)), "`radius` must be two numbers, not negative"),
+        (lambda: spiral(CENTER, turns=np.nan), "must be finite"),
+        (lambda: line(CENTER, [np.nan, 0, 0]), "`end` must be 3 finite numbers"),
+        (lambda: line(CENTER, CENTER, dt=np.inf), "`dt` must be positive"),
+        (lambda: line(CENTER, CENTER, timing="slow"), "`timing` must be one of"),
+    ],
+)
+def test_bad_arguments_say_what_was_needed(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,637 @@
+"""The ELM: its formula, its statistics, its derivatives and its manners as an estimator."""
+
+import copy
+import pickle
+import subprocess
+import sys
+import warnings
+
+import joblib
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import LinAlgWarning
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.linear_model import Ridge
+from sklearn.utils.estimator_checks import parametrize_with_checks
+from torch.testing import assert_close
+
+from hybridkin.learning.elm import ELM, ELMRegressor
+
+BOUNDS = np.array([[0.1] * 9, [0.3] * 9])
+VARIANTS = [
+    {},
+    {"fit_intercept": True},
+    {"activation": "tanh", "direct_link": True},
+    {"activation": "sin", "direct_link": True, "fit_intercept": True, "input_scaling": "standard"},
+    {"input_scaling": None, "weight_scale": 5.0},
+]
+variants = pytest.mark.parametrize("params", VARIANTS, ids=lambda p: "-".join(p) or "paper")
+
+
+def trunk(n=300, seed=0, noise=0.01):
+    """Lengths in [0.1, 0.3] m and a smooth three-dimensional target with noise."""
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(0.1, 0.3, (n, 9))
+    A = np.random.default_rng(99).standard_normal((9, 3))
+    return X, np.sin(5 * X @ A) + 0.5 + noise * rng.standard_normal((n, 3))
+
+
+def elm(n_hidden=30, alpha=0.1, **params):
+    return ELMRegressor(n_hidden, alpha, random_state=0, **params)
+
+
+def features(model, X):
+    """What the readout sees, written out independently of the module."""
+    u = (X - model.input_center_) / model.input_scale_
+    a = u @ model.input_weights_.T + model.input_bias_
+    sigma = {"logistic": lambda a: 1 / (1 + np.exp(-a)), "tanh": np.tanh, "sin": np.sin}
+    phi = sigma[model.activation](a)
+    return np.hstack([phi, u]) if model.direct_link else phi
+
+
+def assert_same_model(a, b, rtol=1e-9):
+    """Both have the same statistics (to rounding) and the same readout (to its conditioning)."""
+    assert_allclose(a._stats.n, b._stats.n, rtol=1e-14)
+    assert_allclose(a._stats.mean, b._stats.mean, rtol=1e-12, atol=1e-13)
+    scale = np.sqrt(np.outer(*[b._stats.scatter.diagonal()] * 2))
+    assert_allclose(a._stats.scatter / scale, b._stats.scatter / scale, rtol=0, atol=1e-12)
+    atol = rtol * np.abs(b.output_weights_).max()
+    assert_allclose(a.output_weights_, b.output_weights_, rtol=0, atol=atol)
+    assert_allclose(a.noise_variance_, b.noise_variance_, rtol=1e-7)
+
+
+@parametrize_with_checks(
+    [
+        ELMRegressor(),
+        ELMRegressor(fit_intercept=True, direct_link=True, input_scaling="standard", block_size=7),
+        ELMRegressor(n_hidden=20, alpha=1e-3, activation="tanh"),
+    ]
+)
+def test_scikit_learn_checks(estimator, check):
+    check(estimator)
+
+
+# The formula
+
+
+@pytest.mark.parametrize("n", [50, 300])
+def test_paper_formula(n):
+    X, Y = trunk(n)
+    model = elm(20).fit(X, Y)
+    H = features(model, X)
+    expected = np.linalg.solve(H.T @ H + 0.1 * np.eye(20), H.T @ Y)
+    assert_allclose(model.output_weights_, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert_allclose(model.predict(X), H @ expected, rtol=1e-12, atol=1e-12)
+    assert_array_equal(model.intercept_, np.zeros(3))
+    assert model.solver_ == "cholesky"
+
+
+@variants
+def test_equals_ridge_on_its_features(params):
+    X, Y = trunk()
+    weights = np.random.default_rng(1).uniform(0.1, 3, len(X))
+    model = elm(**params).fit(X, Y, sample_weight=weights)
+    phi = features(model, X)
+    ridge = Ridge(0.1, fit_intercept=model.fit_intercept, solver="cholesky", tol=1e-12)
+    ridge.fit(phi, Y, sample_weight=weights)
+    atol = 1e-10 * np.abs(ridge.coef_).max()
+    assert_allclose(model.output_weights_, ridge.coef_.T, rtol=0, atol=atol)
+    assert_allclose(model.intercept_, np.broadcast_to(ridge.intercept_, 3), rtol=0, atol=atol)
+    assert_allclose(model.predict(X), ridge.predict(phi), rtol=0, atol=1e-11)
+
+
+def test_hidden_layer_is_the_papers():
+    X, Y = trunk()
+    model = elm(1000).fit(X, Y)
+    W, b = model.input_weights_, model.input_bias_
+    assert W.shape == (1000, 9)
+    assert b.shape == (1000,)
+    for draw in (W, b):
+        assert np.abs(draw).max() <= 1
+        assert draw.min() < -0.97
+        assert draw.max() > 0.97
+        assert_allclose(draw.mean(), 0, atol=4 / np.sqrt(3 * draw.size))
+    # One seed used twice would make the bias the first weights again.
+    assert not np.isin(b, W).any()
+    assert np.abs(np.corrcoef(W.T, b)[-1, :-1]).max() < 0.15
+    assert_allclose(model.input_center_ - model.input_scale_, X.min(0), rtol=1e-14)
+    assert_allclose(model.input_center_ + model.input_scale_, X.max(0), rtol=1e-14)
+    wide = elm(1000, weight_scale=3.0).fit(X, Y)
+    assert_allclose(wide.input_weights_, 3 * W, rtol=1e-15, atol=1e-15)
+    assert_allclose(wide.input_bias_, 3 * b, rtol=1e-15, atol=1e-15)
+
+
+def test_input_scalings():
+    X, Y = trunk()
+    given_bounds = elm(input_scaling=BOUNDS.tolist()).fit(X, Y)
+    assert_allclose(given_bounds.input_center_, [0.2] * 9, rtol=1e-15)
+    assert_allclose(given_bounds.input_scale_, [0.1] * 9, rtol=1e-15)
+    standard = elm(input_scaling="standard").fit(X, Y)
+    assert_allclose(standard.input_center_, X.mean(0), rtol=1e-14)
+    assert_allclose(standard.input_scale_, X.std(0), rtol=1e-13)
+    raw = elm(input_scaling=None).fit(X, Y)
+    assert_array_equal(raw.input_center_, np.zeros(9))
+    assert_array_equal(raw.input_scale_, np.ones(9))
+
+
+@pytest.mark.parametrize("unit", [1e-150, 1e-6, 1e3, 1e150])
+def test_units_of_the_data_do_not_matter(unit):
+    X, Y = trunk()
+    base, other = elm().fit(X, Y), elm().fit(unit * X, 3 * Y)
+    assert_allclose(other.predict(unit * X), 3 * base.predict(X), rtol=1e-8)
+    assert_allclose(other.jacobian(unit * X) * unit, 3 * base.jacobian(X), rtol=1e-7, atol=1e-7)
+
+
+def test_narrow_range_far_from_zero_keeps_its_digits():
+    X, Y = trunk()
+    # 2^-20 and 2^10: the shift and the shrinking are exact up to the grid of the sum.
+    near = np.round((X - 0.2) * 2**20) * 2.0**-20
+    far = near * 2.0**-20 + 1024
+    far_model, near_model = elm().fit(far, Y), elm().fit(near, Y)
+    assert_allclose(far_model.predict(far), near_model.predict(near), rtol=1e-6)
+
+
+# Statistics: add, merge, weigh
+
+
+@variants
+def test_partial_fit_equals_fit(params):
+    X, Y = trunk()
+    params = params | ({} if params.get("input_scaling", 0) is None else {"input_scaling": BOUNDS})
+    whole, parts = elm(**params).fit(X, Y), elm(**params)
+    for rows in np.split(np.arange(300), [1, 2, 50, 120, 299]):
+        parts.partial_fit(X[rows], Y[rows])
+    assert_same_model(parts, whole)
+    assert parts.n_samples_seen_ == 300
+
+
+def test_merge_of_seven_shards_equals_fit():
+    X, Y = trunk()
+    w = np.random.default_rng(1).integers(0, 4, 300).astype(float)
+    params = {"input_scaling": BOUNDS, "fit_intercept": True}
+    whole = elm(**params).fit(X, Y, sample_weight=w)
+    shards = [
+        elm(**params).fit(X[i::7], Y[i::7], sample_weight=w[i::7]) for i in (3, 0, 6, 1, 5, 2, 4)
+    ]
+    before = joblib.hash(shards[1])
+    merged = shards[0]
+    for shard in shards[1:]:
+        assert merged.merge(shard) is merged
+    assert_same_model(merged, whole)
+    assert joblib.hash(shards[1]) == before
+
+
+def test_large_offsets_do_not_cancel():
+    X, Y = trunk()
+    params = {"input_scaling": BOUNDS, "fit_intercept": True}
+    base = elm(**params).fit(X, Y)
+    shifted = elm(**params)
+    for i in range(7):
+        shifted.partial_fit(X[i::7], Y[i::7] + 1e6)
+    assert_allclose(shifted.predict(X) - 1e6, base.predict(X), rtol=0, atol=1e-7)
+    assert_allclose(shifted.noise_variance_, base.noise_variance_, rtol=1e-7)
+
+
+@pytest.mark.parametrize("input_scaling", ["minmax", "standard"])
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_sample_weight_is_repetition(fit_intercept, input_scaling):
+    X, Y = trunk(120)
+    X[0], X[1] = 10.0, -10.0  # absent rows at the edge of the range
+    w = np.random.default_rng(2).integers(0, 4, 120)
+    w[:2] = 0
+    params = {"fit_intercept": fit_intercept, "input_scaling": input_scaling}
+    weighted = elm(**params).fit(X, Y, sample_weight=w)
+    repeated = elm(**params).fit(np.repeat(X, w, axis=0), np.repeat(Y, w, axis=0))
+    assert_same_model(weighted, repeated)
+    Z = X[2:]
+    assert_allclose(weighted.leverage(Z), repeated.leverage(Z), rtol=1e-7)
+    assert weighted.n_samples_seen_ == w.sum()
+
+
+def test_fit_forgets_partial_fit_and_partial_fit_remembers_fit():
+    X, Y = trunk()
+    model = elm(input_scaling=BOUNDS).partial_fit(X[:50], Y[:50]).fit(X[50:], Y[50:])
+    fresh = elm(input_scaling=BOUNDS).fit(X[50:], Y[50:])
+    assert joblib.hash(model) == joblib.hash(fresh)
+    assert_same_model(model.partial_fit(X[:50], Y[:50]), elm(input_scaling=BOUNDS).fit(X, Y))
+    # The features of the rows already summed are not those of another activation.
+    tanh = clone(model).fit(X[50:], Y[50:]).set_params(activation="tanh")
+    assert_same_model(tanh.partial_fit(X[:50], Y[:50]), model)
+    assert pickle.loads(pickle.dumps(tanh)).module_.activation == "logistic"
+
+
+def test_alpha_can_change_between_calls():
+    X, Y = trunk()
+    model = elm(alpha=10.0, input_scaling=BOUNDS).fit(X[:200], Y[:200]).set_params(alpha=0.1)
+    assert_same_model(model.partial_fit(X[200:], Y[200:]), elm(input_scaling=BOUNDS).fit(X, Y))
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_every_output_may_have_its_own_alpha(fit_intercept):
+    X, Y = trunk()
+    alphas = [1e-3, 10.0, 0.1]
+    model = elm(alpha=alphas, fit_intercept=fit_intercept).fit(X, Y)
+    for j, alpha in enumerate(alphas):
+        alone = elm(alpha=alpha, fit_intercept=fit_intercept).fit(X, Y[:, j])
+        assert_allclose(model.predict(X)[:, j], alone.predict(X), rtol=0, atol=1e-10)
+        assert_allclose(model.noise_variance_[j], alone.noise_variance_[0], rtol=1e-9)
+    flexible = elm(alpha=1e-3, fit_intercept=fit_intercept).fit(X, Y)
+    assert_allclose(model.leverage(X), flexible.leverage(X), rtol=1e-12)
+    for wrong in ([0.1, 0.2], [0.1, 0.2, -1.0], [0.1, 0.2, np.nan], [[0.1, 0.2, 0.3]]):
+        with pytest.raises(ValueError, match="`alpha` must be a number >= 0, or 3 of them"):
+            elm(alpha=wrong).fit(X, Y)
+
+
+@pytest.mark.parametrize("block_size", [1, 7, 299, 10**6])
+def test_block_size_does_not_matter(block_size):
+    X, Y = trunk()
+    blocks, whole = elm(block_size=block_size).fit(X, Y), elm().fit(X, Y)
+    assert_same_model(blocks, whole)
+    blocks.output_weights_, blocks.leverage_factor_ = whole.output_weights_, whole.leverage_factor_
+    blocks._build("cpu")
+    assert_allclose(blocks.jacobian(X), whole.jacobian(X), rtol=1e-12, atol=1e-13)
+    assert_allclose(blocks.predict(X), whole.predict(X), rtol=1e-12)
+    assert_allclose(blocks.leverage(X), whole.leverage(X), rtol=1e-11)
+
+
+# Derivatives
+
+
+@variants
+@pytest.mark.parametrize("m", [0, 1, 3])
+def test_jacobian(params, m):
+    X, Y = trunk()
+    model = elm(alpha=1e-2, **params).fit(X, Y[:, 0] if m == 0 else Y[:, :m])
+    J = model.jacobian(X[:6])
+    q = torch.tensor(X[:6])
+    auto = torch.func.vmap(torch.func.jacrev(model.module_))(q).numpy()
+    assert_allclose(J, auto[:, 0] if m == 0 else auto, rtol=1e-11, atol=1e-11)
+    step = 1e-6 * np.eye(9)
+    columns = [(model.predict(X[:6] + h) - model.predict(X[:6] - h)) / 2e-6 for h in step]
+    assert_allclose(J, np.stack(columns, -1), rtol=1e-6, atol=1e-6)
+    y, J_both = model.predict_and_jacobian(X[:6])
+    assert_array_equal(J_both, J)
+    assert_array_equal(y, model.predict(X[:6]))
+    assert y.shape == ((6,) if m == 0 else (6, m))
+
+
+@variants
+def test_gradcheck(params):
+    X, Y = trunk(60)
+    module = elm(8, **params).fit(X, Y).module_
+    q = torch.tensor(X[:2], requires_grad=True)
+    for function in (module, module.jacobian, module.leverage):
+        assert torch.autograd.gradcheck(function, (q,), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradgradcheck(module, (q,), eps=1e-7, atol=1e-4)
+
+
+def test_module_batches_dtypes_and_transforms():
+    X, Y = trunk()
+    model = elm(direct_link=True).fit(X, Y)
+    module = model.module_
+    q = torch.tensor(X[:24]).reshape(2, 3, 4, 9)
+    eps, J = module.forward_and_jacobian(q)
+    assert eps.shape == (2, 3, 4, 3)
+    assert J.shape == (2, 3, 4, 3, 9)
+    assert module.leverage(q).shape == (2, 3, 4)
+    assert_close(eps.reshape(24, 3).numpy(), model.predict(X[:24]), rtol=1e-13, atol=1e-13)
+    one = q[1, 2, 3]
+    assert_close(module(one), eps[1, 2, 3])
+    assert_close(module.jacobian(one), J[1, 2, 3])
+    assert_close(module.leverage(one), module.leverage(q)[1, 2, 3])
+    assert module(q[:0]).shape == (0, 3, 4, 3)
+    assert_close(torch.func.vmap(module.jacobian)(q), J)
+    buffers = dict(module.named_buffers())
+    assert_close(torch.func.functional_call(module, buffers, (q,)), eps)
+    single = module(q.float())
+    assert single.dtype == torch.float32
+    assert_close(single.double(), eps, rtol=1e-4, atol=1e-4)
+    assert list(module.parameters()) == []
+    small = copy.deepcopy(module).to(torch.float32)
+    assert small.jacobian(q.float()).dtype == torch.float32
+    assert_close(small(q).float(), single, rtol=1e-3, atol=1e-3)
+    with pytest.raises(ValueError, match=r"shape \(\.\.\., 9\), got torch.float64 of shape \(8,\)"):
+        module(one[:8])
+    with pytest.raises(ValueError, match="floating-point"):
+        module(torch.zeros(9, dtype=torch.int64))
+
+
+def test_state_dict_is_the_whole_module():
+    X, Y = trunk()
+    a, b = elm(activation="tanh").fit(X, Y).module_, elm(activation="tanh").fit(X, 2 * Y).module_
+    q = torch.tensor(X)
+    rebuilt = ELM(a.state_dict(), a.activation)
+    assert_close(rebuilt.forward_and_jacobian(q), a.forward_and_jacobian(q), rtol=0, atol=0)
+    assert_close(rebuilt.leverage(q), a.leverage(q), rtol=0, atol=0)
+    b.load_state_dict(a.state_dict())
+    assert_close(b.forward_and_jacobian(q), a.forward_and_jacobian(q), rtol=0, atol=0)
+    assert repr(a) == "ELM(9 -> 30 tanh -> 3)"
+
+
+# Uncertainty
+
+
+@variants
+def test_leverage_and_std_equal_dense_formulas(params):
+    X, Y = trunk()
+    model = elm(alpha=0.5, **params).fit(X, Y)
+    phi, new = features(model, X), features(model, X[:20] + 0.03)
+    A = 0.5 * np.eye(phi.shape[1])
+    if model.fit_intercept:  # an unpenalised column of ones
+        phi, new = (np.hstack([f, np.ones((len(f), 1))]) for f in (phi, new))
+        A = np.pad(A, (0, 1))
+    A += phi.T @ phi
+    leverage = np.sum(new * np.linalg.solve(A, new.T).T, axis=1)
+    assert_allclose(model.leverage(X[:20] + 0.03), leverage, rtol=1e-8)
+    hat = phi @ np.linalg.solve(A, phi.T)
+    assert_allclose(model.leverage(X), hat.diagonal(), rtol=1e-8)
+    assert model.leverage(X).max() < 1
+    noise = np.sum((Y - hat @ Y) ** 2, axis=0) / (300 - np.trace(hat))
+    assert_allclose(model.noise_variance_, noise, rtol=1e-8)
+    y, std = model.predict(X[:20] + 0.03, return_std=True)
+    assert_array_equal(y, model.predict(X[:20] + 0.03))
+    assert_allclose(std, np.sqrt(noise * (1 + leverage[:, None])), rtol=1e-8)
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_std_covers_new_measurements(fit_intercept):
+    rng = np.random.default_rng(3)
+    X, new = rng.uniform(-1, 1, (2, 2000, 3))
+    model = elm(40, alpha=1.0, fit_intercept=fit_intercept).fit(X, X[:, 0])
+    phi, phi_new = features(model, X), features(model, new)
+    hits, variances = [], []
+    for _ in range(20):  # answers known by construction: weights from the prior, noise 0.2
+        w = 0.2 * rng.standard_normal(40)
+        model.fit(X, phi @ w + 7 * fit_intercept + 0.2 * rng.standard_normal(2000))
+        y, std = model.predict(new, return_std=True)
+        t = phi_new @ w + 7 * fit_intercept + 0.2 * rng.standard_normal(2000)
+        hits.append(np.mean(np.abs(t - y) < 1.96 * std))
+        variances.append(model.noise_variance_[0])
+    assert_allclose(np.mean(hits), 0.95, atol=0.006)
+    assert_allclose(np.mean(variances), 0.04, rtol=0.02)
+
+
+def test_leverage_grows_outside_the_data():
+    X, Y = trunk()
+    model = elm(100).fit(X, Y)
+    center, outward = X.mean(0), np.ones(9)
+    path = center + np.array([0.0, 0.1, 0.2, 0.4])[:, None] * outward
+    assert (np.diff(model.leverage(path)) > 0).all()
+
+
+# Hard data
+
+
+def test_float32_data_are_accumulated_in_float64():
+    X, Y = trunk(3000)
+    X32 = X.astype(np.float32)
+    single, double = elm(600).fit(X32, Y), elm(600).fit(X32.astype(np.float64), Y)
+    assert_array_equal(single.output_weights_, double.output_weights_)
+    assert single.solver_ == "cholesky"
+    for got, expected in (
+        (single.predict(X32), double.predict(X32.astype(float))),
+        (single.jacobian(X32), double.jacobian(X32.astype(float))),
+        (single.predict(X32, return_std=True)[1], double.predict(X32.astype(float), True)[1]),
+        (single.leverage(X32), double.leverage(X32.astype(float))),
+    ):
+        assert got.dtype == np.float32
+        assert expected.dtype == np.float64
+        assert_allclose(got, expected, rtol=3e-7, atol=1e-7 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("input_scaling", ["minmax", "standard", None])
+def test_constant_and_repeated_columns(input_scaling):
+    X, Y = trunk()
+    X[:, 2], X[:, 5] = 0.1 + 0.2, X[:, 4]
+    model = elm(input_scaling=input_scaling, direct_link=True).fit(X, Y)
+    assert model.solver_ == "cholesky"
+    if input_scaling is not None:
+        assert model.input_scale_[2] == 1
+    assert model.score(X, Y) > 0.5
+    assert np.isfinite(model.jacobian(X)).all()
+    X[:, 2] += np.spacing(0.3) * np.random.default_rng(0).integers(0, 2, 300)
+    model.fit(X, Y)  # constant up to rounding
+    assert np.ptp(X[:, 2]) > 0
+    if input_scaling is not None:
+        assert model.input_scale_[2] == 1
+
+
+@variants
+def test_one_row(params):
+    X, Y = trunk(1)
+    model = elm(**params).fit(X, Y)
+    phi = features(model, X)[0]
+    if model.fit_intercept:
+        assert_allclose(model.predict(X), Y, rtol=1e-13)
+        assert np.isnan(model.noise_variance_).all()
+    else:
+        share = phi @ phi / (phi @ phi + 0.1)
+        assert_allclose(model.predict(X), share * Y, rtol=1e-12)
+        assert_allclose(model.leverage(X), [share], rtol=1e-12)
+        assert_allclose(model.noise_variance_, (1 - share) * Y[0] ** 2, rtol=1e-9)
+
+
+def test_fewer_rows_than_neurons():
+    X, Y = trunk(15)
+    model = elm(200).fit(X, Y)
+    phi = features(model, X)
+    dual = phi.T @ np.linalg.solve(phi @ phi.T + 0.1 * np.eye(15), Y)
+    assert model.solver_ == "cholesky"
+    assert_allclose(model.output_weights_, dual, rtol=0, atol=1e-11 * np.abs(dual).max())
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_alpha_zero(fit_intercept):
+    X, Y = trunk(400)
+    model = elm(6, alpha=0, fit_intercept=fit_intercept).fit(X, Y)
+    assert model.solver_ == "cholesky"
+    phi = np.hstack([features(model, X), np.ones((400, 1))])[:, : 6 + fit_intercept]
+    expected = np.linalg.lstsq(phi, Y, rcond=None)[0]
+    assert_allclose(model.output_weights_, expected[:6], rtol=1e-9)
+    X[:, 1] = X[:, 0]  # the direct link now sees one column twice
+    model.set_params(direct_link=True)
+    with pytest.warns(LinAlgWarning, match="singular at alpha=0"):
+        model.fit(X, Y)
+    assert model.solver_ == "eigh"
+    phi = features(model, X)
+    mean = phi.mean(0) * fit_intercept
+    expected = np.linalg.pinv(phi - mean, rcond=1e-10) @ (Y - Y.mean(0) * fit_intercept)
+    assert_allclose(model.output_weights_, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    assert_allclose(model.leverage(X).sum(), 14 + fit_intercept, rtol=1e-8)
+    inside, split = X[:1], X[:1] + 0.1 * np.eye(9)[1]  # no row has told the two columns apart
+    assert model.leverage(inside) < 1
+    assert model.leverage(split) > 1e3
+
+
+def test_features_of_different_units_are_not_singular():
+    X, Y = trunk()
+    X[:, 0] *= 1e-7
+    model = elm(5, alpha=0, input_scaling=None, direct_link=True).fit(X, Y)
+    assert model.solver_ == "cholesky"
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 12), st.integers(1, 5), st.integers(0, 3), st.integers(1, 20), st.booleans())
+def test_shapes(n, d, m, n_hidden, single):
+    rng = np.random.default_rng(n)
+    dtype = np.float32 if single else np.float64
+    X, Y = rng.standard_normal((n, d)).astype(dtype), rng.standard_normal((n, m) if m else n)
+    model = ELMRegressor(n_hidden, random_state=0, direct_link=True, block_size=5).fit(X, Y)
+    y, J = model.predict_and_jacobian(X)
+    outputs = (m,) if m else ()
+    assert y.shape == (n, *outputs)
+    assert J.shape == (n, *outputs, d)
+    assert y.dtype == J.dtype == dtype
+    assert model.predict(X, return_std=True)[1].shape == y.shape
+    assert model.leverage(X).shape == (n,)
+    assert model.output_weights_.shape == (n_hidden + d, m or 1)
+    assert model.leverage(X).max() <= 1 + 1e-5
+
+
+# Manners
+
+
+def test_pickle_clone_copy_and_hash():
+    X, Y = trunk()
+    model = elm(input_scaling=BOUNDS).fit(X, Y)
+    state = copy.copy(model.__dict__)
+    y, std = model.predict(X, return_std=True)
+    assert model.__dict__.keys() == state.keys()
+    assert joblib.hash(model) == joblib.hash(elm(input_scaling=BOUNDS).fit(X, Y))
+    for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        assert joblib.hash(other) == joblib.hash(model)
+        assert_array_equal(other.predict(X), y)
+        assert_array_equal(other.predict(X, return_std=True)[1], std)
+        assert_array_equal(other.jacobian(X), model.jacobian(X))
+        assert_same_model(other.partial_fit(X, Y), copy.deepcopy(model).partial_fit(X, Y))
+    assert b"torch" not in pickle.dumps(model)
+    fresh = clone(model)
+    assert not hasattr(fresh, "module_")
+    assert joblib.hash(fresh) == joblib.hash(elm(input_scaling=BOUNDS))
+
+
+def test_pickle_is_the_same_in_another_process():
+    code = (
+        "import sys, pickle, numpy as np; from hybridkin.learning.elm import ELMRegressor;"
+        "X = np.random.default_rng(0).uniform(size=(40, 4));"
+        "m = ELMRegressor(10, random_state=0).fit(X, X @ X.T[:, :2]);"
+        "sys.stdout.buffer.write(pickle.dumps(m))"
+    )
+    first, second = (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert first == second
+    X = np.random.default_rng(0).uniform(size=(40, 4))
+    expected = ELMRegressor(10, random_state=0).fit(X, X @ X.T[:, :2])
+    assert_allclose(pickle.loads(first).predict(X), expected.predict(X), rtol=1e-12)
+
+
+def test_device():
+    X, Y = trunk()
+    model = elm(device=torch.device("cpu")).fit(X, Y)
+    assert_array_equal(model.predict(X), elm().fit(X, Y).predict(X))
+    model.device = "xla:7"  # as if it came from a machine that has one
+    moved = pickle.loads(pickle.dumps(model))
+    assert moved.device == "xla:7"
+    assert_array_equal(moved.predict(X), model.predict(X))
+    with pytest.raises(RuntimeError, match=r"`device` must name .*, got 'xla:7'; use device=None"):
+        moved.fit(X, Y)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_equals_cpu():
+    X, Y = trunk()
+    w = np.random.default_rng(1).integers(0, 4, 300)
+    cuda = elm(device="cuda", block_size=64).fit(X, Y, sample_weight=w)
+    assert cuda.module_.input_bias.is_cuda
+    assert_same_model(cuda, elm().fit(X, Y, sample_weight=w))
+
+
+def test_seeds():
+    X, Y = trunk()
+    assert_array_equal(elm().fit(X, Y).predict(X), elm().fit(X, Y).predict(X))
+    other = ELMRegressor(30, random_state=1).fit(X, Y)
+    assert np.abs(other.input_weights_ - elm().fit(X, Y).input_weights_).max() > 0.1
+    rng = np.random.RandomState(0)
+    assert_array_equal(
+        ELMRegressor(30, random_state=rng).fit(X, Y).input_weights_,
+        elm().fit(X, Y).input_weights_,
+    )
+
+
+@pytest.mark.parametrize("frame", [pd.DataFrame, lambda X, columns: pl.DataFrame(X, columns)])
+def test_named_columns(frame):
+    X, Y = trunk()
+    names = [f"q{i}" for i in range(9)]
+    model = elm().fit(frame(X, columns=names) if frame is pd.DataFrame else frame(X, names), Y)
+    assert list(model.feature_names_in_) == names
+    with pytest.raises(ValueError, match="feature names"):
+        model.predict(pd.DataFrame(X[:, ::-1], columns=names[::-1]))
+    assert_array_equal(model.predict(pd.DataFrame(X, columns=names)), elm().fit(X, Y).predict(X))
+
+
+def test_read_only_memory_map(tmp_path):
+    X, Y = trunk()
+    joblib.dump((X, Y), tmp_path / "data")
+    X_map, Y_map = joblib.load(tmp_path / "data", mmap_mode="r")
+    model = elm().fit(X_map, Y_map)
+    assert_array_equal(model.predict(X_map), elm().fit(X, Y).predict(X))
+    joblib.dump(model, tmp_path / "model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mapped = joblib.load(tmp_path / "model", mmap_mode="r")
+        assert_array_equal(mapped.predict(X_map), model.predict(X))
+        assert_same_model(mapped.partial_fit(X, Y), model.partial_fit(X, Y))
+
+
+def test_global_state_is_left_alone():
+    X, Y = trunk()
+    before = torch.get_num_threads(), torch.get_default_dtype(), torch.get_rng_state()
+    numpy_before = np.random.get_state()[1].copy()  # noqa: NPY002
+    elm().fit(X, Y).predict(X)
+    assert torch.is_grad_enabled()
+    assert (torch.get_num_threads(), torch.get_default_dtype()) == before[:2]
+    assert_close(torch.get_rng_state(), before[2])
+    assert_array_equal(np.random.get_state()[1], numpy_before)  # noqa: NPY002
+
+
+def test_clear_errors():
+    X, Y = trunk()
+    fitted = elm(input_scaling=BOUNDS).fit(X, Y)
+    with pytest.raises(ValueError, match=r"shape \(2, 9\) with low <= high, got .* \(2, 8\)"):
+        elm(input_scaling=BOUNDS[:, :8]).fit(X, Y)
+    for bad in (BOUNDS[::-1], BOUNDS * np.nan):
+        with pytest.raises(ValueError, match="`input_scaling` given as bounds must be"):
+            elm(input_scaling=bad).fit(X, Y)
+    with pytest.raises(ValueError, match="'alpha' parameter"):
+        elm(alpha=-1).fit(X, Y)
+    with pytest.raises(ValueError, match="NaN"):
+        elm().fit(np.where(X > 0.29, np.nan, X), Y)
+    with pytest.raises(ValueError, match="`y` must have 3 columns as in earlier calls, got 2"):
+        fitted.partial_fit(X, Y[:, :2])
+    with pytest.raises(ValueError, match="overflow"):
+        elm(direct_link=True, input_scaling=None).fit(X * 1e200, Y)
+    with pytest.raises(NotFittedError):
+        elm().merge(fitted)
+    with pytest.raises(NotFittedError):
+        elm().predict(X, return_std=True)
+    with pytest.raises(TypeError, match="must be a fitted ELMRegressor, got Ridge"):
+        fitted.merge(Ridge())
+    for other, name in (
+        (elm(input_scaling=BOUNDS * 2).fit(X, Y), "input_center differs"),
+        (elm(31, input_scaling=BOUNDS).fit(X, Y), "input_weights differs"),
+        (elm(input_scaling=BOUNDS, activation="sin").fit(X, Y), "activation differs"),
+        (elm(input_scaling=BOUNDS, direct_link=True).fit(X, Y), r"shape \(30, 3\), got \(39, 3\)"),
+        (elm(input_scaling=BOUNDS).fit(X, Y[:, 0]), r"shape \(30, 3\), got \(30, 1\)"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            fitted.merge(other)
+    assert_same_model(fitted, elm(input_scaling=BOUNDS).fit(X, Y))

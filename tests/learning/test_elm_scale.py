@@ -1,0 +1,367 @@
+"""The ELM at scale: streams of chunks, dask, processes, searches over frames, metadata."""
+
+import importlib.util
+import os
+import runpy
+import sys
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+import sklearn
+import threadpoolctl
+import torch
+from joblib.externals.loky import get_reusable_executor
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.model_selection import GridSearchCV, KFold, cross_val_score, cross_validate
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
+from sklearn.utils import estimator_html_repr
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    ELMRegressor,
+    ELMRegressorCV,
+    HybridForwardModel,
+    InverseKinematics,
+)
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "plot_elm_dask.py"
+BOUNDS = [[-1.0] * 4, [1.0] * 4]
+SEARCH = {"alpha": [1e-4, 1e-1, 1e2], "n_hidden": [10, 20]}
+
+
+def data(n=200, seed=0):
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-1, 1, (n, 4))
+    A = np.random.default_rng(99).standard_normal((4, 2))
+    return X, np.sin(X @ A) + 0.3 + 0.05 * rng.standard_normal((n, 2))
+
+
+def elm(n_hidden=20, alpha=0.1, **params):
+    return ELMRegressor(n_hidden, alpha, **{"random_state": 0, **params})
+
+
+def elm_cv(alphas=(1e-3, 0.1), **params):
+    quick = {"weight_scales": (0.5, 1.0), "relevance_rounds": 0, "random_state": 0}
+    return ELMRegressorCV(15, alphas, **{**quick, **params})
+
+
+def assert_same_predictions(a, b, X, rtol=1e-10):
+    expected = b.predict(X)
+    assert_allclose(a.predict(X), expected, rtol=0, atol=rtol * np.abs(expected).max())
+
+
+class WatchedELM(ELMRegressor):
+    """Remembers the process in which it was fitted, and the threads that process may use."""
+
+    def fit(self, X, y, sample_weight=None):
+        super().fit(X, y, sample_weight)
+        pools = [pool["num_threads"] for pool in threadpoolctl.threadpool_info()]
+        self.process_, self.threads_ = os.getpid(), max(*pools, torch.get_num_threads())
+        return self
+
+
+# Streams
+
+
+def stream(sizes=(7, 1, 150, 40, 2, 300), seed=0):
+    """Yield chunks of any size, in both precisions, as a logger might."""
+    for k, n in enumerate(sizes):
+        X, y = data(n, seed=100 * seed + k)
+        dtypes = (np.float32, np.float64) if k % 2 == 0 else (np.float64, np.float32)
+        yield X.astype(dtypes[0]), y.astype(dtypes[1])
+
+
+def together(chunks):
+    """Return all rows in float64, and the number of the chunk of each."""
+    Xs, ys = zip(*chunks, strict=True)
+    chunk = np.repeat(np.arange(len(Xs)), [len(X) for X in Xs])
+    return np.vstack(Xs, dtype=np.float64), np.vstack(ys, dtype=np.float64), chunk
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_a_generator_of_chunks_equals_one_fit(fit_intercept):
+    params = {"input_scaling": BOUNDS, "fit_intercept": fit_intercept, "direct_link": True}
+    streamed = elm(**params)
+    for X, y in stream():
+        streamed.partial_fit(X, y)
+    X, y, _ = together(stream())
+    whole = elm(**params).fit(X, y)
+    assert streamed.n_samples_seen_ == 500
+    assert_same_predictions(streamed, whole, X)
+    assert_allclose(streamed.noise_variance_, whole.noise_variance_, rtol=1e-10)
+    assert_allclose(streamed.leverage(X), whole.leverage(X), rtol=1e-10)
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_decay_is_a_weight_that_falls_with_age(fit_intercept):
+    params = {"input_scaling": BOUNDS, "fit_intercept": fit_intercept}
+    decay, forgetful = 0.7, elm(**params)
+    own = iter(np.random.default_rng(1).uniform(0.5, 2.0, 500))
+    weights = []
+    for X, y in stream():
+        weights.append([next(own) for _ in X])
+        forgetful.partial_fit(X, y, weights[-1], decay=decay)
+    X, y, chunk = together(stream())
+    age = chunk.max() - chunk
+    w = np.concatenate(weights) * decay**age
+    whole = elm(**params).fit(X, y, sample_weight=w)
+    assert_allclose(forgetful.n_samples_seen_, w.sum(), rtol=1e-13)
+    assert_same_predictions(forgetful, whole, X)
+    assert_allclose(forgetful.noise_variance_, whole.noise_variance_, rtol=1e-10)
+    # The formula itself, written out.
+    phi = whole.module_.features(torch.from_numpy(X)).numpy()
+    phi = np.hstack([phi, np.ones((500, int(fit_intercept)))])
+    penalty = np.diag([0.1] * 20 + [0.0] * fit_intercept)
+    expected = phi @ np.linalg.solve(phi.T * w @ phi + penalty, phi.T * w @ y)
+    assert_allclose(forgetful.predict(X), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    assert np.abs(forgetful.predict(X) - elm(**params).fit(X, y).predict(X)).max() > 1e-3
+
+
+def test_each_chunk_may_have_its_own_decay():
+    decays, forgetful = [1.0, 0.5, 1.0, 0.9, 0.2, 1.0], elm(input_scaling=BOUNDS)
+    for (X, y), decay in zip(stream(), decays, strict=True):
+        forgetful.partial_fit(X, y, decay=decay)
+    X, y, chunk = together(stream())
+    later = np.append(np.cumprod(decays[:0:-1])[::-1], 1.0)  # product of the decays that followed
+    whole = elm(input_scaling=BOUNDS).fit(X, y, sample_weight=later[chunk])
+    assert_same_predictions(forgetful, whole, X)
+
+
+@pytest.mark.parametrize("decay", [0, -1, 1.5, np.nan, np.inf])
+def test_a_wrong_decay_or_chunk_changes_nothing(decay):
+    X, y = data()
+    model = elm(input_scaling=BOUNDS).fit(X, y)
+    before = joblib.hash(model)
+    for victim in (model, elm()):
+        with pytest.raises(ValueError, match=rf"`decay` must lie in \(0, 1\], got {decay!r}"):
+            victim.partial_fit(X, y, decay=decay)
+    with pytest.raises(ValueError, match="NaN"):
+        model.partial_fit(np.where(X > 0.9, np.nan, X), y, decay=0.5)
+    assert joblib.hash(model) == before
+
+
+# Dask
+
+
+def load_example():
+    # Not in sys.modules: dask then sends its functions by value, as it does from a script.
+    spec = importlib.util.spec_from_file_location("plot_elm_dask", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+BLOCKS = [range(3), range(3, 5), range(5, 6), range(6, 10), range(10, 11)]
+N_ROWS = 400
+
+
+@pytest.fixture(scope="module")
+def scaled_out():
+    """The example on few rows, in a cluster that then serves the other tests too."""
+    distributed = pytest.importorskip("dask.distributed")
+    example = load_example()
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield example, client, example.compare(cluster, client, BLOCKS, N_ROWS)
+
+
+def test_dask_example_equals_one_fit(scaled_out):
+    example, client, (model, looped, tree, curve, seconds) = scaled_out
+    rows = [example.chunk(number, N_ROWS) for number in range(11)]
+    q, error = (np.vstack(part) for part in zip(*rows, strict=True))
+    bounds = example.bounds_by_dask(client, BLOCKS, N_ROWS)
+    assert_array_equal(bounds, [q.min(axis=0), q.max(axis=0)])
+    whole = ELMRegressor(**example.NETWORK, input_scaling=bounds).fit(q, error)
+    for other in (model, looped):
+        assert other.n_samples_seen_ == 11 * N_ROWS
+        assert_same_predictions(other, whole, q)
+    assert example.relative_difference(model.predict(q), whole.predict(q)) < 1e-10
+    assert_array_equal(tree[:5, 0], [N_ROWS * len(block) for block in BLOCKS])
+    assert_array_equal(tree[5:, 0], N_ROWS * np.array([5, 5, 1, 10, 1, 11]))
+    for end in (tree[-1], curve[-1]):
+        assert_allclose(end, [11 * N_ROWS, example.tip_error(whole)], rtol=1e-9)
+    assert curve[-1, 1] < 0.8 * curve[0, 1]
+    assert seconds.min() > 0
+    assert len(example.draw(tree, curve, seconds).axes) == 2
+
+
+def test_order_of_merges_does_not_matter():
+    example = load_example()
+    bounds = np.array([[0.2] * 9, [0.25] * 9])
+    parts = [example.fitted(block, N_ROWS, bounds) for block in BLOCKS]
+    hashes = [joblib.hash(part) for part in parts]
+    q, _ = example.chunk(99, 1000)
+    expected, _ = example.fit_by_loop(BLOCKS, N_ROWS, bounds)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        left = list(parts)
+        while len(left) > 1:  # any two, in any order
+            a, b = (left.pop(rng.integers(len(left))) for _ in range(2))
+            left.append(example.merged(a, b))
+        assert left[0].n_samples_seen_ == 11 * N_ROWS
+        assert_same_predictions(left[0], expected, q)
+        assert_allclose(left[0].noise_variance_, expected.noise_variance_, rtol=1e-10)
+    assert [joblib.hash(part) for part in parts] == hashes
+
+
+def test_dask_example_says_so_where_dask_is_missing(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    assert "Skipped: this example needs dask" in capsys.readouterr().out
+
+
+def test_joblib_on_dask_gives_the_same_scores(scaled_out):
+    X, y = data()
+    here = cross_validate(WatchedELM(20, random_state=0), X, y, return_estimator=True)
+    chosen = GridSearchCV(elm(), SEARCH, cv=3).fit(X, y)
+    by_itself = elm_cv()
+    scores = cross_val_score(by_itself, X, y)
+    with joblib.parallel_config(backend="dask"):
+        there = cross_validate(WatchedELM(20, random_state=0), X, y, return_estimator=True)
+        searched = GridSearchCV(elm(), SEARCH, cv=3).fit(X, y)
+        assert_allclose(cross_val_score(by_itself, X, y), scores, rtol=1e-9)
+    assert {model.process_ for model in here["estimator"]} == {os.getpid()}
+    assert os.getpid() not in {model.process_ for model in there["estimator"]}
+    assert {model.threads_ for model in there["estimator"]} == {1}
+    assert_allclose(there["test_score"], here["test_score"], rtol=1e-9)
+    assert searched.best_params_ == chosen.best_params_
+    expected = chosen.cv_results_["mean_test_score"]
+    assert_allclose(searched.cv_results_["mean_test_score"], expected, rtol=1e-9)
+    assert_same_predictions(searched, chosen, X)
+
+
+# Processes and threads
+
+
+@pytest.fixture
+def two_processes():
+    with joblib.parallel_config(backend="loky", n_jobs=2):
+        yield
+    get_reusable_executor().shutdown(wait=True)
+
+
+def test_processes_share_the_cores(two_processes):
+    X, y = data()
+    estimator = WatchedELM(20, random_state=0)
+    here = cross_validate(estimator, X, y, return_estimator=True, n_jobs=1)
+    there = cross_validate(estimator, X, y, return_estimator=True)
+    assert os.getpid() not in {model.process_ for model in there["estimator"]}
+    fair = max(1, joblib.cpu_count() // 2)
+    assert max(model.threads_ for model in there["estimator"]) <= fair
+    assert_allclose(there["test_score"], here["test_score"], rtol=1e-9)
+    for a, b in zip(there["estimator"], here["estimator"], strict=True):
+        assert_same_predictions(a, b, X)
+
+
+def test_thread_counts_are_left_alone():
+    q = np.random.default_rng(0).uniform(0.1, 0.3, (60, 9))
+    chain = ConstantCurvatureChain([0.1, 0.093, 0.079])
+    x = chain(torch.from_numpy(q)).numpy() + 0.01 * np.sin(20 * q[:, :3])
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)  # neither what a library would set, nor what the tests run with
+    try:
+        with threadpoolctl.threadpool_limits(2):
+            counts = torch.get_num_threads(), threadpoolctl.threadpool_info()
+            model = elm(input_scaling=[[0.1] * 9, [0.3] * 9]).fit(q, x).partial_fit(q, x)
+            model.merge(elm(input_scaling=[[0.1] * 9, [0.3] * 9]).fit(q, x))
+            model.predict_and_jacobian(q)
+            ELMRegressorCV(20, random_state=0).fit(q, x).predict(q, return_std=True)
+            hybrid = HybridForwardModel(chain, elm(), calibrate=("radii",)).fit(q, x)
+            ik = InverseKinematics(hybrid, q_min=0.1, q_max=0.3, q_pref=0.2)
+            ik.solve(torch.from_numpy(x[0]))
+            assert (torch.get_num_threads(), threadpoolctl.threadpool_info()) == counts
+    finally:
+        torch.set_num_threads(before)
+
+
+# Frames, pipelines, pictures, metadata
+
+
+def as_frames(library, X, y):
+    columns = {f"q{i}": column for i, column in enumerate(X.T)}
+    return library.DataFrame(columns), library.DataFrame({"x": y[:, 0], "z": y[:, 1]})
+
+
+@pytest.mark.parametrize("library", [pd, pl], ids=["pandas", "polars"])
+def test_frames_through_a_search(library):
+    X, y = data()
+    X_frame, y_frame = as_frames(library, X, y)
+    expected = GridSearchCV(elm(), SEARCH, cv=3).fit(X, y)
+    search = GridSearchCV(elm(), SEARCH, cv=3).fit(X_frame, y_frame)
+    assert list(search.best_estimator_.feature_names_in_) == ["q0", "q1", "q2", "q3"]
+    assert search.best_params_ == expected.best_params_
+    scores = expected.cv_results_["mean_test_score"]
+    assert_allclose(search.cv_results_["mean_test_score"], scores, rtol=1e-9)
+    assert_allclose(search.predict(X_frame), expected.predict(X), rtol=1e-9)
+    column = GridSearchCV(elm(), SEARCH, cv=3).fit(X_frame, y_frame["x"])
+    assert column.predict(X_frame).shape == (200,)
+    choosing = elm_cv()
+    scores = cross_val_score(choosing, X, y[:, 0])
+    assert_allclose(cross_val_score(choosing, X_frame, y_frame["x"]), scores, rtol=1e-9)
+
+
+@pytest.mark.parametrize("transform", ["pandas", "polars"])
+@pytest.mark.parametrize("last", [elm(), elm_cv()], ids=["elm", "cv"])
+def test_pipeline_that_hands_on_frames(transform, last):
+    X, y = data()
+    X_frame, _ = as_frames(pd, X, y)
+    plain = make_pipeline(MinMaxScaler(), PolynomialFeatures(2, include_bias=False), last)
+    expected = plain.fit(X, y).predict(X)
+    framed = sklearn.clone(plain).set_output(transform=transform).fit(X_frame, y)
+    assert list(framed[-1].feature_names_in_[:5]) == ["q0", "q1", "q2", "q3", "q0^2"]
+    assert_allclose(framed.predict(X_frame), expected, rtol=1e-9)
+    assert_allclose(framed.score(X_frame, y), plain.score(X, y), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        elm(),
+        elm(alpha=[0.1, 1.0], input_scaling=np.array(BOUNDS), device=torch.device("cpu")),
+        elm_cv(alphas=np.array([0.1, 1.0]), cv=KFold(3)),
+    ],
+    ids=["elm", "arrays", "cv"],
+)
+def test_html_repr(estimator):
+    X, y = data()
+    name = type(estimator).__name__
+    fresh = sklearn.clone(estimator)
+    fitted = sklearn.clone(estimator).fit(X, y)
+    for model, state in ((fresh, "Not fitted"), (fitted, "Fitted")):
+        html = estimator_html_repr(model)
+        assert f"<span>{state}</span>" in html
+        assert name in html
+        assert name in model._repr_html_()
+        assert "text/html" in model._repr_mimebundle_()
+        assert name in estimator_html_repr(make_pipeline(MinMaxScaler(), model))
+    assert name in estimator_html_repr(GridSearchCV(fresh, {"random_state": [0, 1]}).fit(X, y))
+
+
+@pytest.mark.parametrize("weighted", [(True, True), (True, False), (False, True)], ids=str)
+def test_weights_reach_the_folds(weighted):
+    X, y = data()
+    w = np.random.default_rng(3).uniform(0.1, 5.0, 200)
+    folds, expected, plain = KFold(3), [], []
+    for train, test in folds.split(X):
+        w_fit, w_score = (
+            w[rows] if on else None for rows, on in zip((train, test), weighted, strict=True)
+        )
+        expected.append(elm().fit(X[train], y[train], w_fit).score(X[test], y[test], w_score))
+        plain.append(elm().fit(X[train], y[train]).score(X[test], y[test]))
+    assert np.abs(np.subtract(expected, plain)).min() > 1e-5
+    with sklearn.config_context(enable_metadata_routing=True):
+        model = elm().set_fit_request(sample_weight=weighted[0])
+        model.set_score_request(sample_weight=weighted[1])
+        found = cross_validate(model, X, y, cv=folds, params={"sample_weight": w})
+        assert_allclose(found["test_score"], expected, rtol=1e-12)
+        with pytest.raises(sklearn.exceptions.UnsetMetadataPassedError):
+            cross_validate(elm(), X, y, cv=folds, params={"sample_weight": w})

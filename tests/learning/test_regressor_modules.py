@@ -1,0 +1,133 @@
+"""Regressors as torch modules: the same values, and Jacobians that are their derivatives."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from sklearn.ensemble import RandomForestRegressor
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import ElasticNet, Lasso, LinearRegression, Ridge, RidgeCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
+from sklearn.svm import LinearSVR
+from torch.autograd import gradcheck
+from torch.testing import assert_close
+
+from hybridkin import ELMRegressor
+from hybridkin.learning.regressor_modules import (
+    AffineModule,
+    KernelModule,
+    PolynomialModule,
+    RegressorModule,
+    error_module,
+)
+
+GP = GaussianProcessRegressor
+CLOSED = [
+    (AffineModule, LinearRegression()),
+    (AffineModule, make_pipeline(StandardScaler(), MinMaxScaler((-1, 1)), Ridge())),
+    (AffineModule, make_pipeline(StandardScaler(with_mean=False), RidgeCV())),
+    (AffineModule, ElasticNet(1e-4)),
+    (AffineModule, Lasso(1e-4)),
+    (PolynomialModule, make_pipeline(PolynomialFeatures(2), LinearRegression())),
+    (PolynomialModule, make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(3), Ridge(1e-3))),
+    (
+        PolynomialModule,
+        make_pipeline(
+            StandardScaler(with_std=False),
+            PolynomialFeatures(3, include_bias=False, interaction_only=True),
+            Ridge(1e-3, fit_intercept=False),
+        ),
+    ),
+    (KernelModule, KernelRidge(kernel="rbf", alpha=1e-3)),
+    (KernelModule, make_pipeline(StandardScaler(), KernelRidge(kernel="rbf", gamma=0.2))),
+    (
+        KernelModule,
+        GP(ConstantKernel(2.0) * RBF(0.5) + WhiteKernel(0.01), normalize_y=True, optimizer=None),
+    ),
+    (
+        KernelModule,
+        make_pipeline(MinMaxScaler(), GP(WhiteKernel(0.1) + RBF([0.5, 1.0, 2.0]), optimizer=None)),
+    ),
+]
+names = [f"{i}-{kind.__name__}" for i, (kind, _) in enumerate(CLOSED)]
+
+
+def data(m, n=80):
+    rng = np.random.default_rng(0)
+    X = rng.uniform(0.1, 0.4, (n, 3))
+    y = np.sin(8 * X @ rng.standard_normal((3, m))) + 0.2
+    return X, y[:, 0] if m == 1 else y
+
+
+def differences(predict, X, step=1e-6):
+    columns = []
+    for j in range(X.shape[1]):
+        move = np.zeros(X.shape[1])
+        move[j] = step
+        columns.append((predict(X + move) - predict(X - move)) / (2 * step))
+    return np.stack([column.reshape(len(X), -1) for column in columns], axis=-1)
+
+
+@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize(("kind", "regressor"), CLOSED, ids=names)
+def test_closed_form(kind, regressor, m):
+    X, y = data(m)
+    regressor.fit(X, y)
+    q = torch.from_numpy(X)
+    module = error_module(regressor, q)
+    assert type(module) is kind
+    assert_allclose(module(q).numpy(), regressor.predict(X).reshape(len(X), m), atol=1e-11)
+    J = module.jacobian(q).numpy()
+    assert J.shape == (len(X), m, 3)
+    assert_allclose(J, differences(regressor.predict, X), rtol=0, atol=1e-6 * np.abs(J).max())
+    assert gradcheck(module, q[:3].clone().requires_grad_())
+    lead = q[:12].reshape(2, 6, 3)
+    assert_close(module.jacobian(lead), module.jacobian(q[:12]).reshape(2, 6, m, 3))
+    assert_close(module(q.float()), module(q).float(), rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "regressor",
+    [
+        KernelRidge(kernel="laplacian", alpha=0.1),
+        KernelRidge(kernel="poly", alpha=1e-3),
+        GP(Matern(0.5, nu=2.5) + WhiteKernel(0.01), optimizer=None),
+        make_pipeline(MinMaxScaler(clip=True), Ridge()),
+        make_pipeline(PolynomialFeatures(2), LinearSVR()),
+        RandomForestRegressor(5, random_state=0),
+    ],
+    ids=lambda r: type(r).__name__,
+)
+def test_others_are_differenced(regressor):
+    X, y = data(1)
+    regressor.fit(X, y)
+    q = torch.from_numpy(X)
+    module = error_module(regressor, q)
+    assert type(module) is RegressorModule
+    assert_allclose(module(q)[:, 0].numpy(), regressor.predict(X))
+    if not isinstance(regressor, RandomForestRegressor):
+        inside = X[np.all((X > X.min(0) + 0.01) & (X < X.max(0) - 0.01), axis=1)]
+        J = module.jacobian(torch.from_numpy(inside)).numpy()
+        expected = differences(regressor.predict, inside)
+        kinks = np.abs(J - expected) > 1e-4 * np.abs(J).max()
+        assert kinks.mean() < 0.02
+
+
+def test_a_module_of_its_own_is_taken():
+    X, y = data(2)
+    elm = ELMRegressor(random_state=0).fit(X, y)
+    assert error_module(elm, torch.from_numpy(X)) is elm.module_
+
+
+def test_nan_rows_stay_alone():
+    X, y = data(2)
+    for _, regressor in CLOSED:
+        module = error_module(regressor.fit(X, y), torch.from_numpy(X))
+        q = torch.from_numpy(X[:4]).clone()
+        q[1] = torch.nan
+        clean = [0, 2, 3]
+        assert_close(module(q)[clean], module(q[clean]))
+        assert_close(module.jacobian(q)[clean], module.jacobian(q[clean]))

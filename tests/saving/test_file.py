@@ -1,0 +1,284 @@
+import copy
+import json
+import shutil
+import struct
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from safetensors.numpy import load_file, save_file
+from saved_models import FOLDER, models, predictions, trunk_log, write_models
+
+from hybridkin import ELMRegressor, HybridForwardModel, load_model
+from hybridkin.saving._file import VERSION, write
+from hybridkin.saving.saved_model import model_header
+
+STORED = sorted(FOLDER.glob("v*/*.safetensors"))
+NAMES = [f"{path.parent.name}-{path.stem}" for path in STORED]
+NEWEST = FOLDER / f"v{VERSION}"
+ONE_OF_EACH = ("chain", "elastic_chain", "rigid", "elm", "drift_and_radius", "parallel_kernel")
+ONE_OF_EACH += ("parallel_regression", "serial_pose", "serial_elm", "pose_output")
+
+
+def said_of(path):
+    """Return the inputs and the predictions that were stored beside a model."""
+    with np.load(path.parent / "predictions.npz") as stored:
+        said = {
+            name.split(".")[1]: stored[name]
+            for name in stored.files
+            if name.split(".")[0] == path.stem
+        }
+    return said.pop("q"), said
+
+
+def refused_or_the_same(path, q, said):
+    """Return whether a file is refused; else it must predict what it always did."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = load_model(path)
+            found = predictions(model, q)
+    except ValueError:
+        return True
+    for name in said:
+        assert_allclose(found[name], said[name], rtol=0, atol=1e-12)
+    return False
+
+
+@pytest.mark.parametrize("path", STORED, ids=NAMES)
+def test_files_of_every_version_predict_what_they_did(path):
+    q, said = said_of(path)
+    model = load_model(path)
+    found = predictions(model, q)
+    assert {*found} == {*said}
+    # One chain keeps its geometry in single precision, and every machine rounds that its own way.
+    tol = 1e-6 if path.stem == "chain_of_all_parts" else 1e-12
+    for name in said:
+        assert_allclose(found[name], said[name], rtol=tol, atol=tol)
+
+
+@pytest.mark.parametrize("path", STORED, ids=NAMES)
+def test_hybrids_of_every_version_learn_on(path):
+    q, said = said_of(path)
+    model = load_model(path)
+    if not isinstance(model, HybridForwardModel) or model.output == "pose":
+        return
+    wanted = said["x"] + 0.02
+    before = np.abs(model.predict(q[:1]) - wanted[:1]).max()
+    model.partial_fit(np.repeat(q[:1], 30, 0), np.repeat(wanted[:1], 30, 0))
+    assert np.abs(model.predict(q[:1]) - wanted[:1]).max() < 0.3 * before
+
+
+def test_a_serial_network_of_version_1_is_fitted_again_as_one():
+    q, x, _ = trunk_log()
+    model = load_model(FOLDER / "v1" / "serial_elm.safetensors")
+    assert isinstance(model.error_model, ELMRegressor)
+    assert (model.error_model.n_hidden, model.error_model.alpha) == (4, 0.1)
+    model.fit(q, x)
+    assert len(model.module_.error.features.input_bias) == 4
+
+
+def test_there_is_a_file_of_every_kind_and_released_ones_stay(tmp_path):
+    names = {path.stem for path in NEWEST.glob("*.safetensors")}
+    assert names == {*models()}
+    assert sum(path.stat().st_size for path in FOLDER.rglob("*.*")) < 400_000
+    shutil.copytree(NEWEST, tmp_path / "models")
+    (tmp_path / "models" / "elm.safetensors").unlink()
+    write_models(tmp_path / "models")
+    for path in NEWEST.glob("*.safetensors"):
+        if path.stem != "elm":
+            assert (tmp_path / "models" / path.name).read_bytes() == path.read_bytes()
+    q, said = said_of(NEWEST / "elm.safetensors")
+    assert not refused_or_the_same(tmp_path / "models" / "elm.safetensors", q, said)
+    assert_array_equal(said_of(tmp_path / "models" / "rigid.safetensors")[0][0], [-1, -0.75, -0.5])
+
+
+@pytest.mark.parametrize("kind", ["chain", "drift_and_radius"])
+def test_flipped_bits_are_noticed(tmp_path, kind):
+    source = NEWEST / f"{kind}.safetensors"
+    q, said = said_of(source)
+    whole, path = source.read_bytes(), tmp_path / "model"
+    rng = np.random.default_rng(0)
+    places = [*range(64), *rng.integers(64, len(whole), 400)]
+    passed = 0
+    for place in places:
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        passed += not refused_or_the_same(path, q, said)
+    assert passed <= 2  # a letter of an escape sequence may say the same in capitals
+
+
+def test_every_byte_of_the_arrays_counts(tmp_path):
+    whole, path = bytearray((NEWEST / "chain.safetensors").read_bytes()), tmp_path / "model"
+    begin = 8 + struct.unpack("<Q", whole[:8])[0]
+    for place in range(begin, len(whole)):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1
+        path.write_bytes(flipped)
+        with pytest.raises(ValueError, match="checksum"):
+            load_model(path)
+
+
+def test_cut_and_stretched_files(tmp_path):
+    whole, path = (NEWEST / "drift_and_radius.safetensors").read_bytes(), tmp_path / "model"
+    for end in [*range(0, 40, 3), *range(40, len(whole), 97), len(whole) - 1]:
+        path.write_bytes(whole[:end])
+        with pytest.raises(ValueError, match="is not a model"):
+            load_model(path)
+    path.write_bytes(whole + b"more")
+    with pytest.raises(ValueError, match="is not a model"):
+        load_model(path)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"\xff" * 8,
+        struct.pack("<Q", 2**62) + b"{}",
+        struct.pack("<Q", 99_000_000) + b"{}",
+        b'{"a":{"dtype":"F64","shape":[1000000000000],"data_offsets":[0,8000000000000]}}',
+        b'{"a":{"dtype":"F64","shape":[4611686018427387904,4],"data_offsets":[0,0]}}',
+        b'{"a":{"dtype":"F64","shape":[1],"data_offsets":[8,0]}}',
+        b'{"../../a":{"dtype":"F64","shape":[1],"data_offsets":[-8,0]}}',
+        b'{"a":{"dtype":"OBJ","shape":[1],"data_offsets":[0,8]}}',
+    ],
+)
+def test_sizes_that_are_not_there(tmp_path, head):
+    path = tmp_path / "model"
+    long = head if head[:1] != b"{" else struct.pack("<Q", len(head)) + head
+    path.write_bytes(long + bytes(8))
+    with pytest.raises(ValueError, match="is not a model"):
+        load_model(path)
+
+
+def _damages(array):
+    """Return by name what an array may have become."""
+    damages = {
+        "missing": None,
+        "axis": np.stack([array, array]),
+        "integers": np.zeros(array.shape, dtype=np.int64),
+        "halves": array.astype(np.float16),
+        "not a number": np.full(array.shape, np.nan),
+    }
+    if array.ndim:
+        damages["short"] = array[:-1]
+        damages["empty"] = array[:0]
+    return damages
+
+
+@pytest.mark.parametrize("kind", ONE_OF_EACH)
+def test_arrays_that_do_not_fit_are_refused_with_a_right_checksum_too(tmp_path, kind):
+    source, path = NEWEST / f"{kind}.safetensors", tmp_path / "model"
+    header, arrays = model_header(source), load_file(source)
+    q, said = said_of(source)
+    unknown = {"noise_variance", "error.noise_variance_", "error.noise_variance", "error.residual"}
+    unknown |= {"noise_variance_"}
+    optional = {"lengths", "rest_bends", "actuator_zeros", "largest"}
+    for name, array in arrays.items():
+        for damage, changed in _damages(array).items():
+            last = name.split(".")[-1]
+            if damage == "missing" and (last in optional or name.startswith("drift.")):
+                continue
+            if name == "error.residual" and damage in ("short", "empty"):
+                continue  # it has a row for every row of the training
+            if not array.size or (damage == "not a number" and name in unknown):
+                continue
+            others = {key: value for key, value in arrays.items() if key != name}
+            write(path, header, others if changed is None else {**others, name: changed})
+            with pytest.raises(ValueError, match=r"is damaged: .*\.$"):
+                load_model(path)
+    write(path, header, {**arrays, "../../a": np.zeros(3), "new": np.zeros(2)})
+    assert not refused_or_the_same(path, q, said)
+
+
+def _entries(header: Any, at: tuple[Any, ...] = ()) -> list[Any]:
+    """Return the ways to all entries of a header."""
+    ways = [at] if at else []
+    for key in header if isinstance(header, dict) else range(len(header)):
+        if isinstance(header[key], (dict, list)):
+            ways += _entries(header[key], (*at, key))
+        else:
+            ways.append((*at, key))
+    return ways
+
+
+def _may_be(entry, value):
+    """Return whether a hostile value is of the type that an entry has, and not empty."""
+    number = type(entry) in (int, float) and type(value) in (int, float)
+    return number or (type(value) is type(entry) and bool(value))
+
+
+@pytest.mark.parametrize(
+    "kind", ["chain", "elm", "drift_and_radius", "parallel_kernel", "serial_elm"]
+)
+def test_headers_that_say_something_else_are_refused_or_do_no_harm(tmp_path, kind):
+    source, path = NEWEST / f"{kind}.safetensors", tmp_path / "model"
+    header, arrays = model_header(source), load_file(source)
+    q, said = said_of(source)
+    hostile: list[Any] = [None, True, -1, 1e300, "../../x", [], {}, [[[]]]]
+    nullable = ("error", "fitted_guard", "gamma", "mechanical", "radius")
+    refused = set()
+    for way in _entries(header):
+        if way[0] in ("format", "version"):
+            continue
+        for value in hostile:
+            changed: Any = copy.deepcopy(header)
+            entry = changed
+            for key in way[:-1]:
+                entry = entry[key]
+            if _may_be(entry[way[-1]], value) or (value is None and way[-1] in nullable):
+                continue  # that is another model, and a sound one
+            entry[way[-1]] = value
+            write(path, changed, arrays)
+            if refused_or_the_same(path, q, said):
+                refused.add(way[0])
+    assert "kind" in refused
+    assert refused.isdisjoint({"created", "domain", "units", "versions"})
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_rule_for_later_files(tmp_path):
+    source, path = NEWEST / "serial_elm.safetensors", tmp_path / "model"
+    header, arrays = model_header(source), load_file(source)
+    q, said = said_of(source)
+    later = {"versions": {"hybridkin": "7.1.0"}}
+    write(
+        path,
+        {**header, **later, "colour": "red", "mechanical": {**header["mechanical"], "a": 1}},
+        arrays,
+    )
+    assert not refused_or_the_same(path, q, said)
+    message = (
+        r"requires what this hybridkin does not know, wings; install a newer one, 7\.1\.0 wrote"
+    )
+    write(path, {**header, **later, "requires": ["wings"]}, arrays)
+    with pytest.raises(ValueError, match=message):
+        load_model(path)
+    message = (
+        rf"has format version {VERSION + 1}, .* reads up to version {VERSION}; .* 7\.1\.0 wrote"
+    )
+    write(path, {**header, **later, "version": VERSION + 1}, arrays)
+    with pytest.raises(ValueError, match=message):
+        load_model(path)
+    with pytest.raises(ValueError, match=message):
+        model_header(path)
+    for wrong in (3, [3], None, {"wings": 1}):
+        write(path, {**header, "requires": wrong}, arrays)
+        with pytest.raises(ValueError, match="`requires` must be a list of names"):
+            load_model(path)
+    for version in (True, 2.0, "2", 0, -1, None):
+        write(path, {**header, "version": version}, arrays)
+        with pytest.raises(ValueError, match="its header is another one"):
+            load_model(path)
+
+
+def test_a_file_without_its_checksum_is_refused(tmp_path):
+    source, path = NEWEST / "chain.safetensors", tmp_path / "model"
+    header = {"hybridkin": json.dumps(model_header(source))}
+    for metadata in (header, {**header, "sha256": "0" * 64}, {**header, "sha256": ""}):
+        save_file(load_file(source), path, metadata=metadata)
+        with pytest.raises(ValueError, match="checksum"):
+            load_model(path)

@@ -1,0 +1,333 @@
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    HybridForwardModel,
+    PlayOperator,
+    calibrate,
+    datasets,
+    load_model,
+    paper,
+    robots,
+    workflow,
+)
+from hybridkin.cli.main import main
+from hybridkin.paper.identifiability import ASKED, TELLABLE, identifiability
+from hybridkin.paper.paper import summary
+from hybridkin.saving.saved_model import model_header
+from hybridkin.workflow._domain import known_commands
+from hybridkin.workflow.report import geometry_entries
+
+ROBOT = """
+calibrate = ["radii", "base"]
+[[segment]]
+radius = 0.11
+repeat = 2
+[log]
+q = ["l1", "l2", "l3", "l4", "l5", "l6"]
+x = ["x", "y", "z"]
+q_unit = "mm"
+x_unit = "mm"
+"""
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A simulated log of 6 motions in millimetres, and its robot description."""
+    rng = np.random.default_rng(0)
+    q = 0.25 + 0.05 * rng.uniform(-1, 1, (180, 6))
+    robot = tmp_path / "robot.toml"
+    robot.write_text(ROBOT)
+    with torch.no_grad():
+        x = robots.from_toml(robot)(torch.from_numpy(q)).numpy()
+    x += 0.02 * np.sin(30 * q[:, :3]) + 0.001 * rng.standard_normal(x.shape)
+    rows = np.column_stack([1000 * q, 1000 * x, np.repeat(np.arange(6), 30)])
+    path = tmp_path / "log.csv"
+    header = "l1,l2,l3,l4,l5,l6,x,y,z,motion"
+    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
+    return path, robot
+
+
+def test_the_kinds_of_spread_are_told_apart():
+    wide = [
+        [np.array([0.0, 2.0]), np.array([1.0, 3.0])],
+        [np.array([4.0, 6.0]), np.array([5.0, 7.0])],
+    ]
+    expected = {"mean": 3.5, "std": 1.0, "max": 7.0, "mean_max": 4.5}
+    expected |= {"std_splits": 2.0, "std_seeds": 0.5}
+    assert summary(wide) == pytest.approx(expected)
+
+
+def test_table1_orders_the_models_as_the_paper_does():
+    table = paper.table1(datasets.load_trunk(), n_splits=3, n_seeds=2, n_jobs=1)
+    test = {(e["model"], e["learner"]): e["test"]["mean"] for e in table}
+    train = {(e["model"], e["learner"]): e["train"]["mean"] for e in table}
+    mechanical = test["mechanical, nominal", "-"]
+    assert test["hybrid on nominal", "ELM"] < test["hybrid on nominal", "linear"] < mechanical
+    assert test["hybrid on nominal", "ELM"] < test["data-driven", "ELM"]
+    assert test["data-driven", "ELM"] < test["data-driven", "linear"]
+    assert mechanical > 1.8 * test["hybrid on nominal", "ELM"]
+    assert train["data-driven", "ELM"] < test["data-driven", "ELM"]
+    assert test["hybrid on calibrated", "ELM"] < test["mechanical, calibrated", "-"]
+
+
+def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
+    pytest.importorskip("mujoco")
+    out = tmp_path / "results"
+    options = ["--splits", "2", "--seeds", "2", "--points", "25", "--jobs", "1"]
+    assert main(["paper", "--out", str(out), *options]) == 0
+    printed, errors = capsys.readouterr()
+    assert "warning" not in errors
+    record = json.loads((out / "report.json").read_text())
+    report = (out / "report.md").read_text()
+    assert record["tracking_mechanical_over_hybrid"]["nominal"] > 2.0
+    assert len(record["table1"]) == 11
+    closed = record["closed_loop"]
+    assert len(closed) == 5
+    for runs in closed.values():
+        assert runs["closed loop"]["mean"] < 1.1 * runs["feed-forward"]["mean"]
+        assert max(run["largest_step"] for run in runs.values()) < 0.06  # at 25 points
+    serial, nominal = closed["serial on calibrated"], closed["mechanical, nominal"]
+    assert serial["feed-forward"]["mean"] < 0.5 * nominal["feed-forward"]["mean"]
+    told = record["identifiability"]
+    assert (
+        "What 1500 rows of one segment and 400 random rows of the simulated trunk tell" in printed
+    )
+    assert len(told["asked"]["entries"]) == 28
+    for entry in told["asked"]["entries"]:
+        assert re.search(
+            rf"{re.escape(entry['name'])} .* {'' if entry['told'] else 'not '}told\n", printed
+        )
+        assert f"| {entry['name']} [{entry['unit']}] | " in report
+    for sentence in told["asked"]["unidentified"]:
+        assert f"- {sentence}" in report
+        assert sentence in re.sub(r"\s+", " ", printed)
+    pictures = set(re.findall(r"\((\w+\.png)\)", report))
+    assert len(pictures) == 6
+    for name in pictures | {"report.json", "report.md"}:
+        assert (out / name).stat().st_size > 500
+        assert str(out / name) in printed
+    assert [p.name for p in tmp_path.iterdir()] == ["results"]
+
+
+def test_what_the_protocol_tells_about_the_geometry():
+    found = identifiability(datasets.load_trunk())
+    assert (found["n_train"], found["n_single"], found["n_random"]) == (1900, 1500, 400)
+    told = {entry["name"]: entry["told"] for entry in found["asked"]["entries"]}
+    assert all(told[f"radii[{k}]"] for k in range(3))
+    # A turn of all rings is one of the base, a rest bend is what the zeros of its sensors say.
+    assert not told["base[rot z]"]
+    assert not any(told[f"turns[{k}]"] for k in range(3))
+    assert not any(told[f"actuator_zeros[{k}]"] for k in range(9))
+    sentences = found["asked"]["unidentified"]
+    assert sum("turns" in line and "base[rot z]" in line for line in sentences) == 1
+    assert sum("rest_bends" in line and "actuator_zeros" in line for line in sentences) == 9
+    assert len(sentences) == 10
+    # Asked for once each, all is told, and the tip errs no more.
+    assert set(TELLABLE) < set(ASKED)
+    assert all(entry["told"] for entry in found["tellable"]["entries"])
+    assert found["tellable"]["unidentified"] == ()
+    assert found["tellable"]["test"] == pytest.approx(found["asked"]["test"], rel=0.01)
+    assert found["tellable"]["test"] < found["default"]["test"]
+
+
+def test_entries_of_a_calibration_have_units_a_user_reads(rng):
+    q = 0.25 + 0.05 * (2 * torch.rand(100, 6, generator=rng, dtype=torch.float64) - 1)
+    base = np.eye(4)
+    base[:3] = [[0, -1, 0, 0.01], [1, 0, 0, 0.02], [0, 0, 1, 0.03]]
+    truth = ConstantCurvatureChain([0.1, 0.08], base=base, rest_bends=[[0.1, 0], [0, 0.2]])
+    start = ConstantCurvatureChain([0.09, 0.09])
+    result = calibrate(start, q, truth(q), ("radii", "rest_bends", "base"))
+    entries = {entry["name"]: entry for entry in geometry_entries(start, result)}
+    assert tuple(entries) == result.names
+    expected = {"radii[0]": (90, 100, "mm"), "rest_bends[1, y]": (0, np.degrees(0.2), "deg")}
+    expected |= {"base[rot z]": (0, 90, "deg"), "base[y]": (0, 20, "mm")}
+    for name, (before, value, unit) in expected.items():
+        entry = entries[name]
+        assert entry["unit"] == unit
+        assert [entry["start"], entry["value"]] == pytest.approx([before, value], abs=1e-6)
+        assert entry["told"]
+        assert entry["narrowing"] > 10
+
+
+def test_fit_of_ring_turns_tells_that_they_are_turns_of_the_base(log, tmp_path):
+    path, robot = log
+    robot.write_text(ROBOT.replace('"base"]', '"turns", "base"]'))
+    report, _ = workflow.fit_log(
+        path, robot, tmp_path / "m", n_folds=2, n_seeds=1, auto=False, n_jobs=1
+    )
+    text = (tmp_path / "m" / "report.md").read_text()
+    assert re.search(r"\| turns\[1\] \[deg\] \|.*\| no \|", text)
+    (sentence,) = report.record["calibration"]["unidentified"]
+    assert sentence.startswith("all turns +1 deg with base[rot z] -1 deg")
+    assert f"- {sentence}" in text
+
+
+def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
+    path, robot = log
+    robot.write_text(ROBOT.replace("0.11", "0.05"))
+    with pytest.warns(UserWarning, match="left what is physical") as caught:
+        workflow.fit_log(path, robot, tmp_path / "m", n_folds=2, n_seeds=1, auto=False, n_jobs=1)
+    assert len(caught) == 1
+
+
+@pytest.fixture
+def slack_log(tmp_path):
+    """A log of an elastic robot of one segment, its tendons pulled at random, in 6 motions."""
+    rng = np.random.default_rng(0)
+    q = 0.004 * rng.uniform(-1, 1, (120, 3))
+    truth = ElasticTendonChain(
+        [0.005], [0.1], bending_stiffness=1e-6, axial_stiffness=2.0, tendon_zeros=-2e-4
+    )
+    x = truth(torch.from_numpy(q)).numpy() + 1e-4 * rng.standard_normal((120, 3))
+    rows = np.column_stack([-1000 * q, 1000 * x, np.repeat(np.arange(6), 20)])
+    path = tmp_path / "slack.csv"
+    header = "a,b,c,x,y,z,motion"
+    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
+    return path, {"q": q, "x": x}
+
+
+SLACK_ROBOT = """
+[[segment]]
+radius = 0.005
+length = 0.1
+[log]
+q = ["a", "b", "c"]
+x = ["x", "y", "z"]
+q_unit = "mm"
+x_unit = "mm"
+q_sign = -1
+"""
+
+
+def test_fit_of_elastic_tendons(slack_log, tmp_path):
+    path, data = slack_log
+    robot = tmp_path / "elastic.toml"
+    robot.write_text('model = "elastic-tendon"\n' + SLACK_ROBOT)
+    report, paths = workflow.fit_log(
+        path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, auto=False, n_jobs=1
+    )
+    held_out = report.record["held_out"]
+    assert held_out["mechanical, calibrated"]["mean"] < 0.0005
+    assert (
+        held_out["mechanical, calibrated"]["mean"] < 0.3 * held_out["data-driven, linear"]["mean"]
+    )
+    entries = {entry["name"]: entry for entry in report.record["calibration"]["entries"]}
+    stiffness = entries["bending_stiffness[0]"], entries["axial_stiffness[0]"]
+    assert [entry["unit"] for entry in stiffness] == ["mm²/rad²", "-"]
+    assert [entry["start"] for entry in stiffness] == pytest.approx([0.25, 10.0])
+    for entry, true in zip(stiffness, (1.0, 2.0), strict=True):
+        assert entry["value"] == pytest.approx(true, rel=0.2)
+        assert 0 < entry["std_error"] < 0.2 * true
+    assert entries["tendon_zeros[0]"]["unit"] == "mm"
+    assert report.record["calibration"]["warnings"] == []
+    assert {"held_out.png", "error_histogram.png"} <= {path.name for path in paths}
+    model = load_model(tmp_path / "m" / "model.safetensors")
+    assert isinstance(model.mechanical_model_, ElasticTendonChain)
+    errors = np.linalg.norm(model.predict(data["q"]) - data["x"], axis=1)
+    assert errors.mean() < 0.0005
+
+
+def test_fit_of_the_plain_chain_tells_of_slack_once(slack_log, tmp_path):
+    path, _ = slack_log
+    robot = tmp_path / "plain.toml"
+    robot.write_text('calibrate = ["base"]\n' + SLACK_ROBOT)
+    with pytest.warns(UserWarning, match="of 120 rows of `q` pull the tendons") as caught:
+        workflow.fit_log(
+            path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, auto=False, n_jobs=1
+        )
+    assert len(caught) == 1
+    text = (tmp_path / "m" / "report.md").read_text()
+    assert text.count("pull the tendons") == 1
+    assert f"Warning: {caught[0].message}" in text
+
+
+def test_without_a_column_of_motions_the_log_is_cut_into_stretches(log, tmp_path):
+    path, robot = log
+    report, _ = workflow.fit_log(
+        path, robot, tmp_path / "m", n_folds=2, n_seeds=1, auto=False, n_jobs=1
+    )
+    assert report.record["n_motions"] == 10
+
+
+def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home, tmp_path):
+    robot = robots.read_description("examples/robots/ftdcr_v4.toml")
+    data = datasets.load_ftdcr(data_home)
+    errors, _, _ = workflow.compare_by_group(
+        robot.chain,
+        data.q,
+        data.x,
+        data.groups,
+        parameters=robot.calibrate,
+        n_folds=3,
+        n_seeds=1,
+        auto=False,
+        n_jobs=-1,
+    )
+    mean = {name: values.mean() for name, values in errors.items()}
+    assert mean["hybrid, ELM"] <= mean["mechanical, calibrated"] < mean["mechanical, nominal"]
+    assert mean["hybrid, ELM"] < mean["data-driven, ELM"]
+
+
+def test_auto_on_slack_tendons_tells_that_it_took_elastic_ones(slack_log, tmp_path):
+    path, data = slack_log
+    robot = tmp_path / "plain.toml"
+    robot.write_text('calibrate = ["radii"]\n' + SLACK_ROBOT)
+    with pytest.warns(UserWarning, match="pull the tendons"):
+        report, _ = workflow.fit_log(
+            path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, n_jobs=1
+        )
+    assert report.record["saved"] == "hybrid, auto"
+    chosen = report.record["auto"]
+    assert chosen["taken"] == "ElasticTendonChain"
+    errors = chosen["mechanical_models"]
+    assert errors["ElasticTendonChain"] < 0.5 * errors["ConstantCurvatureChain"]
+    assert "on ElasticTendonChain" in report.record["chosen"]
+    assert any(
+        sentence.startswith("Auto compared two mechanical models") for sentence in chosen["words"]
+    )
+    text = (tmp_path / "m" / "report.md").read_text()
+    assert "## Calibration of the elastic tendons that auto took" in text
+    names = [entry["name"] for entry in report.record["calibration_of_saved"]["entries"]]
+    assert "bending_stiffness[0]" in names
+    header = model_header(tmp_path / "m" / "model.safetensors")
+    assert header["training"]["rows"] == 120
+    assert header["training"]["held_out"].keys() == report.record["held_out"].keys()
+    assert workflow.open_model(tmp_path / "m").header == header
+    predicted = workflow.open_model(tmp_path / "m").predict(data["q"])
+    assert np.linalg.norm(predicted - data["x"], axis=1).mean() < 0.0005
+
+
+def test_play_lowers_the_errors_of_auto_on_motions_held_out():
+    rng = np.random.default_rng(0)
+    chain = ConstantCurvatureChain([0.005], lengths=[0.1])
+    groups = np.repeat(np.arange(8), 20)
+    swing = np.sin(np.linspace(0, 6, 20)) * rng.uniform(1, 8, 8)[:, None]
+    q = 0.0005 * np.stack([np.cos(groups - a) * swing.ravel() for a in (0, 2.0944, 4.1888)], axis=1)
+    with torch.no_grad():
+        x = chain(torch.from_numpy(PlayOperator(4e-4).apply_by_group(q, groups))).numpy()
+    options = {"parameters": ("radii",), "n_folds": 2, "n_seeds": 1, "n_jobs": 1}
+    errors, _, choices = workflow.compare_by_group(chain, q, x, groups, play=4e-4, **options)
+    assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
+    assert all(choice["hybrid, auto"].endswith("play 0.4 mm") for choice in choices)
+
+
+def test_an_actuator_that_never_moved_is_held_where_it_was():
+    data = datasets.load_trunk()
+    q = data.q[:200].copy()
+    q[:, 4] = 0.25
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, "linear").fit(q, data.x[:200])
+    opened = workflow.OpenedModel("trunk", Path("trunk"), model, None, None)
+    limits = workflow.path_limits(opened)
+    assert limits["q_min"] == pytest.approx(q.min(axis=0))
+    assert limits["q_max"] == pytest.approx(q.max(axis=0))
+    assert limits["source"] == "range of the fit"
+    assert model.module_.in_domain(torch.from_numpy(known_commands(opened, limits)[0])).all()
