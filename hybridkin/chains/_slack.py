@@ -14,8 +14,6 @@ _MANY = 2000  # rows from which on steps in single precision save more than they
 _ROUGH_STEPS = 5
 _WHOLE_STEPS = 8  # then one tendon at a time, which ends for certain
 _MOST_TURNS = 12  # two to this power, should rounding keep it from an end
-_NEWTON_STEPS = 20
-_SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.0)  # of a Newton step, the last for rows at their end
 
 
 class Elasticity(NamedTuple):
@@ -41,7 +39,7 @@ class Balance(NamedTuple):
 
     shape: Tensor  # (N, 3 S)
     pull: Tensor  # (N, n), tensions
-    share: Tensor  # (N, n), derivative of the tension by the stretch: one where taut
+    taut: Tensor  # (N, n), bool
     compliance: Tensor  # (N, 3 S, 3 S), shape by a generalised force
 
 
@@ -185,49 +183,3 @@ class FindTaut(torch.autograd.Function):
             for k in range(info.batch_size)
         ]
         return torch.stack([FindTaut.apply(find, *parts) for parts in each]), 0
-
-
-def tension(stretch: Tensor, width: float) -> tuple[Tensor, Tensor]:
-    """Return tensions that set in over a width, and their derivatives by the stretch."""
-    root = (stretch * stretch + width * width).sqrt()
-    return 0.5 * (stretch + root), 0.5 * (1.0 + stretch / root)
-
-
-def relaxed(rows: Tensor, shape: Tensor, width: float, elasticity: Elasticity) -> Balance:
-    """Return the balance where tensions set in over a width, from a shape (N, 3 S) nearby.
-
-    Newton's method on the strictly convex energy, every step as long as lowers it most; the last
-    two steps pass on derivatives.
-    """
-    fixed = Elasticity(*(part.detach() for part in elasticity))
-    given, shape = rows.detach(), shape.detach()
-    shares = torch.tensor(_SHARES, dtype=shape.dtype, device=shape.device)[:, None, None]
-    for _ in range(_NEWTON_STEPS):
-        tries = shape - shares * _newton(given, shape, width, fixed)[0]
-        best = _energy(given, tries, width, fixed).argmin(0)
-        shape = tries.gather(0, best[None, :, None].expand(1, *shape.shape))[0]
-    for _ in range(2):
-        shape = shape - _newton(rows, shape, width, elasticity)[0]
-    return _newton(rows, shape, width, elasticity)[1]
-
-
-def _newton(
-    rows: Tensor, shape: Tensor, width: float, elasticity: Elasticity
-) -> tuple[Tensor, Balance]:
-    """Return the Newton step of the energy, to be subtracted, and the balance at its start."""
-    readings, units, stiffness, rest, zeros = elasticity
-    pull, share = tension(shape @ readings.T - rows + zeros, width)
-    hessian = torch.diag(stiffness) + (readings.T * share[:, None]) @ readings
-    inverse = torch.linalg.inv_ex(units[:, None] * hessian * units).inverse
-    compliance = units[:, None] * inverse * units
-    force = stiffness * (shape - rest) + pull @ readings
-    return applied(compliance, force), Balance(shape, pull, share, compliance)
-
-
-def _energy(rows: Tensor, shape: Tensor, width: float, elasticity: Elasticity) -> Tensor:
-    readings, _, stiffness, rest, zeros = elasticity
-    stretch = shape @ readings.T - rows + zeros
-    pull = tension(stretch, width)[0]
-    # The integral of the tension: 1/2 (stretch * pull + width^2 / 2 * asinh(stretch / width)).
-    stored = stretch * pull + 0.5 * width**2 * torch.asinh(stretch / width)
-    return 0.5 * (stiffness * (shape - rest).square()).sum(-1) + 0.5 * stored.sum(-1)

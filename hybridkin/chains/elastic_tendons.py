@@ -31,7 +31,6 @@ from hybridkin.chains._slack import (
     extended,
     find_by_solving,
     find_in_table,
-    relaxed,
     responses_of,
     rough_of,
 )
@@ -86,9 +85,6 @@ class ElasticTendonChain(ArcChain):
         hangs slack. A list of lists, one per segment, will do as well.
     rest_bends : float or array-like of shape (S, 2), default=0.0
         Pre-curvature: bending vector of each segment without tendons [rad].
-    smoothing : float, default=0.0
-        Width over which a tendon's tension sets in [m], for derivatives without kinks:
-        ``(e + sqrt(e^2 + smoothing^2)) / 2`` in place of ``max(0, e)``. Slower, row by row.
     offsets : float or array-like of shape (S,), default=0.0
         Rigid length after each segment along its tangent [m]; the last one is the tool.
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
@@ -126,7 +122,7 @@ class ElasticTendonChain(ArcChain):
     """
 
     _entries = (*_SHAPING, "lengths", "offsets", "base")
-    _structure = (*ArcChain._structure, "smoothing", "_table")  # the table knows its geometry
+    _structure = (*ArcChain._structure, "_table")  # the table knows its geometry
 
     radii: Tensor
     angles: Tensor
@@ -148,7 +144,6 @@ class ElasticTendonChain(ArcChain):
         axial_stiffness: Any = None,
         tendon_zeros: Any = 0.0,
         rest_bends: Any = 0.0,
-        smoothing: float = 0.0,
         offsets: Any = 0.0,
         base: Any = None,
         dtype: torch.dtype = torch.float64,
@@ -166,9 +161,6 @@ class ElasticTendonChain(ArcChain):
         self.n_actuators = sum(counts)
         self.routing = routing
         self.tip_at = float(n_segments)
-        if not (smoothing >= 0.0 and math.isfinite(smoothing)):
-            raise ValueError(f"`smoothing` must be a width >= 0 [m], got {smoothing!r}.")
-        self.smoothing = float(smoothing)
         stiffness = {
             "bending_stiffness": 0.01 * radii**2
             if bending_stiffness is None
@@ -274,7 +266,7 @@ class ElasticTendonChain(ArcChain):
 
     def slack(self, q: Tensor) -> Tensor:
         """Return which tendons hang slack, a bool tensor of the shape of q."""
-        return (self._balance(self._rows(q)).share < 0.5).reshape(q.shape)
+        return ~self._balance(self._rows(q)).taut.reshape(q.shape)
 
     def taut_posture(self, minimum: float = 0.0) -> Callable[[Tensor], Tensor]:
         """Return a posture that keeps tendons taut, for ``InverseKinematics(q_pref=...)``.
@@ -373,19 +365,12 @@ class ElasticTendonChain(ArcChain):
         shape, stretch = (
             applied(maps.index_select(0, at), extended(rows)) for maps in responses[:2]
         )
-        if self.smoothing > 0.0:
-            elasticity = Elasticity(*(part.to(rows) for part in self._elasticity()))
-            return relaxed(rows, shape, self.smoothing, elasticity)
-        taut = as_mask(codes, self.n_actuators).to(rows)
+        taut = as_mask(codes, self.n_actuators)
         compliance = responses.compliance.index_select(0, at)
         return Balance(shape, stretch.relu() * taut, taut, compliance)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         straight = nn.functional.pad(self.lengths.to(rows), (0, 2 * self.n_segments))
-        if self.smoothing > 0.0:
-            shape, _, share, compliance = self._balance(rows)
-            slope = compliance @ (self._elasticity().readings.to(rows).T * share[:, None])
-            return (shape + straight).T.contiguous(), slope.permute(1, 2, 0)
         _, at, responses = self._find(rows)
         maps = responses.shape.index_select(0, at)
         arcs = (applied(maps, extended(rows)) + straight).T.contiguous()
@@ -404,7 +389,7 @@ class ElasticTendonChain(ArcChain):
         moved = turned + levers(change["radii"], self.angles.to(rows), counts)
         by_readings = nn.functional.pad(reading_matrix(moved, counts, self.routing, False), (S, 0))
         readings, _, stiffness, rest, _ = (part.to(rows) for part in self._elasticity())
-        shape, pull, share, compliance = self._balance(rows)
+        shape, pull, taut, compliance = self._balance(rows)
         bending = change["bending_stiffness"]
         by_stiffness = torch.cat([change["axial_stiffness"], bending, bending], dim=-1)
         by_rest = nn.functional.pad(change["rest_bends"].mT.flatten(1), (S, 0))
@@ -412,5 +397,5 @@ class ElasticTendonChain(ArcChain):
         force = stiffness * by_rest + (rest - shape)[:, None] * by_stiffness
         force = force - torch.einsum("ni,pik->npk", pull, by_readings)
         stretch = torch.einsum("nk,pik->npi", shape, by_readings) + change["tendon_zeros"]
-        moves = (force - (stretch * share[:, None]) @ readings) @ compliance
+        moves = (force - (stretch * taut[:, None]) @ readings) @ compliance
         return moves + nn.functional.pad(change["lengths"], (0, 2 * S))

@@ -45,7 +45,7 @@ _CHAINS = {
             *("radii", "angles", "lengths", "bending_stiffness", "axial_stiffness"),
             *("tendon_zeros", "rest_bends", "offsets", "base"),
         ),
-        ("routing", "smoothing"),
+        ("routing",),
         "n_tendons",
     ),
     "rigid": (
@@ -59,7 +59,7 @@ CHAIN_KINDS = tuple(_CHAINS)
 _OF_ARCS = ("actuators_per_segment", "tip_at")
 _OPTIONAL = {"chain": ("lengths", "rest_bends", "actuator_zeros")}
 _UNBOUNDED = ("q_min", "q_max")
-_TYPES: dict[str, Any] = {"routing": str, "smoothing": float}
+_TYPES: dict[str, Any] = {"routing": str}
 _FEATURES = {
     "linear": Features,
     "quadratic": QuadraticFeatures,
@@ -121,6 +121,8 @@ def restored_chain(part: Part) -> Chain:
         raise ValueError(f"`actuators_per_segment` must sum up to the angles, got {counts!r:.60}")
     stored["angles"] = np.split(stored["angles"], np.cumsum(counts)[:-1])
     options = {name: part.value(name, _TYPES[name]) for name in settings}
+    if part.value("smoothing", float, 0.0) != 0.0:
+        raise ValueError("smoothed tendons are no longer supported")
     chain = cls(**stored, **options, **{counts_name: counts}, dtype=dtype)
     return chain.with_tip(part.value("tip_at", float, float(chain.n_segments)))
 

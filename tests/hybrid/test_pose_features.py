@@ -37,7 +37,6 @@ ROBOTS = {
     ),
     "one segment of cables": lambda: (ConstantCurvatureChain([0.01], lengths=[0.1]), 0.0, 0.005),
     "elastic tendons": lambda: (elastic(), 0.0, 0.002),
-    "smoothed tendons": lambda: (elastic(smoothing=1e-4), 0.0, 0.002),
 }
 every_robot = pytest.mark.parametrize("robot", ROBOTS)
 

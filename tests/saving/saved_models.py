@@ -131,7 +131,7 @@ def models() -> dict[str, tuple[Any, Any]]:
     return {
         "chain": (tendon_chain(), tendons),
         "chain_of_all_parts": (bent_chain(dtype=torch.float32).with_tip(1.5), tendons),
-        "elastic_chain": (elastic_chain(smoothing=1e-4), tendons),
+        "elastic_chain": (elastic_chain(), tendons),
         "rigid": (arm(), np.linspace(-1.0, 1.0, 9).reshape(3, 3)),
         "elm": _network(apart),
         "elm_cv": _network(chosen),

@@ -79,7 +79,7 @@ def rewrite(path, arrays, **changes):
         bent_chain().with_tip(1.5),
         bent_chain(dtype=torch.float32).with_tip(0.5),
         elastic_chain(),
-        elastic_chain(dtype=torch.float32, smoothing=1e-4).with_tip(1.5),
+        elastic_chain(dtype=torch.float32).with_tip(1.5),
     ],
 )
 def test_chain_comes_back(tmp_path, chain):
@@ -90,7 +90,6 @@ def test_chain_comes_back(tmp_path, chain):
     for was, came in zip(chain.forward_and_jacobian(q), twin.forward_and_jacobian(q), strict=True):
         assert torch.equal(came, was)
     assert repr(twin) == repr(chain)
-    assert getattr(twin, "smoothing", None) == getattr(chain, "smoothing", None)
     assert {k: v.dtype for k, v in twin.named_buffers()} == {
         k: v.dtype for k, v in chain.named_buffers()
     }
