@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,11 +25,11 @@ class Stumpff(NamedTuple):
     With respect to s: 2 f' = c3 - g, 2 g' = 2 c4 - c3, 2 c' = -f.
     """
 
-    c: Any
-    f: Any
-    g: Any
-    c3: Any
-    c4: Any
+    c: Tensor
+    f: Tensor
+    g: Tensor
+    c3: Tensor
+    c4: Tensor
 
 
 def stumpff(s: Tensor) -> Stumpff:
@@ -59,26 +59,10 @@ def stumpff(s: Tensor) -> Stumpff:
     c3, c4 = both.expand(2, *s.shape).unbind()
     far = s.clamp(min=_SERIES_END)
     theta = far.sqrt()
-    c, far_c3, far_c4 = _by_trigonometry(far, theta, torch.cos(theta), torch.sin(theta))
+    c = torch.cos(theta)
+    far_c3 = (1.0 - torch.sin(theta) / theta) / far
+    far_c4 = (0.5 - (1.0 - c) / far) / far
     bent = s > _SERIES_END
     c3, c4 = torch.where(bent, far_c3, c3), torch.where(bent, far_c4, c4)
     f, g = 1.0 - s * c3, 0.5 - s * c4
     return Stumpff(torch.where(bent, c, 1.0 - s * g), f, g, c3, c4)
-
-
-def stumpff_of_number(s: float) -> Stumpff:
-    """Return the Stumpff functions of one number; see `stumpff`."""
-    if s > _SERIES_END:
-        theta = math.sqrt(s)
-        c, c3, c4 = _by_trigonometry(s, theta, math.cos(theta), math.sin(theta))
-        return Stumpff(c, 1.0 - s * c3, 0.5 - s * c4, c3, c4)
-    c3 = c4 = 0.0
-    for of_c3, of_c4 in _SERIES:
-        c3, c4 = of_c3 + c3 * s, of_c4 + c4 * s
-    g = 0.5 - s * c4
-    return Stumpff(1.0 - s * g, 1.0 - s * c3, g, c3, c4)
-
-
-def _by_trigonometry(s: Any, theta: Any, c: Any, sine: Any) -> tuple[Any, Any, Any]:
-    """Return c, c3 and c4 of s = theta^2 that is not small."""
-    return c, (1.0 - sine / theta) / s, (0.5 - (1.0 - c) / s) / s

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 from torch import Tensor
 
+_TURNS = 4.0 * math.pi  # [rad]; a joint or an angle that goes further is more likely in degrees
 _SPANS = 10.0  # a tip moves within two lengths of its robot; millimetres look like 2000
 
 
@@ -42,3 +44,13 @@ def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
     message = millimetres_message(name, value, limit)
     if message is not None:
         warnings.warn(message, stacklevel=3)
+
+
+def degrees_message(name: str, turns: Tensor) -> str | None:
+    """Return a warning where joint angles are too large to be radians."""
+    if not turns.numel() or float(turns.max()) <= _TURNS:
+        return None
+    return (
+        f"`{name}` reaches {float(turns.max()):.4g} on a revolute joint, which looks like "
+        "degrees; hybridkin works in radians."
+    )

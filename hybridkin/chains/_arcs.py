@@ -1,32 +1,25 @@
 """Kernels of constant curvature: lengths from arcs, tips and derivatives from arcs.
 
 Batches come last here: lengths (S, N), bending vectors (2, S, N), vectors (3, N). The formulas are
-written once, by components, for tensors and for plain numbers: `fma(a, b, c)` is a + b c and
-`fms(a, b, c)` is a - b c.
+written by components: `fma(a, b, c)` is a + b c and `fms(a, b, c)` is a - b c.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.stumpff import Stumpff, stumpff, stumpff_of_number
+from hybridkin._core.stumpff import Stumpff, stumpff
 
-Vector = tuple[Any, ...]  # x, y, z
+Vector = tuple[Tensor, Tensor, Tensor]  # x, y, z
+Bending = tuple[Tensor, Tensor]  # x, y
 
-
-class _Arithmetic(NamedTuple):
-    fma: Callable[[Any, Any, Any], Any]
-    fms: Callable[[Any, Any, Any], Any]
-
-
-_TENSORS = _Arithmetic(torch.addcmul, partial(torch.addcmul, value=-1.0))
-_NUMBERS = _Arithmetic(lambda a, b, c: a + b * c, lambda a, b, c: a - b * c)
+fma = torch.addcmul
+fms = partial(torch.addcmul, value=-1.0)
 
 
 class _Carried(NamedTuple):
@@ -34,44 +27,42 @@ class _Carried(NamedTuple):
 
     point: Vector  # in the start frame
     tail: Vector  # in the end frame, the rigid offset included
-    rest: Any  # length less the tail along the bending
-    across: Any  # how far the point moves across, per bending
+    rest: Tensor  # length less the tail along the bending
+    across: Tensor  # how far the point moves across, per bending
 
 
-def _carried(
-    by: _Arithmetic, point: Vector, length: Any, b: Any, arc: Any, offset: Any
-) -> _Carried:
+def _carried(point: Vector, length: Tensor, b: Bending, arc: Stumpff, offset: Tensor) -> _Carried:
     """Return a point of the frame after a segment's rigid offset in the segment's start frame."""
     x, y, z = point
     c, f, g, _, _ = arc
     z = z + offset
-    rest = by.fms(by.fms(length, b[0], x), b[1], y)
-    m = by.fma(g * rest, f, z)
-    start = by.fma(x, b[0], m), by.fma(y, b[1], m), by.fma(f * rest, c, z)
+    rest = fms(fms(length, b[0], x), b[1], y)
+    m = fma(g * rest, f, z)
+    start = fma(x, b[0], m), fma(y, b[1], m), fma(f * rest, c, z)
     return _Carried(start, (x, y, z), rest, m)
 
 
-def _columns(by: _Arithmetic, at: _Carried, b: Any, arc: Any) -> tuple[Vector, ...]:
+def _columns(at: _Carried, b: Bending, arc: Stumpff) -> tuple[Vector, Vector, Vector]:
     """Return the derivatives of a carried point by (l, bx, by) of the segment."""
-    (bx, by_), (x, y, z), m = b, at.tail, at.across
+    (bx, by), (x, y, z), m = b, at.tail, at.across
     _, f, g, c3, c4 = arc
     slope_f, slope_g = c3 - g, 2.0 * c4 - c3  # twice the derivatives by s
-    to = by.fma(slope_g * at.rest, slope_f, z)
-    n = by.fms(slope_f * at.rest, f, z)
-    to_x, to_y = by.fms(to * bx, g, x), by.fms(to * by_, g, y)
+    to = fma(slope_g * at.rest, slope_f, z)
+    n = fms(slope_f * at.rest, f, z)
+    to_x, to_y = fms(to * bx, g, x), fms(to * by, g, y)
     return (
-        (g * bx, g * by_, f),
-        (by.fma(m, bx, to_x), by_ * to_x, by.fms(n * bx, f, x)),
-        (bx * to_y, by.fma(m, by_, to_y), by.fms(n * by_, f, y)),
+        (g * bx, g * by, f),
+        (fma(m, bx, to_x), by * to_x, fms(n * bx, f, x)),
+        (bx * to_y, fma(m, by, to_y), fms(n * by, f, y)),
     )
 
 
-def _turned(by: _Arithmetic, v: Any, b: Any, arc: Any) -> Vector:
+def _turned(v: Sequence[Tensor], b: Bending, arc: Stumpff) -> Vector:
     """Return vectors of a segment's end frame in its start frame."""
     c, f, g, _, _ = arc
-    along = by.fma(b[0] * v[0], b[1], v[1])
-    m = by.fms(f * v[2], g, along)
-    return by.fma(v[0], b[0], m), by.fma(v[1], b[1], m), by.fms(c * v[2], f, along)
+    along = fma(b[0] * v[0], b[1], v[1])
+    m = fms(f * v[2], g, along)
+    return fma(v[0], b[0], m), fma(v[1], b[1], m), fms(c * v[2], f, along)
 
 
 def tip(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
@@ -97,12 +88,12 @@ def tip_and_columns(
     x, y = bending.unbind()
     arc = stumpff(torch.addcmul(x * x, y, y))
     carried, segments = _all_carried(length, (x, y), arc, offsets)
-    tails = tuple(torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
+    tx, ty, tz = (torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
     rest = torch.stack([at.rest for at in carried])
     across = torch.stack([at.across for at in carried])
     # The segments' own columns all at once, then turned by every segment before them.
-    at = _Carried(carried[0].point, tails, rest, across)
-    entries = [entry for column in _columns(_TENSORS, at, (x, y), arc) for entry in column]
+    at = _Carried(carried[0].point, (tx, ty, tz), rest, across)
+    entries = [entry for column in _columns(at, (x, y), arc) for entry in column]
     if angular:
         entries += _spins(x, y, arc)
     if rigid:
@@ -110,25 +101,25 @@ def tip_and_columns(
     columns = torch.stack(entries).unflatten(0, (-1, 3)).transpose(0, 1)
     turned = columns[:, :, -1:]
     for k in range(len(length) - 2, -1, -1):
-        ahead = torch.stack(_turned(_TENSORS, turned.unbind(), *segments[k]))
+        ahead = torch.stack(_turned(turned.unbind(), *segments[k]))
         turned = torch.cat([columns[:, :, k : k + 1], ahead], dim=2)
     return torch.stack(carried[0].point), turned.flatten(1, 2)
 
 
 def _all_carried(
-    length: Tensor, bending: tuple[Tensor, Tensor], arc: Stumpff, offsets: Tensor
-) -> tuple[list[_Carried], list[tuple[Any, Any]]]:
+    length: Tensor, bending: Bending, arc: Stumpff, offsets: Tensor
+) -> tuple[list[_Carried], list[tuple[Bending, Stumpff]]]:
     """Return the tip in the start frame of every segment, and each segment's bending and arc."""
-    bends, arcs = (
-        [*zip(*(part.unbind() for part in parts), strict=True)] for parts in (bending, arc)
-    )
+    bends = [*zip(*(part.unbind() for part in bending), strict=True)]
+    arcs = [Stumpff(*each) for each in zip(*(part.unbind() for part in arc), strict=True)]
+    segments = [*zip(bends, arcs, strict=True)]
     zero = torch.zeros_like(length[0])
     point, carried = (zero, zero, zero), []
-    parts = [*zip(length.unbind(), bends, arcs, offsets.unbind(), strict=True)]
-    for of_length, b, of_arc, offset in reversed(parts):
-        carried.append(_carried(_TENSORS, point, of_length, b, of_arc, offset))
+    parts = [*zip(length.unbind(), segments, offsets.unbind(), strict=True)]
+    for of_length, (b, of_arc), offset in reversed(parts):
+        carried.append(_carried(point, of_length, b, of_arc, offset))
         point = carried[-1].point
-    return carried[::-1], [*zip(bends, arcs, strict=True)]
+    return carried[::-1], segments
 
 
 def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:
@@ -137,29 +128,6 @@ def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:
     by_x = -c3 * x * y, 1.0 - c3 * y * y, -g * y
     by_y = c3 * x * x - 1.0, c3 * x * y, g * x
     return [zero, zero, zero, *by_x, *by_y]
-
-
-def tip_and_columns_of_numbers(
-    arcs: NDArray, offsets: Sequence[float]
-) -> tuple[Vector, list[list[float]]]:
-    """Return the tip and its derivatives for one configuration, in plain numbers.
-
-    `arcs` holds 3 S numbers: lengths, x- and y-bendings. The columns come as three rows of 3 S
-    numbers in the same order; see `tip_and_columns`.
-    """
-    n = len(offsets)
-    numbers = arcs.tolist()
-    lengths, bendings = numbers[:n], list(zip(numbers[n : 2 * n], numbers[2 * n :], strict=True))
-    point, columns = (0.0, 0.0, 0.0), []
-    for k in range(n - 1, -1, -1):
-        b = bendings[k]
-        arc = stumpff_of_number(b[0] * b[0] + b[1] * b[1])
-        at = _carried(_NUMBERS, point, lengths[k], b, arc, offsets[k])
-        point = at.point
-        columns = [_turned(_NUMBERS, column, b, arc) for column in columns]
-        columns = [*_columns(_NUMBERS, at, b, arc), *columns]
-    ordered = [columns[3 * k + j] for j in range(3) for k in range(n)]
-    return point, [list(row) for row in zip(*ordered, strict=True)]
 
 
 def arc_transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:

@@ -30,10 +30,29 @@ class Joint(NamedTuple):
     limits: Sequence[float] | None = None
 
 
-def limits_of(joint: Joint) -> tuple[float, float]:
-    """Return the limits of a joint, infinite where they are missing or empty."""
-    low, high = (-math.inf, math.inf) if joint.limits is None else joint.limits
-    return (float(low), float(high)) if low < high else (-math.inf, math.inf)
+def moving_joints(path: list[Joint]) -> dict[str, Any]:
+    """Return the arguments of a `RigidChain`, fixed joints folded into the poses of the others."""
+    moving: list[Joint] = []
+    pending = np.eye(4)
+    for joint in path:
+        pending = pending @ joint.origin
+        if joint.kind != "fixed":
+            moving.append(joint._replace(origin=pending))
+            pending = np.eye(4)
+    if not moving:
+        raise ValueError("the path from the root to `end_link` must have a moving joint.")
+    # Limits that are missing or empty (lower = upper) are infinite.
+    given = [(-math.inf, math.inf) if joint.limits is None else joint.limits for joint in moving]
+    limits = [(low, high) if low < high else (-math.inf, math.inf) for low, high in given]
+    return {
+        "origins": np.stack([joint.origin for joint in moving]),
+        "axes": [joint.axis for joint in moving],
+        "kinds": [joint.kind for joint in moving],
+        "names": [joint.name or f"joint_{k + 1}" for k, joint in enumerate(moving)],
+        "q_min": [float(low) for low, _ in limits],
+        "q_max": [float(high) for _, high in limits],
+        "tip": pending,
+    }
 
 
 def _source(text_or_path: str | PathLike[str]) -> str | Path:

@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-_TURNS = 4.0 * math.pi  # nobody counts the angle of a tendon further
+if TYPE_CHECKING:
+    from pytorch_kinematics import Transform3d
+
+Numbers = ArrayLike | Tensor  # what a caller may hand over as an array
+
+_TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
 def vector(
-    value: Any, name: str, dtype: torch.dtype, *, size: int | None = None, positive: bool = False
+    value: Numbers,
+    name: str,
+    dtype: torch.dtype,
+    *,
+    size: int | None = None,
+    positive: bool = False,
 ) -> Tensor:
     """Return one number per segment as a tensor (S,), checked."""
-    vector = _tensor(value, name, dtype)
+    vector = numeric(value, name, dtype)
     if vector.ndim != 1 or vector.numel() == 0 or (size is not None and vector.numel() != size):
         need = "(S,), one value per segment" if size is None else f"({size},), one per segment"
         raise ValueError(f"`{name}` must have shape {need}, got {tuple(vector.shape)}.")
@@ -27,11 +38,11 @@ def vector(
     return vector
 
 
-def filled(value: Any, name: str, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
     """Return one number for all, or an array of the shape (also a list of lists), as a tensor."""
     if len(shape) == 1 and isinstance(value, (list, tuple)) and any(np.ndim(v) for v in value):
         value = [number for part in value for number in np.ravel(part)]
-    tensor = _tensor(value, name, dtype)
+    tensor = numeric(value, name, dtype)
     if tensor.ndim and tensor.shape != shape:
         raise ValueError(
             f"`{name}` must have shape {shape}, or be one number, got {tuple(tensor.shape)}."
@@ -39,25 +50,42 @@ def filled(value: Any, name: str, dtype: torch.dtype, shape: tuple[int, ...]) ->
     return tensor.expand(shape).clone()
 
 
-def _tensor(value: Any, name: str, dtype: torch.dtype) -> Tensor:
+def numeric(
+    value: Numbers, name: str, dtype: torch.dtype = torch.float64, *, finite: bool = True
+) -> Tensor:
+    """Return numbers as a tensor that shares no memory with them; NaN and infinity raise.
+
+    With ``finite=False`` only NaN does.
+    """
     try:
-        tensor = torch.as_tensor(np.asarray(value) if not isinstance(value, Tensor) else value)
-        tensor = tensor.to(dtype).clone()
+        array = value.detach() if isinstance(value, Tensor) else np.asarray(value)
+        tensor = torch.as_tensor(array).to(dtype).clone()
     except (TypeError, ValueError) as error:
         raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
-    if not torch.isfinite(tensor).all():
+    if (not torch.isfinite(tensor).all() and finite) or torch.isnan(tensor).any():
         raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")
     return tensor
 
 
+def shaped(
+    value: Numbers, name: str, shape: tuple[int | None, ...], *, finite: bool = True
+) -> Tensor:
+    """Return an array as a float64 tensor of the given shape; None is any length."""
+    tensor = numeric(value, name, finite=finite)
+    fits = tensor.ndim == len(shape)
+    if not fits or any(b not in (None, a) for a, b in zip(tensor.shape, shape, strict=True)):
+        need = ", ".join("n" if size is None else str(size) for size in shape)
+        need = f"({need},)" if len(shape) == 1 else f"({need})"
+        raise ValueError(f"`{name}` must have shape {need}, got {tuple(tensor.shape)}.")
+    return tensor
+
+
 def actuator_counts(
-    n_actuators: Any, n_segments: int, name: str = "n_actuators", least: int = 3
+    n_actuators: int | Sequence[int], n_segments: int, name: str, least: int
 ) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
-    if np.ndim(n_actuators) == 0:
-        counts = (int(n_actuators),) * n_segments
-    else:
-        counts = tuple(int(n) for n in n_actuators)
+    given = np.asarray(n_actuators).astype(int).tolist()
+    counts = tuple(given) if isinstance(given, list) else (given,) * n_segments
     if len(counts) != n_segments:
         raise ValueError(
             f"`{name}` must be one number or {n_segments} numbers, one per segment as in "
@@ -69,15 +97,14 @@ def actuator_counts(
     return counts
 
 
-def flat_angles(angles: Any, counts: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+def flat_angles(angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """Return the angles of all actuators, segment by segment, shape (n,)."""
     if angles is None:
         rows = [2.0 * math.pi * np.arange(n) / n for n in counts]
-    elif np.ndim(angles[0]) == 0:
-        rows = [angles] * len(counts)
     else:
-        rows = list(angles)
-    rows = [_tensor(row, "angles", dtype) for row in rows]
+        parts = list(angles)  # pyright: ignore[reportArgumentType]
+        rows = parts if np.ndim(parts[0]) else [angles] * len(counts)
+    rows = [numeric(row, "angles", dtype) for row in rows]
     if tuple(row.numel() for row in rows) != counts:
         raise ValueError(
             f"`angles` must hold {list(counts)} angles for the segments, got "
@@ -94,14 +121,14 @@ def flat_angles(angles: Any, counts: tuple[int, ...], dtype: torch.dtype) -> Ten
     return flat
 
 
-def pose(value: Any, name: str, dtype: torch.dtype) -> Tensor:
+def pose(value: Numbers | Transform3d | None, name: str, dtype: torch.dtype) -> Tensor:
     """Return a pose given as a matrix, a Transform3d or None, shape (4, 4)."""
     if value is None:
         return torch.eye(4, dtype=dtype)
     if hasattr(value, "get_matrix"):  # a pytorch_kinematics Transform3d
         value = value.get_matrix().detach()
         value = value[0] if value.shape[:1] == (1,) else value
-    matrix = _tensor(value, name, dtype)
+    matrix = numeric(value, name, dtype)
     if matrix.shape != (4, 4):
         raise ValueError(f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}.")
     rotation = matrix[:3, :3]

@@ -4,69 +4,85 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stumpff import stumpff
-from hybridkin.chains._arcs import arc_transforms, tip, tip_and_columns
-from hybridkin.chains._checks import check_replacements
+from hybridkin._core.units import warn_millimetres
+from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
+from hybridkin.chains._checks import Numbers, actuator_counts, filled, flat_angles, pose, vector
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
+    from pytorch_kinematics import Transform3d
     from typing_extensions import Self
+
+_ROUTINGS = ("segment", "base")
 
 
 class ArcChain(Chain):
     """A chain of circular arcs; its kinds differ in how the actuators shape them.
 
-    A kind names its geometry in `_entries` and what else makes it in `_structure`, sets the
-    attributes below and gives `_set_geometry`, `_arcs_and_slope` and `_arc_tangents`.
+    A kind gives `_arcs_and_slope` and `_arc_tangents`.
     """
 
-    _entries: ClassVar[tuple[str, ...]]
-    _structure: ClassVar[tuple[str, ...]] = (
-        *("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at"),
-    )
+    _structure = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
 
     n_segments: int
     actuators_per_segment: tuple[int, ...]
+    routing: str
     tip_at: float  # the point that is steered, in segments from the base
+    radii: Tensor  # (S,)
+    angles: Tensor  # (n,)
+    lengths: Tensor | None  # (S,)
     offsets: Tensor  # (S,)
+    rest_bends: Tensor  # (S, 2)
 
-    def geometry(self) -> dict[str, Tensor]:
-        """Return the geometry by name, as in the constructor; what a kind lacks is left out."""
-        tensors = {name: getattr(self, name) for name in self._entries}
-        return {name: value for name, value in tensors.items() if value is not None}
+    def _checked(
+        self,
+        radii: Numbers,
+        lengths: Numbers | None,
+        counts: tuple[str, int | Sequence[int], int],
+        angles: Numbers | None,
+        routing: str,
+        offsets: Numbers,
+        rest_bends: Numbers,
+        base: Numbers | Transform3d | None,
+        dtype: torch.dtype,
+    ) -> dict[str, Tensor]:
+        """Set the structure of the chain, and return the checked geometry that all kinds have.
 
-    def with_geometry(self, **geometry: Tensor) -> Self:
-        """Return a chain with some of the geometry replaced, differentiable in the new values.
-
-        Parameters
-        ----------
-        **geometry : Tensor
-            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
-
-        Returns
-        -------
-        ArcChain
-            A new chain of the same kind; this one is left as it was.
+        `counts` is the argument that counts the actuators: its name, its value, and how few a
+        segment may have.
         """
-        current = self.geometry()
-        check_replacements(geometry, current)
-        chain = type(self).__new__(type(self))
-        nn.Module.__init__(chain)
-        for name in self._structure:
-            setattr(chain, name, getattr(self, name))
-        chain._set_geometry({**dict.fromkeys(self._entries), **current, **geometry})
-        return chain
+        if routing not in _ROUTINGS:
+            raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
+        radii = vector(radii, "radii", dtype, positive=True)
+        S = radii.numel()
+        name, n_actuators, least = counts
+        self.actuators_per_segment = actuator_counts(n_actuators, S, name, least)
+        self.n_segments, self.n_actuators = S, sum(self.actuators_per_segment)
+        self.routing, self.tip_at = routing, float(S)
+        warn_millimetres("radii", radii, 1.0)
+        geometry = {
+            "radii": radii,
+            "angles": flat_angles(angles, self.actuators_per_segment, dtype),
+            "offsets": filled(offsets, "offsets", dtype, (S,)),
+            "rest_bends": filled(rest_bends, "rest_bends", dtype, (S, 2)),
+            "base": pose(base, "base", dtype),
+        }
+        if lengths is not None:
+            geometry["lengths"] = vector(lengths, "lengths", dtype, size=S, positive=True)
+            warn_millimetres("lengths", geometry["lengths"], 10.0)
+        return geometry
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         for name in self._entries:
-            self.register_buffer(name, geometry[name])
+            self.register_buffer(name, geometry.get(name))
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the tip position.
@@ -82,10 +98,6 @@ class ArcChain(Chain):
             Tip position in the measuring frame [m].
         """
         return in_blocks(self._forward, q, 8192)[0]
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return the position Jacobian dx/dq, shape (..., 3, n_actuators), in closed form."""
-        return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip position [m] and its Jacobian in one pass.
@@ -274,6 +286,23 @@ class ArcChain(Chain):
     def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
         raise NotImplementedError
+
+    def _changes(
+        self, rows: Tensor, tangents: Mapping[str, Tensor]
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """Return the changes (P, ...) of all entries, and those of the actuators' paths.
+
+        The paths are those by the bendings of all segments, (P, n, 2 S).
+        """
+        counts, P = self.actuators_per_segment, len(next(iter(tangents.values())))
+        change = {
+            name: tangents.get(name, torch.zeros_like(value).expand(P, *value.shape)).to(rows)
+            for name, value in self.geometry().items()
+        }
+        at = levers(self.radii, self.angles, counts).to(rows)
+        turned = torch.stack([-at[1], at[0]]) * change["angles"][:, None]
+        moved = turned + levers(change["radii"], self.angles.to(rows), counts)
+        return change, reading_matrix(moved, counts, self.routing, False)
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, 3 m) up to the tip and their derivative, (3 m, n) or (N, 3 m, n).

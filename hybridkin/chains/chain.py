@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors
 from hybridkin._core.model import PoseModel
+from hybridkin.chains._checks import check_replacements
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -21,11 +22,16 @@ __all__ = ["Chain"]
 class Chain(PoseModel):
     """A mechanical model of a robot: q -> tip position, with a geometry.
 
+    A kind names the buffers of its geometry in `_entries` and what else makes it in `_structure`.
+
     Attributes
     ----------
     base : Tensor of shape (4, 4)
         Pose of the robot's base in the measuring frame.
     """
+
+    _entries: ClassVar[tuple[str, ...]]
+    _structure: ClassVar[tuple[str, ...]]
 
     base: Tensor
 
@@ -40,11 +46,32 @@ class Chain(PoseModel):
         raise NotImplementedError
 
     def geometry(self) -> dict[str, Tensor]:
-        """Return the geometry by name, as in the constructor."""
-        raise NotImplementedError
+        """Return the geometry by name, as in the constructor; what a kind lacks is left out."""
+        entries = {name: self._buffers[name] for name in self._entries}
+        return {name: value for name, value in entries.items() if value is not None}
 
     def with_geometry(self, **geometry: Tensor) -> Self:
-        """Return a chain with some of the geometry replaced, differentiable in the new values."""
+        """Return a chain with some of the geometry replaced, differentiable in the new values.
+
+        Parameters
+        ----------
+        **geometry : Tensor
+            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
+
+        Returns
+        -------
+        Chain
+            A new chain of the same kind; this one is left as it was.
+        """
+        check_replacements(geometry, self.geometry())
+        chain = type(self).__new__(type(self))
+        nn.Module.__init__(chain)
+        chain.__dict__.update({name: self.__dict__[name] for name in self._structure})
+        chain._set_geometry({**self._buffers, **geometry})
+        return chain
+
+    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
+        """Register the buffers, those of `_entries` and what follows from them."""
         raise NotImplementedError
 
     def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:

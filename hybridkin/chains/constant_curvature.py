@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hybridkin._core.units import millimetres_message, warn_millimetres
-from hybridkin.chains._arcs import levers, reading_matrix, tip_and_columns_of_numbers
-from hybridkin.chains._checks import (
-    actuator_counts,
-    filled,
-    flat_angles,
-    pose,
-    vector,
-)
+from hybridkin._core.units import millimetres_message
+from hybridkin.chains._arcs import levers, reading_matrix
+from hybridkin.chains._checks import Numbers, filled
 from hybridkin.chains.arc_chain import ArcChain
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Transform3d
 
 __all__ = ["ConstantCurvatureChain"]
 
-_ROUTINGS = ("segment", "base")
 _CONTRADICTED = 0.3  # of the readings that the arcs explain, in one segment
 _WORTH_A_WORD = 0.1  # of the radius: a bend of a tenth of a radian would read as much
 
@@ -81,64 +75,40 @@ class ConstantCurvatureChain(ArcChain):
 
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
 
-    radii: Tensor
-    angles: Tensor
-    lengths: Tensor | None
-    rest_bends: Tensor
     actuator_zeros: Tensor
     arc_matrix: Tensor
     arc_offset: Tensor
 
     def __init__(
         self,
-        radii: Any,
+        radii: Numbers,
         *,
         n_actuators: int | Sequence[int] = 3,
-        angles: Any = None,
-        lengths: Any = None,
+        angles: Numbers | None = None,
+        lengths: Numbers | None = None,
         routing: str = "segment",
-        offsets: Any = 0.0,
-        rest_bends: Any = 0.0,
-        actuator_zeros: Any = 0.0,
-        base: Any = None,
+        offsets: Numbers = 0.0,
+        rest_bends: Numbers = 0.0,
+        actuator_zeros: Numbers = 0.0,
+        base: Numbers | Transform3d | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        if routing not in _ROUTINGS:
-            raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
-        radii = vector(radii, "radii", dtype, positive=True)
-        n_segments = radii.numel()
-        counts = actuator_counts(n_actuators, n_segments)
-        if lengths is not None:
-            lengths = vector(lengths, "lengths", dtype, size=n_segments, positive=True)
-        self.n_segments = n_segments
-        self.actuators_per_segment = counts
-        self.n_actuators = sum(counts)
-        self.routing = routing
-        self.tip_at = float(n_segments)
-        angles = flat_angles(angles, counts, dtype)
-        for row in angles.split(counts):
+        counts = ("n_actuators", n_actuators, 3)
+        geometry = self._checked(
+            radii, lengths, counts, angles, routing, offsets, rest_bends, base, dtype
+        )
+        zeros = filled(actuator_zeros, "actuator_zeros", dtype, (self.n_actuators,))
+        rows = geometry["angles"].split(self.actuators_per_segment)
+        for row in rows:
             sees = [row.cos(), row.sin(), torch.ones_like(row)]
             if torch.linalg.cond(torch.stack(sees[: 3 if lengths is None else 2])) > 1e6:
                 raise ValueError(
-                    "`angles` must tell the bending of every segment apart, got "
-                    f"{[row.tolist() for row in angles.split(counts)]}; give each segment at least "
-                    "3 actuators at different angles [rad]."
+                    "`angles` must determine the bending of every segment, got "
+                    f"{[row.tolist() for row in rows]}; give each segment at least 3 actuators at "
+                    "different angles [rad]."
                 )
-        self._set_geometry(
-            {
-                "radii": radii,
-                "angles": angles,
-                "lengths": lengths,
-                "offsets": filled(offsets, "offsets", dtype, (n_segments,)),
-                "rest_bends": filled(rest_bends, "rest_bends", dtype, (n_segments, 2)),
-                "actuator_zeros": filled(actuator_zeros, "actuator_zeros", dtype, (sum(counts),)),
-                "base": pose(base, "base", dtype),
-            }
-        )
-        warn_millimetres("radii", radii, 1.0)
-        if lengths is not None:
-            warn_millimetres("lengths", lengths, 10.0)
+        self._set_geometry({**geometry, "actuator_zeros": zeros})
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -248,37 +218,6 @@ class ConstantCurvatureChain(ArcChain):
             "ElasticTendonChain knows tendons that can only pull."
         )
 
-    def numpy_function(self) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
-        """Return a NumPy function for one configuration at a time, without torch's overhead.
-
-        Same formulas in plain numbers, some fifteen times faster than a batch of one.
-
-        Returns
-        -------
-        function
-            Maps q of shape (n_actuators,) to the tip position (3,) [m] and its Jacobian
-            (3, n_actuators), in float64. It keeps the chain's present geometry.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from hybridkin import robots
-        >>> tip_and_jacobian = robots.bionic_handling_assistant().numpy_function()
-        >>> x, J = tip_and_jacobian(np.full(9, 0.25))
-        >>> J.shape
-        (3, 9)
-        """
-        parts = (self._to_tip(self.arc_matrix), self._to_tip(self.arc_offset), self.base)
-        matrix, offset, base = (part.detach().cpu().double().numpy().copy() for part in parts)
-        rotation, position = base[:3, :3], base[:3, 3]
-        offsets = self._tip_offsets().tolist()
-
-        def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
-            tail, columns = tip_and_columns_of_numbers(matrix.dot(q) + offset, offsets)
-            return rotation.dot(tail) + position, rotation.dot(np.array(columns).dot(matrix))
-
-        return tip_and_jacobian
-
     def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
         if self.lengths is None and (rows <= 0).any():
             row = int((rows <= 0).any(dim=1).nonzero()[0])
@@ -326,18 +265,8 @@ class ConstantCurvatureChain(ArcChain):
 
     def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
-        counts, S = self.actuators_per_segment, self.n_segments
-        change = {name: value.to(rows) for name, value in self.geometry().items()}
-        P = len(next(iter(tangents.values())))
-        change = {
-            name: tangents.get(name, torch.zeros_like(value).expand(P, *value.shape).to(rows))
-            for name, value in self.geometry().items()
-        }
-        at = levers(self.radii, self.angles, counts).to(rows)
-        turned = torch.stack([-at[1], at[0]]) * change["angles"][:, None]
-        moved = turned + levers(change["radii"], self.angles.to(rows), counts)
-        readings = self._readings().to(rows)
-        by_reading = reading_matrix(moved, counts, self.routing, False)
+        change, by_reading = self._changes(rows, tangents)
+        readings, S = self._readings().to(rows), self.n_segments
         by_reading = nn.functional.pad(by_reading, (readings.shape[1] - 2 * S, 0))
         # The derivative of a least-squares inverse M of B, with M M' = (B' B)^-1.
         M = self.arc_matrix.to(rows)[-readings.shape[1] :]

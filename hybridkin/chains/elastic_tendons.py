@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.units import millimetres_message, warn_millimetres
+from hybridkin._core.units import millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
-from hybridkin.chains._checks import (
-    actuator_counts,
-    filled,
-    flat_angles,
-    pose,
-    vector,
-)
+from hybridkin.chains._checks import Numbers, filled
 from hybridkin.chains._slack import (
     MOST,
     Balance,
@@ -35,14 +27,19 @@ from hybridkin.chains._slack import (
     rough_of,
 )
 from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Transform3d
 
 __all__ = ["ElasticTendonChain"]
 
-_ROUTINGS = ("segment", "base")
 _SHAPING = (
     *("radii", "angles", "bending_stiffness", "axial_stiffness", "rest_bends", "tendon_zeros"),
 )
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are kept
+_Key = tuple[torch.dtype | torch.device | int, ...]
+_Rough = tuple[Tensor, Tensor]
 
 
 class ElasticTendonChain(ArcChain):
@@ -124,73 +121,48 @@ class ElasticTendonChain(ArcChain):
     _entries = (*_SHAPING, "lengths", "offsets", "base")
     _structure = (*ArcChain._structure, "_table")  # the table knows its geometry
 
-    radii: Tensor
-    angles: Tensor
     lengths: Tensor
     bending_stiffness: Tensor
     axial_stiffness: Tensor
-    rest_bends: Tensor
     tendon_zeros: Tensor
 
     def __init__(
         self,
-        radii: Any,
-        lengths: Any,
+        radii: Numbers,
+        lengths: Numbers,
         *,
         n_tendons: int | Sequence[int] = 3,
-        angles: Any = None,
+        angles: Numbers | None = None,
         routing: str = "base",
-        bending_stiffness: Any = None,
-        axial_stiffness: Any = None,
-        tendon_zeros: Any = 0.0,
-        rest_bends: Any = 0.0,
-        offsets: Any = 0.0,
-        base: Any = None,
+        bending_stiffness: Numbers | None = None,
+        axial_stiffness: Numbers | None = None,
+        tendon_zeros: Numbers = 0.0,
+        rest_bends: Numbers = 0.0,
+        offsets: Numbers = 0.0,
+        base: Numbers | Transform3d | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        if routing not in _ROUTINGS:
-            raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
-        radii = vector(radii, "radii", dtype, positive=True)
-        n_segments = radii.numel()
-        counts = actuator_counts(n_tendons, n_segments, "n_tendons", least=1)
-        if sum(counts) > MOST:
-            raise ValueError(f"`n_tendons` must be at most {MOST} in all, got {sum(counts)}.")
-        self.n_segments = n_segments
-        self.actuators_per_segment = counts
-        self.n_actuators = sum(counts)
-        self.routing = routing
-        self.tip_at = float(n_segments)
-        stiffness = {
-            "bending_stiffness": 0.01 * radii**2
-            if bending_stiffness is None
-            else bending_stiffness,
-            "axial_stiffness": 10.0 if axial_stiffness is None else axial_stiffness,
-        }
-        stiffness = {
-            name: filled(value, name, dtype, (n_segments,)) for name, value in stiffness.items()
-        }
-        for name, value in stiffness.items():
-            if not (value > 0).all():
-                raise ValueError(f"`{name}` must be positive, got {value.tolist()}.")
-        self._table: tuple[Any, ...] | None = None
-        self._set_geometry(
-            {
-                "radii": radii,
-                "angles": flat_angles(angles, counts, dtype),
-                "lengths": vector(lengths, "lengths", dtype, size=n_segments, positive=True),
-                "rest_bends": filled(rest_bends, "rest_bends", dtype, (n_segments, 2)),
-                "tendon_zeros": filled(tendon_zeros, "tendon_zeros", dtype, (sum(counts),)),
-                "offsets": filled(offsets, "offsets", dtype, (n_segments,)),
-                "base": pose(base, "base", dtype),
-                **stiffness,
-            }
+        if lengths is None:
+            raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
+        counts = ("n_tendons", n_tendons, 1)
+        geometry = self._checked(
+            radii, lengths, counts, angles, routing, offsets, rest_bends, base, dtype
         )
-        warn_millimetres("radii", radii, 1.0)
-        warn_millimetres("lengths", self.lengths, 10.0)
+        if self.n_actuators > MOST:
+            raise ValueError(f"`n_tendons` must be at most {MOST} in all, got {self.n_actuators}.")
+        bending = 0.01 * geometry["radii"] ** 2 if bending_stiffness is None else bending_stiffness
+        axial = 10.0 if axial_stiffness is None else axial_stiffness
+        for name, value in (("bending_stiffness", bending), ("axial_stiffness", axial)):
+            geometry[name] = filled(value, name, dtype, (self.n_segments,))
+            if not (geometry[name] > 0).all():
+                raise ValueError(f"`{name}` must be positive, got {geometry[name].tolist()}.")
+        zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
+        self._table: tuple[list[Tensor], _Key, Responses, _Rough] | None = None
+        self._set_geometry({**geometry, "tendon_zeros": zeros})
 
     @classmethod
-    def from_chain(cls, chain: Any, **options: Any) -> ElasticTendonChain:
+    def from_chain(cls, chain: ConstantCurvatureChain, **options: Any) -> ElasticTendonChain:
         """Return elastic tendons on the geometry of a plain chain with tendons.
 
         Parameters
@@ -268,39 +240,6 @@ class ElasticTendonChain(ArcChain):
         """Return which tendons hang slack, a bool tensor of the shape of q."""
         return ~self._balance(self._rows(q)).taut.reshape(q.shape)
 
-    def taut_posture(self, minimum: float = 0.0) -> Callable[[Tensor], Tensor]:
-        """Return a posture that keeps tendons taut, for ``InverseKinematics(q_pref=...)``.
-
-        Parameters
-        ----------
-        minimum : float, default=0.0
-            Stretch that every tendon should keep [m].
-
-        Returns
-        -------
-        function
-            Maps q (..., n_actuators) to itself with every tendon shortened by what it lacks. In the
-            null space of the task the inverse kinematics moves there and leaves the tip alone; how
-            far that goes the task decides.
-
-        Examples
-        --------
-        >>> import torch
-        >>> from hybridkin import ElasticTendonChain
-        >>> chain = ElasticTendonChain([0.005], [0.1], axial_stiffness=100.0)
-        >>> chain.taut_posture(1e-3)(torch.zeros(3))
-        tensor([-0.0010, -0.0010, -0.0010])
-        """
-        if not (minimum >= 0.0 and math.isfinite(minimum)):
-            raise ValueError(f"`minimum` must be a stretch >= 0 [m], got {minimum!r}.")
-        return partial(self._shortened, minimum=minimum)
-
-    def _shortened(self, q: Tensor, minimum: float) -> Tensor:
-        rows = self._rows(q)
-        zeros, readings = self.tendon_zeros.to(q), self._elasticity().readings.to(q)
-        stretch = self._balance(rows).shape @ readings.T - rows + zeros
-        return q - (minimum - stretch).clamp(min=0.0).reshape(q.shape)
-
     def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
         return [millimetres_message(name, rows.abs(), 10.0 * float(self.lengths.detach().sum()))]
 
@@ -323,9 +262,10 @@ class ElasticTendonChain(ArcChain):
             self.tendon_zeros,
         )
 
-    def _all_responses(self, rows: Tensor) -> tuple[Responses, tuple[Tensor, Tensor]]:
+    def _all_responses(self, rows: Tensor) -> tuple[Responses, _Rough]:
         """Return the responses of all sets of tendons, kept while the geometry stays."""
-        shaping = [getattr(self, name) for name in _SHAPING]
+        geometry = self.geometry()
+        shaping = [geometry[name] for name in _SHAPING]
         learning = torch.is_grad_enabled() and any(value.requires_grad for value in shaping)
         passing = learning or any(value.is_inference() for value in shaping)
         key = None if passing else (rows.dtype, rows.device, *(v._version for v in shaping))
@@ -378,16 +318,9 @@ class ElasticTendonChain(ArcChain):
 
     def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
-        counts, S = self.actuators_per_segment, self.n_segments
-        P = len(next(iter(tangents.values())))
-        change = {
-            name: tangents.get(name, torch.zeros_like(value).expand(P, *value.shape)).to(rows)
-            for name, value in self.geometry().items()
-        }
-        crossing = levers(self.radii, self.angles, counts).to(rows)
-        turned = torch.stack([-crossing[1], crossing[0]]) * change["angles"][:, None]
-        moved = turned + levers(change["radii"], self.angles.to(rows), counts)
-        by_readings = nn.functional.pad(reading_matrix(moved, counts, self.routing, False), (S, 0))
+        S = self.n_segments
+        change, by_bendings = self._changes(rows, tangents)
+        by_readings = nn.functional.pad(by_bendings, (S, 0))
         readings, _, stiffness, rest, _ = (part.to(rows) for part in self._elasticity())
         shape, pull, taut, compliance = self._balance(rows)
         bending = change["bending_stiffness"]

@@ -1,11 +1,10 @@
 """Chains alone: tip and Jacobian in one pass against automatic derivation and another library."""
 
-import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, jacobian
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, jacobian
 
 
 def test_against_automatic_derivatives(race, chain, draw, batch, autodiff):
@@ -86,24 +85,8 @@ def test_one_configuration(race, chain, draw, arm):
     )
 
 
-def test_one_configuration_in_plain_numbers(race, chain, draw, arm):
-    if not hasattr(chain, "numpy_function"):
-        pytest.skip("needs ConstantCurvatureChain.numpy_function")
-    q = draw(1)[0]
-    function, array = chain.numpy_function(), q.numpy()
-    for ours, expected in zip(function(array), chain.forward_and_jacobian(q), strict=True):
-        np.testing.assert_allclose(ours, expected.numpy(), rtol=1e-12, atol=1e-14)
-    race(
-        "chain: tip + J, plain numbers",
-        "pytorch_kinematics (9 joints): J",
-        lambda: function(array),
-        lambda: arm.jacobian(q),
-    )
-
-
 def test_rigid_chain(race, urdf, arm, draw, batch):
-    rigid = pytest.importorskip("hybridkin.rigid")
-    ours = rigid.RigidChain.from_urdf(urdf, "link9")
+    ours = RigidChain.from_urdf(urdf, "link9")
     q = torch.randn(batch, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert_close(ours.forward_and_jacobian(q)[1], arm.jacobian(q)[:, :3])
     race(

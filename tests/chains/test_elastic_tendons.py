@@ -14,7 +14,6 @@ from torch.testing import assert_close
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
-    InverseKinematics,
     calibrate,
 )
 from hybridkin.chains import _slack
@@ -552,23 +551,3 @@ def test_bad_input_says_what_is_needed(make, message):
 def test_displacements_in_millimetres_are_noticed():
     (message,) = robot().check_actuators(torch.full((9,), 5.0))
     assert "`q` reaches 5, which looks like millimetres" in message
-
-
-def test_taut_posture_keeps_tendons_taut_and_leaves_the_tip_alone(rng):
-    chain = ElasticTendonChain([0.005] * 3, [0.06] * 3, tendon_zeros=0.0005)
-    q = 0.004 * (2.0 * torch.rand(30, 9, dtype=torch.float64, generator=rng) - 1.0)
-    target = chain(q)
-    assert chain.slack(q).any(-1).float().mean() > 0.5
-    ik = InverseKinematics(chain, q_pref=chain.taut_posture(2e-4), q_min=-0.02, q_max=0.02)
-    for solution in (ik.solve(target, q0=q), ik.solve(target)):
-        assert (solution.error < 1e-4).all()
-        assert (chain.tensions(solution.q).amin(-1) > 1.5e-4).float().mean() > 0.9
-    # A step with the posture moves the tip no further than one without, to first order.
-    steps = [
-        InverseKinematics(chain, q_pref=posture, limits="off").step(q, target).dq
-        for posture in (None, chain.taut_posture(2e-4))
-    ]
-    assert (chain.jacobian(q) @ (steps[1] - steps[0])[..., None]).abs().max() < 1e-12
-    assert (steps[1] - steps[0]).norm(dim=-1).mean() > 1e-6
-    with pytest.raises(ValueError, match="stretch >= 0"):
-        chain.taut_posture(-1.0)
