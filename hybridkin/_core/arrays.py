@@ -4,18 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 
-def as_tensor(value: Any, name: str, device: Any = None) -> Tensor:
+@runtime_checkable
+class Transform(Protocol):
+    """A pose as a pytorch_kinematics Transform3d, which takes a second to import."""
+
+    def get_matrix(self) -> Tensor:
+        """Return the homogeneous transforms, shape (N, 4, 4)."""
+        ...
+
+
+Numbers = ArrayLike | Tensor  # what a caller may hand over as an array
+
+
+def as_tensor(
+    value: Numbers | Transform, name: str, device: torch.device | str | None = None
+) -> Tensor:
     """Return a floating tensor that shares no memory with a caller's array."""
+    if isinstance(value, Transform):
+        return value.get_matrix().detach()
     if not isinstance(value, Tensor):
-        if hasattr(value, "get_matrix"):  # a pytorch_kinematics Transform3d
-            return value.get_matrix().detach()
         try:
             value = torch.tensor(np.asarray(value), device=device)
         except (TypeError, ValueError) as error:
@@ -24,17 +39,17 @@ def as_tensor(value: Any, name: str, device: Any = None) -> Tensor:
     return value if value.is_floating_point() else value.double()
 
 
-def as_array(a: Any) -> np.ndarray:
+def as_array(a: Numbers) -> np.ndarray:
     """Return a tensor or array as a NumPy array."""
     return a.cpu().numpy() if isinstance(a, Tensor) else np.asarray(a)
 
 
-def is_numpy(value: Any) -> bool:
+def is_numpy(value: object) -> bool:
     """Return whether results for this argument go back as NumPy arrays."""
-    return not (isinstance(value, Tensor) or hasattr(value, "get_matrix"))
+    return not isinstance(value, (Tensor, Transform))
 
 
-def bound(value: Any, name: str, default: float) -> Tensor:
+def bound(value: Numbers | None, name: str, default: float) -> Tensor:
     """Return a limit or posture as a float64 tensor of shape () or (n,)."""
     bound = as_tensor(default if value is None else value, name).cpu().double()
     if bound.ndim > 1 or bound.numel() == 0 or torch.isnan(bound).any():

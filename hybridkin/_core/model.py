@@ -140,8 +140,8 @@ class FunctionModel(ForwardModel):
 
     def __init__(
         self,
-        function: Callable[[Tensor], Tensor],
-        jacobian: Callable[[Tensor], Tensor] | None = None,
+        function: Callable[..., Any],
+        jacobian: Callable[..., Any] | None = None,
     ) -> None:
         super().__init__()
         self.function = function

@@ -5,17 +5,12 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from pytorch_kinematics import Transform3d
-
-Numbers = ArrayLike | Tensor  # what a caller may hand over as an array
+from hybridkin._core.arrays import Numbers, Transform
 
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
@@ -121,11 +116,11 @@ def flat_angles(angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dt
     return flat
 
 
-def pose(value: Numbers | Transform3d | None, name: str, dtype: torch.dtype) -> Tensor:
+def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Tensor:
     """Return a pose given as a matrix, a Transform3d or None, shape (4, 4)."""
     if value is None:
         return torch.eye(4, dtype=dtype)
-    if hasattr(value, "get_matrix"):  # a pytorch_kinematics Transform3d
+    if isinstance(value, Transform):
         value = value.get_matrix().detach()
         value = value[0] if value.shape[:1] == (1,) else value
     matrix = numeric(value, name, dtype)

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
-from hybridkin.chains._checks import Numbers, actuator_counts, filled, flat_angles, pose, vector
+from hybridkin.chains._checks import actuator_counts, filled, flat_angles, pose, vector
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
-    from pytorch_kinematics import Transform3d
     from typing_extensions import Self
 
 _ROUTINGS = ("segment", "base")
@@ -38,7 +38,6 @@ class ArcChain(Chain):
     tip_at: float  # the point that is steered, in segments from the base
     radii: Tensor  # (S,)
     angles: Tensor  # (n,)
-    lengths: Tensor | None  # (S,)
     offsets: Tensor  # (S,)
     rest_bends: Tensor  # (S, 2)
 
@@ -51,7 +50,7 @@ class ArcChain(Chain):
         routing: str,
         offsets: Numbers,
         rest_bends: Numbers,
-        base: Numbers | Transform3d | None,
+        base: Numbers | Transform | None,
         dtype: torch.dtype,
     ) -> dict[str, Tensor]:
         """Set the structure of the chain, and return the checked geometry that all kinds have.

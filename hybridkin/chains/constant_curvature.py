@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.units import millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
-from hybridkin.chains._checks import Numbers, filled
+from hybridkin.chains._checks import filled
 from hybridkin.chains.arc_chain import ArcChain
-
-if TYPE_CHECKING:
-    from pytorch_kinematics import Transform3d
 
 __all__ = ["ConstantCurvatureChain"]
 
@@ -75,6 +72,7 @@ class ConstantCurvatureChain(ArcChain):
 
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
 
+    lengths: Tensor | None
     actuator_zeros: Tensor
     arc_matrix: Tensor
     arc_offset: Tensor
@@ -90,7 +88,7 @@ class ConstantCurvatureChain(ArcChain):
         offsets: Numbers = 0.0,
         rest_bends: Numbers = 0.0,
         actuator_zeros: Numbers = 0.0,
-        base: Numbers | Transform3d | None = None,
+        base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()

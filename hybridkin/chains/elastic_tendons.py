@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.units import millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
-from hybridkin.chains._checks import Numbers, filled
+from hybridkin.chains._checks import filled
 from hybridkin.chains._slack import (
     MOST,
     Balance,
@@ -29,16 +30,12 @@ from hybridkin.chains._slack import (
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
-if TYPE_CHECKING:
-    from pytorch_kinematics import Transform3d
-
 __all__ = ["ElasticTendonChain"]
 
 _SHAPING = (
     *("radii", "angles", "bending_stiffness", "axial_stiffness", "rest_bends", "tendon_zeros"),
 )
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are kept
-_Key = tuple[torch.dtype | torch.device | int, ...]
 _Rough = tuple[Tensor, Tensor]
 
 
@@ -139,7 +136,7 @@ class ElasticTendonChain(ArcChain):
         tendon_zeros: Numbers = 0.0,
         rest_bends: Numbers = 0.0,
         offsets: Numbers = 0.0,
-        base: Numbers | Transform3d | None = None,
+        base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
@@ -158,7 +155,7 @@ class ElasticTendonChain(ArcChain):
             if not (geometry[name] > 0).all():
                 raise ValueError(f"`{name}` must be positive, got {geometry[name].tolist()}.")
         zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
-        self._table: tuple[list[Tensor], _Key, Responses, _Rough] | None = None
+        self._table: tuple[list[Tensor], object, Responses, _Rough] | None = None
         self._set_geometry({**geometry, "tendon_zeros": zeros})
 
     @classmethod

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints, urdf_path
-from hybridkin.chains._checks import Numbers, pose, shaped
+from hybridkin.chains._checks import pose, shaped
 from hybridkin.chains._joint_motions import (
     carried_tip,
     column_carriers,
@@ -25,7 +26,6 @@ from hybridkin.chains._joint_motions import (
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
-    from pytorch_kinematics import Transform3d
     from pytorch_kinematics.chain import Chain as KinematicsChain
 
 __all__ = ["RigidChain"]
@@ -105,7 +105,7 @@ class RigidChain(Chain):
         q_max: Numbers | None = None,
         tip: Numbers | None = None,
         tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform3d | None = None,
+        base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class RigidChain(Chain):
         *,
         root_link: str | None = None,
         tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform3d | None = None,
+        base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> RigidChain:
         """Return the arm from one link of a URDF to another.
@@ -200,7 +200,7 @@ class RigidChain(Chain):
         *,
         root_link: str | None = None,
         tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform3d | None = None,
+        base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> RigidChain:
         """Return the arm from one body of a MuJoCo model to another body or site.
@@ -240,7 +240,7 @@ class RigidChain(Chain):
         chain: KinematicsChain,
         *,
         tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform3d | None = None,
+        base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> RigidChain:
         """Return the arm of a pytorch_kinematics chain without branches.

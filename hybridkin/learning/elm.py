@@ -276,7 +276,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"`decay` must lie in (0, 1], got {decay!r}; 1 forgets nothing, 0.99 forgets a "
                 f"hundredth of what earlier rows count."
             )
-        return self._learn(X, y, sample_weight, first=not hasattr(self, "module_"), decay=decay)
+        return self._learn(X, y, sample_weight, first="module_" not in vars(self), decay=decay)
 
     def merge(self, other):
         """Add the rows that `other` has seen; the result is that of one `fit` to all of them.
@@ -391,8 +391,9 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if first:
             elm, stats = draw_layer(self, X, sample_weight).to(device), None
         else:
-            layer = {name: getattr(self, f"{name}_") for name in LAYER}
-            elm = _without_readout(layer, self._activation, len(self.output_weights_)).to(device)
+            elm = _without_readout(
+                self._arrays(LAYER), self._activation, len(self.output_weights_)
+            ).to(device)
             n_outputs = self.output_weights_.shape[1]
             if y.shape[1] != n_outputs:
                 raise ValueError(
@@ -404,7 +405,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         stats = gather(stats, elm, X, y, sample_weight, self.block_size)
         self._activation, self._y_ndim = elm.activation, y_ndim
         for name in LAYER:
-            setattr(self, f"{name}_", getattr(elm, name).numpy(force=True))
+            setattr(self, f"{name}_", elm.get_buffer(name).numpy(force=True))
         return self._solve(stats, len(elm.output_weights), device)
 
     def _solve(self, stats, n_features, device):
@@ -433,8 +434,10 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self
 
     def _build(self, device):
-        arrays = {name: getattr(self, f"{name}_") for name in LAYER + READOUT}
-        self.module_ = ELM(arrays, self._activation).to(device)
+        self.module_ = ELM(self._arrays(LAYER + READOUT), self._activation).to(device)
+
+    def _arrays(self, names):
+        return {name: vars(self)[f"{name}_"] for name in names}
 
     def _map(self, X, function):
         """Return the arrays that `function(module, q)` gives, computed block by block."""
@@ -457,7 +460,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def __setstate__(self, state):
         super().__setstate__(state)
-        if hasattr(self, "_stats"):
+        if "_stats" in state:
             try:
                 device = device_named(self.device)
             except RuntimeError:

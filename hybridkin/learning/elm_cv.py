@@ -56,8 +56,6 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     cv : int, splitter or iterable of (train, test), default=None
         Which rows are left out together. None: each group where `fit` is given groups, else each
         row alone.
-    alpha_per_target : bool, default=False
-        Whether each output gets its own penalty.
     relevance_rounds : int, default=5
         How often at most the inputs are rescaled by their relevance.
     max_hidden : int, default=2000
@@ -75,14 +73,14 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     best_score_ : float
         Minus its mean squared error on rows left out [unit of y^2]. Being chosen by it, it is a
         little optimistic.
-    alpha_ : float or ndarray of shape (n_outputs,)
+    alpha_ : float
         The chosen penalty.
     left_out_errors_ : ndarray of the shape of y
         Target minus prediction of each row without it, under the chosen parameters [unit of y].
         The mean, if a row was left out more than once; NaN, if never or of weight 0.
     cv_results_ : dict of ndarray
         One row per candidate: n_hidden, weight_scale, relevance (n_inputs,), alphas and
-        mean_squared_error, (n_alphas,) or, with a penalty per target, (n_alphas, n_outputs).
+        mean_squared_error (n_alphas,).
     module_ : ELM
         The fitted network as a torch module.
     n_features_in_ : int
@@ -115,7 +113,6 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "alphas": [StrOptions({"auto"}), "array-like"],
         "weight_scales": ["array-like"],
         "cv": ["cv_object"],
-        "alpha_per_target": ["boolean"],
         "relevance_rounds": [Interval(Integral, 0, None, closed="left")],
         "max_hidden": [Interval(Integral, 0, None, closed="left")],
         **{name: ELMRegressor._parameter_constraints[name] for name in (*_SHARED, "random_state")},
@@ -128,7 +125,6 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         weight_scales=(0.1, 0.2, 0.4, 0.8, 1.6),
         *,
         cv=None,
-        alpha_per_target=False,
         relevance_rounds=5,
         max_hidden=2000,
         activation="logistic",
@@ -143,7 +139,6 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.alphas = alphas
         self.weight_scales = weight_scales
         self.cv = cv
-        self.alpha_per_target = alpha_per_target
         self.relevance_rounds = relevance_rounds
         self.max_hidden = max_hidden
         self.activation = activation
@@ -189,7 +184,8 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         seed = self.random_state
         if not isinstance(seed, Integral):
             seed = int(check_random_state(seed).randint(2**31))
-        shared = {name: getattr(self, name) for name in _SHARED} | {"random_state": seed}
+        settings = self.get_params()
+        shared = {name: settings[name] for name in _SHARED} | {"random_state": seed}
         sizes = _positive(self.n_hidden, "n_hidden", integer=True)
         scales = _positive(self.weight_scales, "weight_scales")
         untouched, tried = np.ones(X.shape[1]), []
@@ -277,7 +273,7 @@ class _Candidate(NamedTuple):
     params: dict
     relevance: np.ndarray
     alphas: np.ndarray
-    mse: np.ndarray  # (n_alphas,) or (n_alphas, n_outputs)
+    mse: np.ndarray  # (n_alphas,)
     score: float
     left_out: LeftOut
 
@@ -298,12 +294,9 @@ def _candidate(params, relevance, task):
         w = np.ones(len(rows)) if sample_weight is None else sample_weight[rows]
         total += np.einsum("r, lrm -> lm", w, errors * errors)
         weight += w.sum()
-    mse = np.where(np.isfinite(total), total / weight, np.inf)
-    if not settings.alpha_per_target:
-        mse = mse.mean(axis=1)
-    alpha, score = alphas[mse.argmin(axis=0)], float(mse.min(axis=0).mean())
-    params = {**params, "alpha": alpha if settings.alpha_per_target else float(alpha)}
-    return _Candidate(params, relevance, alphas, mse, score, left_out)
+    mse = np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
+    params = {**params, "alpha": float(alphas[mse.argmin()])}
+    return _Candidate(params, relevance, alphas, mse, float(mse.min()), left_out)
 
 
 def _errors(left_out, n_rows, splits, alphas):
@@ -318,13 +311,10 @@ def _errors(left_out, n_rows, splits, alphas):
 
 
 def _left_out_errors(best, task):
-    n_outputs = task.targets.shape[1]
-    alphas, columns = np.unique(
-        np.broadcast_to(best.params["alpha"], n_outputs), return_inverse=True
-    )
     total, count = np.zeros(task.targets.shape), np.zeros((len(task.X), 1))
-    for rows, errors in _errors(best.left_out, len(task.X), task.splits, alphas):
-        total[rows] += errors[columns, :, np.arange(n_outputs)].T
+    alpha = np.array([best.params["alpha"]])
+    for rows, errors in _errors(best.left_out, len(task.X), task.splits, alpha):
+        total[rows] += errors[0]
         count[rows] += 1
     return total / np.where(count > 0, count, np.nan)
 

@@ -1,8 +1,6 @@
 """A random hidden layer and its readout as a torch module, with closed-form derivatives."""
 
-import numpy as np
 import torch
-from scipy.special import expit
 from torch import nn
 
 from hybridkin._core.blocks import in_blocks
@@ -15,11 +13,6 @@ ACTIVATIONS = {
     "logistic": (torch.sigmoid, lambda a, s: torch.addcmul(s, s, s, value=-1)),
     "tanh": (torch.tanh, lambda a, s: 1 - s * s),
     "sin": (torch.sin, lambda a, s: torch.cos(a)),
-}
-NUMPY_ACTIVATIONS = {
-    "logistic": (expit, lambda a, s: s - s * s),
-    "tanh": (np.tanh, lambda a, s: 1 - s * s),
-    "sin": (np.sin, lambda a, s: np.cos(a)),
 }
 
 LAYER = ("input_weights", "input_bias", "input_center", "input_scale")
@@ -124,10 +117,6 @@ class ELM(ForwardModel):
         u, _, s = self._hidden(q)
         return self._readout(u, s)
 
-    def jacobian(self, q):
-        """Return ``J[..., i, j] = d eps_i / d q_j``, shape (..., n_outputs, n_inputs)."""
-        return self.forward_and_jacobian(q)[1]
-
     def forward_and_jacobian(self, q):
         """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
         x, J, _ = self.forward_jacobian_and(q, lambda features: features[..., :0])
@@ -171,46 +160,6 @@ class ELM(ForwardModel):
         rounding = 8 * len(center) ** 0.5 * torch.finfo(torch.float32).eps * factor.norm()
         bound = half.norm(dim=-1) + rounding * (single.norm(dim=-1) + center.norm())
         return bound < (limit - self.leverage_offset).clamp(min=0.0).sqrt()
-
-    def numpy_function(self, limit=None):
-        """Return a NumPy function of one configuration, without torch's overhead.
-
-        It maps `q` of shape (n_inputs,) to ``eps`` (n_outputs,) and its Jacobian (n_outputs,
-        n_inputs), in float64. With a `limit` it also gives the leverage and, where that is above
-        the limit, its gradient (n_inputs,), else None. It keeps the present arrays.
-        """
-        names = (*LAYER, *READOUT, "tangent")
-        arrays = (getattr(self, name).detach().cpu().double().numpy().copy() for name in names)
-        W, b, center, scale, weights, intercept, mean, factor, offset, tangent = arrays
-        activation, derivative = NUMPY_ACTIVATIONS[self.activation]
-        readout, shape = weights.T.copy(), (len(intercept), len(center))
-        direct = weights[len(W) :].T / scale if len(weights) > len(W) else None
-
-        def function(q):
-            u = (q - center) / scale
-            a = W.dot(u) + b
-            s = activation(a)
-            slope = derivative(a, s)
-            phi = s if direct is None else np.concatenate((s, u))
-            x, J = readout.dot(phi) + intercept, tangent.dot(slope).reshape(shape)
-            if direct is not None:
-                J = J + direct
-            if limit is None:
-                return x, J
-            r = (phi - mean).dot(factor)
-            leverage, gradient = float(r.dot(r) + offset), None
-            if leverage > limit:
-                by_phi = 2.0 * factor.dot(r)
-                by_u = (by_phi[: len(s)] * slope).dot(W)
-                gradient = (by_u if direct is None else by_u + by_phi[len(s) :]) / scale
-            return x, J, leverage, gradient
-
-        return function
-
-    def numpy_leverage(self, limit):
-        """Return a NumPy function of one configuration: leverage, and its gradient or None."""
-        function = self.numpy_function(limit)
-        return lambda q: function(q)[2:]
 
 
 def _refresh_tangent(elm, incompatible_keys=None):

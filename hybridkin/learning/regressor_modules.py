@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import ForwardModel
+from hybridkin._core.model import ForwardModel, as_forward_model
 
 __all__ = ["AffineModule", "KernelModule", "PolynomialModule", "RegressorModule", "error_module"]
 
@@ -26,8 +25,8 @@ _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
 
 
-def error_module(regressor: Any, q: Tensor) -> nn.Module:
-    """Return a fitted regressor as a torch module q (..., n) -> (..., m) with ``jacobian``.
+def error_module(regressor: Any, q: Tensor) -> ForwardModel:
+    """Return a fitted regressor as a forward model q (..., n) -> (..., m).
 
     Parameters
     ----------
@@ -40,10 +39,10 @@ def error_module(regressor: Any, q: Tensor) -> nn.Module:
     """
     module = getattr(regressor, "module_", None)
     if isinstance(module, nn.Module):
-        return module
-    steps: list[Any] = [regressor]
-    if isinstance(regressor, Pipeline):
-        steps = [step for _, step in regressor.steps]
+        return as_forward_model(module)
+    steps = (
+        [step for _, step in regressor.steps] if isinstance(regressor, Pipeline) else [regressor]
+    )
     center, scale = np.zeros(q.shape[1]), np.ones(q.shape[1])
     while len(steps) > 1 and (found := _affine(steps[0])) is not None:
         center, scale = center + scale * found[0], scale * found[1]
@@ -81,20 +80,15 @@ class AffineModule(ForwardModel):
         bias = torch.tensor(np.asarray(intercept), dtype=torch.float64)
         self.register_buffer("coef", matrix)
         self.register_buffer("bias", bias.expand(len(matrix)).clone())
+        self.n_outputs, self.n_actuators = matrix.shape
 
     def forward(self, q: Tensor) -> Tensor:
         """Return coef q + bias, shape (..., m)."""
         return q @ self.coef.to(q).mT + self.bias.to(q)
 
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return the constant matrix for every row, shape (..., m, n)."""
-        coef = self.coef.to(q)
-        return coef.expand(*q.shape[:-1], *coef.shape)
-
-    def numpy_function(self) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
-        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
-        coef, bias = (part.cpu().double().numpy().copy() for part in (self.coef, self.bias))
-        return lambda q: (coef.dot(q) + bias, coef.copy())
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the value (..., m), and the constant matrix for every row (..., m, n)."""
+        return self(q), self.coef.to(q).expand(*q.shape[:-1], *self.coef.shape)
 
 
 class PolynomialModule(ForwardModel):
@@ -151,14 +145,11 @@ class PolynomialModule(ForwardModel):
         ):
             self.register_buffer(name, torch.tensor(np.asarray(array), dtype=torch.float64))
         self.register_buffer("powers", torch.tensor(list(where)))
+        self.n_actuators, self.n_outputs = n, len(coef)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the polynomial, shape (..., m)."""
         return self._monomials(q) @ self.readout.to(q)
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return its derivative, shape (..., m, n)."""
-        return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return both for the price of one set of features."""
@@ -227,14 +218,11 @@ class KernelModule(ForwardModel):
             ("scale", np.asarray(scale) * widths),
         ):
             self.register_buffer(name, torch.tensor(np.asarray(array), dtype=torch.float64))
+        self.n_actuators, self.n_outputs = at.shape[1], heights.shape[1]
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""
         return in_blocks(self._forward, q, self._block)[0]
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return its derivative, shape (..., m, n)."""
-        return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return both for the price of one kernel matrix."""
@@ -275,13 +263,18 @@ class RegressorModule(ForwardModel):
         self.regressor = regressor
         width = (q.amax(0) - q.amin(0)).numpy()
         self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(width > 0, width, 1.0)
+        self.n_actuators, self.n_outputs = q.shape[1], self._predict(q[:1].numpy()).shape[1]
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the regressor's prediction, shape (..., m)."""
         return _Differenced.apply(q, self)
 
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return dx/dq, shape (..., m, n)."""
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the prediction (..., m) and dx/dq (..., m, n)."""
+        return self(q), self.differences(q)
+
+    def differences(self, q: Tensor) -> Tensor:
+        """Return dx/dq outside any graph, shape (..., m, n)."""
         rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
         columns = []
         for j, step in enumerate(self._step):
@@ -312,17 +305,17 @@ class _Differenced(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore
         (q,) = ctx.saved_tensors
-        return (grad[..., None, :] @ ctx.module.jacobian(q))[..., 0, :], None
+        return (grad[..., None, :] @ ctx.module.differences(q))[..., 0, :], None
 
 
 def _affine(step: Any) -> tuple[Any, Any] | None:
     """Return center and scale of a fitted scaler, u = (q - center) / scale."""
-    settings, fitted = step.get_params() if hasattr(step, "get_params") else {}, step
+    settings = step.get_params() if isinstance(step, (StandardScaler, MinMaxScaler)) else {}
     if isinstance(step, StandardScaler):
-        center = fitted.mean_ if settings["with_mean"] else 0.0
-        return center, fitted.scale_ if settings["with_std"] else 1.0
+        center = step.mean_ if settings["with_mean"] else 0.0
+        return center, step.scale_ if settings["with_std"] else 1.0
     if isinstance(step, MinMaxScaler) and not settings["clip"]:
-        return -fitted.min_ / fitted.scale_, 1.0 / fitted.scale_
+        return -step.min_ / step.scale_, 1.0 / step.scale_
     return None
 
 
@@ -333,7 +326,7 @@ def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
         rows, weights = fitted.X_fit_, fitted.dual_coef_
         gamma = fitted.gamma if fitted.gamma is not None else 1.0 / rows.shape[1]
         return rows, weights.reshape(len(rows), -1), (2.0 * gamma) ** -0.5, 0.0
-    if kind is GaussianProcessRegressor and hasattr(fitted, "alpha_"):
+    if kind is GaussianProcessRegressor:
         found = _gaussian(fitted.kernel_)
         if found is not None:
             height, widths = found

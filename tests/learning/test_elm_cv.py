@@ -56,7 +56,7 @@ def refitted(model, alpha, X, y, train, test, sample_weight=None):
         ELMRegressorCV(
             n_hidden=[5, 10], alphas=[0.01, 1.0], weight_scales=[1.0], cv=2, max_hidden=0
         ),
-        ELMRegressorCV(10, cv=KFold(3), alpha_per_target=True, direct_link=False, max_hidden=0),
+        ELMRegressorCV(10, cv=KFold(3), direct_link=False, max_hidden=0),
     ]
 )
 def test_scikit_learn_checks(estimator, check):
@@ -174,20 +174,6 @@ def test_best_params_give_the_chosen_model():
     assert len(results["alphas"]) >= 2 * 2 + 4
 
 
-def test_each_target_may_have_its_own_penalty():
-    rng = np.random.default_rng(0)
-    X, y = data(200, noise=0.0)
-    y = np.column_stack([y[:, 0], rng.standard_normal(200)])  # a smooth one and pure noise
-    model = quick(50, "auto", alpha_per_target=True).fit(X, y)
-    assert model.alpha_[1] > 1e3 * model.alpha_[0]
-    for j in range(2):
-        alone = quick(50, "auto").fit(X, y[:, j])
-        assert alone.alpha_ == model.alpha_[j]
-        assert_allclose(model.predict(X)[:, j], alone.predict(X), rtol=0, atol=1e-9)
-        assert_allclose(model.left_out_errors_[:, j], alone.left_out_errors_, atol=1e-9)
-    assert model.predict(X, return_std=True)[1].shape == (200, 2)
-
-
 def test_irrelevant_and_linear_inputs_cost_nothing():
     # Friedman's first: five of ten inputs do nothing, two act linearly.
     X, y = make_friedman1(1000, noise=1.0, random_state=0)
@@ -244,7 +230,7 @@ def test_units_do_not_matter(unit):
 def test_blocks_do_not_matter(block_size, monkeypatch):
     X, y = data(60)
     expected = quick().fit(X, y)
-    monkeypatch.setattr("hybridkin._left_out._BLOCK_ELEMENTS", 200)
+    monkeypatch.setattr("hybridkin.learning._left_out._BLOCK_ELEMENTS", 200)
     model = quick(block_size=block_size).fit(X, y)
     assert_allclose(model.left_out_errors_, expected.left_out_errors_, rtol=0, atol=1e-10)
 
