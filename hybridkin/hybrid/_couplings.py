@@ -18,8 +18,9 @@ from hybridkin.hybrid._linearised import Pair
 from hybridkin.hybrid._module import BlendModule, HybridModule, SerialHybridModule
 from hybridkin.hybrid._pose_features import PoseFeatures
 from hybridkin.hybrid._readout_fit import SerialFit, fit_serial
-from hybridkin.learning.elm import ELMRegressor, draw_layer
+from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.learning.hidden_layer import draw_layer
 
 __all__ = ["COUPLINGS", "READOUTS", "Blend", "Readout", "blended", "fit_coupled"]
 

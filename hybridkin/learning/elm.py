@@ -7,107 +7,23 @@ import numpy as np
 import torch
 from scipy import linalg
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
-from sklearn.utils import check_random_state, gen_batches
+from sklearn.utils import gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
-from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted, validate_data
 
-from hybridkin.learning._ridge import Statistics, accumulate, fit_readout, merge
+from hybridkin.learning._ridge import Statistics, fit_readout, merge
+from hybridkin.learning.hidden_layer import (
+    BLOCK_ELEMENTS,
+    DTYPES,
+    check_rows,
+    device_named,
+    draw_layer,
+    gather,
+    without_readout,
+)
 from hybridkin.learning.network import ACTIVATIONS, ELM, LAYER, READOUT
 
-__all__ = ["ELM", "ELMRegressor"]
-
-DTYPES = (np.float64, np.float32)
-_BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
-
-
-def _scaling(X, sample_weight, input_scaling):
-    """Return center and scale (d,) that map the columns of `X` to about [-1, 1]."""
-    n_inputs, eps = X.shape[1], np.finfo(X.dtype).eps
-    if input_scaling is None:
-        return np.zeros(n_inputs), np.ones(n_inputs)
-    if isinstance(input_scaling, str):
-        bounds = np.array([X.min(axis=0), X.max(axis=0)], dtype=np.float64)
-    else:
-        bounds = np.asarray(input_scaling, dtype=np.float64)
-    shaped = bounds.shape == (2, n_inputs) and np.isfinite(bounds).all()
-    if not shaped or (bounds[0] > bounds[1]).any():
-        raise ValueError(
-            f"`input_scaling` given as bounds must be a finite array [low, high] of shape "
-            f"(2, {n_inputs}) with low <= high, got {bounds.tolist()} of shape {bounds.shape}; "
-            f'give the limits of each column of `X`, or use "minmax".'
-        )
-    low, high = bounds / 2  # halved first: the widest range must not overflow
-    center, scale = low + high, high - low
-    # A column that is constant up to rounding has no range to divide by.
-    constant = scale <= 4 * eps * np.abs(center)
-    scale = np.where(constant, 1.0, scale)
-    if isinstance(input_scaling, str) and input_scaling == "standard":
-        u = (X - center) / scale
-        mean = np.average(u, axis=0, weights=sample_weight)
-        std = np.sqrt(np.average((u - mean) ** 2, axis=0, weights=sample_weight))
-        center, scale = center + mean * scale, scale * np.where(constant, 1.0, std)
-    return center, scale
-
-
-def check_rows(estimator, X, y, sample_weight, reset=True):
-    """Return `X`, float64 `y`, the weights, and the rows of positive weight; None for all."""
-    checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
-    X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
-    kept = None
-    if sample_weight is not None:
-        sample_weight = _check_sample_weight(
-            sample_weight, X, dtype=np.float64, ensure_non_negative=True
-        )
-        if not sample_weight.all():
-            kept = np.flatnonzero(sample_weight)
-    return X, y.astype(np.float64, copy=False), sample_weight, kept
-
-
-def draw_layer(params, X, sample_weight):
-    """Return the hidden layer that an estimator's parameters ask for, without a readout."""
-    rng, shape = check_random_state(params.random_state), (params.n_hidden, X.shape[1])
-    W = rng.uniform(-params.weight_scale, params.weight_scale, shape)
-    b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
-    layer = (W, b, *_scaling(X, sample_weight, params.input_scaling))
-    n_features = params.n_hidden + params.direct_link * X.shape[1]
-    return _without_readout(dict(zip(LAYER, layer, strict=True)), params.activation, n_features)
-
-
-def _without_readout(layer, activation, n_features):
-    # No outputs: the features come from the one kernel there is.
-    shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
-    blank = {name: np.zeros(shape) for name, shape in zip(READOUT, shapes, strict=True)}
-    return ELM({**layer, **blank}, activation)
-
-
-def gather(stats, elm, X, y, sample_weight, block_size):
-    """Return the statistics `stats` (None: of no rows) with the rows of `X` and `y` added."""
-    n_features = len(elm.output_weights)
-    n_columns = n_features + y.shape[1]
-    if stats is None:
-        stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
-    block_size = block_size or max(1, _BLOCK_ELEMENTS // n_columns)
-    with torch.no_grad():
-        stats = accumulate(stats, elm, X, y, sample_weight, block_size)
-    if not np.isfinite(stats.scatter[:, :n_features]).all():
-        raise ValueError(
-            "`X` and `y` must give finite sums of products of features and targets in float64, "
-            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
-        )
-    return stats
-
-
-def device_named(name):
-    """Return the torch device of that name (None: the CPU), where float64 works."""
-    try:
-        device = torch.device("cpu" if name is None else name)
-        torch.zeros(1, dtype=torch.float64, device=device).item()
-    except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
-        raise RuntimeError(
-            f"`device` must name a device on which torch computes in float64 here, got "
-            f"{str(name)!r}; use device=None for the CPU."
-        ) from error
-    return device
+__all__ = ["ELMRegressor"]
 
 
 class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -179,7 +95,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Examples
     --------
     >>> import numpy as np
-    >>> from hybridkin.learning.elm import ELMRegressor
+    >>> from hybridkin import ELMRegressor
     >>> q = np.random.default_rng(0).uniform(0.1, 0.3, (500, 3))
     >>> error = 0.01 * np.sin(20 * q[:, :2])
     >>> elm = ELMRegressor(alpha=1e-6, random_state=0).fit(q, error)
@@ -391,7 +307,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if first:
             elm, stats = draw_layer(self, X, sample_weight).to(device), None
         else:
-            elm = _without_readout(
+            elm = without_readout(
                 self._arrays(LAYER), self._activation, len(self.output_weights_)
             ).to(device)
             n_outputs = self.output_weights_.shape[1]
@@ -446,7 +362,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         elm, outputs = self.module_, ()
         width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
-            for rows in gen_batches(len(X), self.block_size or max(1, _BLOCK_ELEMENTS // width)):
+            for rows in gen_batches(len(X), self.block_size or max(1, BLOCK_ELEMENTS // width)):
                 q = torch.tensor(X[rows], dtype=torch.float64, device=elm.input_center.device)
                 parts = function(elm, q)
                 outputs = outputs or [np.empty((len(X), *p.shape[1:]), X.dtype) for p in parts]

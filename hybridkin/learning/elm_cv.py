@@ -12,14 +12,8 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from hybridkin.learning._left_out import LeftOut
-from hybridkin.learning.elm import (
-    DTYPES,
-    ELMRegressor,
-    check_rows,
-    device_named,
-    draw_layer,
-    gather,
-)
+from hybridkin.learning.elm import ELMRegressor
+from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer, gather
 
 __all__ = ["ELMRegressorCV"]
 

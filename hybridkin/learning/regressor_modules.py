@@ -60,6 +60,11 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     return RegressorModule(regressor, q)
 
 
+def _register(module: nn.Module, **arrays: ArrayLike) -> None:
+    for name, array in arrays.items():
+        module.register_buffer(name, torch.tensor(np.array(array), dtype=torch.float64))
+
+
 class AffineModule(ForwardModel):
     """A fitted linear regressor as a torch module.
 
@@ -137,13 +142,8 @@ class PolynomialModule(ForwardModel):
                 if power:
                     slope[where[_lower(monomial, j)], :, j] += power * coef[:, k]
         slope /= np.asarray(scale)
-        for name, array in (
-            ("readout", readout),
-            ("slope", slope.reshape(len(where), -1)),
-            ("center", center),
-            ("scale", scale),
-        ):
-            self.register_buffer(name, torch.tensor(np.asarray(array), dtype=torch.float64))
+        slope = slope.reshape(len(where), -1)
+        _register(self, readout=readout, slope=slope, center=center, scale=scale)
         self.register_buffer("powers", torch.tensor(list(where)))
         self.n_actuators, self.n_outputs = n, len(coef)
 
@@ -209,15 +209,9 @@ class KernelModule(ForwardModel):
         super().__init__()
         at, heights = np.asarray(rows) / np.asarray(widths), np.asarray(weights)
         tangent = heights[:, :, None] * at[:, None, :]
-        for name, array in (
-            ("rows", at),
-            ("weights", heights),
-            ("tangent", tangent.reshape(len(at), -1)),
-            ("bias", np.broadcast_to(bias, heights.shape[1])),
-            ("center", center),
-            ("scale", np.asarray(scale) * widths),
-        ):
-            self.register_buffer(name, torch.tensor(np.asarray(array), dtype=torch.float64))
+        bias, scale = np.broadcast_to(bias, heights.shape[1]), np.asarray(scale) * widths
+        _register(self, rows=at, weights=heights, tangent=tangent.reshape(len(at), -1))
+        _register(self, bias=bias, center=center, scale=scale)
         self.n_actuators, self.n_outputs = at.shape[1], heights.shape[1]
 
     def forward(self, q: Tensor) -> Tensor:

@@ -27,7 +27,8 @@ from hybridkin.hybrid._readout_fit import SerialFit
 from hybridkin.hybrid._serial import SerialModule
 from hybridkin.hybrid._settings import check_settings
 from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.learning.elm import ELMRegressor, device_named
+from hybridkin.learning.elm import ELMRegressor
+from hybridkin.learning.hidden_layer import device_named
 from hybridkin.learning.regressor_modules import AffineModule
 from hybridkin.saving._file import Arrays, Part, plain, read, read_header, write
 from hybridkin.saving._parts import (

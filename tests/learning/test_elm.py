@@ -22,7 +22,8 @@ from sklearn.linear_model import Ridge
 from sklearn.utils.estimator_checks import parametrize_with_checks
 from torch.testing import assert_close
 
-from hybridkin.learning.elm import ELM, ELMRegressor
+from hybridkin import ELMRegressor
+from hybridkin.learning.network import ELM
 
 BOUNDS = np.array([[0.1] * 9, [0.3] * 9])
 VARIANTS = [
@@ -519,7 +520,7 @@ def test_pickle_clone_copy_and_hash():
 
 def test_pickle_is_the_same_in_another_process():
     code = (
-        "import sys, pickle, numpy as np; from hybridkin.learning.elm import ELMRegressor;"
+        "import sys, pickle, numpy as np; from hybridkin import ELMRegressor;"
         "X = np.random.default_rng(0).uniform(size=(40, 4));"
         "m = ELMRegressor(10, random_state=0).fit(X, X @ X.T[:, :2]);"
         "sys.stdout.buffer.write(pickle.dumps(m))"
