@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from hybridkin.calibration._parameters import Problem
+from hybridkin.chains.chain import Chain
 
 _MAX_ROUNDS = 12
 
@@ -23,7 +24,7 @@ class Rows(NamedTuple):
     x: Tensor
     weight: Tensor
 
-    def residual(self, chain: Any) -> Tensor:
+    def residual(self, chain: Chain) -> Tensor:
         """Return the weighted coordinate errors (3 N,), whose squares add up to the loss."""
         return ((chain(self.q) - self.x) * self.weight.sqrt()[:, None]).reshape(-1)
 
@@ -33,7 +34,7 @@ class Rows(NamedTuple):
         J = chain.geometry_jacobian(self.q, problem.tangents(theta))
         return (J * self.weight.sqrt()[:, None, None]).flatten(0, 1)
 
-    def rmse(self, chain: Any) -> float:
+    def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
         with torch.no_grad():
             return float((self.residual(chain).square().sum() / self.weight.sum()).sqrt())
@@ -60,7 +61,7 @@ class Fit:
     rmse: float
     converged: bool
 
-    def chain(self) -> Any:
+    def chain(self) -> Chain:
         """Return the chain at the end of the search."""
         base = self.problem.chain.geometry()["base"]
         with torch.no_grad():
@@ -70,7 +71,7 @@ class Fit:
 def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: bool = False) -> Fit:
     """Alternate least squares and the noise level that weighs the prior against the data.
 
-    `roughly`: just far enough to tell good starts from bad ones.
+    With `roughly` the search stops as soon as good and bad initial guesses differ.
     """
 
     def residual(theta: NDArray) -> NDArray:

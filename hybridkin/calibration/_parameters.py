@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,8 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.rotations import cross_matrix, rotation
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
 
-ALIASES = {"turns": "angles", "tool": "offsets"}  # name -> the entry that it moves a part of
+_Vector = TypeVar("_Vector", NDArray, Tensor)
+
+ALIASES = {"turns": "angles", "tool": "offsets"}  # name -> the entry of which it moves a part
 # Positive geometry, and the factor of its start within which it stays, both ways.
 SCALED = {"radii": 5.0, "lengths": 5.0, "bending_stiffness": 1e4, "axial_stiffness": 1e4}
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
@@ -63,16 +67,16 @@ class Parameter:
         raise NotImplementedError
 
     def value(self, entry: Tensor) -> Tensor:
-        """Return what the user knows by this name."""
+        """Return the part of the entry that the user calls by this name."""
         return entry
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         """Return the standard errors of `value` from those of the free directions."""
         raise NotImplementedError
 
-    def flags(self, known: NDArray) -> NDArray:
-        """Return for each entry of `value` whether the directions that move it are known."""
-        return known
+    def flags(self, identified: NDArray) -> NDArray:
+        """Return for each entry of `value` whether the directions that move it are identified."""
+        return identified
 
 
 class Scaled(Parameter):
@@ -97,16 +101,16 @@ class Scaled(Parameter):
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         return std.reshape(value.shape) * value
 
-    def flags(self, known: NDArray) -> NDArray:
-        return known.reshape(tuple(self.start.shape))
+    def flags(self, identified: NDArray) -> NDArray:
+        return identified.reshape(tuple(self.start.shape))
 
 
 @dataclass(frozen=True, eq=False)
 class Shifted(Parameter):
     """Numbers moved along constant directions, each entry by at most one of them.
 
-    `origin` is what bounds count from, `physical` are those by default; where the user knows only
-    some entries by this name, `shown` has their indices.
+    Bounds count from `origin`; `physical` are the default ones. Where this name means only some
+    entries, `shown` has their indices.
     """
 
     directions: NDArray  # (numel, size)
@@ -123,7 +127,7 @@ class Shifted(Parameter):
 
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
         low, high = self.physical if bound is None else bound
-        if bound is None:  # the start is never wrong
+        if bound is None:  # the start itself is always allowed
             low, high = np.minimum(low, self.origin), np.maximum(high, self.origin)
         return (low - self.origin) / self.units, (high - self.origin) / self.units
 
@@ -136,8 +140,8 @@ class Shifted(Parameter):
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         return self._of_entries(np.abs(self.directions) @ std).reshape(value.shape)
 
-    def flags(self, known: NDArray) -> NDArray:
-        flags = ~((self.directions != 0) & ~known).any(axis=1)
+    def flags(self, identified: NDArray) -> NDArray:
+        flags = ~((self.directions != 0) & ~identified).any(axis=1)
         return self._of_entries(flags).reshape(tuple(self.value(self.start).shape))
 
     def _of_entries(self, all_entries: NDArray) -> NDArray:
@@ -154,9 +158,7 @@ class Posed(Parameter):
         return torch.cat([pose, self.start[3:]], dim=0)
 
     def tangents(self, part: Tensor) -> Tensor:
-        spins = cross_matrix(
-            rotation(part[:3])[1].T
-        )  # of the columns of the left Jacobian of the rotation group
+        spins = cross_matrix(rotation(part[:3])[1].T)  # of the columns of the left Jacobian
         tangents = self.start.new_zeros(6, 4, 4)
         tangents[:3, :3, :3] = spins @ self.moved(part)[:3, :3]
         tangents[3:, :3, 3] = torch.diag(torch.as_tensor(self.units[3:]).to(part))
@@ -173,13 +175,13 @@ class Posed(Parameter):
         return std * self.units
 
 
-def parameter_names(chain: Any) -> list[str]:
-    """Return the names that `calibrate` knows for a chain."""
-    names = list(chain.geometry())
-    return names + [alias for alias, entry in ALIASES.items() if entry in names]
+def parameter_names(chain: Chain) -> list[str]:
+    """Return the names that `calibrate` takes for a chain."""
+    aliases = ALIASES if isinstance(chain, ArcChain) else ()
+    return [*chain.geometry(), *aliases]
 
 
-def parameter(chain: Any, name: str) -> Parameter:
+def parameter(chain: Chain, name: str) -> Parameter:
     """Return the free directions of one name, at the chain's present geometry."""
     geometry = {key: value.detach().cpu() for key, value in chain.geometry().items()}
     reach = float(chain.reach)
@@ -190,7 +192,7 @@ def parameter(chain: Any, name: str) -> Parameter:
         units, low = np.array([reach]), (_SHORTEST * reach, np.inf)
         shown = np.array([len(offsets) - 1])
         return Shifted(name, "offsets", offsets, ("tool",), units, ("m",), last, origin, low, shown)
-    if name == "turns":
+    if name == "turns" and isinstance(chain, ArcChain):
         start, counts = geometry["angles"], np.array(chain.actuators_per_segment)
         rings = np.repeat(np.eye(len(counts)), counts, axis=0)
         first = np.cumsum(counts) - counts
@@ -230,7 +232,7 @@ def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 class Problem:
     """The free parameters theta of a chain, all of natural size one, zero at the start."""
 
-    chain: Any
+    chain: Chain
     parameters: tuple[Parameter, ...]
     prior_std: NDArray
     low: NDArray
@@ -239,7 +241,7 @@ class Problem:
     @classmethod
     def of(
         cls,
-        chain: Any,
+        chain: Chain,
         names: tuple[str, ...],
         bounds: Mapping[str, tuple[float, float]],
         prior: Mapping[str, float],
@@ -256,17 +258,19 @@ class Problem:
         """Names of all free directions."""
         return tuple(label for part in self.parameters for label in part.labels)
 
-    def start(self) -> NDArray:
-        """Return the start, brought inside the limits."""
-        return np.clip(np.zeros(self.prior_std.size), self.low, self.high)
+    def start(self, scale: float) -> NDArray:
+        """Return the start with all radii times a factor, brought inside the limits."""
+        logs = [np.log(scale) if part.name == "radii" else 0.0 for part in self.parameters]
+        sizes = [part.size for part in self.parameters]
+        return np.clip(np.repeat(logs, sizes), self.low, self.high)
 
-    def parts(self, theta: Any) -> list[Any]:
+    def parts(self, theta: _Vector) -> list[_Vector]:
         """Return theta (P,) by parameters."""
         ends = np.cumsum([part.size for part in self.parameters])
         starts = [0, *ends[:-1]]
         return [theta[a:b] for a, b in zip(starts, ends, strict=True)]
 
-    def moved(self, theta: Tensor) -> Any:
+    def moved(self, theta: Tensor) -> Chain:
         """Return the chain at theta (P,), differentiable in it."""
         pairs = zip(self.parameters, self.parts(theta), strict=True)
         return self.chain.with_geometry(**{part.entry: part.moved(at) for part, at in pairs})

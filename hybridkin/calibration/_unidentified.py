@@ -1,4 +1,4 @@
-"""What calibration data leave open, in sentences: few parameters each, and what to do."""
+"""Directions that calibration data do not identify, in sentences: few parameters each, advice."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hybridkin.calibration._parameters import Problem
 
 _N_TERMS = 6  # moves in a sentence
 _FAIR = 0.5  # of the largest share, which may lead a sentence
-_SMALL = 0.05  # of a step, or of what a sentence moves: not worth a word
-_SLIGHT = 0.01  # of what the moves of one sentence do each alone
+_SMALL = 0.05  # of a step, or of the tips' move: not mentioned
+_SLIGHT = 0.01  # of the largest move of the tips by one parameter alone
 _ALIKE = 0.02
 _STILL = 1e-6  # [mm]
 _INSIDE = 0.05  # of a unit vector: within a span
@@ -20,7 +20,7 @@ _STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%")}
 
 
 def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
-    """Say which moves of the parameters hardly move the tips, each by few of them.
+    """Return a sentence for each direction that hardly moves the tips, in few parameters.
 
     `directions` (K, P) are orthonormal moves in units of the prior.
     """
@@ -29,7 +29,7 @@ def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
     steps = [_STEPS[kind] for part in problem.parameters for kind in part.kind]
     to_steps = problem.prior_std * units / np.array([size for size, _ in steps])
     columns = 1e3 * fit.jacobian * problem.prior_std / np.sqrt(n_rows)  # [mm] of tip
-    said = []
+    found = []
     for move in _few_terms(directions):
         # Led by the first with a fair share, which moves one step.
         lead = int(np.argmax(np.abs(move) > _FAIR * np.abs(move).max()))
@@ -52,14 +52,14 @@ def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
         if others:
             second = next((other for other in others if other[1] != first[1]), others[0])
             advice = f"leave out or measure {first[0]} or {second[0]}"
-        said.append(f"{moved} {effect}: {advice}.")
-    return tuple(said)
+        found.append(f"{moved} {effect}: {advice}.")
+    return tuple(found)
 
 
 def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float, int]]:
-    """Return a move by (label, size, index): what leads, then the largest first.
+    """Return a move by (label, size, index): the leading one, then the largest first.
 
-    Entries of one name that all move alike are one.
+    Entries of one name that all move alike count as one.
     """
     terms, row = [], 0
     for part in problem.parameters:
@@ -88,7 +88,7 @@ def _few_terms(directions: NDArray) -> NDArray:
     def shortest(held: NDArray) -> NDArray:
         equal = np.concatenate([held, np.zeros(P)])[None]
         found = linprog(cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)).x
-        a = held if found is None else found[:K]  # the nearest to it will do as well
+        a = held if found is None else found[:K]  # else the nearest to it
         return a / np.linalg.norm(a)
 
     columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
@@ -96,7 +96,7 @@ def _few_terms(directions: NDArray) -> NDArray:
     chosen: list[NDArray] = []
     while len(chosen) < K:
         taken = np.array(chosen).reshape(-1, K)
-        rest = np.linalg.svd(taken)[2][len(chosen) :]  # what no chosen one has
+        rest = np.linalg.svd(taken)[2][len(chosen) :]  # spans what the chosen ones do not
         free = [a for a in candidates if np.linalg.norm(rest @ a) > _INSIDE]
         chosen.append(free[0] if free else shortest(rest[0]))
     return np.array(chosen) @ directions

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
-from hybridkin._core.arrays import as_tensor
+from hybridkin._core.arrays import Numbers, as_tensor
 from hybridkin._core.units import span_message
-from hybridkin.calibration._initial_guesses import Start, starts
+from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import Fit, Rows, solve
 from hybridkin.calibration._parameters import ALIASES, Problem, parameter_names
 from hybridkin.calibration._unidentified import sentences
@@ -26,21 +26,23 @@ __all__ = ["CalibrationResult", "calibrate"]
 
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 _WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
-_KNOWN = 0.1  # k parameters that share one unknown direction narrow to 1 / sqrt(k) by the prior
-_EQUAL = 1.0 - 1e-4  # of starts that explain the tips alike the given one counts
-_BETTER = 0.8  # another handedness than the given one must explain the tips this much better,
-_FAR_BETTER = 0.5  # and this much where the user has not asked for it
-_MEASURED = ("radii", "lengths")  # sizes that a ruler tells:
-_UNPHYSICAL = 1.75  # one that moves by this factor is worth a word
+# Identified below this share of the prior: k parameters that share one unidentified direction
+# narrow to 1 / sqrt(k) by the prior alone.
+_IDENTIFIED = 0.1
+_EQUAL = 1.0 - 1e-4  # of guesses that explain the tips alike the given chain counts
+_BETTER = 0.8  # another handedness than the given one must lower the error to this share,
+_FAR_BETTER = 0.5  # and to this share where the user has not asked for it
+_MEASURED = ("radii", "lengths")  # sizes that a ruler measures:
+_UNPHYSICAL = 1.75  # a change by this factor is a warning
 
 
 @dataclass(frozen=True, repr=False)
 class CalibrationResult:
-    """Calibrated chain and what the data say about its geometry.
+    """Calibrated chain, and how far the data identify its geometry.
 
     Attributes
     ----------
-    chain
+    chain : Chain
         Copy of the given chain with the calibrated geometry.
     values : dict of str to array
         The calibrated geometry by parameter name, in the chain's shapes and units, as
@@ -58,19 +60,19 @@ class CalibrationResult:
     identifiable : dict of str to bool array
         False where the data narrow the prior less than tenfold: that value is an assumption.
     singular_values : ndarray of shape (P,)
-        How many times the data narrow the prior, along P directions that they tell apart, largest
-        first. Below 10 the prior decides.
+        How many times the data narrow the prior, along P independent directions, largest first.
+        Below 10 the prior decides.
     unidentified : tuple of str
-        A sentence for each direction that the data leave open, with what to do.
+        A sentence for each direction that the data do not identify, with advice.
     rmse : float
         Root mean square tip distance on the given data [m].
     cv_rmse : float or None
-        The same on groups held out (at most 5 folds), when `groups` was given [m].
+        The same on held-out groups (at most 5 folds), when `groups` was given [m].
     converged : bool
         Whether the solver met its tolerance.
     """
 
-    chain: Any
+    chain: Chain
     values: dict[str, Any]
     std_errors: dict[str, Any]
     correlations: NDArray
@@ -89,12 +91,12 @@ class CalibrationResult:
             lines.append(f"  {name}: {_shown(value)}")
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
         if self.unidentified:
-            lines.append("  These data cannot tell, and the prior decides:")
+            lines.append("  Not identified by these data, the prior decides:")
             lines += [f"    {sentence}" for sentence in self.unidentified]
         return "\n".join(lines)
 
 
-def _shown(value: Any) -> str:
+def _shown(value: Numbers) -> str:
     array = np.asarray(value)
     rows = array[:3].reshape(3, 4) if array.shape == (4, 4) else np.atleast_2d(array)
     return "; ".join(" ".join(f"{entry:.4g}" for entry in row) for row in rows)
@@ -102,30 +104,29 @@ def _shown(value: Any) -> str:
 
 def calibrate(
     chain: Chain,
-    q: ArrayLike | Tensor,
-    x: ArrayLike | Tensor,
+    q: Numbers,
+    x: Numbers,
     parameters: Sequence[str] = ("radii", "base"),
     *,
     loss: str = "linear",
     bounds: Mapping[str, tuple[float, float]] | None = None,
     prior: float | Mapping[str, float] = 0.5,
     groups: ArrayLike | None = None,
-    sample_weight: ArrayLike | Tensor | None = None,
+    sample_weight: Numbers | None = None,
 ) -> CalibrationResult:
     """Return the chain whose geometry explains measured tips best.
 
     Nonlinear least squares on the tip distance with exact derivatives. Radii and lengths are
     fitted by their logarithm and so stay positive. A weak prior keeps every parameter near its
-    start where the data say nothing; its weight against the data follows the noise level, which
-    is estimated from the residuals, so exact data override it. With a free base or free angles
-    several starts are tried, other turns and mirror images of the actuator rings among them: of a
-    robot wired the other way round the data tell.
+    start where the data do not identify it; its weight against the data follows the noise level,
+    which is estimated from the residuals, so exact data override it. With a free base or free
+    angles several initial guesses are tried, among them other turns and mirror images of the
+    actuator rings, so that a robot wired the other way round is recognised.
 
     Parameters
     ----------
-    chain : ConstantCurvatureChain, RigidChain or nn.Module
-        Start of the search; it is not changed. Any module q -> x with `geometry()`,
-        `with_geometry()`, `reach` and `check_actuators()` will do.
+    chain : ConstantCurvatureChain, ElasticTendonChain, RigidChain or another Chain
+        Start of the search; it is not changed.
     q : array or Tensor of shape (N, n_actuators)
         Actuator vectors [m], of revolute joints [rad].
     x : array or Tensor of shape (N, 3)
@@ -148,7 +149,7 @@ def calibrate(
         "offsets", "tool" and the base position, radians for angles, rest bends and the base
         orientation. ``inf`` turns it off.
     groups : array-like of shape (N,), optional
-        Motion of every row; asks for `cv_rmse` on motions held out.
+        Motion of every row; asks for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional
         How many times each row counts; rows of weight zero are left out.
 
@@ -165,10 +166,10 @@ def calibrate(
     Warns
     -----
     UserWarning
-        Where q or x look like millimetres. Where a value ran into a bound or left what is
-        physical, and where the mirror image of the given robot explains the data far better: then
-        that is returned. For tendons of a ConstantCurvatureChain that contradict each other, as
-        slack does.
+        Where q or x look like millimetres. Where a value ran into a bound or is no longer
+        physical. Where the mirror image of the given robot explains the data far better; it is
+        then returned. Where tendons of a ConstantCurvatureChain contradict each other, as slack
+        tendons do.
 
     References
     ----------
@@ -185,15 +186,7 @@ def calibrate(
     tensor([0.0500, 0.0400], dtype=torch.float64)
     """
     result, messages = fit_geometry(
-        chain,
-        q,
-        x,
-        parameters,
-        loss=loss,
-        bounds=bounds,
-        prior=prior,
-        groups=groups,
-        sample_weight=sample_weight,
+        chain, q, x, parameters, loss, bounds, prior, groups, sample_weight
     )
     for message in messages:
         warnings.warn(message, stacklevel=2)
@@ -202,17 +195,21 @@ def calibrate(
 
 def fit_geometry(
     chain: Chain,
-    q: ArrayLike | Tensor,
-    x: ArrayLike | Tensor,
+    q: Numbers,
+    x: Numbers,
     parameters: Sequence[str],
-    *,
     loss: str = "linear",
     bounds: Mapping[str, tuple[float, float]] | None = None,
     prior: float | Mapping[str, float] = 0.5,
     groups: ArrayLike | None = None,
-    sample_weight: ArrayLike | Tensor | None = None,
+    sample_weight: Numbers | None = None,
 ) -> tuple[CalibrationResult, list[str]]:
     """Return what `calibrate` returns, and the messages of its warnings; nothing is issued."""
+    if not isinstance(chain, Chain):
+        raise TypeError(
+            "`chain` must be a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain or "
+            f"another Chain, got {type(chain).__name__}."
+        )
     names = _check_parameters(chain, parameters, bounds, prior)
     if loss not in _LOSSES:
         raise ValueError(f"`loss` must be one of {_LOSSES}, got {loss!r}.")
@@ -231,14 +228,14 @@ def fit_geometry(
     stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
     stds = {name: min(float(stds.get(name, 0.5)), _WIDEST) for name in names}
     with torch.no_grad():
-        candidates = starts(chain, rows, names)
+        guesses = initial_guesses(chain, rows, names)
     fits = []
-    for start in candidates:
-        problem = Problem.of(start.chain, names, bounds or {}, stds)
-        first = _first_theta(problem, start)
-        fits.append(solve(problem, rows, first, loss, roughly=len(candidates) > 1))
-    best, message = _best(fits, candidates, bool({"angles", "turns"} & {*names}))
-    if len(candidates) > 1:
+    for guess in guesses:
+        problem = Problem.of(guess.chain, names, bounds or {}, stds)
+        first = problem.start(guess.scale)
+        fits.append(solve(problem, rows, first, loss, roughly=len(guesses) > 1))
+    best, message = _best(fits, guesses, bool({"angles", "turns"} & {*names}))
+    if len(guesses) > 1:
         best = solve(best.problem, rows, best.theta, loss)
     messages += [message, _unphysical(best), best.chain().contradiction(q)]
     cv_rmse = None
@@ -248,22 +245,14 @@ def fit_geometry(
     return result, [message for message in messages if message is not None]
 
 
-def _first_theta(problem: Problem, start: Start) -> NDArray:
-    theta = [np.zeros(part.size) for part in problem.parameters]
-    for part, own in zip(problem.parameters, theta, strict=True):
-        if part.name == "radii":
-            own += np.log(start.scale)
-    return np.clip(np.concatenate(theta), problem.low, problem.high)
-
-
-def _best(fits: list[Fit], candidates: list[Start], free_angles: bool) -> tuple[Fit, str | None]:
+def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit, str | None]:
     """Return the best fit, and a warning where it is a mirror image that nobody asked for.
 
     Of equals the first is the best, a mirror image only where it is clearly better.
     """
     best, image = fits[0], None
-    for fit, start in zip(fits[1:], candidates[1:], strict=True):
-        if not any(start.mirrored):
+    for fit, guess in zip(fits[1:], guesses[1:], strict=True):
+        if not any(guess.mirrored):
             best = fit if fit.rmse < _EQUAL * best.rmse else best
         elif image is None or fit.rmse < image.rmse:
             image = fit
@@ -272,7 +261,7 @@ def _best(fits: list[Fit], candidates: list[Start], free_angles: bool) -> tuple[
     if free_angles:
         return image, None
     return image, (
-        f"the actuators run the other way round than `chain` says: its mirror image leaves "
+        f"the actuators run the other way round than in `chain`: its mirror image leaves "
         f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
         "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`."
     )
@@ -310,24 +299,24 @@ def _unphysical(fit: Fit) -> str | None:
 def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> CalibrationResult:
     problem, chain = fit.problem, fit.chain()
     prior_std = problem.prior_std
-    # By singular values in units of the prior: squares would lose what the data leave open.
+    # By singular values in units of the prior: squares would lose the small ones to rounding.
     J = fit.jacobian * prior_std
-    _, told, directions = np.linalg.svd(J / fit.noise, full_matrices=len(J) < J.shape[1])
-    told = np.pad(told, (0, len(prior_std) - told.size))
-    factor = prior_std[:, None] * directions.T / np.sqrt(told**2 + 1.0)
+    _, narrowed, directions = np.linalg.svd(J / fit.noise, full_matrices=len(J) < J.shape[1])
+    narrowed = np.pad(narrowed, (0, len(prior_std) - narrowed.size))
+    factor = prior_std[:, None] * directions.T / np.sqrt(narrowed**2 + 1.0)
     covariance = factor @ factor.T
     std = np.sqrt(np.diag(covariance))
     safe = np.where(std > 0, std, 1.0)
     geometry = {name: value.detach() for name, value in chain.geometry().items()}
     values, std_errors, identifiable = {}, {}, {}
-    pieces = (problem.parts(part) for part in (std, std < _KNOWN * prior_std))
-    for part, error, known in zip(problem.parameters, *pieces, strict=True):
+    pieces = (problem.parts(part) for part in (std, std < _IDENTIFIED * prior_std))
+    for part, error, identified in zip(problem.parameters, *pieces, strict=True):
         value = part.value(geometry[part.entry])
         error = part.std_errors(error, value.numpy())
         values[part.name] = value if torch_given else value.numpy()
         std_errors[part.name] = torch.as_tensor(error) if torch_given else np.asarray(error)
-        identifiable[part.name] = np.asarray(part.flags(known))
-    open_ones = directions[told * _KNOWN < 1.0]
+        identifiable[part.name] = np.asarray(part.flags(identified))
+    unidentified = directions[narrowed * _IDENTIFIED < 1.0]
     return CalibrationResult(
         chain=chain,
         values=values,
@@ -336,8 +325,8 @@ def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> C
         names=problem.labels,
         narrowing=prior_std / safe,
         identifiable=identifiable,
-        singular_values=told,
-        unidentified=sentences(fit, open_ones, float(rows.weight.sum())),
+        singular_values=narrowed,
+        unidentified=sentences(fit, unidentified, float(rows.weight.sum())),
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
         converged=fit.converged,
@@ -360,7 +349,7 @@ def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
 
 
 def _check_parameters(
-    chain: Any, parameters: Sequence[str], bounds: Mapping | None, prior: float | Mapping
+    chain: Chain, parameters: Sequence[str], bounds: Mapping | None, prior: float | Mapping
 ) -> tuple[str, ...]:
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     available = parameter_names(chain)
@@ -392,9 +381,7 @@ def _check_parameters(
     return names
 
 
-def _check_data(
-    chain: Chain, q: ArrayLike | Tensor, x: ArrayLike | Tensor
-) -> tuple[Tensor, Tensor, list[str | None]]:
+def _check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str | None]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q, x = as_tensor(q, "q").to(dtype), as_tensor(x, "x").to(dtype)
@@ -414,7 +401,7 @@ def _check_data(
     return q, x, [*messages, span_message("x", x, float(chain.reach.detach()))]
 
 
-def _check_weights(sample_weight: Any, q: Tensor) -> Tensor:
+def _check_weights(sample_weight: Numbers | None, q: Tensor) -> Tensor:
     if sample_weight is None:
         return q.new_ones(len(q))
     weights = as_tensor(sample_weight, "sample_weight").to(q)

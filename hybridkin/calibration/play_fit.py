@@ -1,4 +1,4 @@
-"""Backlash of the actuators from a log, chosen by held-out motions."""
+"""Backlash (play) of the actuators from a log, chosen by held-out motions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold
 
-from hybridkin.calibration.calibrate import CalibrationResult, calibrate
+from hybridkin._core.arrays import Numbers, as_array
+from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
+from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 
 __all__ = ["PlayFit", "fit_play"]
@@ -21,7 +23,7 @@ _FOLDS = 5
 
 @dataclass(frozen=True)
 class PlayFit:
-    """Play that a log shows, and the chain calibrated with it.
+    """Backlash (play) identified from a log, and the chain calibrated with it.
 
     Attributes
     ----------
@@ -30,13 +32,13 @@ class PlayFit:
     widths : ndarray of shape (W,)
         Widths tried [m], ascending, the first zero.
     cv_rmse : ndarray of shape (W,)
-        Root mean square tip distance on motions held out, with each width [m].
+        Root mean square tip distance on held-out motions, with each width [m].
     gain : float
         By how much the best width lowers the error of a fold, on average [m].
     gain_std_error : float
         Standard error of `gain` over the folds [m].
     kept : bool
-        Whether play is worth its while: `gain` is above `gain_std_error`.
+        Whether the play lowers the error: `gain` is above `gain_std_error`.
     result : CalibrationResult
         The calibration on all rows with the chosen width.
     """
@@ -56,32 +58,33 @@ class PlayFit:
 
 
 def fit_play(
-    chain: Any,
-    q: Any,
-    x: Any,
+    chain: Chain,
+    q: Numbers,
+    x: Numbers,
     groups: ArrayLike,
     widths: Sequence[float] = (0.0, 0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3),
     parameters: Sequence[str] | None = None,
     **calibrate_options: Any,
 ) -> PlayFit:
-    """Return the play of the tendons, chosen by motions held out, and the chain behind it.
+    """Return the backlash (play) of the tendons, chosen by held-out motions, and the chain.
 
     With every width the chain is calibrated on the effective changes of the training motions and
-    measured on the others, in at most 5 folds. The best width is kept only where its gain over no
-    play, averaged over the folds, exceeds its standard error.
+    evaluated on the others, in at most 5 folds. The best width is kept only where its gain over no
+    play, averaged over the folds, exceeds its standard error. Calibrations of folds issue no
+    warnings; that of all rows does.
 
     Parameters
     ----------
-    chain : ElasticTendonChain, ConstantCurvatureChain or nn.Module
+    chain : ElasticTendonChain, ConstantCurvatureChain or another Chain
         Start of the calibration; it is not changed.
     q : array or Tensor of shape (N, n_actuators)
         Commanded tendon length changes, the rows of one motion in the order of time [m].
     x : array or Tensor of shape (N, 3)
         Measured tip positions [m].
     groups : array-like of shape (N,)
-        Motion of every row; each starts without a past.
+        Motion of every row; the play of each starts afresh.
     widths : sequence of float, default=(0, 0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3)
-        Total play to try, the same for all tendons [m]. Zero is tried in any case.
+        Total play to try, the same for all tendons [m]. Zero is always tried.
     parameters : sequence of str, optional
         What to calibrate, see `calibrate`. Default: the chain's own list.
     **calibrate_options
@@ -121,14 +124,18 @@ def fit_play(
     if folds < 2:
         raise ValueError("`groups` must name at least 2 motions to hold one out, got 1.")
     names = tuple(chain.default_parameters) if parameters is None else parameters
+    q, x = as_array(q), as_array(x)
     effective = [PlayOperator(width).apply_by_group(q, groups) for width in tried]
     splits = list(GroupKFold(folds).split(groups, groups=groups))
-    mean_squares = np.array(
-        [
-            [_mean_square(chain, y, x, names, split, calibrate_options) for split in splits]
-            for y in effective
-        ]
-    )
+
+    def mean_square(y: NDArray, train: NDArray, test: NDArray) -> float:
+        """Return the mean squared tip distance on the held-out motions."""
+        result, _ = fit_geometry(chain, y[train], x[train], names, **calibrate_options)
+        with torch.no_grad():
+            tips = result.chain(torch.as_tensor(y[test]).to(result.chain.base)).numpy()
+        return float(((tips - x[test]) ** 2).sum(axis=1).mean())
+
+    mean_squares = np.array([[mean_square(y, *split) for split in splits] for y in effective])
     sizes = [len(test) for _, test in splits]
     cv_rmse = np.sqrt(np.average(mean_squares, axis=1, weights=sizes))
     best = int(np.argmin(cv_rmse))
@@ -138,15 +145,3 @@ def fit_play(
     chosen = best if kept else 0
     result = calibrate(chain, effective[chosen], x, names, **calibrate_options)
     return PlayFit(float(tried[chosen]), tried, cv_rmse, gain, std_error, kept, result)
-
-
-def _mean_square(
-    chain: Any, y: Any, x: Any, names: Sequence[str], split: Any, options: dict[str, Any]
-) -> float:
-    """Return the mean squared tip distance on the motions held out."""
-    train, test = split
-    fitted = calibrate(chain, y[train], x[train], names, **options).chain
-    with torch.no_grad():
-        held_out = torch.as_tensor(y[test]).to(fitted.geometry()["base"])
-        error = fitted(held_out) - torch.as_tensor(x[test]).to(held_out)
-    return float(error.square().sum(dim=1).mean())
