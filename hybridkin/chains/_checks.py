@@ -136,6 +136,15 @@ def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Te
     return matrix
 
 
+def rigid_pose(value: Numbers, name: str) -> Tensor:
+    """Return a pose whose rotation is orthonormal to the last bit, checked."""
+    matrix = pose(value, name, torch.float64)
+    u, _, vh = torch.linalg.svd(matrix[:3, :3])
+    matrix[:3, :3] = u @ vh
+    matrix[3] = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
+    return matrix
+
+
 def check_replacements(values: Mapping[str, Tensor], current: Mapping[str, Tensor]) -> None:
     """Raise where values are not part of the geometry, or have another shape."""
     for name, value in values.items():

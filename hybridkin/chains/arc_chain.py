@@ -99,20 +99,7 @@ class ArcChain(Chain):
         return in_blocks(self._forward, q, 8192)[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the tip position [m] and its Jacobian in one pass.
-
-        Parameters
-        ----------
-        q : Tensor of shape (..., n_actuators)
-            Actuator lengths, or tendon length changes [m].
-
-        Returns
-        -------
-        x : Tensor of shape (..., 3)
-            Tip position [m].
-        J : Tensor of shape (..., 3, n_actuators)
-            Closed-form Jacobian dx/dq [-].
-        """
+        """Return the tip (..., 3) [m] and its Jacobian (..., 3, n_actuators) [-] in one pass."""
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         x, J = in_blocks(self._forward_and_jacobian, q)
         return x, J
@@ -154,14 +141,12 @@ class ArcChain(Chain):
         """
         rows = self._rows(q)
         length, bending = self._split(self._to_tip(self._arcs_and_slope(rows)[0]))
-        offsets, base = self._tip_offsets().to(q), self.base.to(q)
+        offsets = self._tip_offsets().to(q)
         tail, columns = tip_and_columns(length, bending, offsets, rigid=True)
         tangents = {name: value.to(q) for name, value in tangents.items()}
         moves = self._to_tip(self._arc_tangents(rows, tangents).permute(2, 1, 0)).permute(2, 1, 0)
-        columns = (base[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
-        by_arcs, by_offsets = (
-            columns.permute(2, 0, 1).contiguous().split([3 * len(length), len(length)], dim=2)
-        )
+        columns, S = self._turned(columns).permute(2, 0, 1).contiguous(), len(length)
+        by_arcs, by_offsets = columns.split([3 * S, S], dim=2)
         J = by_arcs @ moves.mT
         if "offsets" in tangents:
             J = J + by_offsets @ self._tip_offsets(tangents["offsets"]).T
@@ -313,16 +298,13 @@ class ArcChain(Chain):
 
     def from_coordinates(self, z: Tensor) -> Tensor:
         """Return the tip (N, 3) of arcs (N, 3 m) up to it."""
-        arcs = z.mT
-        tail = tip(*self._split(arcs), self._tip_offsets().to(arcs))
-        return self._in_measuring_frame(tail, z)
+        return self._tip_of(z.mT, z)
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (N, 3) of arcs (N, 3 m) up to it, and its derivative (N, 3, 3 m)."""
         arcs = z.mT
         tail, columns = tip_and_columns(*self._split(arcs), self._tip_offsets().to(arcs))
-        turned = (self.base.to(arcs)[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
-        return self._in_measuring_frame(tail, arcs.T), turned.permute(2, 0, 1)
+        return self._in_measuring_frame(tail, z), self._turned(columns).permute(2, 0, 1)
 
     def _rows(self, q: Tensor) -> Tensor:
         check_vectors(q, self.n_actuators, "q", self._why_shape())
@@ -377,15 +359,23 @@ class ArcChain(Chain):
         return torch.stack(poses, dim=-3)
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
-        length, bending = self._split(self._to_tip(self._arcs(q)))
-        tail = tip(length, bending, self._tip_offsets().to(q))
-        return (self._in_measuring_frame(tail, q),)
+        return (self._tip_of(self._to_tip(self._arcs(q)), q),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         arcs, slope = self._arcs_and_slope(self._rows(q))
-        length, bending = self._split(self._to_tip(arcs))
-        tail, columns = tip_and_columns(length, bending, self._tip_offsets().to(q))
+        arcs = self._split(self._to_tip(arcs))
+        tail, columns = tip_and_columns(*arcs, self._tip_offsets().to(q))
         return self._in_measuring_frame(tail, q), self._by_actuators(columns, slope, q)
+
+    def _tip_of(self, arcs: Tensor, q: Tensor) -> Tensor:
+        """Return the tips (..., 3) of arcs (3 m, N) up to them, in the batch shape of q."""
+        tail = tip(*self._split(arcs), self._tip_offsets().to(arcs))
+        return self._in_measuring_frame(tail, q)
+
+    def _turned(self, columns: Tensor) -> Tensor:
+        """Return columns (3, k, N) of the base frame in the measuring frame."""
+        base = self.base.to(columns)[:3, :3]
+        return (base @ columns.flatten(1)).unflatten(1, columns.shape[1:])
 
     def _in_measuring_frame(self, tail: Tensor, q: Tensor) -> Tensor:
         base = self.base.to(q)
@@ -393,8 +383,7 @@ class ArcChain(Chain):
 
     def _by_actuators(self, columns: Tensor, slope: Tensor, q: Tensor) -> Tensor:
         """Fold the slope of the arcs and the base into columns (3, 3 m, N)."""
-        columns = (self.base.to(q)[:3, :3] @ columns.flatten(1)).unflatten(1, columns.shape[1:])
-        slope = self._to_tip(slope)
+        columns, slope = self._turned(columns), self._to_tip(slope)
         if slope.ndim == 3:
             J = torch.matmul(columns.permute(2, 0, 1), slope.permute(2, 0, 1))
             return J.reshape(*q.shape[:-1], 3, self.n_actuators)

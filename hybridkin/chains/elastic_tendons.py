@@ -185,19 +185,17 @@ class ElasticTendonChain(ArcChain):
             raise ValueError(
                 "`chain` must have `lengths`: the actuators of extensible segments are no tendons."
             )
-        counts = chain.actuators_per_segment
-        geometry = {
-            "lengths": chain.lengths,
+        geometry, counts = chain.geometry(), chain.actuators_per_segment
+        zeros = geometry.pop("actuator_zeros")
+        given = {
+            **geometry,
             "n_tendons": counts,
-            "angles": [part.tolist() for part in chain.angles.split(counts)],
+            "angles": [part.tolist() for part in geometry["angles"].split(counts)],
+            "tendon_zeros": zeros,
             "routing": chain.routing,
-            "tendon_zeros": chain.actuator_zeros,
-            "rest_bends": chain.rest_bends,
-            "offsets": chain.offsets,
-            "base": chain.base,
             "dtype": chain.radii.dtype,
         }
-        return cls(chain.radii, **(geometry | options)).with_tip(chain.tip_at)
+        return cls(**(given | options)).with_tip(chain.tip_at)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:

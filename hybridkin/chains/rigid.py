@@ -14,7 +14,7 @@ from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints, urdf_path
-from hybridkin.chains._checks import pose, shaped
+from hybridkin.chains._checks import pose, rigid_pose, shaped
 from hybridkin.chains._joint_motions import (
     carried_tip,
     column_carriers,
@@ -118,12 +118,11 @@ class RigidChain(Chain):
             )
         axes = axes / lengths
         origins = shaped(origins, "origins", (n, 4, 4))
-        origins = torch.stack([_rigid(origins[k], f"origins[{k}]") for k in range(n)])
+        origins = torch.stack([rigid_pose(origins[k], f"origins[{k}]") for k in range(n)])
         self.n_actuators = n
         self.kinds = ("revolute",) * n if kinds is None else tuple(map(str, kinds))
-        self.names = tuple(
-            map(str, [f"joint_{k + 1}" for k in range(n)] if names is None else names)
-        )
+        default = [f"joint_{k + 1}" for k in range(n)]
+        self.names = tuple(map(str, default if names is None else names))
         if len(self.kinds) != n or not set(self.kinds) <= set(_KINDS):
             raise ValueError(f"`kinds` must hold {n} of {_KINDS}, one per joint, got {self.kinds}.")
         if len(self.names) != n:
@@ -141,7 +140,7 @@ class RigidChain(Chain):
             "axes": axes,
             "q_min": low,
             "q_max": high,
-            "tip": _rigid(torch.eye(4) if tip is None else tip, "tip"),
+            "tip": rigid_pose(torch.eye(4) if tip is None else tip, "tip"),
             "tool": shaped(tool, "tool", (3,)),
             "base": pose(base, "base", dtype),
             "motions": motions,
@@ -301,19 +300,9 @@ class RigidChain(Chain):
         return in_blocks(self._tip, q)[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the tip position [m] and its Jacobian in one pass.
+        """Return the tip (..., 3) [m] and its Jacobian dx/dq (..., 3, n) in one pass.
 
-        Parameters
-        ----------
-        q : Tensor of shape (..., n_actuators)
-            Joint positions [rad], of prismatic joints [m].
-
-        Returns
-        -------
-        x : Tensor of shape (..., 3)
-            Tip position [m].
-        J : Tensor of shape (..., 3, n_actuators)
-            Closed-form Jacobian dx/dq [m/rad], of prismatic joints [-].
+        In closed form, in [m/rad] for revolute joints and [-] for prismatic ones.
         """
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         x, J = in_blocks(self._forward_and_jacobian, q)
@@ -437,12 +426,3 @@ class RigidChain(Chain):
     def _end(self, q: Tensor) -> Tensor:
         """Return the tool in the last joint's moving frame, homogeneous, shape (4,)."""
         return self.tip.to(q) @ nn.functional.pad(self.tool.to(q), (0, 1), value=1.0)
-
-
-def _rigid(value: Numbers, name: str) -> Tensor:
-    """Return a pose whose rotation is orthonormal to the last bit, checked."""
-    matrix = pose(value, name, torch.float64)
-    u, _, vh = torch.linalg.svd(matrix[:3, :3])
-    matrix[:3, :3] = u @ vh
-    matrix[3] = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
-    return matrix

@@ -23,7 +23,6 @@ else:
 
 __all__ = [
     "BHA_LENGTH_LIMITS",
-    "BHA_WORKING_BOX",
     "Limits",
     "LogFormat",
     "RobotDescription",
@@ -35,14 +34,9 @@ __all__ = [
 BHA_LENGTH_LIMITS = (0.10, 0.40)
 """Shortest and longest chamber of the Bionic Handling Assistant [m]."""
 
-BHA_WORKING_BOX = (0.19, 0.31)
-"""Chamber lengths it works in: 0.25 m, give or take 0.06 m."""
-
 _UNITS = ("m", "cm", "mm")
 _MODELS = ("constant-curvature", "elastic-tendon")
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
-
-Chain = ConstantCurvatureChain | ElasticTendonChain
 
 
 def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
@@ -139,13 +133,13 @@ class RobotDescription:
     """
 
     name: str
-    chain: Chain
+    chain: ConstantCurvatureChain | ElasticTendonChain
     calibrate: tuple[str, ...]
     log: LogFormat | None
     limits: Limits = Limits()
 
 
-def from_toml(path: str | Path) -> Chain:
+def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
     r"""Return the chain that a TOML file describes.
 
     Parameters
@@ -387,11 +381,8 @@ def _limits(table: Mapping[str, Any], n_actuators: int) -> Limits:
         values = [value] * n_actuators if type(value) in (int, float) else value
         found[key] = _numbers({key: values}, key, "[limits]", n_actuators)
     limits = Limits(**found)
-    if (
-        limits.q_min is not None
-        and limits.q_max is not None
-        and (limits.q_min > limits.q_max).any()
-    ):
+    low, high = limits.q_min, limits.q_max
+    if low is not None and high is not None and (low > high).any():
         raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
     if limits.dq_max is not None and not (limits.dq_max > 0).all():
         raise ValueError(f"`dq_max` in [limits] must be positive, got {table['dq_max']!r}.")

@@ -154,7 +154,7 @@ def draw():
     """Draw rows of nine chamber lengths [m], uniform in the working box."""
 
     def rows(n):
-        low, high = robots.BHA_WORKING_BOX
+        low, high = 0.19, 0.31  # chamber lengths [m]
         uniform = torch.rand(n, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
         return low + (high - low) * uniform
 
