@@ -17,7 +17,7 @@ def in_blocks(
     What the function gives may lie in memory with the batch last; the result is contiguous.
     """
     if not isinstance(q, Tensor) or q.ndim == 0:
-        return function(q)  # which says what is wrong
+        return function(q)  # which raises
     blocks = q.reshape(-1, q.shape[-1]).split(size)
     first = function(blocks[0])
     if len(blocks) == 1:

@@ -44,7 +44,7 @@ class ForwardModel(PortableModule):
     """A model of a robot: a torch module that maps every row of q to a row of x.
 
     Chains, error models, hybrids and wrapped functions are forward models; inverse kinematics,
-    calibration and plots know nothing else. A subclass gives `forward`, and `forward_and_jacobian`
+    calibration and plots use nothing else. A subclass gives `forward`, and `forward_and_jacobian`
     where it has a closed form.
 
     Attributes
@@ -100,7 +100,7 @@ class ForwardModel(PortableModule):
 
 
 class PoseModel(ForwardModel):
-    """A forward model of the tip's position that knows the pose of the tip as well."""
+    """A forward model of the tip's position with the pose of the tip as well."""
 
     n_outputs: int = 3
 

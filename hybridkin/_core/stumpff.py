@@ -49,7 +49,7 @@ def stumpff(s: Tensor) -> Stumpff:
         Five tensors of the shape of `s`.
     """
     # c3 and c4 together: one multiply-add per power, however small the batch.
-    # Not s.new_tensor: before torch 2.5 it does not know functional transforms.
+    # Not s.new_tensor: before torch 2.5 it does not work in functional transforms.
     powers = torch.tensor(_SERIES[-1 - _DEGREE.get(s.dtype, 7) :], dtype=s.dtype, device=s.device)
     powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
     near = s.clamp(max=_SERIES_END)

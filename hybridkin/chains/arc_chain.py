@@ -123,7 +123,7 @@ class ArcChain(Chain):
         q : Tensor of shape (..., n_actuators)
             Actuator lengths, or tendon length changes [m].
         tangents : dict of str to Tensor of shape (P, ...)
-            P changes of entries of `geometry()`, stacked; entries left out stay as they are.
+            P changes of entries of `geometry()`, stacked; other entries stay as they are.
 
         Returns
         -------

@@ -46,7 +46,7 @@ class Chain(PoseModel):
         raise NotImplementedError
 
     def geometry(self) -> dict[str, Tensor]:
-        """Return the geometry by name, as in the constructor; what a kind lacks is left out."""
+        """Return the geometry by name, as in the constructor; without what a kind lacks."""
         entries = {name: self._buffers[name] for name in self._entries}
         return {name: value for name, value in entries.items() if value is not None}
 
@@ -61,7 +61,7 @@ class Chain(PoseModel):
         Returns
         -------
         Chain
-            A new chain of the same kind; this one is left as it was.
+            A new chain of the same kind; this one is not changed.
         """
         check_replacements(geometry, self.geometry())
         chain = type(self).__new__(type(self))
@@ -82,7 +82,7 @@ class Chain(PoseModel):
         q : Tensor of shape (..., n_actuators)
             Actuator vectors.
         tangents : dict of str to Tensor of shape (P, ...)
-            P changes of entries of `geometry()`, stacked; entries left out stay as they are.
+            P changes of entries of `geometry()`, stacked; other entries stay as they are.
         """
         current = self.geometry()
 

@@ -15,8 +15,8 @@ from hybridkin.chains.arc_chain import ArcChain
 
 __all__ = ["ConstantCurvatureChain"]
 
-_CONTRADICTED = 0.3  # of the readings that the arcs explain, in one segment
-_WORTH_A_WORD = 0.1  # of the radius: a bend of a tenth of a radian would read as much
+_CONTRADICTED = 0.3  # share of the readings that the arcs explain, in one segment
+_NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
 
 
 class ConstantCurvatureChain(ArcChain):
@@ -50,8 +50,8 @@ class ConstantCurvatureChain(ArcChain):
     rest_bends : float or array-like of shape (S, 2), default=0.0
         Pre-curvature: bending vector of each segment while all its actuators agree [rad].
     actuator_zeros : float or array-like of shape (n,), default=0.0
-        What each sensor reads too much [m]: the chain bends by ``q - actuator_zeros``. A list of
-        lists, one per segment, will do as well.
+        Offset of each sensor [m]: the chain bends by ``q - actuator_zeros``. A list of
+        lists, one per segment, is accepted too.
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
         Pose of the robot's base in the measuring frame. Default: identity.
     dtype : torch.dtype, default=torch.float64
@@ -150,13 +150,13 @@ class ConstantCurvatureChain(ArcChain):
         return self._by_segment(residual, q)
 
     def contradictory(self, q: Tensor) -> Tensor:
-        """Return where the readings of a segment contradict each other too much to be believed.
+        """Return where the readings of a segment contradict each other.
 
         That is where their `consistency` residual exceeds both 30 % of the readings that the arcs
         explain and a tenth of the segment's radius, which a bend of 0.1 rad would read. On tendon
         chains slack does that: a single tendon pulled while the others stay leaves 71 % of what
-        bends the segment, balanced tendons leave nothing. Extensible segments take a common change
-        up as length.
+        bends the segment, balanced tendons leave nothing. In extensible segments a common
+        change is a change of length.
 
         Parameters
         ----------
@@ -180,7 +180,7 @@ class ConstantCurvatureChain(ArcChain):
         readings = self._by_segment(self._rows(q) - self.actuator_zeros.to(q), q)
         residual = self.consistency(q)
         explained = (readings.square() - residual.square()).clamp(min=0.0).sqrt()
-        tall = residual > _WORTH_A_WORD * self.radii.to(q)
+        tall = residual > _NOTICED * self.radii.to(q)
         return tall & (residual > _CONTRADICTED * explained)
 
     def contradiction(self, q: Tensor, name: str = "q") -> str | None:
@@ -213,7 +213,7 @@ class ConstantCurvatureChain(ArcChain):
             "segment together or let them go, which bends nothing in a ConstantCurvatureChain "
             "but compresses a robot or leaves tendons slack: worst is row "
             f"{row}, segment {segment + 1}, {1e3 * float(residual[row, segment]):.3g} mm rms. "
-            "ElasticTendonChain knows tendons that can only pull."
+            "ElasticTendonChain models tendons that can only pull."
         )
 
     def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:

@@ -35,7 +35,7 @@ __all__ = ["ElasticTendonChain"]
 _SHAPING = (
     *("radii", "angles", "bending_stiffness", "axial_stiffness", "rest_bends", "tendon_zeros"),
 )
-_TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are kept
+_TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are stored
 _Rough = tuple[Tensor, Tensor]
 
 
@@ -76,7 +76,7 @@ class ElasticTendonChain(ArcChain):
         Of a segment over that of a tendon [-]. Default: 10.
     tendon_zeros : float or array-like of shape (n,), default=0.0
         Pre-tension: stretch of each tendon at q = 0 on the straight backbone [m]; negative where it
-        hangs slack. A list of lists, one per segment, will do as well.
+        hangs slack. A list of lists, one per segment, is accepted too.
     rest_bends : float or array-like of shape (S, 2), default=0.0
         Pre-curvature: bending vector of each segment without tendons [rad].
     offsets : float or array-like of shape (S,), default=0.0
@@ -90,10 +90,10 @@ class ElasticTendonChain(ArcChain):
     -----
     q holds the *changes* of tendon length from straight [m], negative where a tendon is shortened.
 
-    The taut tendons are found by block principal pivoting: all tendons that contradict their role
-    change it at once, and after eight such steps only the first, by Murty's rule, which ends for
-    certain. Up to twelve tendons the linear answers of all sets of taut tendons are kept from the
-    first use on, beyond they are solved for row by row.
+    The taut tendons are found by block principal pivoting: all tendons with the wrong sign change
+    their role at once, and after eight such steps only the first, by Murty's rule, which always
+    terminates. Up to twelve tendons the linear responses of all sets of taut tendons are stored at
+    the first use; with more tendons they are solved for row by row.
 
     Derivatives are those of the present set of taut tendons: where a tendon is just about to pull,
     the one-sided derivative towards its taut side.
@@ -116,7 +116,7 @@ class ElasticTendonChain(ArcChain):
     """
 
     _entries = (*_SHAPING, "lengths", "offsets", "base")
-    _structure = (*ArcChain._structure, "_table")  # the table knows its geometry
+    _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
 
     lengths: Tensor
     bending_stiffness: Tensor
@@ -258,7 +258,7 @@ class ElasticTendonChain(ArcChain):
         )
 
     def _all_responses(self, rows: Tensor) -> tuple[Responses, _Rough]:
-        """Return the responses of all sets of tendons, kept while the geometry stays."""
+        """Return the responses of all sets of taut tendons, stored while the geometry stays."""
         geometry = self.geometry()
         shaping = [geometry[name] for name in _SHAPING]
         learning = torch.is_grad_enabled() and any(value.requires_grad for value in shaping)

@@ -52,7 +52,7 @@ class RigidChain(Chain):
     names : sequence of n str, optional
         Names of the joints. Default: "joint_1", ...
     q_min, q_max : array-like of shape (n,), optional
-        Joint limits [rad] or [m], kept for `InverseKinematics`; the arm itself knows no limits.
+        Joint limits [rad] or [m], kept for `InverseKinematics`; the arm itself ignores them.
         Default: none, infinite.
     tip : array-like of shape (4, 4), optional
         Pose of the end link in the frame that the last joint moves. Default: identity.

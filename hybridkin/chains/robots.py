@@ -48,7 +48,7 @@ def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
     Parameters
     ----------
     tool : float, default=0.0
-        Rigid length beyond the last segment [m].
+        Rigid length after the last segment [m].
 
     Returns
     -------
@@ -194,7 +194,7 @@ def read_description(path: str | Path) -> RobotDescription:
             clockwise = false               # which way the others follow
             offset = 0.0                    # rigid length after the segment [m]
             rest_bend_deg = [0.0, 0.0]      # its pre-curvature: a bending vector
-            zeros = [0.0, 0.0, 0.0]         # what the sensor of each actuator reads too much [m]
+            zeros = [0.0, 0.0, 0.0]         # offset of the sensor of each actuator [m]
                                             # of elastic tendons their `tendon_zeros`
             bending_stiffness = 2.0e-7      # of elastic tendons only, in all segments or in none
             axial_stiffness = 10.0          # likewise; units and defaults: `ElasticTendonChain`
@@ -222,7 +222,7 @@ def read_description(path: str | Path) -> RobotDescription:
     Returns
     -------
     RobotDescription
-        The nominal chain and what else the file says.
+        The nominal chain and the other entries of the file.
 
     Raises
     ------

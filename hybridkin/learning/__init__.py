@@ -1,1 +1,1 @@
-"""Regressors that know no robot: extreme learning machines, and others as torch modules."""
+"""Regressors, independent of any robot: extreme learning machines, and others as torch modules."""

@@ -1,4 +1,4 @@
-"""Exact errors of a ridge readout on rows left out, for a whole grid of penalties, in one pass."""
+"""Exact errors of a ridge readout on held-out rows, for a whole grid of penalties, in one pass."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ _BLOCK_ELEMENTS = 2_000_000  # 16 MB of float64 per temporary
 
 
 class LeftOut:
-    """Errors that the readout of a hidden layer makes on rows that it has not seen.
+    """Errors of the readout of a hidden layer on held-out rows.
 
     With the residuals ``r = y - Phi W`` of all rows and their operator ``P = 1 - Phi A^-1 Phi'``,
     ``A = Phi' Phi + alpha 1``, the errors on rows S without S are ``P_SS^-1 r_S``: no refit. In the
@@ -30,7 +30,7 @@ class LeftOut:
     sample_weight : ndarray of shape (n_samples,) or None
         Positive weights, or ones.
     fit_intercept : bool
-        Whether the readout has an intercept; it is fitted anew without the rows left out.
+        Whether the readout has an intercept; it is fitted anew without the held-out rows.
 
     References
     ----------
@@ -62,13 +62,13 @@ class LeftOut:
         self.eigenvalues = np.maximum(eigenvalues, 0.0)
 
     def rows_at_a_time(self, n_alphas):
-        """Return how many rows may be asked for at once in little memory."""
+        """Return how many rows can be computed at once in little memory."""
         return max(1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1]))
 
     def each(self, rows, alphas):
-        """Return the errors (n_alphas, n_rows, n_outputs) on rows each left out alone.
+        """Return the errors (n_alphas, n_rows, n_outputs) on rows each held out alone.
 
-        Of a row of weight above 1, a repeated one, a weight of 1 is left out.
+        Of a row of weight above 1, a repeated one, a weight of 1 is held out.
         """
         Z, D, root = self._z(rows), self._d(alphas), self._root[rows]
         p = D @ (Z * Z).T
@@ -84,7 +84,7 @@ class LeftOut:
         Parameters
         ----------
         out : ndarray of int of shape (n_out,)
-            Rows left out, ascending.
+            Held-out rows, ascending.
         asked : ndarray of int of shape (n_asked,)
             Some of them.
         alphas : ndarray of shape (n_alphas,)

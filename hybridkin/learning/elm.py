@@ -173,7 +173,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def partial_fit(self, X, y, sample_weight=None, decay=1.0):
         """Add rows to those already seen; the result is that of one `fit` to all of them.
 
-        The first call draws the hidden layer and fixes the input scaling, for good.
+        The first call draws the hidden layer and fixes the input scaling; later calls keep them.
 
         Parameters
         ----------
@@ -189,8 +189,8 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if not isinstance(decay, Real) or not 0.0 < decay <= 1.0:
             raise ValueError(
-                f"`decay` must lie in (0, 1], got {decay!r}; 1 forgets nothing, 0.99 forgets a "
-                f"hundredth of what earlier rows count."
+                f"`decay` must lie in (0, 1], got {decay!r}; 1 keeps the weight of earlier rows, "
+                f"0.99 lowers it by a hundredth."
             )
         return self._learn(X, y, sample_weight, first="module_" not in vars(self), decay=decay)
 

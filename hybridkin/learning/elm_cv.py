@@ -1,4 +1,4 @@
-"""Extreme learning machine whose complexity is chosen by its errors on rows left out."""
+"""Extreme learning machine whose complexity is chosen by cross-validation."""
 
 from itertools import product
 from numbers import Integral
@@ -30,8 +30,8 @@ _SHARED = (
 class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Extreme learning machine that chooses penalty, weight scale, size and input scales itself.
 
-    Every choice is made by the mean squared error on rows that were left out, each alone or by
-    groups. These errors are exact for the given hidden layer and input scales, and come from one
+    Every choice is made by the mean squared error on held-out rows, each row alone or by groups.
+    These errors are exact for the given hidden layer and input scales, and come from one
     factorisation for the whole grid of penalties: no model is fitted twice.
 
     With rounds of relevance, each input is then scaled by how much the derivative along it varies
@@ -48,7 +48,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     weight_scales : sequence of float, default=(0.1, 0.2, 0.4, 0.8, 1.6)
         Ranges of the random weights to try.
     cv : int, splitter or iterable of (train, test), default=None
-        Which rows are left out together. None: each group where `fit` is given groups, else each
+        Which rows are held out together. None: each group where `fit` is given groups, else each
         row alone.
     relevance_rounds : int, default=5
         How often at most the inputs are rescaled by their relevance.
@@ -65,13 +65,13 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     best_estimator_ : ELMRegressor
         The chosen model, fitted to all rows.
     best_score_ : float
-        Minus its mean squared error on rows left out [unit of y^2]. Being chosen by it, it is a
-        little optimistic.
+        Minus its mean squared error on held-out rows [unit of y^2]; a little optimistic, because
+        the model was chosen by it.
     alpha_ : float
         The chosen penalty.
     left_out_errors_ : ndarray of the shape of y
         Target minus prediction of each row without it, under the chosen parameters [unit of y].
-        The mean, if a row was left out more than once; NaN, if never or of weight 0.
+        The mean, if a row was held out more than once; NaN, if never or of weight 0.
     cv_results_ : dict of ndarray
         One row per candidate: n_hidden, weight_scale, relevance (n_inputs,), alphas and
         mean_squared_error (n_alphas,).
@@ -145,7 +145,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     @_fit_context(prefer_skip_nested_validation=True)
     def fit(self, X, y, sample_weight=None, groups=None):
-        """Choose the parameters by rows left out, and fit them to all rows.
+        """Choose the parameters by held-out rows, and fit them to all rows.
 
         Parameters
         ----------
@@ -154,10 +154,10 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets.
         sample_weight : array-like of shape (n_samples,), default=None
-            How often each row counts. One repetition is left out at a time, or what there is of
+            How often each row counts. One repetition is held out at a time, or what there is of
             it; with groups all of them.
         groups : array-like of shape (n_samples,), default=None
-            Rows that belong together, such as those of one motion; they are left out together.
+            Rows that belong together, such as those of one motion; they are held out together.
 
         Returns
         -------
@@ -170,7 +170,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             X, y, sample_weight = X[kept], y[kept], sample_weight[kept]  # pyright: ignore
         if len(y) < 2:
             raise ValueError(
-                f"`X` must have at least 2 rows of positive weight, so that one can be left out, "
+                f"`X` must have at least 2 rows of positive weight, so that one can be held out, "
                 f"got n_samples={len(y)}; ELMRegressor needs no choice."
             )
         splits = _splits(self.cv, y_shape, groups, kept)
@@ -251,7 +251,7 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 class _Task(NamedTuple):
-    """Rows of positive weight, and which of them are left out together (None: each alone)."""
+    """Rows of positive weight, and which of them are held out together (None: each alone)."""
 
     X: np.ndarray
     y: np.ndarray
@@ -294,7 +294,7 @@ def _candidate(params, relevance, task):
 
 
 def _errors(left_out, n_rows, splits, alphas):
-    """Yield rows left out and their errors (n_alphas, n_rows, n_outputs)."""
+    """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
     if splits is not None:
         for out, asked in splits:
             yield asked, left_out.together(out, asked, alphas)
@@ -345,8 +345,8 @@ def _splits(cv, y_shape, groups, kept):
             )
         if len(np.unique(groups)) < 2:
             raise ValueError(
-                "`groups` must name at least 2 groups, to leave one out, got 1; without `groups` "
-                "single rows are left out."
+                "`groups` must name at least 2 groups, to hold one out, got 1; without `groups` "
+                "single rows are held out."
             )
         if cv is None:
             cv = LeaveOneGroupOut()

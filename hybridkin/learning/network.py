@@ -152,7 +152,7 @@ class ELM(ForwardModel):
     def leverage_is_below(self, limit, features):
         """Return where the leverage is certainly below `limit`, shape (...), bool.
 
-        In single precision, at half the price; what is close to the limit is left out.
+        In single precision, at half the price; rows close to the limit count as above it.
         """
         center, factor = self.leverage_center.float(), self.leverage_factor.float()
         single = features.float()

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, RigidChain, calibrate, datasets
 from hybridkin.calibration._parameters import Problem, parameter_names
+from hybridkin.calibration.calibrate import fit_geometry
 
 # The plain chain makes most tips itself here: tendons pulled at random mean no slack.
 pytestmark = pytest.mark.filterwarnings("ignore:.* pull the tendons of a segment together")
@@ -189,7 +190,7 @@ def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
         assert "does not move the tips" in sentence
 
 
-def test_beyond_a_tip_along_the_robot_nothing_is_told(rng):
+def test_no_sentence_for_a_tip_beyond_the_robot(rng):
     q = tendons(rng)
     truth = tendon_robot(base=planted_base(), offsets=[0.01, 0.02, 0.0]).with_tip(1.5)
     start = nominal_tendon_robot().with_tip(1.5)
@@ -346,7 +347,7 @@ def test_standard_errors_are_honest(rng):
     assert z.mean(0).abs().max() < 0.25
 
 
-def test_prior_keeps_what_the_data_do_not_tell(rng):
+def test_prior_keeps_what_the_data_do_not_identify(rng):
     q = chambers(rng, 60)
     q[:, 6:] = 0.25  # the last segment never bends: its radius cannot be seen
     x = ConstantCurvatureChain(RADII)(q)
@@ -357,7 +358,7 @@ def test_prior_keeps_what_the_data_do_not_tell(rng):
     assert "radii[2] +1 % does not move the tips: leave radii[2] out" in repr(result)
 
 
-def test_without_a_prior_what_the_data_do_not_tell_is_still_told_apart(rng):
+def test_without_a_prior_unidentified_directions_are_still_reported(rng):
     q = chambers(rng, 60)
     q[:, 6:] = 0.25
     x = ConstantCurvatureChain(RADII)(q)
@@ -420,8 +421,8 @@ MOVES = re.compile(r"(all )?([a-z_]+)(?:\[([^\]]+)\])? ([+-]\S+) (mm|deg|%)")
 SIZES = {"mm": 1e-3, "deg": math.pi / 180, "%": 0.01}
 
 
-def moved_as_told(chain, sentence, part):
-    """The chain, its geometry moved a part of what a sentence says, and the parameters it names."""
+def moved_as_described(chain, sentence, part):
+    """The chain, its geometry moved by a part of a sentence, and the parameters it names."""
     geometry = {name: value.clone() for name, value in chain.geometry().items()}
     names = set()
     for everything, name, index, size, unit in MOVES.findall(sentence):
@@ -462,7 +463,7 @@ HARDLY_TOLD = {
 
 
 @pytest.mark.parametrize("case", HARDLY_TOLD)
-def test_sentences_say_what_the_data_leave_open_and_what_it_would_move(case, rng):
+def test_sentences_describe_unidentified_directions_and_their_effect(case, rng):
     names, (common, each), noise, expected = HARDLY_TOLD[case]
     q = 0.25 + common * uniform(rng, 100, 1) + each * uniform(rng, 100, 9)
     truth = trunk(offsets=[0.0, 0.0, 0.1])
@@ -472,7 +473,7 @@ def test_sentences_say_what_the_data_leave_open_and_what_it_would_move(case, rng
     named = []
     for sentence in result.unidentified:
         part = 1e-3  # so that all moves are small
-        moved, names = moved_as_told(result.chain, sentence, part)
+        moved, names = moved_as_described(result.chain, sentence, part)
         rms = 1e3 / part * float((moved(q) - result.chain(q)).square().sum(-1).mean().sqrt())
         found = re.search(r"moves the tips by (\S+) mm rms", sentence)
         if found is None:
@@ -484,7 +485,7 @@ def test_sentences_say_what_the_data_leave_open_and_what_it_would_move(case, rng
     assert expected in named
 
 
-def test_singular_values_and_standard_errors_tell_the_same(rng):
+def test_singular_values_and_standard_errors_agree(rng):
     q = chambers(rng)
     x = trunk()(q) + 0.005 * gauss(rng, 100, 3)
     names = ("radii", "turns", "tool")
@@ -611,7 +612,7 @@ def test_real_nine_tendon_robot(data_home):
     assert distances(result.chain, data)[kept].mean() < 0.006
 
 
-def test_tendons_that_contradict_each_other_are_told_once(rng):
+def test_tendons_that_contradict_each_other_warn_once(rng):
     truth = nominal_tendon_robot()
     q = tendons(rng)
     parts = q.unflatten(1, (3, 3))
@@ -626,3 +627,14 @@ def test_tendons_that_contradict_each_other_are_told_once(rng):
         calibrate(truth, balanced, truth(balanced), ("radii",))
     assert len(caught) == 1
     assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # the fit itself returns its messages
+        result, messages = fit_geometry(truth, balanced, truth(balanced), ("radii",))
+    assert messages == [str(caught[0].message)]
+    assert_close(result.values["radii"], truth.radii, rtol=1e-9, atol=0)
+
+
+def test_only_chains_can_be_calibrated(rng):
+    q = chambers(rng, 5)
+    with pytest.raises(TypeError, match="another Chain, got Linear"):
+        calibrate(torch.nn.Linear(9, 3), q, torch.zeros(5, 3))

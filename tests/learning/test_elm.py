@@ -466,7 +466,7 @@ def test_alpha_zero(fit_intercept):
     expected = np.linalg.pinv(phi - mean, rcond=1e-10) @ (Y - Y.mean(0) * fit_intercept)
     assert_allclose(model.output_weights_, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
     assert_allclose(model.leverage(X).sum(), 14 + fit_intercept, rtol=1e-8)
-    inside, split = X[:1], X[:1] + 0.1 * np.eye(9)[1]  # no row has told the two columns apart
+    inside, split = X[:1], X[:1] + 0.1 * np.eye(9)[1]  # no row separates the two columns
     assert model.leverage(inside) < 1
     assert model.leverage(split) > 1e3
 

@@ -1,4 +1,4 @@
-"""The ELM that chooses its complexity: its errors on rows left out, its choices, its manners."""
+"""The ELM that chooses its complexity: its errors on held-out rows, its choices."""
 
 import pickle
 
@@ -63,7 +63,7 @@ def test_scikit_learn_checks(estimator, check):
     check(estimator)
 
 
-# Errors on rows left out
+# Errors on held-out rows
 
 
 @pytest.mark.parametrize("fit_intercept", [False, True])
