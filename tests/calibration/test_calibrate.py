@@ -190,7 +190,7 @@ def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
         assert "does not move the tips" in sentence
 
 
-def test_no_sentence_for_a_tip_beyond_the_robot(rng):
+def test_segments_beyond_the_tip_are_not_identified(rng):
     q = tendons(rng)
     truth = tendon_robot(base=planted_base(), offsets=[0.01, 0.02, 0.0]).with_tip(1.5)
     start = nominal_tendon_robot().with_tip(1.5)
