@@ -14,7 +14,6 @@ from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin.chains.arc_chain import ArcChain, Frames
 from hybridkin.learning.network import ACTIVATIONS
 
-
 _POSE_BLOCK = 2048  # rows of pose features, whose temporaries stay in the cache
 _BLOCK = 2**18  # numbers in the features of a block of rows, which stay in the cache
 
