@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics, datasets, robots
-from hybridkin.hybrid._module import BlendModule
+from hybridkin.hybrid._module import HybridModule
 from hybridkin.learning.regressor_modules import AffineModule
 
 WEIGHTS = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
@@ -29,9 +29,14 @@ def parts(log):
     return [model.fit(*log).module_ for model in models]
 
 
+def blended(parts, weights):
+    corrections = [correction for part in parts for correction in part.corrections]
+    return HybridModule(parts[0].mechanical, corrections, weights)
+
+
 @pytest.fixture(scope="module")
 def blend(parts):
-    return BlendModule(parts, WEIGHTS)
+    return blended(parts, WEIGHTS)
 
 
 @pytest.fixture
@@ -75,14 +80,6 @@ def test_drift_is_added_once_and_leaves_the_parts_alone(blend, parts, q):
     assert_close(torch.stack(ahead, -1), J, rtol=0.0, atol=1e-6)
 
 
-def test_one_configuration_in_numpy(blend, q):
-    function = blend.numpy_function()
-    for row in q[::7]:
-        x, J = function(row.numpy())
-        assert_close(torch.from_numpy(x), blend(row), rtol=0.0, atol=1e-12)
-        assert_close(torch.from_numpy(J), blend.jacobian(row), rtol=0.0, atol=1e-11)
-
-
 def test_single_precision_and_inversion(blend, q):
     x, J = blend.forward_and_jacobian(q.float())
     assert x.dtype == J.dtype == torch.float32
@@ -90,3 +87,20 @@ def test_single_precision_and_inversion(blend, q):
     ik = InverseKinematics(blend, q_min=0.1, q_max=0.4, q_pref=0.25)
     target = blend(q[:5]).numpy()
     assert np.abs(ik.solve(target).x - target).max() < 1e-4
+
+
+def test_a_blend_of_a_hybrid_with_itself_is_the_hybrid():
+    data, rng = datasets.load_trunk(), np.random.default_rng(0)
+    chain = robots.bionic_handling_assistant()
+    for settings in ({}, {"error_model": "quadratic", "coupling": "serial"}):
+        model = HybridForwardModel(chain, random_state=0, **settings).fit(data.q, data.x).module_
+        twice = blended([model, model], torch.tensor([0.5, 0.5], dtype=torch.float64))
+        q = torch.from_numpy(rng.uniform(0.1, 0.4, (400, 9)))
+        assert_close(twice.domain_distance(q), model.domain_distance(q), rtol=0.0, atol=0.0)
+        assert (twice.in_domain(q) == model.in_domain(q)).all()
+        assert_close(twice.forward_and_jacobian(q), model.forward_and_jacobian(q))
+        targets = model(q).detach()
+        options = dict(q_min=0.1, q_max=0.4, q_pref=0.33)
+        found = [InverseKinematics(one, **options).solve(targets) for one in (model, twice)]
+        assert (found[0].status == found[1].status).all()
+        assert 0.3 < found[0].converged.double().mean() < 1.0
