@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from hybridkin.ik._gram import apply_columns, apply_rows, damped_solve, row_gram
-from hybridkin.ik._step import Law
+from hybridkin.ik._settings import StepSettings
 
 _POLISHES = 4
 
 
-def differentiable(law: Law, q: Tensor, target: Tensor, reached: Tensor) -> Tensor:
+def differentiable(settings: StepSettings, q: Tensor, target: Tensor, reached: Tensor) -> Tensor:
     """Return q with its graph to the targets and to the model's parameters.
 
     A solution is a root of F = (W (q_pref - q) + J^T mu, f(q) - x) in q and mu, what lies at a
@@ -20,8 +20,8 @@ def differentiable(law: Law, q: Tensor, target: Tensor, reached: Tensor) -> Tens
 
     Parameters
     ----------
-    law : Law
-        What was solved.
+    settings : StepSettings
+        Task, limits and posture that were solved for.
     q : Tensor of shape (N, n)
         Solutions; first polished to a root.
     target : Tensor of shape (N, ...)
@@ -38,32 +38,34 @@ def differentiable(law: Law, q: Tensor, target: Tensor, reached: Tensor) -> Tens
     if rows.numel() == 0:  # an empty write, so that there is a graph all the same
         return q.index_put((rows,), target[rows].flatten(1)[:, :1].expand(-1, q.shape[-1]))
     part, goal = q[rows], target[rows]
-    lower, upper = law.box(part)
+    lower, upper = settings.box(part)
     free = (part > lower) & (part < upper)
-    dq, lacking = _newton(law, part, goal.detach(), free)
+    dq, lacking = _newton(settings, part, goal.detach(), free)
     for _ in range(_POLISHES):
         new = part + dq.detach()
-        dq_new, lacking_new = _newton(law, new, goal.detach(), free)
+        dq_new, lacking_new = _newton(settings, new, goal.detach(), free)
         better = (lacking_new < lacking) & (((new > lower) & (new < upper)) | ~free).all(-1)
         part = torch.where(better[:, None], new, part)
         dq = torch.where(better[:, None], dq_new, 0.0)
         lacking = torch.where(better, lacking_new, lacking)
-    dq, _ = _newton(law, part, goal, free)
+    dq, _ = _newton(settings, part, goal, free)
     return q.index_put((rows,), part + dq - dq.detach())
 
 
-def _newton(law: Law, q: Tensor, target: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+def _newton(
+    settings: StepSettings, q: Tensor, target: Tensor, free: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return the Newton step of F in q, its matrix a constant, and |F|; what is held stays."""
     n = q.shape[-1]
-    unit = law.unit(q)
+    unit = settings.unit(q)
     weights = unit.square().reciprocal().expand_as(q)
     leaf = q.detach().requires_grad_(True)
-    x, J = law.evaluate(leaf)
-    e = law.task.difference(x, target)
+    x, J = settings.evaluate(leaf)
+    e = settings.task.difference(x, target)
     held = torch.where(free[:, None], J.detach(), 0.0)
     pull, H = torch.zeros_like(q), -torch.diag_embed(weights)
-    if law.q_pref is not None:
-        posture = weights * (law.preferred(leaf) - leaf)
+    if settings.has_posture:
+        posture = weights * (settings.preferred(leaf) - leaf)
         scaled = held * unit
         mu = damped_solve(row_gram(scaled), apply_rows(scaled, unit * posture.detach()))
         pull = posture - apply_columns(J, mu)
