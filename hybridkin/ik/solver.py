@@ -45,8 +45,8 @@ class InverseKinematics:
         Largest speed of every actuator [unit of q per second]: a step is at most ``dq_max dt``.
     q_pref : float, array-like of shape (n,) or callable, optional
         Preferred configuration, or a function that gives it for configurations (..., n), torch to
-        torch: `ElasticTendonChain.taut_posture`, or a step against any gradient. Default: the
-        middle of the limits where both are finite, else there is no posture term.
+        torch, such as a step against a gradient. Default: the middle of the limits where both are
+        finite, else there is no posture term.
     beta : float, default=1.0
         Rate of the posture [1/s], with 0 <= beta dt <= 1.
     gain : float, optional
