@@ -18,7 +18,7 @@ from hybridkin.ik.tasks import Task, Tolerance
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
 
-Values: TypeAlias = "ArrayLike | Tensor | Transform3d"  # what comes in, NumPy or torch
+Array: TypeAlias = "ArrayLike | Tensor | Transform3d"  # what comes in, NumPy or torch
 Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 
@@ -49,22 +49,15 @@ class StepSettings:
 
     def __post_init__(self) -> None:
         """Check the settings, and take the middle of the limits where no posture is given."""
-        sizes = self._sizes()
-        require(
-            len(set(sizes.values())) < 2,
-            f"limits and posture must agree in the number of actuators, got {sizes}; give scalars "
-            "or one value per actuator.",
-        )
+        sizes, one = self._sizes(), "give scalars or one value per actuator"
+        good = len(set(sizes.values())) < 2
+        require(good, f"settings must agree in the number of actuators, got {sizes}; {one}.")
         low, high, speed = (a.tolist() for a in (self.q_min, self.q_max, self.dq_max))
-        require(
-            (self.q_min <= self.q_max).all(),
-            f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.",
-        )
+        good = (self.q_min <= self.q_max).all()
+        require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
         lock = "to lock an actuator give it equal limits."
-        require(
-            (self.dq_max > 0.0).all(),
-            f"`dq_max` must be positive [unit of q per second], got {speed}; {lock}",
-        )
+        good = (self.dq_max > 0.0).all()
+        require(good, f"`dq_max` must be positive [unit of q / s], got {speed}; {lock}")
         if self.q_pref is None:
             object.__setattr__(self, "q_pref", self.middle)
         elif isinstance(self.q_pref, Tensor):
@@ -78,12 +71,9 @@ class StepSettings:
         self.rates()
         good = self.limits in ("saturate", "off")
         require(good, f'`limits` must be "saturate" or "off", got {self.limits!r}.')
-        number = not isinstance(self.damping, str) and 0.0 <= self.damping < math.inf
-        require(
-            number or self.damping == "adaptive",
-            '`damping` must be "adaptive" or a number >= 0 (lambda / sigma_max), got '
-            f"{self.damping!r}.",
-        )
+        share = 0.0 if self.damping == "adaptive" else self.damping
+        good, text = not isinstance(share, str) and 0.0 <= share < math.inf, '"adaptive" or'
+        require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
 
     def _sizes(self) -> dict[str, int]:
         """Return the numbers of actuators that the settings and the model know, by name."""
@@ -123,15 +113,11 @@ class StepSettings:
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); where it is a function, that at the middle."""
         start = self.middle if callable(self.q_pref) else self.q_pref
+        need = "give `q0` or `q_pref` of shape (n,)"
         if start is None:
-            raise ValueError(
-                "a start is needed: give `q0`, `q_pref` of shape (n,), or finite `q_min`, `q_max`."
-            )
+            raise ValueError(f"a start is needed: {need}, or finite `q_min` and `q_max`.")
         if self.n_actuators is None:
-            raise ValueError(
-                "the number of actuators is not known from scalar limits and this model; give "
-                "`q0`, or `q_pref` of shape (n,)."
-            )
+            raise ValueError(f"the number of actuators is not known from this model; {need}.")
         start = start.to(like).expand(self.n_actuators)
         return self.preferred(start) if callable(self.q_pref) else start
 
@@ -185,20 +171,20 @@ class StepSettings:
 
     # What comes in from a caller, as tensors.
 
-    def configurations(self, value: Values, name: str, like: Tensor | None = None) -> Tensor:
+    def configurations(self, value: Array, name: str, like: Tensor | None = None) -> Tensor:
         """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
         q = as_tensor(value, name, self.task.device if like is None else like.device)
         n = self.n_actuators
-        if q.ndim == 0 or n not in (None, q.shape[-1]):
-            raise ValueError(
-                f"`{name}` must have shape (..., {n or 'n'}), got {tuple(q.shape)}; the last axis "
-                "is the actuators."
-            )
+        good, shape = q.ndim > 0 and n in (None, q.shape[-1]), tuple(q.shape)
+        require(
+            good,
+            f"`{name}` must have shape (..., {n or 'n'}), one column per actuator, got {shape}.",
+        )
         return q if like is None else q.to(torch.promote_types(q.dtype, like.dtype))
 
     def points(
         self,
-        value: Values,
+        value: Array,
         name: str,
         like: Tensor | None = None,
         *,
@@ -225,12 +211,9 @@ class StepSettings:
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
         """Return one tolerance [m], or one for every part of the task."""
         given = np.atleast_1d(np.asarray(tol, dtype=float))
-        require((given > 0.0).all(), f"`tol` must be positive [m], got {tol!r}.")
+        require(bool((given > 0.0).all()), f"`tol` must be positive [m], got {tol!r}.")
         if np.ndim(tol) == 0:
             return float(given[0])
-        n = len(self.task.parts)
-        require(
-            given.shape == (n,),
-            f"`tol` must be one number [m] or {n}, one for every part of the task, got {tol!r}.",
-        )
+        n, parts = len(self.task.parts), "one for every part of the task"
+        require(given.shape == (n,), f"`tol` must be one number [m] or {n}, {parts}, got {tol!r}.")
         return tuple(given.tolist())

@@ -13,7 +13,7 @@ from hybridkin._core.arrays import as_array, as_tensor, bound, give_back, is_num
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
-from hybridkin.ik._settings import Posture, StepSettings, Values, require
+from hybridkin.ik._settings import Array, Posture, StepSettings, require
 from hybridkin.ik._step import control_step
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
@@ -107,16 +107,16 @@ class InverseKinematics:
         self,
         model: object,
         *,
-        q_min: Values | None = None,
-        q_max: Values | None = None,
-        dq_max: Values | None = None,
-        q_pref: Values | Posture | None = None,
+        q_min: Array | None = None,
+        q_max: Array | None = None,
+        dq_max: Array | None = None,
+        q_pref: Array | Posture | None = None,
         beta: float = 1.0,
         gain: float | None = None,
         damping: str | float = "adaptive",
         limits: str = "saturate",
         dt: float = 0.01,
-        weights: Values | None = None,
+        weights: Array | None = None,
     ) -> None:
         self.model = model
         self.settings = StepSettings(
@@ -142,12 +142,7 @@ class InverseKinematics:
 
     @torch.no_grad()
     def step(
-        self,
-        q: Values,
-        x_target: Values,
-        dx: Values | None = None,
-        *,
-        x_measured: Values | None = None,
+        self, q: Array, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
     ) -> Step:
         """Return the change of q for one period, eq. (1).
 
@@ -187,8 +182,8 @@ class InverseKinematics:
     @torch.no_grad()
     def solve(
         self,
-        x_target: Values,
-        q0: Values | None = None,
+        x_target: Array,
+        q0: Array | None = None,
         *,
         tol: float | Sequence[float] = 1e-4,
         max_iter: int = 50,
@@ -238,11 +233,8 @@ class InverseKinematics:
         """
         settings, task = self.settings, self.settings.task
         tolerance = settings.tolerance(tol)
-        require(
-            max_iter >= 1 and restarts >= 0,
-            f"`max_iter` must be at least 1 and `restarts` at least 0, got {max_iter} and "
-            f"{restarts}.",
-        )
+        good, given = max_iter >= 1 and restarts >= 0, (max_iter, restarts)
+        require(good, f"`max_iter` must be at least 1 and `restarts` at least 0, got {given}.")
         as_numpy, axes = is_numpy(x_target), len(task.shape)
         if differentiable and not isinstance(x_target, Tensor):
             raise ValueError("`x_target` must be a torch tensor for differentiable=True.")
@@ -256,7 +248,7 @@ class InverseKinematics:
         q = found.q
         if differentiable:
             with torch.enable_grad():
-                goal = rows_of(x_target.to(q), lead, axes)
+                goal = rows_of(torch.as_tensor(x_target).to(q), lead, axes)
                 q = with_derivatives(settings, q, goal, found.reached)
         # The error and the status are those of the q that is returned.
         x, J = settings.evaluate(q.detach())
@@ -264,8 +256,7 @@ class InverseKinematics:
         error, gram = e.norm(dim=-1), row_gram(J)
         reached = task.reached(e, tolerance)
         status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
-        nearest = found.stationary & ~reached & torch.isfinite(error)
-        status[nearest] = IKStatus.UNREACHABLE
+        status[found.stationary & ~reached & torch.isfinite(error)] = IKStatus.UNREACHABLE
         margin = settings.margin(q.detach())
         results = (q, x, error, status, found.n_iter, gram.sigma_min, margin)
         with torch.set_grad_enabled(differentiable):
@@ -274,10 +265,10 @@ class InverseKinematics:
     @torch.no_grad()
     def track(
         self,
-        path: Values | Trajectory,
-        t: Values | None = None,
+        path: Array | Trajectory,
+        t: Array | None = None,
         *,
-        q0: Values | None = None,
+        q0: Array | None = None,
         plant: Plant | None = None,
         feedback: str | None = "model",
         memory: float | None = None,
@@ -325,24 +316,20 @@ class InverseKinematics:
         good = feedback != "measured" or plant is not None
         require(good, '`feedback="measured"` needs `plant`, a callable q -> measured tip.')
         good = memory is None or feedback == "measured"
-        text = '`memory` must be a positive time [s] with feedback="measured", got feedback='
-        require(good, f"{text}{feedback!r}.")
-        points = path
-        if isinstance(path, Trajectory):
-            points, t = path.x, path.t if t is None else t
+        require(good, '`memory` must be a positive time [s], with feedback="measured" only.')
+        points = path.x if isinstance(path, Trajectory) else path
+        if isinstance(path, Trajectory) and t is None:
+            t = path.t
         as_numpy, tolerance = is_numpy(points), settings.tolerance(tol)
         target = settings.points(points, "path", lead="T")
         require(len(target) > 0, f"`path` must hold at least one point, got {tuple(target.shape)}.")
         times, periods = self._times(t, target)
-        if q0 is None:
-            q = self.solve(target[0], tol=tol).q
-        else:
-            q = settings.configurations(q0, "q0", target)
+        start = self.solve(target[0], tol=tol).q if q0 is None else q0
+        q = settings.configurations(start, "q0", target)
         target = target.to(q.dtype)
         tracker = Tracker(settings, as_array(q) if as_numpy else q, tolerance, memory)
-        q, x, measured, sigma_min, held, damped = tracker.follow(
-            target, periods, plant, feedback, progress
-        )
+        parts = tracker.follow(target, periods, plant, feedback, progress)
+        q, x, measured, sigma_min, held, damped = parts
         e_model, e = (task.difference(a, target) for a in (x, measured))
         judged, error = e if feedback == "measured" else e_model, e.norm(dim=-1)
         reached = task.reached(judged, tolerance)
@@ -355,11 +342,7 @@ class InverseKinematics:
         return Track(*results)
 
     def tracker(
-        self,
-        q0: Values,
-        *,
-        tol: float | Sequence[float] = 1e-4,
-        memory: float | None = None,
+        self, q0: Array, *, tol: float | Sequence[float] = 1e-4, memory: float | None = None
     ) -> Tracker:
         """Return what follows targets tick by tick, for one robot at its control rate.
 
@@ -389,31 +372,24 @@ class InverseKinematics:
     ) -> list[Tensor]:
         """Return further starts (n,): the preferred configuration, then draws in the limits."""
         n, settings = q.shape[-1], self.settings
-        points: list[Tensor] = []
-        if from_preferred and restarts > 0 and settings.q_pref is not None:
-            points = [settings.start(q)]
-        draws = max(restarts - len(points), 0)
-        if draws == 0:
+        preferred = from_preferred and restarts > 0 and settings.q_pref is not None
+        points = [settings.start(q)] if preferred else []
+        if restarts <= len(points):
             return points
         low, span = settings.q_min.expand(n), (settings.q_max - settings.q_min).expand(n)
-        require(
-            torch.isfinite(span).all(),
-            "`restarts` draws starts in the limits: give finite `q_min`, `q_max`.",
-        )
-        shares = np.random.default_rng(random_state).random((draws, n))
+        if not torch.isfinite(span).all():
+            raise ValueError("`restarts` draws starts in the limits: give finite `q_min`, `q_max`.")
+        shares = np.random.default_rng(random_state).random((restarts - len(points), n))
         return points + list((low + span * torch.as_tensor(shares)).to(q))
 
-    def _times(self, t: Values | None, target: Tensor) -> tuple[Tensor, list[float]]:
+    def _times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
         """Return the times of a path's points, and the period that follows each."""
         n, dt = len(target), self.settings.dt
         if t is None:
             return dt * torch.arange(n, dtype=target.dtype, device=target.device), [dt] * n
         times = as_tensor(t, "t", target.device)
-        if times.shape != (n,):
-            raise ValueError(
-                f"`t` must have shape ({n},), one time per point of `path`, got "
-                f"{tuple(times.shape)}."
-            )
+        good, shape = times.shape == (n,), tuple(times.shape)
+        require(good, f"`t` must have shape ({n},), one time per point of `path`, got {shape}.")
         periods = times.diff().tolist()
         increasing = bool(torch.isfinite(times).all()) and min(periods, default=dt) > 0.0
         require(increasing, "`t` must be finite and increasing [s]; sort it, drop repeated times.")

@@ -253,22 +253,19 @@ class StackedTask(Task):
     """
 
     def __init__(self, *tasks: object, weights: Sequence[float] | None = None) -> None:
-        if not tasks:
-            raise ValueError("`tasks` must hold at least one task or model, got none.")
         self.tasks = tuple(as_task(task) for task in tasks)
-        weights = [1.0] * len(tasks) if weights is None else [float(w) for w in weights]
-        if len(weights) != len(tasks) or not all(0.0 < w < math.inf for w in weights):
+        self.weights = [1.0] * len(tasks) if weights is None else [float(w) for w in weights]
+        n, good = len(tasks), all(0.0 < w < math.inf for w in self.weights)
+        if n == 0 or len(self.weights) != n or not good:
             raise ValueError(
-                f"`weights` must be {len(tasks)} positive numbers, one per task, got {weights}."
+                f"`weights` must be positive, one per task, of one task or more; got {n} tasks and "
+                f"weights {self.weights}."
             )
-        self.weights = weights
         self.models = tuple(model for task in self.tasks for model in task.models)
-        self._sizes = [math.prod(task.shape) for task in self.tasks]
-        self.shape = (sum(self._sizes),)
+        self.shape = (sum(math.prod(task.shape) for task in self.tasks),)
         self.parts = tuple(rows for task in self.tasks for rows in task.parts)
-        self.units = tuple(
-            w * unit for w, task in zip(weights, self.tasks, strict=True) for unit in task.units
-        )
+        pairs = zip(self.weights, self.tasks, strict=True)
+        self.units = tuple(weight * unit for weight, task in pairs for unit in task.units)
 
     def join(self, *x: ArrayLike | Tensor) -> Tensor | NDArray:
         """Return one target (..., k) from the targets ``(..., *shape)`` of all tasks."""
@@ -283,18 +280,18 @@ class StackedTask(Task):
         return joined if any(isinstance(a, Tensor) for a in x) else joined.numpy()
 
     def split(self, x: Tensor) -> tuple[Tensor, ...]:
-        """Return the targets, or the x, of every task from one vector (..., k), torch or NumPy."""
-        ends = np.cumsum(self._sizes)
-        return tuple(
-            x[..., end - size : end].reshape(*x.shape[:-1], *task.shape)
-            for end, size, task in zip(ends, self._sizes, self.tasks, strict=True)
-        )
+        """Return the targets, or the x, of every task from one (..., k), torch or NumPy."""
+        lead = x.shape[: x.ndim - len(self.shape)]
+        x, ends = x.reshape(*lead, -1), np.cumsum([math.prod(task.shape) for task in self.tasks])
+        parts = zip(self.tasks, [0, *ends[:-1]], ends, strict=True)
+        return tuple(x[..., a:b].reshape(*lead, *task.shape) for task, a, b in parts)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return all x (N, k), side by side, and the weighted J (N, m, n)."""
+        """Return all x (N, *shape), side by side, and the weighted J (N, m, n)."""
         parts = [task.evaluate(q) for task in self.tasks]
         rows = [w * J for w, (_, J) in zip(self.weights, parts, strict=True)]
-        return torch.cat([x.flatten(1) for x, _ in parts], dim=1), torch.cat(rows, dim=-2)
+        x = torch.cat([x.flatten(1) for x, _ in parts], dim=1)
+        return x.reshape(-1, *self.shape), torch.cat(rows, dim=-2)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the weighted errors (N, m), one task after another."""
@@ -341,7 +338,7 @@ class _WithPoints(Protocol):
     def with_tip(self, at: float) -> ForwardModel: ...
 
 
-class PointsTask(Task):
+class PointsTask(StackedTask):
     """Bring several points along the backbone to points: 3 P rows, targets (P, 3).
 
     Parameters
@@ -362,19 +359,8 @@ class PointsTask(Task):
                 f"`chain` must have with_tip(at), got {type(chain).__name__}; stack the models of "
                 "the points with StackedTask."
             )
-        stack = StackedTask(*(chain.with_tip(float(a)) for a in at), weights=weights)
-        self.models, self.parts, self.units = stack.models, stack.parts, stack.units
-        self._stack = stack
-        self.shape = (len(self.parts), 3)
-
-    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the points (N, P, 3) and the weighted J (N, 3 P, n)."""
-        x, J = self._stack.evaluate(q)
-        return x.unflatten(1, self.shape), J
-
-    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return the weighted errors (N, 3 P)."""
-        return self._stack.difference(x.flatten(-2), x_target.flatten(-2))
+        super().__init__(*(chain.with_tip(float(a)) for a in at), weights=weights)
+        self.shape = (len(self.tasks), 3)
 
 
 def as_task(model: object) -> Task:

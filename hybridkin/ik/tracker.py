@@ -12,12 +12,12 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy
 from hybridkin.ik._gram import row_gram
-from hybridkin.ik._settings import StepSettings, Values
+from hybridkin.ik._settings import Array, StepSettings
 from hybridkin.ik._step import StepRows, control_step
 from hybridkin.ik.results import IKStatus, statuses
 from hybridkin.ik.tasks import Tolerance
 
-Plant = Callable[["NDArray | Tensor"], Values]
+Plant = Callable[["NDArray | Tensor"], Array]
 
 
 class Tracker:
@@ -28,6 +28,18 @@ class Tracker:
 
     Attributes
     ----------
+    x : array of shape (3,)
+        The model's tip at the configuration that the last step started from [m], in the shape of
+        the task.
+    error : float
+        Distance from the tip, the measured one where it was given, to the target before the last
+        step [m]; NaN where it is not known.
+    saturated : bool array of shape (n,)
+        Actuators that the last step held at a limit of position or speed.
+    sigma_min : float
+        Smallest singular value of the Jacobian there, NaN where an input was not finite.
+    damping : float
+        Damping lambda of the last step, in the unit of `sigma_min`.
     backend : str
         What computes: "torch".
 
@@ -43,10 +55,15 @@ class Tracker:
     ('CONVERGED', 0)
     """
 
+    x: NDArray | Tensor
+    error: float
+    saturated: NDArray | Tensor
+    sigma_min: float
+    damping: float
     backend = "torch"
 
     def __init__(
-        self, settings: StepSettings, q0: Values, tol: Tolerance, memory: float | None
+        self, settings: StepSettings, q0: Array, tol: Tolerance, memory: float | None
     ) -> None:
         if memory is not None and not 0.0 < memory < math.inf:
             raise ValueError(f"`memory` must be a positive time [s], got {memory!r}.")
@@ -65,31 +82,6 @@ class Tracker:
         return self._given_back(self._q)
 
     @property
-    def x(self) -> NDArray | Tensor:
-        """The model's x, as the tip [m], at the configuration that the last step started from."""
-        return self._given_back(self._x)
-
-    @property
-    def error(self) -> float:
-        """Distance from the tip (measured where given) to the target before the last step [m]."""
-        return float(self._e.norm(dim=-1))
-
-    @property
-    def sigma_min(self) -> float:
-        """Smallest singular value of the Jacobian there; NaN where an input was not finite."""
-        return float(self._last.sigma_min)
-
-    @property
-    def damping(self) -> float:
-        """Damping lambda of the last step, in the unit of `sigma_min`."""
-        return float(self._last.damping)
-
-    @property
-    def saturated(self) -> NDArray | Tensor:
-        """Actuators that the last step held at a limit of position or speed, shape (n,), bool."""
-        return self._given_back(self._last.saturated)
-
-    @property
     def status(self) -> IKStatus:
         """Outcome of the last step.
 
@@ -98,14 +90,13 @@ class Tracker:
         MAX_ITER where it was free. INVALID_INPUT where the target, the measured tip or the model's
         answer was not finite, and before the first step.
         """
-        task, last = self._settings.task, self._last
-        error = self._e.norm(dim=-1) + 0.0 * last.sigma_min
-        reached, held = task.reached(self._e, self._tol), last.saturated.any(-1)
+        task, e, last = self._settings.task, self._e, self._last
+        error = e.norm(dim=-1) + 0.0 * last.sigma_min  # NaN where either is
+        parts = (task.reached(e, self._tol), last.saturated.any(-1), last.damping > 0.0)
         with torch.no_grad():
-            status = statuses(task, self._before, error, reached, held, last.damping > 0.0)
-        return IKStatus(int(status))
+            return IKStatus(int(statuses(task, self._before, error, *parts)))
 
-    def reset(self, q: Values) -> None:
+    def reset(self, q: Array) -> None:
         """Start anew from an actuator vector, as read from the robot.
 
         Parameters
@@ -117,20 +108,18 @@ class Tracker:
         n = settings.n_actuators
         if given.ndim != 1 or n not in (None, len(given)) or not torch.isfinite(given).all():
             raise ValueError(
-                f"`q` must be finite and of shape ({n or 'n'},), got {given.tolist()}; read it from "
-                "the robot, or solve for a start."
+                f"`q` must be finite and of shape ({n or 'n'},), got {given.tolist()}; read it "
+                "from the robot, or solve for a start."
             )
-        self._q = self._before = given.clone()[None]
+        self._q = given.clone()[None]
         with torch.no_grad():
-            self._x, self._J = settings.evaluate(self._q)
-        unknown = self._q.new_full((1,), math.nan)
-        self._e = self._q.new_full((1, sum(settings.task.parts)), math.nan)
-        none = torch.zeros_like(self._q)
-        self._last = StepRows(none, unknown, torch.zeros_like(unknown), none > 0.0)
-        self._offset = torch.zeros_like(self._e)  # of the model at the last reading, as it fades
+            x, _ = settings.evaluate(self._q)
+        self._offset = x.new_zeros(1, sum(settings.task.parts))  # of the model at the last reading
+        unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(self._q)
+        self._note(x, unknown, StepRows(none, unknown[:, 0], none[:, 0], none > 0.0))
 
     def step(
-        self, x_target: Values, dx: Values | None = None, *, x_measured: Values | None = None
+        self, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
     ) -> NDArray | Tensor:
         """Return the actuator vector to command next, one period ahead, eq. (1).
 
@@ -170,30 +159,38 @@ class Tracker:
         feed_forward: Tensor | float,
         tip: Tensor | None,
         period: float | None = None,
-    ) -> None:
-        """Take one step towards a target (1, ...); a tip of None stands for the model's.
+    ) -> Tensor:
+        """Take one step towards a target (1, ...), and return the Jacobian before it.
 
-        Without a target the step is feed-forward alone.
+        A tip of None stands for the model's. Without a target the step is feed-forward alone.
         """
         settings, task = self._settings, self._settings.task
         x, J = settings.evaluate(self._q)
-        if target is None:
-            self._e, e = torch.full_like(self._e, math.nan), torch.zeros_like(self._e)
-        else:
-            e = self._e = e_model = task.difference(x, target)
+        error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
+        if target is not None:
+            error = used = task.difference(x, target)
             if tip is not None:
                 # Without a reading the model's error counts, moved by the offset that is
                 # remembered; without memory no error counts.
-                self._e = task.difference(tip, target)
-                offset = e_model - self._e
+                error = task.difference(tip, target)
+                offset = used - error
                 seen = torch.isfinite(offset).all(-1, keepdim=True)
-                e = torch.where(seen, self._e, e - (e if self._memory is None else self._offset))
+                remembered = used if self._memory is None else self._offset
+                used = torch.where(seen, error, used - remembered)
                 self._offset = torch.where(seen, offset, self._offset)
-        step = control_step(settings, self._q, J, e, feed_forward, period)
+        step = control_step(settings, self._q, J, used, feed_forward, period)
         if self._memory is not None:
             self._offset = math.exp(-(period or settings.dt) / self._memory) * self._offset
-        self._before, self._x, self._J, self._last = self._q, x, J, step
+        self._note(x, error, step)
         self._q = self._q + step.dq
+        return J
+
+    def _note(self, x: Tensor, e: Tensor, step: StepRows) -> None:
+        """Keep what is known of the last step: what is shown to the user is their own copy."""
+        self._before, self._x, self._e, self._last = self._q, x, e, step
+        self.x, self.saturated = self._given_back(x), self._given_back(step.saturated)
+        self.error, self.sigma_min = float(e.norm(dim=-1)), float(step.sigma_min)
+        self.damping = float(step.damping)
 
     def _given_back(self, row: Tensor) -> NDArray | Tensor:
         return as_array(row[0]).copy() if self._as_numpy else row[0].clone()
@@ -224,9 +221,9 @@ class Tracker:
             tip = None if plant is None else self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
             q = self._q
-            self._advance(target if known[i] else None, ahead[i : i + 1], used, periods[i])
-            sigma_min = row_gram(self._J).sigma_min
-            rows.append((q, self._x, self._x if tip is None else tip, sigma_min, held, damped))
+            J = self._advance(target if known[i] else None, ahead[i : i + 1], used, periods[i])
+            seen = self._x if tip is None else tip
+            rows.append((q, self._x, seen, row_gram(J).sigma_min, held, damped))
             held, damped = self._last.saturated.any(-1), self._last.damping > 0.0
         return [torch.cat(parts) for parts in zip(*rows, strict=True)]
 

@@ -223,10 +223,7 @@ def test_step_takes_the_measured_tip_in_place_of_the_models(rng):
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    dtype=st.sampled_from([torch.float64, torch.float32]),
-)
+@given(seed=st.integers(0, 2**31), dtype=st.sampled_from([torch.float64, torch.float32]))
 def test_limits_hold_to_the_last_bit(seed, dtype):
     rng = torch.Generator().manual_seed(seed)
     low, high = uniform(rng, -1.0, 0.2, 7), uniform(rng, 0.2, 1.0, 7)
