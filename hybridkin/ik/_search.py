@@ -161,7 +161,8 @@ class Search:
         found, head = self._start(q, target), slice(None, first)
         start = found.e[:, head].norm(dim=-1)
         nu, growth = torch.full_like(start, _FIRST_DAMPING), torch.full_like(start, 2.0)
-        live = _Descent(*vars(found).values(), start, nu, growth, torch.zeros_like(start))
+        slow = torch.zeros_like(start)
+        live = _Descent(**vars(found), start=start, nu=nu, growth=growth, slow=slow)
         rows = torch.arange(len(q), device=q.device)
         for iteration in range(self.max_iter + 1):
             e, J = live.e[:, head], live.J[:, head]
@@ -296,7 +297,8 @@ class Search:
 
     def _slide(self, at: Point, wanted: Callable[[Tensor], Tensor], share: Tensor) -> _Slide:
         wish = wanted(at.q)
-        return _Slide(*vars(at).values(), wish, null_step(self.settings, at.J, wish), share)
+        free = null_step(self.settings, at.J, wish)
+        return _Slide(**vars(at), wish=wish, free=free, share=share)
 
     def _try_step(
         self, at: Point, posture: Tensor | None, hold: bool = False

@@ -136,7 +136,7 @@ class IKSolution(Generic[ArrayT]):
     @property
     def converged(self) -> ArrayT:
         """Bool array of shape (...,), true where the status is CONVERGED."""
-        return self.status == IKStatus.CONVERGED.value
+        return self.status == IKStatus.CONVERGED.value  # pyright: ignore[reportReturnType]
 
     def __repr__(self) -> str:
         """Return a one-line summary."""

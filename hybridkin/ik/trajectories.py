@@ -41,16 +41,12 @@ class Trajectory:
             raise ValueError(f"`t` must have shape ({len(x)},), as many as `x`, got {t.shape}.")
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(x).all(axis=1)))
         if bad.size:
-            raise ValueError(
-                f"`t` and `x` must be finite, got NaN or infinity in {bad.size} rows (first: row "
-                f"{bad[0]}); drop those rows."
-            )
+            rows = f"{bad.size} rows (first: row {bad[0]})"
+            raise ValueError(f"`t` and `x` must be finite, drop the {rows} that are not.")
         late = np.flatnonzero(np.diff(t) <= 0)
         if late.size:
-            raise ValueError(
-                f"`t` must increase, got {t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s in row "
-                f"{late[0] + 1}; sort the rows and drop repeated times."
-            )
+            row, pair = late[0] + 1, f"{t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s"
+            raise ValueError(f"`t` must increase, got {pair} in row {row}; sort, drop repeats.")
         largest = float(np.abs(x).max())
         if largest > _FAR:
             warnings.warn(
