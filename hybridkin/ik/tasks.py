@@ -282,7 +282,8 @@ class StackedTask(Task):
     def split(self, x: Tensor) -> tuple[Tensor, ...]:
         """Return the targets, or the x, of every task from one (..., k), torch or NumPy."""
         lead = x.shape[: x.ndim - len(self.shape)]
-        x, ends = x.reshape(*lead, -1), np.cumsum([math.prod(task.shape) for task in self.tasks])
+        ends = np.cumsum([math.prod(task.shape) for task in self.tasks]).tolist()
+        x = x.reshape(*lead, ends[-1])
         parts = zip(self.tasks, [0, *ends[:-1]], ends, strict=True)
         return tuple(x[..., a:b].reshape(*lead, *task.shape) for task, a, b in parts)
 
@@ -291,7 +292,7 @@ class StackedTask(Task):
         parts = [task.evaluate(q) for task in self.tasks]
         rows = [w * J for w, (_, J) in zip(self.weights, parts, strict=True)]
         x = torch.cat([x.flatten(1) for x, _ in parts], dim=1)
-        return x.reshape(-1, *self.shape), torch.cat(rows, dim=-2)
+        return x.reshape(len(q), *self.shape), torch.cat(rows, dim=-2)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the weighted errors (N, m), one task after another."""

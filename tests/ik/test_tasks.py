@@ -232,6 +232,7 @@ def test_points_along_the_backbone(rng):
     assert_close(solution.x[:, 1], CHAIN(solution.q), rtol=0.0, atol=1e-14)
     one = InverseKinematics(task, **LIMITS).solve(target[0].numpy())
     assert one.x.shape == (2, 3)
+    assert InverseKinematics(task, **LIMITS).solve(target[:0]).x.shape == (0, 2, 3)
     with pytest.raises(TypeError, match="with_tip"):
         PointsTask(Linear(randn(rng, 3, 9)), [1.0])
 
