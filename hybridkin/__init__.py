@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from hybridkin.hybrid.estimator import HybridForwardModel
     from hybridkin.ik import tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
-    from hybridkin.ik.solver import Controller, InverseKinematics, Tracker
+    from hybridkin.ik.solver import InverseKinematics
+    from hybridkin.ik.tracker import Tracker
     from hybridkin.learning.elm import ELMRegressor
     from hybridkin.learning.elm_cv import ELMRegressorCV
     from hybridkin.saving.saved_model import load_model, save_model
@@ -26,7 +27,6 @@ __version__ = "0.1.0"
 __all__ = [
     "CalibrationResult",
     "ConstantCurvatureChain",
-    "Controller",
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
@@ -69,7 +69,8 @@ _NAMES_OF = {
     "chains.rigid": ("RigidChain",),
     "hybrid.estimator": ("HybridForwardModel",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),
-    "ik.solver": ("Controller", "InverseKinematics", "Tracker"),
+    "ik.solver": ("InverseKinematics",),
+    "ik.tracker": ("Tracker",),
     "learning.elm": ("ELMRegressor",),
     "learning.elm_cv": ("ELMRegressorCV",),
     "saving.saved_model": ("load_model", "save_model"),

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+HEALTHY = 0.02  # sigma_min / sigma_max above which the pseudo-inverse needs no damping
+
 
 class RowGram(NamedTuple):
     """G = J J^T of a Jacobian, taken apart, and the singular values of J.
@@ -20,6 +22,11 @@ class RowGram(NamedTuple):
     parts: tuple[Tensor, ...]
     sigma_min: Tensor
     sigma_max: Tensor
+
+    @property
+    def is_singular(self) -> Tensor:
+        """Where a direction is (nearly) lost, shape (...), bool."""
+        return self.sigma_min < HEALTHY * self.sigma_max
 
 
 def row_gram(J: Tensor) -> RowGram:
@@ -142,22 +149,18 @@ def apply_columns(J: Tensor, mu: Tensor) -> Tensor:
     return (mu[..., None, :] @ J)[..., 0, :]
 
 
-def adaptive_damping(
-    gram: RowGram, healthy: float = 0.02, sigma_max: Tensor | None = None
-) -> Tensor:
+def adaptive_damping(gram: RowGram, sigma_max: Tensor) -> Tensor:
     """Return lambda^2, zero for a healthy J and growing smoothly from there.
 
-    lambda = healthy sigma_max (1 - (sigma_min / (healthy sigma_max))^2) below
-    sigma_min = healthy sigma_max: free of units, and once differentiable as a square.
+    With s = 0.02 sigma_max, lambda = s (1 - (sigma_min / s)^2) below sigma_min = s: free of units,
+    and once differentiable as a square.
 
     Parameters
     ----------
     gram : RowGram
         From `row_gram`.
-    healthy : float, default=0.02
-        Ratio sigma_min / sigma_max from which on no damping is needed.
-    sigma_max : Tensor of shape (...,), optional
-        What to compare with. Default: that of `gram`.
+    sigma_max : Tensor of shape (...,)
+        Largest singular value to compare with, usually that of `gram`.
 
     Returns
     -------
@@ -168,7 +171,7 @@ def adaptive_damping(
     ----------
     Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
     """
-    threshold = healthy * (gram.sigma_max if sigma_max is None else sigma_max)
+    threshold = HEALTHY * sigma_max
     ratio = gram.sigma_min / torch.where(threshold > 0.0, threshold, torch.ones_like(threshold))
     return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
 

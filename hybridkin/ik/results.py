@@ -1,14 +1,19 @@
-"""Outcomes of inverse kinematics: statuses, one step, solved targets, a tracked path."""
+"""Results of inverse kinematics: statuses, one step, solved targets, a tracked path."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from hybridkin._core.arrays import as_array
+from hybridkin.ik.tasks import Task
+
+ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
 
 
 class IKStatus(IntEnum):
@@ -29,13 +34,39 @@ class IKStatus(IntEnum):
     MAX_ITER = 4
     """Not converged within `max_iter` iterations."""
     OUT_OF_DOMAIN = 5
-    """Converged, but where the model does not vouch for itself (its `in_domain` is False)."""
+    """Converged, but outside the domain of the model (its `in_domain` is False)."""
     INVALID_INPUT = 6
     """The target, the start, the model's answer or the measured tip is not finite."""
 
 
+def statuses(
+    task: Task, q: Tensor, error: Tensor, reached: Tensor, held: Tensor, singular: Tensor
+) -> Tensor:
+    """Return the `IKStatus` of rows, int (N,); of what holds, the last one named here counts.
+
+    Parameters
+    ----------
+    task : Task
+        Task whose domain counts.
+    q : Tensor of shape (N, n)
+        Configurations.
+    error : Tensor of shape (N,)
+        Errors [m], not finite where an input was not.
+    reached, held, singular : bool Tensor of shape (N,)
+        Whether the error is within the tolerance, limits held the motion back, or it was damped.
+    """
+    status = torch.full(error.shape, IKStatus.MAX_ITER.value, device=error.device)
+    status[singular] = IKStatus.SINGULAR
+    status[held] = IKStatus.AT_LIMITS
+    status[reached] = IKStatus.CONVERGED
+    if len(q) > 0:
+        status[reached & ~task.in_domain(q)] = IKStatus.OUT_OF_DOMAIN
+    status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
+    return status
+
+
 @dataclass(frozen=True, repr=False)
-class Step:
+class Step(Generic[ArrayT]):
     """One control step; arrays are of the kind that was given (numpy or torch).
 
     Attributes
@@ -53,18 +84,14 @@ class Step:
         lambda used, in the unit of `sigma_min`; 0 where the step is the pseudo-inverse's.
     saturated : bool array of shape (..., n)
         Actuators held at a limit of position or speed by this step.
-    scale : array of shape (...,)
-        How far the step goes along the wanted change of the tip, to first order: 1 is all of it.
-        With mode="direction" the share that the limits leave of it.
     """
 
-    dq: Any
-    x: Any
-    error: Any
-    sigma_min: Any
-    damping: Any
-    saturated: Any
-    scale: Any
+    dq: ArrayT
+    x: ArrayT
+    error: ArrayT
+    sigma_min: ArrayT
+    damping: ArrayT
+    saturated: ArrayT
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
@@ -76,7 +103,7 @@ class Step:
 
 
 @dataclass(frozen=True, repr=False)
-class IKSolution:
+class IKSolution(Generic[ArrayT]):
     """Configurations found for a batch of targets, in the kind that was given.
 
     Attributes
@@ -98,26 +125,26 @@ class IKSolution:
         Smallest distance of an actuator to its limits, in the unit of q; inf without limits.
     """
 
-    q: Any
-    x: Any
-    error: Any
-    status: Any
-    n_iter: Any
-    sigma_min: Any
-    limit_margin: Any
+    q: ArrayT
+    x: ArrayT
+    error: ArrayT
+    status: ArrayT
+    n_iter: ArrayT
+    sigma_min: ArrayT
+    limit_margin: ArrayT
 
     @property
-    def converged(self) -> Any:
+    def converged(self) -> ArrayT:
         """Bool array of shape (...,), true where the status is CONVERGED."""
-        return self.status == IKStatus.CONVERGED.value
+        return self.status == IKStatus.CONVERGED.value  # pyright: ignore[reportReturnType]
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
-        return f"IKSolution({_tally(self.status)}; {_errors(as_array(self.error))})"
+        return f"IKSolution({_tally(as_array(self.status))}; {_errors(as_array(self.error))})"
 
 
 @dataclass(frozen=True, repr=False)
-class Track:
+class Track(Generic[ArrayT]):
     """A followed path, in the kind that was given.
 
     Attributes
@@ -142,33 +169,15 @@ class Track:
         Smallest distance of an actuator to its limits, in the unit of q; inf without limits.
     """
 
-    t: Any
-    q: Any
-    x: Any
-    x_measured: Any
-    target: Any
-    error: Any
-    status: Any
-    sigma_min: Any
-    limit_margin: Any
-
-    @property
-    def n_laps(self) -> int:
-        """How often the target repeats itself; 0 for a path that does not end where it starts."""
-        target = as_array(self.target).reshape(len(self.t), -1)
-        near = 1e-9 + 1e-6 * float(np.ptp(target, axis=0).max())
-        n = len(target) - 1
-        for laps in range(n, 0, -1):
-            period = n // laps
-            if n % laps == 0 and np.abs(target[period:] - target[:-period]).max() <= near:
-                return laps
-        return 0
-
-    @property
-    def lap_gap(self) -> np.ndarray:
-        """How far q ends from where it started on every lap, shape (n_laps,), in the unit of q."""
-        marks = as_array(self.q)[:: (len(self.t) - 1) // self.n_laps] if self.n_laps else self.q[:1]
-        return np.linalg.norm(np.diff(as_array(marks), axis=0), axis=1)
+    t: ArrayT
+    q: ArrayT
+    x: ArrayT
+    x_measured: ArrayT | None
+    target: ArrayT
+    error: ArrayT
+    status: ArrayT
+    sigma_min: ArrayT
+    limit_margin: ArrayT
 
     @property
     def mean_error(self) -> float:
@@ -193,15 +202,15 @@ class Track:
     def __repr__(self) -> str:
         """Return a one-line summary."""
         return (
-            f"Track({_tally(self.status)}; {_errors(as_array(self.error))}; "
+            f"Track({_tally(as_array(self.status))}; {_errors(as_array(self.error))}; "
             f"largest step {self.largest_step:.3g})"
         )
 
 
-def _tally(status: Any) -> str:
-    codes, counts = np.unique(as_array(status), return_counts=True)
+def _tally(status: np.ndarray) -> str:
+    codes, counts = np.unique(status, return_counts=True)
     parts = [f"{n} {IKStatus(int(c)).name}" for c, n in zip(codes, counts, strict=True)]
-    return f"{as_array(status).size} targets" + (": " if parts else "") + ", ".join(parts)
+    return f"{status.size} targets" + (": " if parts else "") + ", ".join(parts)
 
 
 def _errors(error: np.ndarray) -> str:

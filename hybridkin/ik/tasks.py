@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import PoseModel, as_forward_model, forward_and_jacobian
+from hybridkin._core.model import ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
 
-__all__ = [
-    "PointsTask",
-    "PoseTask",
-    "PositionTask",
-    "PrioritizedTask",
-    "StackedTask",
-    "Task",
-    "away_from_limits",
-    "downhill",
-]
+__all__ = ["PointsTask", "PoseTask", "PositionTask", "PrioritizedTask", "StackedTask", "Task"]
+
+Tolerance: TypeAlias = float | tuple[float, ...]
 
 
 class Task:
-    """What the model does at q, and what it lacks to a target: x(q), J(q) and an error of m rows.
+    """What is steered: x(q), its Jacobian, and the error of x to a target in m rows.
 
     A subclass sets the attributes and gives `evaluate` and `difference`.
 
@@ -41,15 +35,15 @@ class Task:
         What one unit of every part counts in metres.
     first : int or None
         Number of leading rows that come before the others; None: all count alike.
-    models : tuple of callables
-        What is evaluated.
+    models : tuple of ForwardModel
+        The models that are evaluated.
     """
 
     shape: tuple[int, ...]
     parts: tuple[int, ...]
     units: tuple[float, ...]
     first: int | None = None
-    models: tuple[Any, ...]
+    models: tuple[ForwardModel, ...]
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x ``(N, *shape)`` and how fast the error falls along q (N, m, n), q (N, n).
@@ -66,9 +60,9 @@ class Task:
         raise NotImplementedError
 
     def check(self, x_target: Tensor, name: str) -> None:
-        """Raise where targets ``(..., *shape)`` cannot be meant."""
+        """Raise where targets ``(..., *shape)`` are not valid, as of rotations."""
 
-    def reached(self, error: Tensor, tol: float | tuple[float, ...]) -> Tensor:
+    def reached(self, error: Tensor, tol: Tolerance) -> Tensor:
         """Return whether errors (N, m) are within one tolerance [m], or one for every part."""
         if not isinstance(tol, tuple):
             return error.norm(dim=-1) <= tol
@@ -78,11 +72,17 @@ class Task:
 
     @property
     def n_actuators(self) -> int | None:
-        """Length of q, where a model tells it."""
+        """Length of q, where a model knows it."""
         return next((model.n_actuators for model in self.models if model.n_actuators), None)
 
+    @property
+    def device(self) -> torch.device:
+        """Device of the first model that holds tensors; the CPU where none does."""
+        tensors = (a for model in self.models for a in (*model.parameters(), *model.buffers()))
+        return next((a.device for a in tensors), torch.device("cpu"))
+
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return how far q is from what the models learned from, at most 1 inside, shape (N,)."""
+        """Return the largest domain distance of the models, at most 1 inside, shape (N,)."""
         return torch.stack([model.domain_distance(q) for model in self.models]).amax(0)
 
     def in_domain(self, q: Tensor) -> Tensor:
@@ -91,14 +91,14 @@ class Task:
 
 
 class PositionTask(Task):
-    """The tip is to be at a point: the task of `InverseKinematics` unless told otherwise.
+    """Bring the tip to a point: the default task of `InverseKinematics`.
 
     Parameters
     ----------
-    model : nn.Module, callable or (callable, callable)
+    model : ForwardModel, nn.Module, callable or (callable, callable)
         Maps q ``(..., n)`` to x ``(..., size)``, or a pair of such a function and its Jacobian
-        ``(..., size, n)``; row by row, for torch tensors or for NumPy arrays. A fitted estimator
-        is unwrapped to its ``module_``.
+        ``(..., size, n)``; row by row, torch to torch, see `as_forward_model`. NumPy functions:
+        `from_numpy`.
     size : int, default=3
         Number of coordinates.
 
@@ -117,18 +117,41 @@ class PositionTask(Task):
     ...     second = np.stack([-np.sin(b), np.cos(b)], axis=-1)
     ...     first = np.stack([-np.sin(a), np.cos(a)], axis=-1) + second
     ...     return np.stack([first, second], axis=-1)
-    >>> ik = InverseKinematics(PositionTask((tip, jacobian), size=2))
+    >>> ik = InverseKinematics(PositionTask.from_numpy(tip, jacobian, size=2))
     >>> ik.solve(np.array([1.2, 0.9]), q0=np.array([0.2, 0.8]), tol=1e-9).x.round(6)
     array([1.2, 0.9])
     """
 
-    def __init__(self, model: Any, size: int = 3) -> None:
-        self.models = (_model(model),)
+    def __init__(self, model: object, size: int = 3) -> None:
+        self.models = (as_forward_model(model),)
         self.shape, self.parts, self.units = (int(size),), (int(size),), (1.0,)
 
+    @classmethod
+    def from_numpy(
+        cls,
+        function: Callable[[NDArray], ArrayLike],
+        jacobian: Callable[[NDArray], ArrayLike],
+        size: int = 3,
+    ) -> PositionTask:
+        """Return the task for a model in NumPy.
+
+        Parameters
+        ----------
+        function, jacobian : callable
+            Map q ``(..., n)`` to x ``(..., size)`` and to dx/dq ``(..., size, n)``, row by row.
+        size : int, default=3
+            Number of coordinates.
+
+        Returns
+        -------
+        PositionTask
+            Whose model keeps no graph.
+        """
+        return cls(_NumpyModel(function, jacobian), size)
+
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x (N, size) and J (N, size, n), in closed form where the model offers it."""
-        x, J = forward_and_jacobian(self.models[0], q)
+        """Return x (N, size) and J (N, size, n), in closed form where the model has one."""
+        x, J = self.models[0].forward_and_jacobian(q)
         if x.shape != (len(q), *self.shape):
             raise ValueError(
                 f"`model` must map q of shape {tuple(q.shape)} to tips of shape "
@@ -143,7 +166,7 @@ class PositionTask(Task):
 
 
 class PoseTask(Task):
-    """The tip is to be at a point and turned as asked: six rows.
+    """Bring the tip to a pose, position and orientation: six rows.
 
     The error of the rotation is its logarithm, the rotation vector from the present to the wanted
     frame, in the measuring frame. Targets are homogeneous (4, 4) matrices, or a
@@ -151,14 +174,10 @@ class PoseTask(Task):
 
     Parameters
     ----------
-    model : nn.Module
-        A chain with ``pose_jacobian(q)`` and ``tip_transform(q)``, or any model of the tip's
-        position if `orientation` is given.
+    model : PoseModel
+        A chain, or a hybrid fitted with ``output="pose"``.
     radian : float, default=0.1
         Metres that a radian counts as.
-    orientation : nn.Module, optional
-        The chain that tells the orientation, where `model` does not: a hybrid model of positions
-        learns nothing else, and its chain turns the tip. Default: `model`.
 
     Examples
     --------
@@ -172,32 +191,22 @@ class PoseTask(Task):
     tensor(True)
     """
 
-    def __init__(self, model: Any, radian: float = 0.1, orientation: Any = None) -> None:
+    def __init__(self, model: object, radian: float = 0.1) -> None:
         if not (radian > 0.0 and math.isfinite(radian)):
             raise ValueError(f"`radian` must be positive metres, got {radian!r}.")
-        model = _model(model)
-        turning = model if orientation is None else _model(orientation)
-        if not isinstance(turning, PoseModel):
+        model = as_forward_model(model)
+        if not isinstance(model, PoseModel):
             raise TypeError(
-                "`model` must have pose_jacobian(q) and tip_transform(q), got "
-                f"{type(turning).__name__}; give the chain that knows as `orientation`."
+                "`model` must be a PoseModel, which knows the pose of the tip, got "
+                f"{type(model).__name__}; take a chain, or fit a hybrid with output='pose'."
             )
-        self.models = (model,) if turning is model else (model, turning)
+        self.models, self._model = (model,), model
         self.shape, self.parts, self.units = (4, 4), (3, 3), (1.0, float(radian))
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip's poses (N, 4, 4) and J (N, 6, n), its angular rows times `radian`."""
-        T, J = in_blocks(self._evaluate, q)
-        return T.to(q), J.to(q)
-
-    def _evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        turning: Any = self.models[-1]
-        T, J = turning.pose_and_jacobian(q)
-        if turning is not self.models[0]:
-            x, linear = forward_and_jacobian(self.models[0], q)
-            moved = torch.cat([T[:, :3, :3], x.to(T)[..., None]], dim=-1)
-            T, J = torch.cat([moved, T[:, 3:]], dim=-2), torch.cat([linear.to(J), J[:, 3:]], -2)
-        return T, torch.cat([J[:, :3], self.units[1] * J[:, 3:]], dim=-2)
+        T, J = in_blocks(self._model.pose_and_jacobian, q)
+        return T.to(q), torch.cat([J[:, :3], self.units[1] * J[:, 3:]], dim=-2).to(q)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the way [m] and the rotation vector [rad] times `radian`, (N, 6)."""
@@ -205,7 +214,7 @@ class PoseTask(Task):
         return torch.cat([x_target[..., :3, 3] - x[..., :3, 3], self.units[1] * turn], dim=-1)
 
     def check(self, x_target: Tensor, name: str) -> None:
-        """Raise where a finite target holds no rotation."""
+        """Raise where a finite target does not hold a rotation."""
         R = x_target[..., :3, :3]
         R = R[torch.isfinite(R).all(-1).all(-1)]
         off = (R.mT @ R - torch.eye(3).to(R)).abs().amax((-2, -1))
@@ -226,7 +235,7 @@ class StackedTask(Task):
     *tasks : Task, nn.Module or callable
         The tasks; a model stands for its `PositionTask`.
     weights : sequence of float, optional
-        What a metre of every task's error counts. Default: 1 each.
+        Factor on every task's error. Default: 1 each.
 
     Examples
     --------
@@ -243,53 +252,47 @@ class StackedTask(Task):
     tensor(True)
     """
 
-    def __init__(self, *tasks: Any, weights: Sequence[float] | None = None) -> None:
-        if not tasks:
-            raise ValueError("`tasks` must hold at least one task or model, got none.")
+    def __init__(self, *tasks: object, weights: Sequence[float] | None = None) -> None:
         self.tasks = tuple(as_task(task) for task in tasks)
-        weights = [1.0] * len(tasks) if weights is None else [float(w) for w in weights]
-        if len(weights) != len(tasks) or not all(0.0 < w < math.inf for w in weights):
+        self.weights = [1.0] * len(tasks) if weights is None else [float(w) for w in weights]
+        n, good = len(tasks), all(0.0 < w < math.inf for w in self.weights)
+        if n == 0 or len(self.weights) != n or not good:
             raise ValueError(
-                f"`weights` must be {len(tasks)} positive numbers, one per task, got {weights}."
+                f"`weights` must be positive, one per task, of one task or more; got {n} tasks and "
+                f"weights {self.weights}."
             )
-        self.weights = weights
         self.models = tuple(model for task in self.tasks for model in task.models)
-        self._sizes = [math.prod(task.shape) for task in self.tasks]
-        self.shape = (sum(self._sizes),)
+        self.shape = (sum(math.prod(task.shape) for task in self.tasks),)
         self.parts = tuple(rows for task in self.tasks for rows in task.parts)
-        self.units = tuple(
-            w * unit for w, task in zip(weights, self.tasks, strict=True) for unit in task.units
-        )
+        pairs = zip(self.weights, self.tasks, strict=True)
+        self.units = tuple(weight * unit for weight, task in pairs for unit in task.units)
 
-    def join(self, *x: Any) -> Any:
-        """Return one target (..., k) of the targets ``(..., *shape)`` of all tasks."""
+    def join(self, *x: ArrayLike | Tensor) -> Tensor | NDArray:
+        """Return one target (..., k) from the targets ``(..., *shape)`` of all tasks."""
         if len(x) != len(self.tasks):
             raise ValueError(f"`x` must be {len(self.tasks)} targets, one per task, got {len(x)}.")
         tensors = [a if isinstance(a, Tensor) else torch.as_tensor(np.asarray(a)) for a in x]
-        leads = [
-            a.shape[: a.ndim - len(task.shape)] for a, task in zip(tensors, self.tasks, strict=True)
+        parts = [
+            a.flatten(a.ndim - len(task.shape)) for a, task in zip(tensors, self.tasks, strict=True)
         ]
-        lead = torch.broadcast_shapes(*leads)
-        rows = [
-            a.expand(*lead, *task.shape).reshape(*lead, size)
-            for a, task, size in zip(tensors, self.tasks, self._sizes, strict=True)
-        ]
-        joined = torch.cat(rows, dim=-1)
+        lead = torch.broadcast_shapes(*(a.shape[:-1] for a in parts))
+        joined = torch.cat([a.expand(*lead, -1) for a in parts], dim=-1)
         return joined if any(isinstance(a, Tensor) for a in x) else joined.numpy()
 
-    def split(self, x: Any) -> tuple[Any, ...]:
-        """Return the targets, or the x, of every task from one vector (..., k)."""
-        ends = np.cumsum(self._sizes)
-        return tuple(
-            x[..., end - size : end].reshape(*x.shape[:-1], *task.shape)
-            for end, size, task in zip(ends, self._sizes, self.tasks, strict=True)
-        )
+    def split(self, x: Tensor) -> tuple[Tensor, ...]:
+        """Return the targets, or the x, of every task from one (..., k), torch or NumPy."""
+        lead = x.shape[: x.ndim - len(self.shape)]
+        ends = np.cumsum([math.prod(task.shape) for task in self.tasks]).tolist()
+        x = x.reshape(*lead, ends[-1])
+        parts = zip(self.tasks, [0, *ends[:-1]], ends, strict=True)
+        return tuple(x[..., a:b].reshape(*lead, *task.shape) for task, a, b in parts)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return all x (N, k), side by side, and the weighted J (N, m, n)."""
+        """Return all x (N, *shape), side by side, and the weighted J (N, m, n)."""
         parts = [task.evaluate(q) for task in self.tasks]
         rows = [w * J for w, (_, J) in zip(self.weights, parts, strict=True)]
-        return torch.cat([x.flatten(1) for x, _ in parts], dim=1), torch.cat(rows, dim=-2)
+        x = torch.cat([x.flatten(1) for x, _ in parts], dim=1)
+        return x.reshape(len(q), *self.shape), torch.cat(rows, dim=-2)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the weighted errors (N, m), one task after another."""
@@ -298,13 +301,13 @@ class StackedTask(Task):
         return torch.cat([w * e for w, e in zip(self.weights, errors, strict=True)], dim=-1)
 
     def check(self, x_target: Tensor, name: str) -> None:
-        """Raise where a part of a target cannot be meant."""
+        """Raise where the part of a task is not valid."""
         for task, part in zip(self.tasks, self.split(x_target), strict=True):
             task.check(part, name)
 
 
 class PrioritizedTask(StackedTask):
-    """Two tasks, the second one in the null space of the first: it never costs the first anything.
+    """Two tasks, the second one in the null space of the first, which it never disturbs.
 
     Parameters
     ----------
@@ -324,141 +327,62 @@ class PrioritizedTask(StackedTask):
     [True, False]
     """
 
-    def __init__(self, first: Any, second: Any) -> None:
+    def __init__(self, first: object, second: object) -> None:
         super().__init__(first, second)
         self.first = sum(self.tasks[0].parts)
 
 
-class PointsTask(Task):
-    """Several points along the backbone are to be at points: 3 P rows, targets (P, 3).
+@runtime_checkable
+class _WithPoints(Protocol):
+    """A chain that can be cut at a point of its backbone."""
+
+    def with_tip(self, at: float) -> ForwardModel: ...
+
+
+class PointsTask(StackedTask):
+    """Bring several points along the backbone to points: 3 P rows, targets (P, 3).
 
     Parameters
     ----------
-    chain : nn.Module
-        Offers ``with_tip(at)``.
+    chain : chain
+        With the method ``with_tip(at)``, as chains of arcs have.
     at : sequence of float
         Where on the backbone, in segments from the base.
     weights : sequence of float, optional
-        What a metre of every point's error counts. Default: 1 each.
+        Factor on every point's error. Default: 1 each.
     """
 
     def __init__(
-        self, chain: Any, at: Sequence[float], weights: Sequence[float] | None = None
+        self, chain: object, at: Sequence[float], weights: Sequence[float] | None = None
     ) -> None:
-        if not hasattr(chain, "with_tip"):
+        if not isinstance(chain, _WithPoints):
             raise TypeError(
                 f"`chain` must have with_tip(at), got {type(chain).__name__}; stack the models of "
                 "the points with StackedTask."
             )
-        self._stack = StackedTask(*(chain.with_tip(float(a)) for a in at), weights=weights)
-        self.models, self.parts, self.units = (
-            *(self._stack.models, self._stack.parts, self._stack.units),
-        )
-        self.shape = (len(self.parts), 3)
-
-    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the points (N, P, 3) and the weighted J (N, 3 P, n)."""
-        x, J = self._stack.evaluate(q)
-        return x.unflatten(1, self.shape), J
-
-    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return the weighted errors (N, 3 P)."""
-        return self._stack.difference(x.flatten(-2), x_target.flatten(-2))
+        super().__init__(*(chain.with_tip(float(a)) for a in at), weights=weights)
+        self.shape = (len(self.tasks), 3)
 
 
-def as_task(model: Any) -> Task:
-    """Return a task as it is, and a model as the task to put its tip somewhere."""
+def as_task(model: object) -> Task:
+    """Return a task as it is, and a model as the task to bring its tip to a point."""
     return model if isinstance(model, Task) else PositionTask(model)
 
 
-def away_from_limits(q_min: Any, q_max: Any, reach: float = 1.0) -> Callable[[Tensor], Tensor]:
-    """Return a posture for ``q_pref=`` that keeps actuators off their limits.
+class _NumpyModel(ForwardModel):
+    """A NumPy function and its Jacobian, without a graph."""
 
-    It moves against the gradient of sum_i u_i^4 / 4 with u in [-1, 1] between the limits: next to
-    nothing in the middle, and all the way there at a limit.
+    def __init__(
+        self, function: Callable[[NDArray], ArrayLike], jacobian: Callable[[NDArray], ArrayLike]
+    ) -> None:
+        super().__init__()
+        self._function, self._jacobian = function, jacobian
 
-    Parameters
-    ----------
-    q_min, q_max : float or array-like of shape (n,)
-        The limits, finite.
-    reach : float, default=1.0
-        Share of the way from a limit to the middle that is asked for.
-
-    Returns
-    -------
-    function
-        Maps q (..., n) to preferred configurations (..., n).
-    """
-    low, high = (torch.as_tensor(np.asarray(a), dtype=torch.float64) for a in (q_min, q_max))
-    half = 0.5 * (high - low)
-    if not (torch.isfinite(half) & (half > 0.0)).all():
-        raise ValueError(
-            f"`q_min` must lie below `q_max`, both finite, got {low.tolist()} and {high.tolist()}."
-        )
-
-    def posture(q: Tensor) -> Tensor:
-        u = (q - (low + half).to(q)) / half.to(q)
-        return q - reach * half.to(q) * u**3
-
-    return posture
-
-
-def downhill(gradient: Callable[[Tensor], Tensor], rate: float = 1.0) -> Callable:
-    """Return a posture for ``q_pref=`` that lowers a cost of q in the null space of the task.
-
-    Parameters
-    ----------
-    gradient : callable
-        Maps q (..., n) to the gradient of the cost (..., n), torch to torch.
-    rate : float, default=1.0
-        Step along the gradient; at most 2 over the cost's largest curvature.
-
-    Returns
-    -------
-    function
-        Maps q to ``q - rate gradient(q)``.
-    """
-    return lambda q: q - rate * gradient(q)
-
-
-class _FunctionPair:
-    """A function and its Jacobian as a model, for torch tensors or for NumPy arrays."""
-
-    def __init__(self, f: Callable, J: Callable) -> None:
-        self.f, self.J = f, J
-        self.speaks_torch: bool | None = None
-
-    def __call__(self, q: Tensor) -> Tensor:
-        return self._ask(self.f, q)
+    def forward(self, q: Tensor) -> Tensor:
+        return self._computed(self._function, q)
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self._ask(self.f, q), self._ask(self.J, q)
+        return self(q), self._computed(self._jacobian, q)
 
-    def _ask(self, function: Callable, q: Tensor) -> Tensor:
-        if self.speaks_torch is None:
-            try:
-                self.speaks_torch = isinstance(self.f(q), Tensor)
-            except Exception:
-                self.speaks_torch = False  # and if that was not the reason, NumPy says it again
-        if self.speaks_torch:
-            return function(q)
-        if q.requires_grad and torch.is_grad_enabled():
-            raise ValueError(
-                "`model` must be twice differentiable by torch for derivatives of the solution, "
-                "got functions for NumPy."
-            )
+    def _computed(self, function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:
         return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)
-
-
-def _model(model: Any) -> Any:
-    pair = isinstance(model, (tuple, list)) and len(model) == 2 and all(map(callable, model))
-    return as_forward_model(_FunctionPair(*model) if pair else model)
-
-
-def device_of(task: Task) -> torch.device:
-    """Return the device of the first model that has one."""
-    for model in task.models:
-        if isinstance(model, nn.Module):
-            for tensor in (*model.parameters(), *model.buffers()):
-                return tensor.device
-    return torch.device("cpu")

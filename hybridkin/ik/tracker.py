@@ -1,177 +1,237 @@
-"""Following a path, one step per point: for a whole path at once, or tick by tick."""
+"""Following targets one step per period: tick by tick, or a whole path at once."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import as_array, as_tensor, give_back
+from hybridkin._core.arrays import as_array, as_tensor, is_numpy
 from hybridkin.ik._gram import row_gram
-from hybridkin.ik._step import Law, Move
-from hybridkin.ik.results import Step
+from hybridkin.ik._settings import Array, StepSettings
+from hybridkin.ik._step import StepRows, control_step
+from hybridkin.ik.results import IKStatus, statuses
+from hybridkin.ik.tasks import Tolerance
 
-FEEDBACKS = ("model", "measured", None)
-_Rates = Callable[["float | None"], "tuple[float, float, float]"]
-
-
-class _Look(NamedTuple):
-    """What is known of one point before the step that leaves it."""
-
-    q: Tensor
-    x: Tensor
-    measured: Tensor
-    sigma_min: Tensor
-    held: Tensor
-    damped: Tensor
+Plant = Callable[["NDArray | Tensor"], Array]
 
 
 class Tracker:
-    """A path followed tick by tick, for controllers; made by `InverseKinematics.tracker`.
+    """Inverse kinematics tick by tick: a target goes in, the next command comes out.
+
+    The law is that of `InverseKinematics.step`, for one configuration. It follows any task. Made
+    by `InverseKinematics.tracker`; arrays are of the kind of its `q0`, NumPy or torch.
 
     Attributes
     ----------
-    q : array of shape (n,)
-        The configuration to command now.
+    x : array of shape (3,)
+        The model's tip at the configuration that the last step started from [m], in the shape of
+        the task.
+    error : float
+        Distance from the tip, the measured one where it was given, to the target before the last
+        step [m]; NaN where it is not known.
+    saturated : bool array of shape (n,)
+        Actuators that the last step held at a limit of position or speed.
+    sigma_min : float
+        Smallest singular value of the Jacobian there, NaN where an input was not finite.
+    damping : float
+        Damping lambda of the last step, in the unit of `sigma_min`.
+    backend : str
+        What computes: "torch".
 
     Examples
     --------
     >>> import numpy as np
     >>> from hybridkin import InverseKinematics, robots
-    >>> ik = InverseKinematics(robots.bionic_handling_assistant(), q_min=0.1, q_max=0.4, dt=0.02)
-    >>> path = np.linspace([0.0, 0.0, 0.75], [0.1, 0.0, 0.75], 50)
-    >>> tracker = ik.tracker(path[0])
-    >>> for point in path[1:]:
-    ...     step = tracker.tick(point)  # give x_measured= to close the loop; send tracker.q
-    >>> bool(np.linalg.norm(step.x - path[-2]) < 1e-4)
-    True
+    >>> ik = InverseKinematics(robots.bionic_handling_assistant(), q_min=0.1, q_max=0.4)
+    >>> tracker = ik.tracker(np.full(9, 0.25))
+    >>> for _ in range(5):
+    ...     q = tracker.step([0.1, 0.05, 0.7])  # x_measured= closes the loop; send q
+    >>> tracker.status.name, int(tracker.saturated.sum())
+    ('CONVERGED', 0)
     """
 
+    backend = "torch"
+
     def __init__(
-        self,
-        law: Law,
-        rates: _Rates,
-        q: Tensor,
-        target: Tensor,
-        feedback: str | None,
-        memory: float | None,
-        as_numpy: bool,
+        self, settings: StepSettings, q0: Array, tol: Tolerance, memory: float | None
     ) -> None:
-        self._law, self._rates, self._feedback, self._as_numpy = law, rates, feedback, as_numpy
-        self._q, self._target, self._memory = q, target, memory
-        self._missed: Any = 0.0  # by the model, at the last reading or what is left of it
-        no = torch.zeros(1, dtype=torch.bool, device=q.device)
-        self._held, self._damped = no, no
+        if memory is not None and not 0.0 < memory < math.inf:
+            raise ValueError(f"`memory` must be a positive time [s], got {memory!r}.")
+        self._settings, self._tol, self._memory = settings, tol, memory
+        self._as_numpy = is_numpy(q0)
+        self.reset(q0)
+
+    def __repr__(self) -> str:
+        """Return a one-line summary."""
+        n = self._q.shape[1]
+        return f"Tracker({n} actuators, {self.status.name}, error {self.error:.3g} m)"
 
     @property
-    def q(self) -> Any:
-        """The configuration to command now, shape (n,)."""
-        return as_array(self._q[0]).copy() if self._as_numpy else self._q[0].clone()
+    def q(self) -> NDArray | Tensor:
+        """The present command, shape (n,): what the last `step` returned, or `reset` was given."""
+        return self._given_back(self._q)
 
-    @torch.no_grad()
-    def tick(self, x_next: Any, x_measured: Any = None, period: float | None = None) -> Step:
-        """Move `q` on by one period, eq. (1), towards the next point of the path.
+    @property
+    def status(self) -> IKStatus:
+        """Outcome of the last step.
+
+        CONVERGED where `error` is within the tolerance (OUT_OF_DOMAIN where the model is not in its
+        domain there); else AT_LIMITS where a limit held the step, SINGULAR where it was damped,
+        MAX_ITER where it was free. INVALID_INPUT where the target, the measured tip or the model's
+        answer was not finite, and before the first step.
+        """
+        task, e, last = self._settings.task, self._e, self._last
+        error = e.norm(dim=-1) + 0.0 * last.sigma_min  # NaN where either is
+        parts = (task.reached(e, self._tol), last.saturated.any(-1), last.damping > 0.0)
+        with torch.no_grad():
+            return IKStatus(int(statuses(task, self._before, error, *parts)))
+
+    def reset(self, q: Array) -> None:
+        """Start anew from an actuator vector, as read from the robot.
 
         Parameters
         ----------
-        x_next : array-like of shape (3,)
-            The point of the next tick [m]; the difference to the present one is the feed-forward.
+        q : array-like of shape (n,)
+            Actuator vector, in the unit of q. Outside the limits it is led back at `dq_max`.
+        """
+        given, settings = as_tensor(q, "q", self._settings.task.device), self._settings
+        n = settings.n_actuators
+        if given.ndim != 1 or n not in (None, len(given)) or not torch.isfinite(given).all():
+            raise ValueError(
+                f"`q` must be finite and of shape ({n or 'n'},), got {given.tolist()}; read it "
+                "from the robot, or solve for a start."
+            )
+        self._q = given.clone()[None]
+        with torch.no_grad():
+            x, _ = settings.evaluate(self._q)
+        self._offset = x.new_zeros(1, sum(settings.task.parts))  # of the model at the last reading
+        unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(self._q)
+        self._note(x, unknown, StepRows(none, unknown[:, 0], none[:, 0], none > 0.0))
+
+    def step(
+        self, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
+    ) -> NDArray | Tensor:
+        """Return the actuator vector to command next, one period ahead, eq. (1).
+
+        Parameters
+        ----------
+        x_target : array-like of shape (3,)
+            Present target [m], in the shape of the task.
+        dx : array-like of shape (3,), optional
+            Velocity of the target [m/s], one for every row of the task; (next target - target) / dt
+            for second order in dt. Default: at rest.
         x_measured : array-like of shape (3,), optional
-            Tip measured at `q` [m], needed for feedback="measured"; NaN is no reading.
-        period : float, optional
-            Time to the next tick [s]. Default: `dt`.
+            Measured tip [m], to close the loop on. NaN is no reading: the step is feed-forward
+            alone, or with `memory` goes by the model's tip, moved by the last measured offset.
+            Default: the model's tip.
 
         Returns
         -------
-        Step
-            With x and the error at `q` before the step, with respect to the present point.
+        array of shape (n,)
+            The command, within the limits to the last bit; the caller's to keep. Where `x_target`
+            or `dx` is not finite the robot holds still.
         """
-        if self._feedback == "measured" and x_measured is None:
-            raise ValueError(
-                '`x_measured` must be given for feedback="measured"; NaN says no reading.'
-            )
-        goal, tip = (self._point(a, name) for a, name in ((x_next, "x_next"), (x_measured, "tip")))
-        assert goal is not None
-        look, error, move = self._tick(goal, tip, period)
-        parts = (move.dq, look.x, error, look.sigma_min, move.damping, move.saturated, move.scale)
-        return Step(*give_back(parts, (), self._as_numpy))
+        settings, like = self._settings, self._q
+        target = settings.points(x_target, "x_target", like, lead="")[None]
+        feed_forward, tip = 0.0, None
+        if dx is not None:
+            rows = (sum(settings.task.parts),)
+            feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)
+        if x_measured is not None:
+            tip = settings.points(x_measured, "x_measured", like, lead="")[None]
+        self._advance(target, feed_forward, tip)
+        return self.q
 
-    def _point(self, value: Any, name: str) -> Tensor | None:
-        if value is None:
-            return None
-        point, shape = as_tensor(value, name, self._q.device), self._law.task.shape
-        if point.shape != shape:
-            raise ValueError(f"`{name}` must have shape {shape}, got {tuple(point.shape)}.")
-        return point.to(self._q)[None]
+    @torch.no_grad()
+    def _advance(
+        self,
+        target: Tensor | None,
+        feed_forward: Tensor | float,
+        tip: Tensor | None,
+        period: float | None = None,
+    ) -> Tensor:
+        """Take one step towards a target (1, ...), and return the Jacobian before it.
 
-    def _tick(
-        self, goal: Tensor | None, tip: Tensor | None, period: float | None
-    ) -> tuple[_Look, Tensor, Move]:
-        """Look, then step; without a goal the error is all that is wanted."""
-        task, law = self._law.task, self._law
-        x, J = law.evaluate(self._q)
-        seen = x if tip is None else tip
-        gram = row_gram(J)
-        look = _Look(self._q, x, seen, gram.sigma_min, self._held, self._damped)
-        goal = self._target if goal is None else goal
-        e = task.difference(seen if self._feedback == "measured" else x, self._target)
-        error = e.norm(dim=-1)
-        v = _known(task.difference(self._target, goal))
-        gain, beta, seconds = self._rates(period)
+        A tip of None stands for the model's. Without a target the step is feed-forward alone.
+        """
+        settings, task = self._settings, self._settings.task
+        x, J = settings.evaluate(self._q)
+        error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
+        if target is not None:
+            error = used = task.difference(x, target)
+            if tip is not None:
+                # Without a reading the model's error counts, moved by the offset that is
+                # remembered; without memory no error counts.
+                error = task.difference(tip, target)
+                offset = used - error
+                seen = torch.isfinite(offset).all(-1, keepdim=True)
+                remembered = used if self._memory is None else self._offset
+                used = torch.where(seen, error, used - remembered)
+                self._offset = torch.where(seen, offset, self._offset)
+        step = control_step(settings, self._q, J, used, feed_forward, period)
         if self._memory is not None:
-            e = self._remembered(e, task.difference(x, self._target), seconds, self._memory)
-        if self._feedback is not None:
-            v = v + gain * _known(e)
-        move = law.advance(self._q, J, v, beta, seconds)
-        self._q, self._target = self._q + move.dq, goal
-        self._held, self._damped = move.saturated.any(-1), move.damping > 0.0
-        return look, error, move
+            self._offset = math.exp(-(period or settings.dt) / self._memory) * self._offset
+        self._note(x, error, step)
+        self._q = self._q + step.dq
+        return J
 
-    def _remembered(self, e: Tensor, e_model: Tensor, seconds: float, memory: float) -> Tensor:
-        """Return the error by the reading, or by the model moved as far as the last one told."""
-        seen = torch.isfinite(e).all(-1, keepdim=True)
-        missed = _known(torch.where(seen, e_model - e, self._missed))
-        self._missed = math.exp(-seconds / memory) * missed
-        return torch.where(seen, e, e_model - missed)
+    def _note(self, x: Tensor, e: Tensor, step: StepRows) -> None:
+        """Keep what is known of the last step: what is shown to the user is their own copy."""
+        self._before, self._x, self._e, self._last = self._q, x, e, step
+        self.x, self.saturated = self._given_back(x), self._given_back(step.saturated)
+        self.error, self.sigma_min = float(e.norm(dim=-1)), float(step.sigma_min)
+        self.damping = float(step.damping)
+
+    def _given_back(self, row: Tensor) -> NDArray | Tensor:
+        return as_array(row[0]).copy() if self._as_numpy else row[0].clone()
 
     def follow(
         self,
         targets: Tensor,
         periods: list[float],
-        plant: Callable[[Any], Any] | None,
+        plant: Plant | None,
+        feedback: str | None,
         progress: Callable[[int, int], None] | None,
-    ) -> tuple[Tensor, ...]:
-        """Return what was seen at every point of a path (T, ...): the fields of a look, stacked."""
-        looks: list[_Look] = []
-        for i in range(len(targets)):
-            if progress is not None:
-                progress(i, len(targets))
-            tip = None if plant is None else self._measure(plant, i)
-            end = i + 1 == len(targets)
-            goal = None if end else targets[i + 1 : i + 2].to(self._q)
-            looks.append(self._tick(goal, tip, None if end else periods[i])[0])
-        return tuple(torch.cat(parts) for parts in zip(*looks, strict=True))
+    ) -> list[Tensor]:
+        """Return q, x, the measured tip, sigma_min, and whether limits or damping held the step.
 
-    def _measure(self, plant: Callable[[Any], Any], i: int) -> Tensor:
-        """Return the plant's tip (1, ...), NaN where it fails: what was done must not be lost."""
-        shape = self._law.task.shape
+        Rows are the points of the path (T, ...), with what was seen before the step that leaves
+        them; held and damped is the step that led there.
+        """
+        task, n = self._settings.task, len(targets)
+        ahead = task.difference(targets, torch.cat([targets[1:], targets[-1:]]))
+        ahead = torch.where(torch.isfinite(ahead).all(-1, keepdim=True), ahead, 0.0)
+        known = torch.isfinite(targets.flatten(1)).all(-1).tolist()
+        unread = torch.full_like(targets[:1], math.nan)
+        held = damped = torch.zeros(1, dtype=torch.bool, device=targets.device)
+        rows = []
+        for i, target in enumerate(targets.split(1)):
+            if progress is not None:
+                progress(i, n)
+            tip = None if plant is None else self._measured(plant, i)
+            used = {"model": None, "measured": tip, None: unread}[feedback]
+            q = self._q
+            J = self._advance(target if known[i] else None, ahead[i : i + 1], used, periods[i])
+            seen = self._x if tip is None else tip
+            rows.append((q, self._x, seen, row_gram(J).sigma_min, held, damped))
+            held, damped = self._last.saturated.any(-1), self._last.damping > 0.0
+        return [torch.cat(parts) for parts in zip(*rows, strict=True)]
+
+    def _measured(self, plant: Plant, i: int) -> Tensor:
+        """Return the plant's tip (1, ...), NaN where the plant raises.
+
+        The plant is the user's robot, and may fail with any exception: the motion goes on, so that
+        the rows before it are not lost.
+        """
+        shape = self._settings.task.shape
         try:
-            tip = as_tensor(plant(self.q), "tip", self._q.device)
-            if tip.shape != shape:
-                raise ValueError(
-                    f"the measured tip must have shape {shape}, got {tuple(tip.shape)}"
-                )
+            return self._settings.points(plant(self.q), "tip", self._q, lead="")[None]
         except Exception as error:
             message = f"`plant` failed at point {i}: {error!r}; it counts as NaN."
-            warnings.warn(message, stacklevel=5)
+            warnings.warn(message, stacklevel=6)
             return self._q.new_full((1, *shape), math.nan)
-        return tip.to(self._q)[None]
-
-
-def _known(v: Tensor) -> Tensor:
-    """Return v, or zero where the target or the measured tip is not known."""
-    return torch.where(torch.isfinite(v).all(-1, keepdim=True), v, 0.0)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
 
@@ -41,16 +41,12 @@ class Trajectory:
             raise ValueError(f"`t` must have shape ({len(x)},), as many as `x`, got {t.shape}.")
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(x).all(axis=1)))
         if bad.size:
-            raise ValueError(
-                f"`t` and `x` must be finite, got NaN or infinity in {bad.size} rows (first: row "
-                f"{bad[0]}); drop those rows."
-            )
+            rows = f"{bad.size} rows (first: row {bad[0]})"
+            raise ValueError(f"`t` and `x` must be finite, drop the {rows} that are not.")
         late = np.flatnonzero(np.diff(t) <= 0)
         if late.size:
-            raise ValueError(
-                f"`t` must increase, got {t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s in row "
-                f"{late[0] + 1}; sort the rows and drop repeated times."
-            )
+            row, pair = late[0] + 1, f"{t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s"
+            raise ValueError(f"`t` must increase, got {pair} in row {row}; sort, drop repeats.")
         largest = float(np.abs(x).max())
         if largest > _FAR:
             warnings.warn(
@@ -66,33 +62,6 @@ class Trajectory:
         """Time from the first to the last point [s]."""
         return float(self.t[-1] - self.t[0])
 
-    def repeated(self, n_laps: int) -> Trajectory:
-        """Return the path run several times on end, for a path that ends where it starts.
-
-        Parameters
-        ----------
-        n_laps : int
-            Number of laps, at least 1.
-
-        Returns
-        -------
-        Trajectory
-            ``n_laps (T - 1) + 1`` points.
-        """
-        if n_laps < 1:
-            raise ValueError(f"`n_laps` must be at least 1, got {n_laps}.")
-        gap = float(np.linalg.norm(self.x[-1] - self.x[0]))
-        if n_laps > 1 and (
-            len(self) < 2 or gap > 1e-9 + 1e-6 * float(np.ptp(self.x, axis=0).max())
-        ):
-            raise ValueError(
-                f"only a closed path can be repeated; this one ends {gap:.4g} m from its start."
-            )
-        t = [self.t[0] + lap * self.duration + (self.t[1:] - self.t[0]) for lap in range(n_laps)]
-        return Trajectory(
-            np.concatenate([self.t[:1], *t]), np.concatenate([self.x[:1], *[self.x[1:]] * n_laps])
-        )
-
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.t)
@@ -104,7 +73,7 @@ class Trajectory:
         return f"Trajectory({len(self)} points, {self.duration:.4g} s, {span} m)"
 
 
-def min_jerk(s: Any) -> np.ndarray:
+def min_jerk(s: ArrayLike) -> np.ndarray:
     """Return the minimum-jerk timing law 10 s^3 - 15 s^4 + 6 s^5.
 
     It runs from 0 to 1 with speed and acceleration zero at both ends.
@@ -128,12 +97,12 @@ def min_jerk(s: Any) -> np.ndarray:
 
 
 def figure_eight(
-    center: Any,
+    center: ArrayLike,
     size: Sequence[float] = (0.3, 0.15),
     *,
     duration: float = 10.0,
     dt: float = 0.01,
-    normal: Any = (0.0, 0.0, 1.0),
+    normal: ArrayLike = (0.0, 0.0, 1.0),
     timing: str = "min_jerk",
 ) -> Trajectory:
     """Return a figure eight (Gerono's lemniscate) that starts and ends in its crossing.
@@ -176,18 +145,19 @@ def figure_eight(
     across, up, _ = _plane(normal)
     phase = 2.0 * math.pi * s[:, None]
     x = 0.5 * width * np.sin(phase) * across + 0.5 * height * np.sin(2.0 * phase) * up
-    return Trajectory(t, center + _closed(x))
+    x[-1] = x[0]  # exactly: sin(2 pi) is not zero
+    return Trajectory(t, center + x)
 
 
 def spiral(
-    center: Any,
+    center: ArrayLike,
     radius: float | Sequence[float] = (0.0, 0.15),
     *,
     rise: float = 0.0,
     turns: float = 3.0,
     duration: float = 15.0,
     dt: float = 0.01,
-    normal: Any = (0.0, 0.0, 1.0),
+    normal: ArrayLike = (0.0, 0.0, 1.0),
     timing: str = "min_jerk",
 ) -> Trajectory:
     """Return a spiral or helix.
@@ -228,10 +198,7 @@ def spiral(
     Trajectory(501 points, 5 s, 0.363 x 0.326 x 0.1 m)
     """
     center = _point(center, "center")
-    radii = (
-        np.broadcast_to(np.asarray(radius, dtype=float), (2,)) if np.ndim(radius) == 0 else radius
-    )
-    first, last = _sizes(radii, "radius", smallest=0.0)
+    first, last = _sizes((radius, radius) if np.ndim(radius) == 0 else radius, "radius", zero=True)
     if not (math.isfinite(rise) and math.isfinite(turns)):
         raise ValueError(f"`rise` [m] and `turns` must be finite, got {rise!r} and {turns!r}.")
     t, s = _timing(duration, dt, timing)
@@ -244,7 +211,12 @@ def spiral(
 
 
 def line(
-    start: Any, end: Any, *, duration: float = 5.0, dt: float = 0.01, timing: str = "min_jerk"
+    start: ArrayLike,
+    end: ArrayLike,
+    *,
+    duration: float = 5.0,
+    dt: float = 0.01,
+    timing: str = "min_jerk",
 ) -> Trajectory:
     """Return a straight line.
 
@@ -276,22 +248,18 @@ def line(
     return Trajectory(t, (1.0 - s)[:, None] * start + s[:, None] * end)
 
 
-def from_csv(
-    path: str | PathLike[str], *, dt: float | None = None, unit: str = "m", delimiter: str = ","
-) -> Trajectory:
+def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = "m") -> Trajectory:
     """Return a recorded path.
 
     Parameters
     ----------
     path : path-like
-        A text file with columns t, x, y, z, or x, y, z together with `dt`. One line of names
-        and lines that start with # are allowed.
+        A text file with columns t, x, y, z, or x, y, z together with `dt`, with commas between
+        them. One line of names and lines that start with # are allowed.
     dt : float, optional
         Time between rows [s], for files without a time column.
     unit : {"m", "cm", "mm"}, default="m"
         Unit of the positions in the file. Times are seconds.
-    delimiter : str, default=","
-        Separator of the columns.
 
     Returns
     -------
@@ -302,25 +270,20 @@ def from_csv(
         raise ValueError(f"`unit` must be one of {tuple(_UNITS)}, got {unit!r}.")
     with open(path, encoding="utf-8-sig") as file:
         lines = [text.strip() for text in file]
-    rows = [text.split(delimiter) for text in lines if text and not text.startswith("#")]
-    if rows and not _is_number(rows[0][0]):
-        rows = rows[1:]
+    rows = [text.split(",") for text in lines if text and not text.startswith("#")]
     columns = 4 if dt is None else 3
     need = "t, x, y, z" if dt is None else "x, y, z, because `dt` is given"
+    named = bool(rows) and not _is_number(rows[0][0])
     try:
-        table = np.array(rows, dtype=float)
+        table = np.array(rows[named:], dtype=float)
     except ValueError as error:
-        raise ValueError(
-            f"{path} must hold numbers in {columns} columns ({need}) after one line of names: "
-            f"{error}."
-        ) from error
+        need = f"numbers in {columns} columns ({need}) after one line of names"
+        raise ValueError(f"{path} must hold {need}: {error}.") from error
     if table.ndim != 2 or table.shape[1] != columns:
         raise ValueError(f"{path} must have rows of {columns} columns ({need}), got {table.shape}.")
-    if dt is None:
-        t = table[:, 0]
-    else:
+    if dt is not None:
         _check_positive(dt, "dt")
-        t = dt * np.arange(len(table))
+    t = table[:, 0] if dt is None else dt * np.arange(len(table))
     return Trajectory(t, _UNITS[unit] * table[:, -3:])
 
 
@@ -328,22 +291,14 @@ def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.nda
     """Return times [s] and the share of the way at each."""
     _check_positive(duration, "duration")
     _check_positive(dt, "dt")
-    laws: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-        "min_jerk": min_jerk,
-        "uniform": lambda s: s,
-    }
-    if timing not in laws:
-        raise ValueError(f"`timing` must be one of {tuple(laws)}, got {timing!r}.")
+    if timing not in ("min_jerk", "uniform"):
+        raise ValueError(f'`timing` must be one of "min_jerk" and "uniform", got {timing!r}.')
     n = max(1, round(duration / dt))
-    return dt * np.arange(n + 1), laws[timing](np.arange(n + 1) / n)
+    s = np.arange(n + 1) / n
+    return dt * np.arange(n + 1), s if timing == "uniform" else min_jerk(s)
 
 
-def _closed(x: np.ndarray) -> np.ndarray:
-    """Return the curve with its last point exactly on the first: sin(2 pi) is not zero."""
-    return np.concatenate([x[:-1], x[:1]])
-
-
-def _plane(normal: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a right-handed frame (across, up, normal)."""
     normal = _point(normal, "normal")
     norm = np.linalg.norm(normal)
@@ -356,18 +311,18 @@ def _plane(normal: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return across, np.cross(normal, across), normal
 
 
-def _point(value: Any, name: str) -> np.ndarray:
+def _point(value: ArrayLike, name: str) -> np.ndarray:
     point = np.array(value, dtype=float)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise ValueError(f"`{name}` must be 3 finite numbers [m], got {value!r}.")
     return point
 
 
-def _sizes(value: Any, name: str, *, smallest: float | None = None) -> tuple[float, float]:
+def _sizes(value: ArrayLike, name: str, *, zero: bool = False) -> tuple[float, float]:
     pair = np.array(value, dtype=float)
     good = pair.shape == (2,) and np.isfinite(pair).all()
-    if not good or not (pair > 0.0 if smallest is None else pair >= smallest).all():
-        need = "positive" if smallest is None else "not negative"
+    if not good or not (pair >= 0.0 if zero else pair > 0.0).all():
+        need = "not negative" if zero else "positive"
         raise ValueError(f"`{name}` must be two numbers, {need} [m], got {value!r}.")
     return float(pair[0]), float(pair[1])
 

@@ -56,7 +56,7 @@ def measure_speed(
     q = middle + 0.2 * (rng.uniform(low, high) - middle)
     with torch.no_grad():
         x = opened.module(torch.from_numpy(middle[None]))[0].numpy()
-    controller = ik.controller(q)
+    tracker = ik.tracker(q)
     jobs: list[tuple[str, int, Callable[[], Any]]] = []
     for n in batches:
         rows = torch.from_numpy(rng.uniform(low, high, (n, len(low))))
@@ -64,7 +64,7 @@ def measure_speed(
         both = partial(forward_and_jacobian, opened.module, rows)
         jobs.append(("forward kinematics and Jacobian", n, both))
     jobs.append(("step of inverse kinematics (torch)", 1, lambda: ik.step(q, x)))
-    jobs.append(("tick of the controller (NumPy)", 1, lambda: controller.step(x)))
+    jobs.append(("tick of the tracker", 1, lambda: tracker.step(x)))
     entries = []
     with torch.no_grad():
         for k, (what, n, job) in enumerate(jobs):

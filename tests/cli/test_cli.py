@@ -483,7 +483,7 @@ def test_benchmark_tells_the_speed_of_a_model(fitted, capsys):
     assert record["versions"]["torch"]
     assert record["threads"] >= 1
     code, printed, _ = run(capsys, *arguments)
-    assert "tick of the controller" in printed
+    assert "tick of the tracker" in printed
 
 
 def test_describe_tells_what_a_model_is(fitted, capsys):

@@ -30,7 +30,6 @@ from hybridkin import (
 )
 from hybridkin._core.model import PoseModel
 from hybridkin._core.rotations import rotation
-from hybridkin.ik._realtime import Controller
 from hybridkin.ik.solver import IKStatus
 from hybridkin.ik.tasks import PoseTask, rotation_vector
 
@@ -447,10 +446,10 @@ def test_inverse_kinematics_of_the_position(fitted):
     solution = ik.solve(target, tol=1e-8)
     assert solution.converged.all()
     assert_close(fitted.module_(solution.q), target, rtol=0, atol=1e-8)
-    controller = Controller(ik, np.full(9, 0.25))
+    tracker = ik.tracker(np.full(9, 0.25))
     for _ in range(40):
-        controller.step(target[0].numpy())
-    assert controller.error < 1e-4
+        tracker.step(target[0].numpy())
+    assert tracker.error < 1e-4
 
 
 def test_inverse_kinematics_of_the_pose(fitted):

@@ -1,0 +1,219 @@
+"""The checked settings of inverse kinematics, and the arrays that come in with them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from hybridkin._core.arrays import as_tensor
+from hybridkin.ik.tasks import Task, Tolerance
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Transform3d
+
+Array: TypeAlias = "ArrayLike | Tensor | Transform3d"  # what comes in, NumPy or torch
+Posture: TypeAlias = Callable[[Tensor], Tensor]
+
+
+def require(good: bool | Tensor, message: str) -> None:
+    """Raise a ValueError where an argument is not what it must be."""
+    if not good:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """What a step depends on besides q and the target; see `InverseKinematics`.
+
+    Limits, weights and a fixed posture are float64 tensors of shape () or (n,).
+    """
+
+    task: Task
+    q_min: Tensor
+    q_max: Tensor
+    dq_max: Tensor
+    q_pref: Tensor | Posture | None
+    beta: float
+    gain: float | None
+    damping: str | float
+    limits: str
+    dt: float
+    weights: Tensor | None
+
+    def __post_init__(self) -> None:
+        """Check the settings, and take the middle of the limits where no posture is given."""
+        sizes, one = self._sizes(), "give scalars or one value per actuator"
+        good = len(set(sizes.values())) < 2
+        require(good, f"settings must agree in the number of actuators, got {sizes}; {one}.")
+        low, high, speed = (a.tolist() for a in (self.q_min, self.q_max, self.dq_max))
+        good = (self.q_min <= self.q_max).all()
+        require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
+        lock = "to lock an actuator give it equal limits."
+        good = (self.dq_max > 0.0).all()
+        require(good, f"`dq_max` must be positive [unit of q / s], got {speed}; {lock}")
+        if self.q_pref is None:
+            object.__setattr__(self, "q_pref", self.middle)
+        elif isinstance(self.q_pref, Tensor):
+            good = torch.isfinite(self.q_pref).all()
+            require(good, f"`q_pref` must be finite, got {self.q_pref.tolist()}.")
+        if self.weights is not None:
+            good = ((self.weights > 0.0) & torch.isfinite(self.weights)).all()
+            require(good, f"`weights` must be positive, got {self.weights.tolist()}; {lock}")
+        good = 0.0 < self.dt < math.inf
+        require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
+        self.rates()
+        good = self.limits in ("saturate", "off")
+        require(good, f'`limits` must be "saturate" or "off", got {self.limits!r}.')
+        share = 0.0 if self.damping == "adaptive" else self.damping
+        good, text = not isinstance(share, str) and 0.0 <= share < math.inf, '"adaptive" or'
+        require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
+
+    def _sizes(self) -> dict[str, int]:
+        """Return the numbers of actuators that the settings and the model know, by name."""
+        vectors = {k: a for k, a in vars(self).items() if isinstance(a, Tensor) and a.ndim == 1}
+        sizes = {name: len(a) for name, a in vectors.items()}
+        n = self.task.n_actuators
+        return sizes if n is None else {**sizes, "model": n}
+
+    @property
+    def n_actuators(self) -> int | None:
+        """Length of q, where settings or model know it."""
+        return next(iter(self._sizes().values()), None)
+
+    @property
+    def middle(self) -> Tensor | None:
+        """The middle of the limits, where they are finite."""
+        middle = 0.5 * (self.q_min + self.q_max)
+        return middle if torch.isfinite(middle).all() else None
+
+    @property
+    def has_posture(self) -> bool:
+        """Whether there is a preferred configuration to go to."""
+        return self.q_pref is not None and self.beta > 0.0
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (N, ...) and J (N, m, n) at q of shape (N, n)."""
+        if len(q) > 0:
+            return self.task.evaluate(q)
+        return q.new_zeros(0, *self.task.shape), q.new_zeros(0, sum(self.task.parts), q.shape[1])
+
+    def preferred(self, q: Tensor) -> Tensor:
+        """Return the preferred configurations, of shape (n,) or that of q."""
+        wanted = self.q_pref(q) if callable(self.q_pref) else self.q_pref
+        assert wanted is not None
+        return wanted.to(q)
+
+    def start(self, like: Tensor) -> Tensor:
+        """Return the preferred configuration (n,); where it is a function, that at the middle."""
+        start = self.middle if callable(self.q_pref) else self.q_pref
+        need = "give `q0` or `q_pref` of shape (n,)"
+        if start is None:
+            raise ValueError(f"a start is needed: {need}, or finite `q_min` and `q_max`.")
+        if self.n_actuators is None:
+            raise ValueError(f"the number of actuators is not known from this model; {need}.")
+        start = start.to(like).expand(self.n_actuators)
+        return self.preferred(start) if callable(self.q_pref) else start
+
+    def rates(self, period: float | None = None) -> tuple[float, float, float]:
+        """Return gain dt and beta dt, both at most 1, and dt, of a period [s], by default `dt`."""
+        dt = self.dt if period is None else period
+        gain = 1.0 if self.gain is None else self.gain * dt
+        beta = self.beta * dt
+        for name, rate, share in (("gain", self.gain, gain), ("beta", self.beta, beta)):
+            if not 0.0 <= share <= 1.0 + 1e-9 or (name == "gain" and share == 0.0):
+                raise ValueError(
+                    f"`{name}` times the period must lie in {'(' if name == 'gain' else '['}0, 1], "
+                    f"got {rate} 1/s x {dt:.6g} s = {share:.4g}; take a {name} up to "
+                    f"{1.0 / dt:.4g} 1/s or a shorter period."
+                )
+        return min(gain, 1.0), min(beta, 1.0), dt
+
+    def unit(self, q: Tensor) -> Tensor:
+        """Return the units, shape () or (n,), of q in which nothing has a weight."""
+        return q.new_ones(()) if self.weights is None else self.weights.to(q).rsqrt()
+
+    def box(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the limits of q."""
+        if self.limits == "off":
+            return q.new_tensor(-math.inf), q.new_tensor(math.inf)
+        return self.q_min.to(q), self.q_max.to(q)
+
+    def inside(self, q: Tensor) -> Tensor:
+        """Return q moved into the limits."""
+        return torch.clamp(q, *self.box(q))
+
+    def step_bounds(self, q: Tensor, largest: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the bounds of dq: position and speed intersected, never empty.
+
+        From outside the limits both bounds meet at the way back, at most the largest step. The
+        nextafter makes q + upper <= q_max hold after rounding, and with it q + dq for every dq.
+        """
+        q_min, q_max = self.box(q)
+        lower, upper = q_min - q, q_max - q
+        up, down = torch.full_like(q, math.inf), torch.full_like(q, -math.inf)
+        upper = torch.where(q + upper > q_max, torch.nextafter(upper, down), upper)
+        lower = torch.where(q + lower < q_min, torch.nextafter(lower, up), lower)
+        if self.limits != "off" and largest is not None:
+            lower = torch.clamp(lower, -largest, largest)
+            upper = torch.clamp(upper, -largest, largest)
+        return lower, upper
+
+    def margin(self, q: Tensor) -> Tensor:
+        """Return the smallest distance of an actuator to its limits."""
+        return torch.minimum(q - self.q_min.to(q), self.q_max.to(q) - q).amin(-1)
+
+    # What comes in from a caller, as tensors.
+
+    def configurations(self, value: Array, name: str, like: Tensor | None = None) -> Tensor:
+        """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
+        q = as_tensor(value, name, self.task.device if like is None else like.device)
+        n = self.n_actuators
+        good, shape = q.ndim > 0 and n in (None, q.shape[-1]), tuple(q.shape)
+        require(
+            good,
+            f"`{name}` must have shape (..., {n or 'n'}), one column per actuator, got {shape}.",
+        )
+        return q if like is None else q.to(torch.promote_types(q.dtype, like.dtype))
+
+    def points(
+        self,
+        value: Array,
+        name: str,
+        like: Tensor | None = None,
+        *,
+        lead: str = "...",
+        shape: tuple[int, ...] | None = None,
+    ) -> Tensor:
+        """Return targets or tips (..., *shape), by default in the shape of the task's targets.
+
+        `lead` says which axes come first: "..." any, "T" one, "" none.
+        """
+        x, shape_of_one = as_tensor(value, name, self.task.device), shape or self.task.shape
+        axes = x.ndim - len(shape_of_one)
+        fits = axes >= 0 if lead == "..." else axes == len(lead)
+        if not fits or tuple(x.shape[axes:]) != shape_of_one:
+            sizes = [*filter(None, [lead]), *map(str, shape_of_one)]
+            raise ValueError(
+                f"`{name}` must have shape ({', '.join(sizes)}{',' * (len(sizes) == 1)}) [m], got "
+                f"{tuple(x.shape)}; one target per row."
+            )
+        if shape is None:
+            self.task.check(x, name)
+        return x if like is None else x.to(like)
+
+    def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
+        """Return one tolerance [m], or one for every part of the task."""
+        given = np.atleast_1d(np.asarray(tol, dtype=float))
+        require(bool((given > 0.0).all()), f"`tol` must be positive [m], got {tol!r}.")
+        if np.ndim(tol) == 0:
+            return float(given[0])
+        n, parts = len(self.task.parts), "one for every part of the task"
+        require(given.shape == (n,), f"`tol` must be one number [m] or {n}, {parts}, got {tol!r}.")
+        return tuple(given.tolist())
