@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, bound, give_back, is_numpy, leading, rows_of
 from hybridkin.ik._gram import row_gram
+from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
 from hybridkin.ik._settings import Array, Posture, StepSettings, require
 from hybridkin.ik._step import control_step
@@ -188,6 +189,7 @@ class InverseKinematics:
         max_iter: int = 50,
         restarts: int = 0,
         random_state: int | np.random.Generator | None = None,
+        differentiable: bool = False,
     ) -> IKSolution:
         """Return configurations that reach the targets, or come as near as the limits allow.
 
@@ -212,17 +214,30 @@ class InverseKinematics:
             in the limits, the same for every row.
         random_state : int, Generator or None, default=None
             Seed of the restarts.
+        differentiable : bool, default=False
+            Keep the graph from q to `x_target`, and to parameters of the model that require
+            gradients, by the implicit function theorem at the solution.
 
         Returns
         -------
         IKSolution
             Never raises for an unreachable target; a NaN target marks only its own row.
+
+        Notes
+        -----
+        The derivatives are those of the configuration nearest to `q_pref` among the solutions
+        around the one found, with the actuators that lie at a limit held there; without posture
+        they are J+. They are exact where that configuration is unique and the set of held
+        actuators does not change nearby; rows that have not converged get none. The model must be
+        twice differentiable by torch.
         """
         settings, task = self.settings, self.settings.task
         tolerance = settings.tolerance(tol)
         good, given = max_iter >= 1 and restarts >= 0, (max_iter, restarts)
         require(good, f"`max_iter` must be at least 1 and `restarts` at least 0, got {given}.")
         as_numpy, axes = is_numpy(x_target), len(task.shape)
+        if differentiable and not isinstance(x_target, Tensor):
+            raise ValueError("`x_target` must be a torch tensor for differentiable=True.")
         target = settings.points(x_target, "x_target")
         q = settings.start(target) if q0 is None else settings.configurations(q0, "q0", target)
         target = target.to(q.dtype)
@@ -230,17 +245,22 @@ class InverseKinematics:
         q, target = rows_of(q, lead), rows_of(target, lead, axes)
         starts = self._restarts(q, restarts, random_state, q0 is not None)
         found = Search(settings, tolerance, max_iter).solve(q, target, q0 is None, starts)
-        # The error and the status are those of the q that is returned.
         q = found.q
-        x, J = settings.evaluate(q)
+        if differentiable:
+            with torch.enable_grad():
+                goal = rows_of(torch.as_tensor(x_target).to(q), lead, axes)
+                q = with_derivatives(settings, q, goal, found.reached)
+        # The error and the status are those of the q that is returned.
+        x, J = settings.evaluate(q.detach())
         e = task.difference(x, target)
         error, gram = e.norm(dim=-1), row_gram(J)
         reached = task.reached(e, tolerance)
-        status = statuses(task, q, error, reached, found.held, gram.is_singular)
+        status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
         status[found.stationary & ~reached & torch.isfinite(error)] = IKStatus.UNREACHABLE
-        margin = settings.margin(q)
+        margin = settings.margin(q.detach())
         results = (q, x, error, status, found.n_iter, gram.sigma_min, margin)
-        return IKSolution(*give_back(results, lead, as_numpy))
+        with torch.set_grad_enabled(differentiable):
+            return IKSolution(*give_back(results, lead, as_numpy))
 
     @torch.no_grad()
     def track(

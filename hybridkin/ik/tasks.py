@@ -145,7 +145,7 @@ class PositionTask(Task):
         Returns
         -------
         PositionTask
-            Whose model keeps no graph.
+            Without derivatives of solutions (`differentiable`).
         """
         return cls(_NumpyModel(function, jacobian), size)
 
@@ -385,4 +385,9 @@ class _NumpyModel(ForwardModel):
         return self(q), self._computed(self._jacobian, q)
 
     def _computed(self, function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:
+        if q.requires_grad and torch.is_grad_enabled():
+            raise ValueError(
+                "`model` must be twice differentiable by torch for derivatives of the solution, "
+                "got functions for NumPy."
+            )
         return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)

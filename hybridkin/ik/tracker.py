@@ -55,6 +55,11 @@ class Tracker:
     ('CONVERGED', 0)
     """
 
+    x: NDArray | Tensor
+    error: float
+    saturated: NDArray | Tensor
+    sigma_min: float
+    damping: float
     backend = "torch"
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Tasks beyond the tip's position, weights, secondary objectives."""
+"""Tasks beyond the tip's position, weights, secondary objectives, derivatives."""
 
 import numpy as np
 import pytest
@@ -323,6 +323,8 @@ def test_pairs_of_functions_for_torch_and_for_numpy(rng):
     assert_close(by_torch, expected, rtol=0.0, atol=1e-10)
     with pytest.raises(TypeError, match="two callables"):
         InverseKinematics((f, None))
+    with pytest.raises(ValueError, match="twice differentiable"):
+        InverseKinematics(arrays).solve(target, q, differentiable=True)
     with pytest.raises(TypeError, match="from_numpy"):
         InverseKinematics(lambda q: q.detach().numpy()[..., :3]).step(q, target)
 
@@ -399,3 +401,82 @@ class Unguided(torch.nn.Module):
 
     def forward(self, q):
         return self.module(q)
+
+
+# ---------------------------------------------------------------- derivatives of solve
+
+
+def uneven(q):
+    """Return the gradient of a cost with another curvature for every actuator."""
+    return torch.linspace(0.5, 1.5, 9).to(q) * (q - 0.22) + 5.0 * (q - 0.22) ** 3
+
+
+def finite_differences(ik, target, q, h=1e-5, **options):
+    columns = []
+    for k in range(target.shape[-1]):
+        step = torch.zeros_like(target)
+        step[..., k] = h
+        ends = [
+            ik.solve(moved.requires_grad_(), q, differentiable=True, **options).q.detach()
+            for moved in (target + step, target - step)
+        ]
+        columns.append((ends[0] - ends[1]) / (2.0 * h))
+    return torch.stack(columns, dim=-1)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"weights": np.arange(1.0, 10.0)}, {"q_pref": lambda q: q - 0.5 * uneven(q)}],
+    ids=["posture", "weights", "gradient"],
+)
+def test_derivatives_of_the_solution_against_finite_differences(rng, settings):
+    target = CHAIN(uniform(rng, 0.18, 0.32, 20, 9)).requires_grad_()
+    ik = InverseKinematics(CHAIN, **LIMITS, **settings)
+    solution = ik.solve(target, differentiable=True, tol=1e-8)
+    assert solution.converged.all()
+    assert solution.error.max() < 1e-12
+    rows = [
+        torch.autograd.grad(column.sum(), target, retain_graph=True)[0]
+        for column in solution.q.unbind(-1)
+    ]
+    slope = torch.stack(rows, dim=-2)
+    expected = finite_differences(ik, target.detach(), None, tol=1e-8)
+    assert_close(slope, expected, rtol=0.0, atol=1e-5)
+
+
+def test_derivatives_with_held_actuators_and_by_the_models_parameters(rng):
+    q = uniform(rng, 0.2, 0.3, 9)
+    target = CHAIN(q)
+    free = InverseKinematics(CHAIN, q_pref=0.2, **LIMITS).solve(target).q
+    low = [0.1] * 8 + [float(free[8]) + 0.02]  # the posture pulls against this limit
+    ik = InverseKinematics(CHAIN, q_min=low, q_max=0.4, q_pref=0.2)
+    moving = target.clone().requires_grad_()
+    solution = ik.solve(moving, differentiable=True, tol=1e-8)
+    assert solution.limit_margin == 0.0
+    rows = [torch.autograd.grad(part, moving, retain_graph=True)[0] for part in solution.q.unbind()]
+    slope = torch.stack(rows)
+    assert (slope[8] == 0.0).all()
+    expected = finite_differences(ik, target, None, tol=1e-8)
+    assert_close(slope, expected, rtol=0.0, atol=1e-5)
+    radii = CHAIN.radii.clone().requires_grad_()
+    chain = CHAIN.with_geometry(radii=radii)
+    found = InverseKinematics(chain, **LIMITS).solve(moving, differentiable=True, tol=1e-8).q
+    (by_radii,) = torch.autograd.grad(found[0], radii)
+
+    def first(r):
+        solver = InverseKinematics(CHAIN.with_geometry(radii=r), **LIMITS)
+        again = solver.solve(target.clone().requires_grad_(), differentiable=True, tol=1e-8)
+        return again.q.detach()[0]
+
+    h = 1e-6 * torch.eye(3, dtype=torch.float64)
+    expected = torch.stack([first(radii.detach() + d) - first(radii.detach() - d) for d in h])
+    assert_close(by_radii, expected / 2e-6, rtol=1e-5, atol=1e-5)
+
+
+def test_rows_that_have_not_converged_get_no_derivatives(rng):
+    far = torch.tensor([[0.0, 0.0, 9.0]], dtype=torch.float64, requires_grad=True)
+    solution = InverseKinematics(CHAIN, **LIMITS).solve(far, differentiable=True)
+    (slope,) = torch.autograd.grad(solution.q.sum(), far)
+    assert (slope == 0.0).all()
+    with pytest.raises(ValueError, match="torch tensor"):
+        InverseKinematics(CHAIN, **LIMITS).solve(np.zeros(3), differentiable=True)
