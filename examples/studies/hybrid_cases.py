@@ -25,7 +25,7 @@ from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.hybrid._couplings import COUPLINGS, READOUTS
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
-from hybridkin.paper.paper import PAPER_ELM
+from hybridkin.paper import PAPER_ELM
 from hybridkin.workflow.report import distance
 
 PLANTS: dict[str, dict[str, Any]] = {

@@ -28,7 +28,7 @@ from hybridkin.calibration.calibrate import calibrate
 from hybridkin.chains.rigid import RigidChain
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.paper.paper import PAPER_ELM
+from hybridkin.paper import PAPER_ELM
 from hybridkin.workflow.report import Progress, Report, distance, quiet
 
 _LOOKS = ("o-#0072B2", "s-#D55E00", "D-#009E73", "^-#CC79A7")
