@@ -17,7 +17,7 @@ from typing_extensions import Self
 LENGTHS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 # Okabe & Ito: colour-blind readers can distinguish them.
 COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
-STYLES = ("-", "--", "-.", ":")
+STYLES = ("--", "-", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
