@@ -1,6 +1,6 @@
 """
-Beyond the data: what the guard does
-====================================
+Outside the data: what the guard does
+=====================================
 
 A network knows nothing where it has seen nothing, and says something all the same. The guard of
 `HybridForwardModel` fades the learned error out there, and the mechanical model remains. The models

@@ -73,7 +73,7 @@ for where, color in (("parallel", "#E69F00"), ("serial", "#0072B2")):
             ax.fill_between(
                 alpha[some], mean - spread, mean + spread, color=color, alpha=0.15, linewidth=0
             )
-ax.set(xscale="log", xlabel="penalty of the network", ylabel="mean tip error, groups left out [mm]")
+ax.set(xscale="log", xlabel="penalty of the network", ylabel="mean tip error, held-out groups [mm]")
 ax.legend(frameon=False)
 ax.set_ylim(bottom=0)
 plt.show()

@@ -13,7 +13,16 @@ import hybridkin
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
-ROOMS = ("datasets", "paper", "plots", "robots", "simulation", "tasks", "trajectories", "workflow")
+MODULES = (
+    "datasets",
+    "paper",
+    "plots",
+    "robots",
+    "simulation",
+    "tasks",
+    "trajectories",
+    "workflow",
+)
 # In the unit of the robot's actuators, whatever that is, or of data that need no robot.
 OF_THE_ACTUATORS = {"q", "q0", "q_min", "q_max", "q_pref", "dq", "X", "y", "std"}
 WITHOUT_UNIT = {
@@ -107,12 +116,12 @@ def test_gallery_lists_every_example():
 
 
 def public():
-    """Return all functions and classes of the public rooms, and the classes' own methods."""
+    """Return all functions and classes of the public modules, and the classes' own methods."""
     found = {name: getattr(hybridkin, name) for name in hybridkin.__all__}
     found = {name: o for name, o in found.items() if callable(o)}
-    for room in ROOMS:
-        module = getattr(hybridkin, room)
-        members = {f"{room}.{name}": getattr(module, name) for name in module.__all__}
+    for folder in MODULES:
+        module = getattr(hybridkin, folder)
+        members = {f"{folder}.{name}": getattr(module, name) for name in module.__all__}
         found |= {name: o for name, o in members.items() if callable(o)}
     for name, cls in list(found.items()):
         if inspect.isclass(cls):
@@ -149,12 +158,12 @@ def names_in(entries):
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_docstring_tells_what_goes_in_and_what_comes_out(name):
+def test_docstring_names_arguments_and_results(name):
     thing = PUBLIC[name]
     doc = inspect.getdoc(thing)
     assert doc, "has no docstring"
     assert doc.splitlines()[0].endswith((".", ":")), "the first line is a sentence"
-    is_method = not inspect.isclass(thing) and "." in name and name.split(".")[-2] not in ROOMS
+    is_method = not inspect.isclass(thing) and "." in name and name.split(".")[-2] not in MODULES
     if re.search(r"; see `\w+`", doc.splitlines()[0]):  # where the details are
         return
     is_made_by_user = inspect.isclass(thing) and "Parameters\n---" in doc
@@ -185,7 +194,7 @@ def test_arrays_have_a_shape_and_a_unit(name):
 
 @pytest.mark.parametrize("name", [n for n in PUBLIC if inspect.isclass(PUBLIC[n])])
 def test_reference_lists_every_class(name):
-    """Functions and classes of the rooms are listed from `__all__` by the pages' template."""
+    """Functions and classes of the modules are listed from `__all__` by the pages' template."""
     text = (DOCS / "api.rst").read_text(encoding="utf-8")
     assert re.search(rf"^   {name.split('.')[0]}$", text, re.MULTILINE)
 

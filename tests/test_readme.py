@@ -84,7 +84,7 @@ def test_what_pip_installs_is_there():
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 def test_make_knows_its_targets():
-    """`make test` runs this very file, `make paper` what tests/test_experiments.py runs."""
+    """`make test` runs this very file, `make paper` what tests/workflow runs."""
     named = re.findall(r"`make\s(\w+)`", README)
     printed = [command[1] for command in COMMANDS if command[0] == "make"]
     assert {"paper", "test", "docs"} <= {*named, *printed}

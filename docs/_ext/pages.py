@@ -46,7 +46,7 @@ def _block_math(writer, node):
 
 
 def _resolve(app, env, node, contnode):
-    """Resolve `Name` and `room.name` as the public hybridkin.Name and hybridkin.room.name."""
+    """Resolve `Name` and `module.name` as the public hybridkin.Name and hybridkin.module.name."""
     target = node.get("reftarget", "")
     python = env.get_domain("py")
     name = f"hybridkin.{target}"

@@ -1,4 +1,4 @@
-"""Robots, rows to learn from and to be examined on, and the models of `hybrids`."""
+"""Robots, training rows, test rows and models of the study `hybrids`."""
 
 from __future__ import annotations
 
@@ -19,23 +19,26 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
 from threadpoolctl import threadpool_limits
 
-from hybridkin import datasets, robots
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
-from hybridkin.hybrid.estimator import COUPLINGS, FEATURES, HybridForwardModel
-from hybridkin.learning.elm import ELMRegressor
-from hybridkin.paper.paper import PAPER_ELM
-from hybridkin.workflow.report import distance
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    ELMRegressor,
+    HybridForwardModel,
+    datasets,
+    robots,
+)
+from hybridkin.paper import PAPER_ELM
 
 PLANTS: dict[str, dict[str, Any]] = {
     "trunk 1": {},
     "trunk 2": {"tilt": 1.2, "mass": 1.6, "tip_mass": 0.15, "bending_stiffness": 1.3},
 }
-"""Arguments of `simulation.TrunkPlant` by name; the seed of a plant is its place."""
+"""Arguments of `simulation.TrunkPlant` by name; the seed of a plant is its position."""
 
-RAW, CALIBRATED, PAPER, AUTO = "mechanical, raw", "mechanical", "parallel paper's ELM", "auto"
-AUTO_PLAY = "auto, play"
-DATA_ONLY = ("data, quadratic", "data, kernel")
+NOMINAL, CALIBRATED = "mechanical, nominal", "mechanical, calibrated"
+PAPER, AUTO, AUTO_PLAY = "parallel, the paper's ELM", "auto", 'auto, play="auto"'
+DATA_ONLY = ("data alone, quadratic", "data alone, kernel ridge")
+COUPLINGS, READOUTS = ("parallel", "serial"), ("linear", "quadratic", "pose")
 
 _CABLE_NOISE, _MOCAP_NOISE = 1e-3, 5e-4  # as the defaults of `make_trunk` [m]
 _LOW, _HIGH, _INNER = 0.19, 0.31, 0.6  # the range of `paper_protocol` [m]; its inner part
@@ -43,12 +46,12 @@ _NEAR = 6.05e-3  # cables of the inner part of armlab_3cable [m]
 
 
 class Case(NamedTuple):
-    """Rows to learn from and rows to be examined on, with the robot's nominal kinematics."""
+    """Training rows and test rows, with the robot's nominal kinematics."""
 
     name: str
     draw: int
     chain: Any
-    raw: tuple[str, ...]  # what even the raw model has fitted: where the frame is unknown
+    frame: tuple[str, ...]  # calibrated even in the nominal model: where the frame is unknown
     calibrate: tuple[str, ...] | str
     q: NDArray
     x: NDArray
@@ -58,11 +61,11 @@ class Case(NamedTuple):
     in_time: bool = False  # whether the rows of a group are in the order of time
 
 
-@threadpool_limits.wrap(limits=1)  # CPU time is to be that of one thread
+@threadpool_limits.wrap(limits=1)  # CPU time of one thread
 def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
-    """Return the entries of a case, of the models by these names or all."""
+    """Return the entries of a case, of the models with these names or all."""
     entries = []
-    with warnings.catch_warnings():  # a plain chain warns of the slack that is examined here
+    with warnings.catch_warnings():  # a plain chain warns of slack tendons, as in ftdcr_v4
         warnings.simplefilter("ignore", UserWarning)
         for name, learner in _learners(case).items():
             if names is not None and name not in names:
@@ -74,7 +77,7 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
             if model.cv_results_ is not None:
                 results = model.cv_results_
                 scores = zip(results["candidate"], results["mean_distance"].tolist(), strict=True)
-                entry |= {"chosen": results["chosen"], "promised": dict(scores)}
+                entry |= {"chosen": results["chosen"], "scores": dict(scores)}
             entry["errors"] = {test: _errors(model, *rows) for test, rows in case.tests.items()}
             entries.append(entry)
     return entries
@@ -83,7 +86,7 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
 def _errors(
     model: HybridForwardModel, q: NDArray, x: NDArray, groups: NDArray | None = None
 ) -> dict[str, float]:
-    errors = distance(model.predict(q, groups=groups), x)
+    errors = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1)
     found = {"mean": float(errors.mean()), "max": float(errors.max()), "n_test": len(errors)}
     if model.coverage is not None:
         radius = model.predict(q, return_radius=True, groups=groups)[1]
@@ -101,19 +104,19 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     calibrated = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate).fit(q, x)
     hybrid = partial(HybridForwardModel, calibrated.mechanical_model_, random_state=seed)
     learners: dict[str, Callable[[], HybridForwardModel]] = {
-        RAW: lambda: HybridForwardModel(case.chain, "drop", calibrate=case.raw),
+        NOMINAL: lambda: HybridForwardModel(case.chain, "drop", calibrate=case.frame),
         CALIBRATED: lambda: hybrid("drop"),
         DATA_ONLY[0]: lambda: HybridForwardModel(None, _quadratic()),
         DATA_ONLY[1]: lambda: HybridForwardModel(None, _kernel(q, x, folds)),
         PAPER: lambda: hybrid(ELMRegressor(**PAPER_ELM, random_state=seed)),
-        "parallel kernel": lambda: hybrid(_kernel(q, x - calibrated.predict(q), folds)),
+        "parallel, kernel ridge": lambda: hybrid(_kernel(q, x - calibrated.predict(q), folds)),
     }
     for coupling in COUPLINGS:
-        for kind in FEATURES:
-            learners[f"{coupling} {kind}"] = partial(hybrid, kind, coupling=coupling)
-    for kind in FEATURES:
+        for kind in READOUTS:
+            learners[f"{coupling}, {kind}"] = partial(hybrid, kind, coupling=coupling)
+    for kind in READOUTS:
         free = partial(hybrid, kind, coupling="serial", guard=None)
-        learners[f"serial {kind}, no guard"] = free
+        learners[f"serial, {kind}, no guard"] = free
     auto = partial(HybridForwardModel, case.chain, AUTO, calibrate=case.calibrate)
     auto = partial(auto, coverage=case.coverage, random_state=seed)
     learners[AUTO] = auto
@@ -128,7 +131,7 @@ def _quadratic() -> Any:
 
 
 def _kernel(q: NDArray, y: NDArray, folds: list[tuple[NDArray, NDArray]]) -> Any:
-    """Return kernel ridge with the width and the penalty that err least on the folds."""
+    """Return kernel ridge with the width and the penalty of least error on the folds."""
     ridge = make_pipeline(StandardScaler(), KernelRidge(kernel="rbf"))
     grid = {"alpha": np.logspace(-5, 0, 6), "gamma": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)}
     grid = {f"kernelridge__{name}": values for name, values in grid.items()}
@@ -145,6 +148,7 @@ def trunk_cases(
     n_jobs: int | None,
     inner: bool = False,
 ) -> list[Case]:
+    """Return the cases of the simulated trunks; `inner` trains within part of the range."""
     cases, largest = [], max(sizes)
     for seed, name in enumerate(PLANTS):
         make = partial(_without_noise, name, folder, n_jobs)
@@ -170,7 +174,7 @@ def trunk_cases(
 def _without_noise(
     name: str, folder: Any, n_jobs: int | None, **rows: Any
 ) -> tuple[NDArray, NDArray]:
-    """Return rows of a plant as they are, so that noise can be added and left out."""
+    """Return rows of a plant without noise, so that it can be added or not."""
     checkpoint = None
     if folder is not None:
         asked = f"{rows['n_random']}" if "n_random" in rows else f"inner, {len(rows['q_target'])}"
@@ -197,6 +201,7 @@ def _noisy(q: NDArray, x: NDArray, seed: list[int]) -> tuple[NDArray, NDArray]:
 def armlab_cases(
     sizes: Sequence[int], n_draws: int, n_test: int, data_home: Any, inner: bool = False
 ) -> list[Case]:
+    """Return the cases of armlab_3cable, none where the recording is absent."""
     try:
         data = datasets.load_armlab(data_home)
     except FileNotFoundError as missing:
@@ -204,7 +209,7 @@ def armlab_cases(
         return []
     turns = -2.0 * np.pi / 3.0 * np.arange(3)[None]
     chain = ConstantCurvatureChain([0.003], angles=turns, lengths=[0.15])
-    names, cases = ("radii", "lengths", "base", "tool"), []
+    parameters, cases = ("radii", "lengths", "base", "tool"), []
     lines, near = np.unique(data.groups), (data.q >= -_NEAR).all(1)
     for draw in range(n_draws):
         rng = np.random.default_rng(draw)
@@ -214,11 +219,12 @@ def armlab_cases(
         tests = {"measured": (data.q[test[:n_test]], data.x[test[:n_test]])}
         for n in sizes:
             some = data.q[rows[:n]], data.x[rows[:n]], data.groups[rows[:n]]
-            cases.append(Case("armlab_3cable", draw, chain, ("base",), names, *some, tests))
+            cases.append(Case("armlab_3cable", draw, chain, ("base",), parameters, *some, tests))
     return cases
 
 
 def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case]:
+    """Return the cases of ftdcr_v4, none where the recording is absent."""
     try:
         data = datasets.load_ftdcr(data_home)
     except FileNotFoundError as missing:
@@ -248,9 +254,9 @@ def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case
     ]
     ways = {
         "5 folds": (folds, data.groups),
-        "a pair of segments left out": (pairs, data.groups),
+        "a pair held out": (pairs, data.groups),
         "pairs from single segments": ([(single, pair)], data.groups),
-        "the same, groups being segments": ([(single, pair)], families),
+        "the same, groups: segments": ([(single, pair)], families),
     }
     cases = []
     for name, (chain, parameters) in chains.items():

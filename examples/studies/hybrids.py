@@ -1,8 +1,21 @@
-"""Hybrid models compared: with few rows, outside the training range, on motions held out."""
+"""Hybrid models compared: few rows, outside the training range, held-out motions of a robot.
+
+The tables of the docs page "Choosing coupling and error model"::
+
+    python examples/studies/hybrids.py --out results/hybrids
+
+About two hours on one core. It needs `hybridkin[sim]`, and the recordings in the folder that
+``--data`` or HYBRIDKIN_DATA names (`help(hybridkin.datasets.load_ftdcr)` names their sources); an
+absent recording is left out with a warning. The folder gets report.md, report.json and two figures.
+Draw k of the rows and of the noise has the seed k, and so have the networks; fold k of the motions,
+too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+import sys
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,8 +23,8 @@ from hybrid_cases import (
     AUTO,
     CALIBRATED,
     DATA_ONLY,
+    NOMINAL,
     PAPER,
-    RAW,
     Case,
     armlab_cases,
     examined,
@@ -21,15 +34,18 @@ from hybrid_cases import (
 from joblib import Parallel, delayed
 
 from hybridkin import plots
-from hybridkin.workflow.report import Progress, Report, quiet
+from hybridkin.workflow.report import Report
 
 SIZES = (25, 50, 100, 200, 400, 800, 1600)
 
-_LOOKS = {RAW: ("black", ":"), CALIBRATED: ("black", "--")}
+Progress = Callable[[str, int, int], None]
+"""Called with (what, done, total)."""
+
+_LOOKS = {NOMINAL: ("black", ":"), CALIBRATED: ("black", "--")}
 _LOOKS |= dict(zip(DATA_ONLY, (("#E69F00", "s-"), ("#D55E00", "o-")), strict=True))
-_LOOKS |= {PAPER: ("0.6", "v-"), "parallel quadratic": ("#F0E442", "s-")}
-_LOOKS |= {"parallel kernel": ("#0072B2", "o-"), "serial quadratic": ("#56B4E9", "s-")}
-_LOOKS |= {"serial pose": ("#CC79A7", "^-"), AUTO: ("#009E73", "D-")}
+_LOOKS |= {PAPER: ("0.6", "v-"), "parallel, quadratic": ("#F0E442", "s-")}
+_LOOKS |= {"parallel, kernel ridge": ("#0072B2", "o-"), "serial, quadratic": ("#56B4E9", "s-")}
+_LOOKS |= {"serial, pose": ("#CC79A7", "^-"), AUTO: ("#009E73", "D-")}
 
 
 def learning_curves(
@@ -41,38 +57,38 @@ def learning_curves(
     data_home: Any = None,
     folder: Any = None,
     n_jobs: int | None = 1,
-    progress: Progress = quiet,
+    progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Return the errors of all models against the number of rows they learn from.
+    """Return the errors of all models against the number of training rows.
 
-    On two simulated trunks, rows fully random, lengths and tips measured with the noise of
-    `datasets.make_trunk`, and examined on other rows without noise and with it; and on
-    armlab_3cable, examined on a fifth of its grid lines, groups being lines.
+    Two simulated trunks: fully random rows with the noise of `datasets.make_trunk`, tested on other
+    rows without noise and with it. armlab_3cable: tested on a fifth of its grid lines, groups are
+    lines.
 
     Parameters
     ----------
     sizes : sequence of int
-        Rows to learn from; fewer rows are part of more rows of the same draw.
+        Training rows; fewer rows are part of more rows of the same draw.
     n_draws : int, default=3
         Draws of these rows and of the noise; of armlab_3cable also of the lines held out.
     n_test : int, default=1000
-        Rows to be examined on.
+        Test rows.
     models : sequence of str, optional
         Names of the models, as in the result. Default: all.
     data_home : path-like, optional
         Folder of the recordings, see `datasets.load_armlab`. One that is absent is left out with
         a warning.
     folder : path-like, optional
-        Where rows of the plants are kept and found again.
+        Where rows of the simulated trunks are stored, to be loaded by the next run.
     n_jobs, progress
-        Processes, and a callable handed (what, done, total).
+        Processes, and a callable that gets (what, done, total).
 
     Returns
     -------
     list of dict
         One entry per case and model: "case", "draw", "n", "model", "seconds" (CPU time of the fit)
         and by "errors" of every test "mean", "max" [m] and "n_test". Of "auto" also "chosen" and
-        "promised", its own score by candidate [m].
+        "scores", its cross-validated errors by candidate [m].
     """
     cases = trunk_cases(sizes, n_draws, n_test, folder, n_jobs)
     return examine(
@@ -89,18 +105,18 @@ def extrapolation(
     data_home: Any = None,
     folder: Any = None,
     n_jobs: int | None = 1,
-    progress: Progress = quiet,
+    progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Return the errors of all models outside the range that they learned from.
+    """Return the errors of all models outside their training range.
 
-    The trunks: learned from the inner 60 % of the range of every length, examined on rows of the
-    whole range that leave this box. armlab_3cable: learned where no cable is shortened by more than
-    6 mm, examined where one is.
+    The trunks: trained within the inner 60 % of the range of every length, tested on rows of the
+    whole range that leave this box. armlab_3cable: trained where no cable is shortened by more than
+    6 mm, tested where one is.
 
     Parameters
     ----------
     n : int, default=400
-        Rows to learn from.
+        Training rows.
     n_draws, n_test, models, data_home, folder, n_jobs, progress
         As in `learning_curves`.
 
@@ -121,31 +137,30 @@ def held_out_motions(
     models: Sequence[str] | None = None,
     data_home: Any = None,
     n_jobs: int | None = 1,
-    progress: Progress = quiet,
+    progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Return the errors of all models on motions of ftdcr_v4 that they have not seen.
+    """Return the errors of all models on held-out motions of ftdcr_v4.
 
-    Whole motions in five folds; all motions of a pair of segments left out, three times; and the
-    motions of two segments, learned from those of a single one, groups being the motions, or the
-    segments that move. Underneath: a constant-curvature chain, and one of elastic tendons. "auto,
-    play" looks for play as well; its predictions know the motion so far.
+    Whole motions in five folds; all motions of a pair of segments held out, three times; and the
+    motions of two segments, learned from those of a single one, where groups are the motions or the
+    segments that move. Mechanical models: a constant-curvature chain, and one of elastic tendons.
+    `auto, play="auto"` fits backlash as well; its predictions use the motion so far.
 
     Parameters
     ----------
     coverage : float or None, default=0.9
-        Share of tips within the radius of "auto"; the result has the share found, and the mean
-        radius [m].
+        Share of tips within the estimated error radius of "auto"; the result has the share found,
+        and the mean radius [m].
     thin : int, default=2
-        Learn from every so many rows only: the motions are slow.
+        Step between training rows: the motions are slow.
     models, data_home, n_jobs, progress
-        As in `learning_curves`; where the recording is absent, a warning says so and the result is
-        empty.
+        As in `learning_curves`; without the recording the result is empty, with a warning.
 
     Returns
     -------
     list of dict
         One entry per case and model, as in `learning_curves`, its "errors" with "within", the share
-        of tips inside the radius, and "radius", its mean [m], where the model tells one.
+        of tips inside the radius, and "radius", its mean [m], where the model estimates one.
     """
     return examine(motion_cases(data_home, coverage, thin), models, n_jobs, progress)
 
@@ -154,7 +169,7 @@ def examine(
     cases: Sequence[Case],
     models: Sequence[str] | None = None,
     n_jobs: int | None = 1,
-    progress: Progress = quiet,
+    progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
     """Return the entries of all cases, see `learning_curves`; the seed of a case is its draw."""
     table: list[dict[str, Any]] = []
@@ -162,37 +177,9 @@ def examine(
     results: Any = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
     for done, (case, entries) in enumerate(zip(cases, results, strict=True), 1):
         table += entries
-        progress(f"{case.name}, {len(case.q)} rows", done, len(cases))
+        if progress is not None:
+            progress(f"{case.name}, {len(case.q)} rows", done, len(cases))
     return table
-
-
-def data_demand(curves: list[dict[str, Any]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return how many rows "auto" needs to err as little as the best data-only model with all.
-
-    Parameters
-    ----------
-    curves : list of dict
-        As from `learning_curves`.
-
-    Returns
-    -------
-    dict of (str, str) to (float, float)
-        By case and test: the error of the data-only model with all rows [m], the mean over draws;
-        and the number of rows from which "auto" errs as little, between two sizes by a straight
-        line in logarithms, infinite where it never does.
-    """
-    found = {}
-    for case, test in _tests(curves):
-        means = _means(curves, case, test, by_size=True)
-        sizes = sorted({n for _, n in means})
-        goal = min(means[model, sizes[-1]][0] for model in DATA_ONLY)
-        # What was reached with fewer rows does not get lost with more.
-        errors = np.minimum.accumulate([means[AUTO, n][0] for n in sizes])
-        demand = np.inf
-        if errors[-1] <= goal:
-            demand = np.exp(np.interp(-np.log(goal), -np.log(errors), np.log(sizes)))
-        found[case, test] = goal, float(demand)
-    return found
 
 
 def hybrids_report(
@@ -223,13 +210,8 @@ def hybrids_report(
             rows.append([model, *(f"{mean:.2f} ± {std:.2f}" for mean, std, _ in values)])
         report.table(["rows", *map(str, sizes)], rows)
     if curves:
-        report.text("Rows with which auto errs as little as the best data-only model with all:")
-        demand = [
-            [*key, f"{1e3 * e:.2f}", f"{n:.0f}"] for key, (e, n) in data_demand(curves).items()
-        ]
-        report.table(["case", "test", "error [mm]", "rows of auto"], demand)
         report.figure("hybrid_curves", _curves_figure(curves), "Tip error against training rows.")
-    for title, entries in (("Outside the training range", outside), ("Unseen motions", motions)):
+    for title, entries in (("Outside the training range", outside), ("Held-out motions", motions)):
         cases = _tests(entries)
         found = [_means(entries, *case) for case in cases]
         report.text(f"## {title}", "Tip error in mm, mean over draws or folds (largest of all).")
@@ -238,19 +220,22 @@ def hybrids_report(
             values = (1e3 * np.array(means.get(model, [np.nan] * 3)) for means in found)
             rows.append([model, *(f"{mean:.2f} ({largest:.1f})" for mean, _, largest in values)])
         report.table(["model", *(", ".join(case) for case in cases)], rows)
-        report.text("What auto chose, what its own score promised, and the radius, in mm:")
-        report.table(_PROMISES, [_promise(entry) for entry in entries if "promised" in entry])
+        report.text("Choice of auto, its cross-validated error, its test error and radius, in mm:")
+        report.table(_CHOICES, [_choice(entry) for entry in entries if "scores" in entry])
     if outside:
         report.figure("hybrid_outside", _outside_figure(outside), "Tip error outside the range.")
     return report
 
 
-_PROMISES = ("case", "draw", "model", "chosen", "promised", "got", "within the radius", "radius")
+_CHOICES = (
+    *("case", "draw", "model", "chosen", "cross-validated", "test"),
+    *("within the radius", "radius"),
+)
 
 
-def _promise(entry: dict[str, Any]) -> list[str]:
+def _choice(entry: dict[str, Any]) -> list[str]:
     errors = next(iter(entry["errors"].values()))
-    numbers = [f"{1e3 * e:.2f}" for e in (entry["promised"][entry["chosen"]], errors["mean"])]
+    numbers = [f"{1e3 * e:.2f}" for e in (entry["scores"][entry["chosen"]], errors["mean"])]
     if "within" in errors:
         numbers += [f"{100 * errors['within']:.1f} %", f"{1e3 * errors['radius']:.1f}"]
     return [
@@ -303,7 +288,7 @@ def _curves_figure(curves: list[dict[str, Any]]) -> Any:
 def _outside_figure(outside: list[dict[str, Any]]) -> Any:
     cases = [(case, test) for case, test in _tests(outside) if test != "with noise"]
     figure, axes = plots.new_figure(8.0, 4.2, 1, len(cases), sharey=True, squeeze=False)
-    names = [name for name in dict.fromkeys(entry["model"] for entry in outside) if name != RAW]
+    names = [name for name in dict.fromkeys(entry["model"] for entry in outside) if name != NOMINAL]
     for ax, case in zip(axes[0], cases, strict=True):
         means = _means(outside, *case)
         shown = [name for name in names if name in means]
@@ -326,3 +311,32 @@ def _plain_ticks(axis: Any) -> None:
     ticks = [t for t in (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if low < t < high]
     axis.set_ticks(ticks, [f"{t:g}" for t in ticks])
     axis.set_ticks([], minor=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run all comparisons and write the report."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", required=True, help="folder of the report")
+    parser.add_argument("--data", help="folder of the recordings; default: HYBRIDKIN_DATA")
+    parser.add_argument("--rows", help="folder that stores the simulated rows for the next run")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="training rows")
+    parser.add_argument("--draws", type=int, default=3, help="draws of rows and noise; default: 3")
+    parser.add_argument("--test-rows", type=int, default=1000, help="default: 1000")
+    parser.add_argument("--models", nargs="+", help="names as in the report; default: all")
+    parser.add_argument("--jobs", type=int, default=1, help="processes; default: 1")
+    given = parser.parse_args(arguments)
+
+    def shown(what: str, done: int, total: int) -> None:
+        print(f"{done}/{total} {what}", file=sys.stderr)
+
+    common = {"models": given.models, "data_home": given.data, "n_jobs": given.jobs}
+    common["progress"] = shown
+    trunks = {"n_test": given.test_rows, "folder": given.rows, **common}
+    curves = learning_curves(given.sizes, given.draws, **trunks)
+    outside = extrapolation(min(400, max(given.sizes)), given.draws, **trunks)
+    for path in hybrids_report(curves, outside, held_out_motions(**common)).write(given.out):
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -263,8 +263,7 @@ def _seed(random_state, checkpoint):
 def _plant_parameters(given, cable_noise, mocap_noise):
     """All arguments of the plant, as plain numbers and lists."""
     defaults = {k: v.default for k, v in inspect.signature(TrunkPlant).parameters.items()}
-    for name in ("random_state", "warm_start"):  # rows are independent, each with a seed of its own
-        del defaults[name]
+    del defaults["random_state"]  # every row has its own seed
     unknown = sorted(set(given) - set(defaults))
     if unknown:
         raise ValueError(

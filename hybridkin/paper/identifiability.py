@@ -1,4 +1,4 @@
-"""What the paper's sampling protocol tells about the simulated trunk's geometry."""
+"""Which geometry of the simulated trunk the paper's sampling protocol identifies."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from sklearn.utils import Bunch
 
 from hybridkin import datasets, robots
 from hybridkin.calibration.calibrate import calibrate
@@ -21,12 +22,12 @@ from hybridkin.workflow.report import (
 ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
 """The geometry that `identifiability` asks for at once."""
 
-TELLABLE = ("radii", "rest_bends", "tool", "base")
-"""What remains of it where each thing that the samples cannot tell apart is asked for once."""
+IDENTIFIABLE = ("radii", "rest_bends", "tool", "base")
+"""What remains of it where parameters with the same effect on the samples are asked for once."""
 
 
-def identifiability(data: Any, split: int = 0) -> dict[str, Any]:
-    """Return what the training rows of the paper's protocol tell about the trunk's geometry.
+def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
+    """Return which geometry of the trunk the training rows of the paper's protocol identify.
 
     Parameters
     ----------
@@ -39,71 +40,59 @@ def identifiability(data: Any, split: int = 0) -> dict[str, Any]:
     -------
     dict
         "n_train", "n_single" (rows in which one segment moves) and "n_random"; then by "asked",
-        "tellable" and "default" (radii and base) a dict of "parameters", "entries" (one for each
-        free parameter, see `geometry_entries`), "unidentified" (a sentence for each direction
-        left open), and "rmse", "test" and "test_max", tip errors on the training rows and on the
-        test rows [m].
+        "identifiable" and "default" (radii and base) a dict of "parameters", "entries" (one for
+        each free parameter, see `geometry_entries`), "unidentified" (a sentence for each direction
+        that is not identified), and "rmse", "test" and "test_max", tip errors on the training rows
+        and on the test rows [m].
     """
     train, test = datasets.paper_split(data, split)
     chain = robots.bionic_handling_assistant()
     n_random = int((data.part[train] == 3).sum())
     found: dict[str, Any] = {"n_train": len(train), "n_random": n_random}
     found["n_single"] = len(train) - n_random
-    for label, names in (
-        ("asked", ASKED),
-        ("tellable", TELLABLE),
-        ("default", chain.default_parameters),
-    ):
+    asked = {"asked": ASKED, "identifiable": IDENTIFIABLE, "default": chain.default_parameters}
+    for label, names in asked.items():
         result = calibrate(chain, data.q[train], data.x[train], names)
         with torch.no_grad():
             tips = result.chain(torch.from_numpy(data.q[test])).numpy()
         errors = distance(tips, data.x[test])
-        found[label] = {
-            "parameters": names,
-            "entries": geometry_entries(chain, result),
-            "unidentified": result.unidentified,
-            "rmse": result.rmse,
-            "test": errors.mean(),
-            "test_max": errors.max(),
-        }
+        entries = geometry_entries(chain, result)
+        found[label] = {"parameters": names, "entries": entries, "rmse": result.rmse}
+        found[label] |= {"test": errors.mean(), "test_max": errors.max()}
+        found[label]["unidentified"] = result.unidentified
     return found
 
 
-def write_identifiability(report: Report, data: Any, found: dict[str, Any]) -> None:
+def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) -> None:
     """Add what `identifiability` found to a report."""
     report.record["identifiability"] = found
-    asked, tellable, default = (found[label] for label in ("asked", "tellable", "default"))
-    told = sum(entry["told"] for entry in asked["entries"])
+    asked, fewer, default = (found[label] for label in ("asked", "identifiable", "default"))
     report.text(
-        "## What the samples tell about the geometry",
-        f"Everything asked at once ({', '.join(ASKED)}) of the {found['n_train']} training rows of "
-        f"one split of the **simulated** data: {found['n_single']} rows of one segment moving "
-        f"alone and {found['n_random']} fully random ones. A parameter is told where the rows "
-        f"narrow its prior at least {TOLD:.0f} times; other values are assumptions, near the "
-        f"published geometry. Told: {told} of {len(asked['entries'])} parameters. The base by its "
-        "turn from the start and its position.",
+        "## Which geometry the samples identify",
+        f"All of {', '.join(ASKED)} at once, from the {found['n_train']} training rows of one "
+        f"split of the **simulated** data: {found['n_single']} rows of one segment moving alone "
+        f"and {found['n_random']} fully random ones. Identified means that the rows narrow the "
+        f"prior at least {TOLD:.0f} times: {sum(e['told'] for e in asked['entries'])} of "
+        f"{len(asked['entries'])} parameters. The others stay near the published geometry. The "
+        "base is given by its rotation from the start and its position.",
     )
     report.table(GEOMETRY_HEADER, geometry_rows(asked["entries"]))
-    report.text("What the samples leave open, and what settles it:")
+    report.text("What the samples do not identify, and which measurement would:")
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
-    report.text(
-        f"Without turns and actuator zeros ({', '.join(TELLABLE)}) all is told:"
-        if all(entry["told"] for entry in tellable["entries"])
-        else f"Without turns and actuator zeros ({', '.join(TELLABLE)}):"
-    )
-    report.table(GEOMETRY_HEADER, geometry_rows(tellable["entries"]))
-    base = {entry["name"]: entry for entry in tellable["entries"]}
+    n = sum(entry["told"] for entry in fewer["entries"])
+    report.text(f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:")
+    report.table(GEOMETRY_HEADER, geometry_rows(fewer["entries"]))
+    base = {entry["name"]: entry for entry in fewer["entries"]}
     true = dict(zip("xyz", 1e3 * np.array(data.parameters["plant"]["base_error"][:3]), strict=True))
     away = {axis: base[f"base[{axis}]"]["value"] - true[axis] for axis in true}
     far = max(abs(away[axis]) / base[f"base[{axis}]"]["std_error"] for axis in away)
     found["base_position_error"] = list(away.values())
     report.text(
-        "The tip hardly cares: mean error on the 100 test rows "
-        f"{100 * asked['test']:.2f} cm with everything fitted, {100 * tellable['test']:.2f} cm "
-        f"without turns and actuator zeros, {100 * default['test']:.2f} cm with radii and base "
-        "alone. Standard errors say how far noise moves a value, not how far a wrong model does: "
-        f"the simulated trunk sags and is no chain of arcs ({100 * tellable['rmse']:.2f} cm rms "
-        "remain), and its base, known in the simulation, is missed by "
-        f"{', '.join(f'{value:+.1f}' for value in away.values())} mm, up to {far:.0f} standard "
-        "errors."
+        f"The tip error on the 100 test rows hardly changes: {100 * asked['test']:.2f} cm with "
+        f"everything fitted, {100 * fewer['test']:.2f} cm without turns and actuator zeros, "
+        f"{100 * default['test']:.2f} cm with radii and base alone. Standard errors measure noise, "
+        "not the error of a wrong model: the simulated trunk sags and is no chain of arcs "
+        f"({100 * fewer['rmse']:.2f} cm rms remain), and the position of its base, known in the "
+        f"simulation, is off by {', '.join(f'{value:+.1f}' for value in away.values())} mm, up to "
+        f"{far:.0f} standard errors."
     )

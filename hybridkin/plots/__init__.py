@@ -3,17 +3,12 @@
 A display is made from arrays, or by ``from_estimator``, ``from_predictions`` and ``from_tracks``;
 ``plot`` draws it and returns it, with the axes as ``ax_`` and the figure as ``figure_``. Arrays
 are in metres; ``unit`` is that of the axes. Colours are those of Okabe & Ito and cividis, which
-colour-blind readers tell apart, and lines differ in style too.
+colour-blind readers can distinguish, and lines differ in style too.
 """
 
 from hybridkin.plots._canvas import new_figure
 from hybridkin.plots.animation import TrackAnimation
-from hybridkin.plots.errors import (
-    BarDisplay,
-    ErrorBoxDisplay,
-    ErrorHistogramDisplay,
-    PredictionErrorDisplay,
-)
+from hybridkin.plots.errors import ErrorBoxDisplay, ErrorHistogramDisplay
 from hybridkin.plots.learning import LearningCurveDisplay
 from hybridkin.plots.space import BackboneDisplay, WorkspaceDisplay
 from hybridkin.plots.tracking import ActuatorDisplay, TrackingDisplay
@@ -21,11 +16,9 @@ from hybridkin.plots.tracking import ActuatorDisplay, TrackingDisplay
 __all__ = [
     "ActuatorDisplay",
     "BackboneDisplay",
-    "BarDisplay",
     "ErrorBoxDisplay",
     "ErrorHistogramDisplay",
     "LearningCurveDisplay",
-    "PredictionErrorDisplay",
     "TrackAnimation",
     "TrackingDisplay",
     "WorkspaceDisplay",

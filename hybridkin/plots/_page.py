@@ -1,28 +1,26 @@
-"""A track as one interactive page: turned with the mouse, played, and scrubbed by a slider."""
+"""A scene as one interactive page: turned with the mouse, played, and scrubbed by a slider."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin.plots._canvas import COLORS, decimals, scale_of
-
-if TYPE_CHECKING:
-    from hybridkin.plots.animation import TrackAnimation
+from hybridkin.plots._canvas import COLORS, decimals
+from hybridkin.plots._scene import Line, Scene
 
 _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
-_SYMBOLS = {"o": "circle", "x": "x", ".": "circle"}
-_SIZES = {"o": 5, "x": 4, ".": 3}
+_MARKERS = {"o": ("circle", 5), "x": ("x", 4), ".": ("circle", 3)}
 _FAR = 1.6  # the eye from the scene's middle, in longest sides of the scene
+
+Numbers = list[float | None]
 
 
 def page(
-    film: TrackAnimation,
-    unit: str,
-    speed: float,
+    scene: Scene,
+    fps: float,
     view: tuple[float, float],
     progress: Callable[[int, int], None] | None,
 ) -> str:
@@ -35,101 +33,73 @@ def page(
             '`path` ends in .html, which needs plotly: pip install "hybridkin[interactive]", or '
             "save as .gif or .mp4."
         ) from error
-    scale = scale_of(unit)
-    low, high = (scale * corner for corner in film.limits())
-    digits = max(0, 4 - int(np.floor(np.log10((high - low).max()))))  # a hair's breadth
-    still, moving = _still(film, scale, digits, unit), film.lines()
-    data = still + [_trace(line, scale * line.points[0], digits) for line in moving]
-    if film.error is not None:
-        data.append({**_on_error_axes(film, scale, 0), "marker": {"color": "black"}})
-    layout = _layout(film, unit, speed, low, high)
-    layout["scene"]["camera"] = _camera(*view)
-    figure = go.Figure(data, layout).to_dict()
-    K, frames = len(film.rows), []
-    places = [*range(len(still), len(data))]
-    for k in range(K):
-        parts = [_coordinates(scale * line.points[k], digits) for line in moving]
-        if film.error is not None:
-            own = _on_error_axes(film, scale, k)
-            parts.append({"x": own["x"], "y": own["y"]})
+    digits = max(0, 4 - int(np.floor(np.log10((scene.high - scene.low).max()))))
+    steps, error = _numbers(scene.steps, 4), None
+    still = [_path("path reached", scene.x, digits, color=COLORS[0], dash="dash")]
+    if scene.target is not None:
+        still.insert(0, _path("target", scene.target, digits, color="black"))
+    if scene.error is not None:
+        # Rounded by its own size: it is far below the robot's.
+        error = _numbers(scene.error, decimals(scene.error) + 2)
+        curve = {"type": "scatter", "mode": "lines", "line": {"color": COLORS[0], "width": 2}}
+        name = f"tip error [{scene.unit}]"
+        still.append({**curve, "x": steps, "y": error, "name": name, "showlegend": False})
+    frames = []
+    for k, row in enumerate(scene.rows):
+        parts: list[dict[str, Any]] = [_xyz(line.points[k], digits) for line in scene.moving]
+        if error is not None:
+            parts.append({"x": [steps[row]], "y": [error[row]]})
+        places = [*range(len(still), len(still) + len(parts))]
         frames.append({"name": str(k), "data": parts, "traces": places})
         if progress is not None:
-            progress(k + 1, K)
+            progress(k + 1, len(scene.rows))
+    looks = [_look(line) for line in scene.moving]
+    if error is not None:
+        dot = {"type": "scatter", "mode": "markers", "marker": {"color": "black"}}
+        looks.append({**dot, "showlegend": False})
+    first = [{**look, **part} for look, part in zip(looks, frames[0]["data"], strict=True)]
+    figure = go.Figure(still + first, _layout(scene, fps, view)).to_dict()
     figure["frames"] = frames  # plain, or each number would be checked at a second per frame
-    html = plotly.io.to_html(
-        figure,
-        include_plotlyjs=True,
-        auto_play=False,
-        validate=False,
-        default_height="100vh",
-        config={"responsive": True, "displaylogo": False},
-    )
+    config = {"responsive": True, "displaylogo": False}
+    options = {"auto_play": False, "validate": False, "default_height": "100vh"}
+    html = plotly.io.to_html(figure, include_plotlyjs=True, config=config, **options)
     head = "<head><title>Track</title><style>body { margin: 0; overflow: hidden; }</style>"
     return html.replace("<head>", head, 1)
 
 
-def _still(film: TrackAnimation, scale: float, digits: int, unit: str) -> list[dict[str, Any]]:
-    """Return what does not move: the paths and the error over time."""
-    look: dict[str, Any] = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip"}
-    reached = _coordinates(scale * film.x, digits)
-    dashed = {"color": COLORS[0], "width": 3, "dash": "dash"}
-    found = [{**look, **reached, "line": dashed, "name": "path reached"}]
-    if film.target is not None:
-        target = _coordinates(scale * film.target, digits)
-        line = {"color": "black", "width": 3}
-        found.insert(0, {**look, **target, "line": line, "name": "target"})
-    if film.error is not None:
-        steps = np.arange(len(film.x)) if film.t is None else film.t
-        error = {"x": _numbers(steps, 4), "y": _errors(film, scale)}
-        name, line = f"tip error [{unit}]", {"color": COLORS[0], "width": 2}
-        more = {"type": "scatter", "mode": "lines", "name": name, "line": line}
-        found.append({**more, **error, "showlegend": False})
-    return found
+def _path(name: str, points: NDArray, digits: int, **look: str) -> dict[str, Any]:
+    """Return a path that does not move."""
+    trace = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "name": name}
+    return {**trace, **_xyz(points, digits), "line": {"width": 3, **look}}
 
 
-def _trace(line: Any, points: NDArray, digits: int) -> dict[str, Any]:
+def _look(line: Line) -> dict[str, Any]:
+    """Return a moving line without its points."""
     trace: dict[str, Any] = {"type": "scatter3d", "name": line.label, "hoverinfo": "skip"}
-    trace |= {"showlegend": bool(line.label), "opacity": line.alpha, "mode": "lines"}
+    trace |= {"showlegend": bool(line.label), "mode": "lines"}
     if line.style != "none":
         look = {"color": line.color, "width": 2.0 * line.width, "dash": _DASHES[line.style]}
         trace["line"] = look
     if line.marker:
         trace["mode"] = "markers" if line.style == "none" else "lines+markers"
-        symbol, size = _SYMBOLS[line.marker], _SIZES[line.marker]
+        symbol, size = _MARKERS[line.marker]
         trace["marker"] = {"color": line.color, "size": size, "symbol": symbol}
-    return {**trace, **_coordinates(points, digits)}
+    return trace
 
 
-def _on_error_axes(film: TrackAnimation, scale: float, k: int) -> dict[str, Any]:
-    """Return the dot that runs along the error over time."""
-    assert film.error is not None
-    row = film.rows[k]
-    when = float(row if film.t is None else film.t[row])
-    error = _errors(film, scale)[row : row + 1]
-    return {"type": "scatter", "mode": "markers", "x": [when], "y": error, "showlegend": False}
-
-
-def _errors(film: TrackAnimation, scale: float) -> list[float | None]:
-    """Return the error of every row, rounded by its own size: it is far below the robot's."""
-    assert film.error is not None
-    error = scale * film.error
-    return _numbers(error, decimals(error) + 2)
-
-
-def _layout(
-    film: TrackAnimation, unit: str, speed: float, low: NDArray, high: NDArray
-) -> dict[str, Any]:
-    wait = 1000.0 / (speed * film.fps)
+def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, Any]:
+    """Return axes, camera, buttons and slider."""
     at_once = {"mode": "immediate", "transition": {"duration": 0}}
-    play = {**at_once, "frame": {"duration": wait, "redraw": True}, "fromcurrent": True}
-    jump = {**at_once, "frame": {"duration": 0, "redraw": True}}
+    frame = {"duration": 1000.0 / fps, "redraw": True}
+    play = {**at_once, "frame": frame, "fromcurrent": True}
+    jump = {**at_once, "frame": {**frame, "duration": 0}}
     buttons = [
         {"label": "Play", "method": "animate", "args": [None, play]},
         {"label": "Pause", "method": "animate", "args": [[None], jump]},
     ]
     steps = [
-        {"label": film.caption(k, unit), "method": "animate", "args": [[str(k)], jump]}
-        for k in range(len(film.rows))
+        {"label": caption, "method": "animate", "args": [[str(k)], jump]}
+        for k, caption in enumerate(scene.captions)
     ]
     slider = {
         **{"steps": steps, "x": 0.14, "len": 0.84, "y": 0.0, "pad": {"t": 30}, "ticklen": 0},
@@ -141,39 +111,41 @@ def _layout(
         **{"type": "buttons", "direction": "left", "buttons": buttons, "showactive": False},
         **{"x": 0.0, "xanchor": "left", "y": 0.0, "yanchor": "top", "pad": {"t": 40}},
     }
+    corners = zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True)
     axes = {
-        f"{letter}axis": {"title": {"text": f"{letter} [{unit}]"}, "range": [a, b]}
-        for letter, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
+        f"{letter}axis": {"title": {"text": f"{letter} [{scene.unit}]"}, "range": [low, high]}
+        for letter, low, high in corners
     }
-    width = 1.0 if film.error is None else 0.66
-    sides = dict(zip("xyz", ((high - low) / (high - low).max()).tolist(), strict=True))
-    scene = {**axes, "aspectmode": "manual", "aspectratio": sides}
-    scene |= {"domain": {"x": [0.0, width], "y": [0.0, 1.0]}}
-    layout: dict[str, Any] = {
-        **{"template": "plotly_white", "scene": scene, "updatemenus": [menu], "sliders": [slider]},
+    width = 1.0 if scene.error is None else 0.66
+    sides = (scene.high - scene.low) / (scene.high - scene.low).max()
+    up, around = np.radians(view)
+    eye = _FAR * np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    space = {
+        **axes,
+        **{"aspectmode": "manual", "aspectratio": dict(zip("xyz", sides.tolist(), strict=True))},
+        "domain": {"x": [0.0, width], "y": [0.0, 1.0]},
+        "camera": {
+            "eye": dict(zip("xyz", eye.tolist(), strict=True)),
+            "center": {"x": 0.0, "y": 0.0, "z": -0.05},
+        },
+    }
+    layout = {
+        **{"template": "plotly_white", "scene": space, "updatemenus": [menu], "sliders": [slider]},
         "margin": {"l": 20, "r": 20, "t": 20, "b": 110, "autoexpand": False},
         "legend": {"x": 0.0, "y": 1.0, "bgcolor": "rgba(255, 255, 255, 0.6)"},
         "uirevision": "kept",  # the view stays as it was turned
     }
-    if film.error is not None:
-        when = "time step" if film.t is None else "time [s]"
-        layout["xaxis"] = {"domain": [width + 0.06, 1.0], "title": {"text": when}}
-        layout["yaxis"] = {"title": {"text": f"tip error [{unit}]"}, "rangemode": "tozero"}
-        layout["yaxis"]["domain"] = [0.15, 0.9]
+    if scene.error is not None:
+        error = {"title": {"text": f"tip error [{scene.unit}]"}, "rangemode": "tozero"}
+        layout["xaxis"] = {"domain": [width + 0.06, 1.0], "title": {"text": scene.when}}
+        layout["yaxis"] = {**error, "domain": [0.15, 0.9]}
     return layout
 
 
-def _camera(elevation: float, azimuth: float) -> dict[str, Any]:
-    up, around = np.radians([elevation, azimuth])
-    eye = _FAR * np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    center = {"x": 0.0, "y": 0.0, "z": -0.05}
-    return {"eye": dict(zip("xyz", eye.tolist(), strict=True)), "center": center}
-
-
-def _coordinates(points: NDArray, digits: int) -> dict[str, list[float | None]]:
+def _xyz(points: NDArray, digits: int) -> dict[str, Numbers]:
     return {letter: _numbers(points[:, i], digits) for i, letter in enumerate("xyz")}
 
 
-def _numbers(values: NDArray, digits: int) -> list[float | None]:
+def _numbers(values: NDArray, digits: int) -> Numbers:
     """Return rounded numbers, None for what is not known."""
     return [v if np.isfinite(v) else None for v in values.round(digits).tolist()]

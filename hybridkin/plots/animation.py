@@ -5,40 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import animation
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Self
 
-from hybridkin.plots._canvas import (
-    COLORS,
-    axes_or_new,
-    decimals,
-    distance,
-    label_space,
-    plain,
-    predicted,
-    scale_of,
-    times,
-    tips,
-)
+from hybridkin.plots._arrays import distance, plain, shaped, times
+from hybridkin.plots._canvas import COLORS, Display, decimals, scale_of, space_or_new, steps_of
+from hybridkin.plots._models import Model, predicted
 from hybridkin.plots._page import page
-from hybridkin.plots.space import BackboneDisplay, Line
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
+from hybridkin.plots._scene import Line, Scene, Stage
+from hybridkin.plots.space import BackboneDisplay
 
 __all__ = ["TrackAnimation"]
 
 _FORMATS = (".mp4", ".gif", ".html")
-_PACE = 20.0  # frames per second where there are no times
+_PACE = 20.0  # frames per second without times
 _SIZE = (9.0, 4.5)  # [inch]
 _DPI = {".mp4": 160, ".gif": 80}
 
 
-class TrackAnimation:
+class TrackAnimation(Display):
     """A robot that follows a path: target, reached tips, moving body and error over time.
 
     Parameters
@@ -77,7 +67,9 @@ class TrackAnimation:
     >>> chain = robots.bionic_handling_assistant()
     >>> path = trajectories.figure_eight([0.0, 0.0, 0.75], (0.2, 0.1), duration=2.0, dt=0.05)
     >>> track = InverseKinematics(chain, q_min=0.1, q_max=0.4, dt=0.05).track(path.x, path.t)
-    >>> film = plots.TrackAnimation.from_track(chain, track, n_frames=3)
+    >>> film = plots.TrackAnimation.from_estimator(
+    ...     chain, track.q, target=track.target, t=track.t, n_frames=3
+    ... )
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     film.save(Path(folder) / "track.gif").stat().st_size > 10_000
     True
@@ -93,9 +85,9 @@ class TrackAnimation:
         rows: ArrayLike | None = None,
         name: str = "tip",
     ) -> None:
-        self.x = tips(x, "x")
+        self.x = shaped(x, "x", "T3")
         T = len(self.x)
-        self.target = None if target is None else tips(target, "target", T)
+        self.target = None if target is None else shaped(target, "target", "T3", T)
         self.error = None if self.target is None else distance(self.x, self.target)
         self.t = times(t, T)
         self.rows = np.arange(T) if rows is None else np.array(rows, dtype=int)
@@ -104,15 +96,13 @@ class TrackAnimation:
         if not (inside and (np.diff(self.rows) > 0).all()):
             raise ValueError(f"`rows` must increase within the {T} rows of `x`, got {self.rows}.")
         if body is not None and len(body.points) != K:
-            raise ValueError(
-                f"`body` must hold {K} configurations, one per frame, got {len(body.points)}."
-            )
+            raise ValueError(f"`body` must hold {K} configurations, got {len(body.points)}.")
         self.body, self.name = body, name
 
     @classmethod
     def from_estimator(
         cls,
-        model: Any,
+        model: Model,
         q: ArrayLike,
         *,
         target: ArrayLike | None = None,
@@ -156,29 +146,6 @@ class TrackAnimation:
             x[known] = predicted(model, q[known])
         return cls(x, target=target, t=t, body=body, rows=rows, name=name)
 
-    @classmethod
-    def from_track(cls, model: Any, track: Any, *, n_frames: int = 150) -> Self:
-        """Return the film of a result of `InverseKinematics.track`.
-
-        Parameters
-        ----------
-        model : chain or HybridForwardModel
-            The robot that was steered, or its model.
-        track : Track
-            Of tip positions. The measured tips are shown where a plant was there, else those of
-            the model.
-        n_frames : int, default=150
-            Frames at most, evenly in time.
-
-        Returns
-        -------
-        TrackAnimation
-            Nothing is drawn yet.
-        """
-        return cls.from_estimator(
-            model, track.q, target=track.target, t=track.t, x=track.x_measured, n_frames=n_frames
-        )
-
     @property
     def fps(self) -> float:
         """Frames per second at which the film takes as long as the motion [1/s]."""
@@ -186,7 +153,7 @@ class TrackAnimation:
             return _PACE
         return (len(self.rows) - 1) / float(self.t[self.rows[-1]] - self.t[self.rows[0]])
 
-    def plot(self, ax: Any = None, *, unit: str = "cm", frame: int = -1) -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm", frame: int = -1) -> Self:
         """Draw one frame into a 3-D axes and return self.
 
         Parameters
@@ -203,10 +170,9 @@ class TrackAnimation:
         TrackAnimation
             Itself, drawn.
         """
-        ax = axes_or_new(ax, projection="3d")
-        _Stage(self, ax, None, unit).show(range(len(self.rows))[frame])
-        self.ax_, self.figure_ = ax, ax.figure
-        return self
+        space = space_or_new(ax)
+        Stage(self._scene(unit), space).show(range(len(self.rows))[frame])
+        return self._drawn(space)
 
     def save(
         self,
@@ -257,11 +223,24 @@ class TrackAnimation:
             raise ValueError(f"`path` must end in one of {_FORMATS}, got {path.name!r}.")
         if not 0.0 < speed < np.inf:
             raise ValueError(f"`speed` must be positive, got {speed!r}.")
+        scene, fps = self._scene(unit), speed * self.fps
         if kind == ".html":
-            path.write_text(page(self, unit, speed, view, progress), encoding="utf-8")
-        else:
-            writer = _writer(kind, speed * self.fps)
-            self._film(path, writer, _DPI[kind] if dpi is None else dpi, unit, view, progress)
+            path.write_text(page(scene, fps, view, progress), encoding="utf-8")
+            return path
+        writer, figure = _writer(kind, fps), Figure(figsize=_SIZE, layout="constrained")
+        grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
+        ax = figure.add_subplot(grid[:] if self.error is None else grid[0], projection="3d")
+        ax.view_init(*view)
+        stage = Stage(scene, ax, None if self.error is None else figure.add_subplot(grid[1]))
+        stage.show(0)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # or the picture would tremble
+        with writer.saving(figure, str(path), _DPI[kind] if dpi is None else dpi):
+            for k in range(len(self.rows)):
+                stage.show(k)
+                writer.grab_frame()
+                if progress is not None:
+                    progress(k + 1, len(self.rows))
         return path
 
     def lines(self) -> list[Line]:
@@ -290,104 +269,46 @@ class TrackAnimation:
         return low - margin, high + margin
 
     def caption(self, k: int, unit: str) -> str:
-        """Return what is to be said of a frame: the time, and the error [unit]."""
+        """Return the title of frame k: the time, and the error [unit]."""
         row = self.rows[k]
         when = f"step {row}" if self.t is None else f"t = {self.t[row]:.2f} s"
         if self.error is None:
             return when
         error, places = scale_of(unit) * self.error[row], decimals(scale_of(unit) * self.error)
-        told = f"{error:.{places}f} {unit}" if np.isfinite(error) else "not known"
-        return f"{when}, error {told}"
+        shown = f"{error:.{places}f} {unit}" if np.isfinite(error) else "not known"
+        return f"{when}, error {shown}"
 
-    def _film(
-        self, path: Path, writer: Any, dpi: float, unit: str, view: Any, progress: Any
-    ) -> None:
-        figure = Figure(figsize=_SIZE, layout="constrained")
-        if self.error is None:
-            ax, error_ax = figure.add_subplot(projection="3d"), None
-        else:
-            grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
-            ax, error_ax = figure.add_subplot(grid[0], projection="3d"), figure.add_subplot(grid[1])
-        ax.view_init(*view)
-        stage = _Stage(self, ax, error_ax, unit)
-        stage.show(0)
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # or the picture would tremble
-        K = len(self.rows)
-        with writer.saving(figure, str(path), dpi):
-            for k in range(K):
-                stage.show(k)
-                writer.grab_frame()
-                if progress is not None:
-                    progress(k + 1, K)
-
-
-class _Stage:
-    """Artists that show one frame after another."""
-
-    def __init__(self, film: TrackAnimation, ax: Any, error_ax: Any, unit: str) -> None:
-        self.film, self.unit, self.scale = film, unit, scale_of(unit)
-        self.ax, self.error_ax = ax, error_ax
-        low, high = film.limits()
-        for bounds, setter in zip(
-            np.stack([low, high], axis=1), (ax.set_xlim, ax.set_ylim, ax.set_zlim), strict=True
-        ):
-            setter(self.scale * bounds)
-        label_space(ax, unit)
-        if film.target is not None:
-            ax.plot(*(self.scale * film.target.T), color="black", linewidth=1.0, label="target")
-        self.trail = ax.plot([], [], [], color=COLORS[0], linewidth=1.2, linestyle="--")[0]
-        self.moving = []
-        for line in film.lines():
-            look = {"color": line.color, "linewidth": line.width, "alpha": line.alpha}
-            look |= {"linestyle": line.style, "marker": line.marker, "markersize": 6}
-            self.moving.append((ax.plot([], [], [], label=line.label or None, **look)[0], line))
-        ax.legend(frameon=False, fontsize="small", loc="upper left", bbox_to_anchor=(-0.25, 1.0))
-        if error_ax is not None:
-            self._draw_error()
-
-    def _draw_error(self) -> None:
-        film, ax = self.film, self.error_ax
-        self.error = self.scale * np.asarray(film.error)
-        self.steps = np.arange(len(film.x)) if film.t is None else film.t
-        ax.plot(self.steps, self.error, color=COLORS[0], linewidth=1.5)
-        ax.set(xlabel="time step" if film.t is None else "time [s]")
-        ax.set(ylabel=f"tip error [{self.unit}]")
-        ax.set_ylim(bottom=0.0)
-        self.cursor = ax.axvline(self.steps[0], color="black", linewidth=1.0)
-        self.dot = ax.plot([], [], "o", color=COLORS[0])[0]
-
-    def show(self, k: int) -> None:
-        """Move everything to frame k."""
-        film, row = self.film, self.film.rows[k]
-        self.trail.set_data_3d(*(self.scale * film.x[: row + 1].T))
-        for artist, line in self.moving:
-            artist.set_data_3d(*(self.scale * line.points[k].T))
-        if self.error_ax is None:
-            self.ax.set_title(film.caption(k, self.unit), fontsize="medium")
-            return
-        self.error_ax.set_title(film.caption(k, self.unit), fontsize="medium")
-        self.cursor.set_xdata([self.steps[row]] * 2)
-        self.dot.set_data([self.steps[row]], [self.error[row]])
+    def _scene(self, unit: str) -> Scene:
+        scale, (low, high) = scale_of(unit), self.limits()
+        steps, when = steps_of(self.t, len(self.x))
+        return Scene(
+            unit=unit,
+            low=scale * low,
+            high=scale * high,
+            x=scale * self.x,
+            target=None if self.target is None else scale * self.target,
+            error=None if self.error is None else scale * self.error,
+            steps=steps,
+            when=when,
+            rows=self.rows,
+            moving=[line._replace(points=scale * line.points) for line in self.lines()],
+            captions=[self.caption(k, unit) for k in range(len(self.rows))],
+        )
 
 
 def _evenly(t: NDArray | None, n_rows: int, most: int) -> NDArray:
     """Return the rows nearest to even times, increasing."""
     t = np.arange(n_rows) if t is None else t
     wanted = np.linspace(t[0], t[-1], min(most, n_rows))
-    after = np.searchsorted(t, wanted).clip(1, max(1, n_rows - 1))
-    before = after - 1
-    after = after.clip(max=n_rows - 1)
-    return np.unique(np.where(wanted - t[before] <= t[after] - wanted, before, after))
+    return np.unique(np.rint(np.interp(wanted, t, np.arange(n_rows))).astype(int))
 
 
-def _writer(kind: str, fps: Any) -> Any:
+def _writer(kind: str, fps: float) -> animation.AbstractMovieWriter:
     if kind == ".gif":
-        return animation.PillowWriter(fps=fps)
+        return animation.PillowWriter(fps=fps)  # pyright: ignore[reportArgumentType]
     if not animation.writers.is_available("ffmpeg"):
         raise RuntimeError(
             "`path` ends in .mp4, which needs the program ffmpeg, and none was found; install it "
-            "(apt install ffmpeg, brew install ffmpeg, conda install ffmpeg), or save as .gif or "
-            ".html."
+            "(apt, brew or conda install ffmpeg), or save as .gif or .html."
         )
-    return animation.FFMpegWriter(fps=fps, bitrate=2000)
+    return animation.FFMpegWriter(fps=fps, bitrate=2000)  # pyright: ignore[reportArgumentType]

@@ -2,39 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike, NDArray
-from sklearn.model_selection import GroupKFold, KFold, learning_curve
+from sklearn.model_selection import GroupKFold, KFold, check_cv, learning_curve
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import has_fit_parameter
+from typing_extensions import Self
 
-from hybridkin.plots._canvas import (
-    COLORS,
-    MARKERS,
-    axes_or_new,
-    distance,
-    measured,
-    named,
-    plain,
-    predicted,
-    scale_of,
-)
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
+from hybridkin.plots._arrays import distance, named, plain, positions
+from hybridkin.plots._canvas import COLORS, MARKERS, STYLES, Display, axes_or_new, scale_of
+from hybridkin.plots._models import Predictor, predicted
 
 __all__ = ["LearningCurveDisplay"]
 
-_LINES = ("-", "--", "-.", ":")
 _MOST_TICKS = 8
-_curve: Any = learning_curve  # its types know no error_score="raise"
 
 
-class LearningCurveDisplay:
+class LearningCurveDisplay(Display):
     """Mean tip error against the number of training rows, one curve per model.
 
     Parameters
@@ -81,42 +70,36 @@ class LearningCurveDisplay:
     @classmethod
     def from_estimator(
         cls,
-        models: Any,
-        q: Any,
+        models: Predictor | Mapping[str, Predictor],
+        q: ArrayLike,
         x: ArrayLike,
         *,
         groups: ArrayLike | None = None,
         sizes: Iterable[int] | None = None,
         cv: Any = 5,
         random_state: int | np.random.RandomState | None = None,
-        n_jobs: int | None = None,
-        progress: Callable[[int, int], None] | None = None,
     ) -> Self:
         """Return the curves of models fitted to more and more rows of a log.
 
         Parameters
         ----------
         models : mapping of str to estimator, or estimator
-            They are cloned, never changed.
+            Cloned before each fit.
         q : array-like of shape (N, n)
             Actuator vectors.
         x : array-like of shape (N, m)
             Measured tips [m].
         groups : array-like of shape (N,), optional
             Motion of every row. Whole motions are then held out, and fewer rows are fewer motions
-            (in an order of chance, the last one cut), as a shorter recording would have them;
-            models that take groups are given them. Rows of a motion log without groups flatter
-            every model: neighbours in time are alike. Default: rows that stand alone.
+            (in random order, the last one cut), as in a shorter recording; models that take
+            groups get them. Without groups every model looks too good on a motion log, because
+            neighbouring rows are alike. Default: independent rows.
         sizes : iterable of int, optional
             Training rows. Default: six, from 25 to as many as there are, evenly in logarithms.
         cv : int, splitter or iterable of (train, test), default=5
-            How to hold out; a number means groups, or else rows, in so many parts by chance.
+            How to hold out; a number means so many random parts of the groups, or else the rows.
         random_state : int, RandomState or None, default=None
             Seed of parts and order.
-        n_jobs : int, optional
-            Processes.
-        progress : callable, optional
-            Handed (done, total), in models.
 
         Returns
         -------
@@ -126,7 +109,7 @@ class LearningCurveDisplay:
         Raises
         ------
         ValueError
-            For sizes that the smallest training part has not, and fewer than two groups.
+            For sizes above the rows of the smallest training part, and fewer than two groups.
 
         Examples
         --------
@@ -141,36 +124,24 @@ class LearningCurveDisplay:
         """
         if not isinstance(models, Mapping):
             models = {type(models).__name__: models}
-        models = named(models, "models")
         rng = check_random_state(random_state)
         groups = None if groups is None else np.asarray(groups)
         splits = _splits(cv, q, groups, rng)
         splits = [(_ordered(np.asarray(train), groups, rng), test) for train, test in splits]
         most = min(len(train) for train, _ in splits)
         chosen = np.unique(_sizes(sizes, most))
+        options: dict[str, Any] = {"train_sizes": chosen, "cv": splits, "error_score": "raise"}
         errors = {}
-        for done, (name, model) in enumerate(models.items()):
-            if progress is not None:
-                progress(done, len(models))
+        for name, model in named(models, "models").items():
             takes = groups is not None and has_fit_parameter(model, "groups")
-            errors[name] = _curve(
-                model,
-                q,
-                x,
-                train_sizes=chosen,
-                cv=splits,
-                scoring=_mean_distance,
-                n_jobs=n_jobs,
-                error_score="raise",
-                params={"groups": groups} if takes else None,
-            )[2]
-        if progress is not None:
-            progress(len(models), len(models))
+            params = {"groups": groups} if takes else None
+            scores = learning_curve(model, q, x, scoring=_mean_distance, params=params, **options)
+            errors[name] = scores[2]
         return cls(chosen, errors)
 
     def plot(
         self,
-        ax: Any = None,
+        ax: Axes | None = None,
         *,
         unit: str = "cm",
         styles: Mapping[str, tuple[str, str]] | None = None,
@@ -192,10 +163,9 @@ class LearningCurveDisplay:
             Itself, drawn.
         """
         scale, ax = scale_of(unit), axes_or_new(ax)
-        styles = {} if styles is None else styles
         for i, (name, errors) in enumerate(self.errors.items()):
-            own = (COLORS[i % 8], MARKERS[i % 8] + _LINES[i % 4])
-            color, form = styles.get(name, own)
+            own = (COLORS[i % 8], MARKERS[i % 8] + STYLES[i % 4])
+            color, form = (styles or {}).get(name, own)
             known = np.isfinite(errors).any(axis=1)
             sizes, values = self.sizes[known], scale * errors[known]
             ax.plot(sizes, np.nanmean(values, axis=1), form, color=color, markersize=4, label=name)
@@ -212,15 +182,16 @@ class LearningCurveDisplay:
         ax.yaxis.set_minor_formatter(NullFormatter())
         ax.grid(alpha=0.3)
         ax.legend(frameon=False)
-        self.ax_, self.figure_ = ax, ax.figure
-        return self
+        return self._drawn(ax)
 
 
-def _splits(cv: Any, q: Any, groups: NDArray | None, rng: Any) -> list[tuple[Any, Any]]:
-    if hasattr(cv, "split"):
-        return [*cv.split(q, groups=groups)]
+def _splits(
+    cv: Any, q: ArrayLike, groups: NDArray | None, rng: np.random.RandomState
+) -> list[tuple[NDArray, NDArray]]:
+    """Return pairs of training and held-out rows."""
     if not isinstance(cv, int):
-        return [*cv]
+        splitter: Any = check_cv(cv)
+        return [*splitter.split(q, groups=groups)]
     if groups is None:
         return [*KFold(cv, shuffle=True, random_state=rng).split(q)]
     n_groups = len(np.unique(groups))
@@ -233,7 +204,7 @@ def _splits(cv: Any, q: Any, groups: NDArray | None, rng: Any) -> list[tuple[Any
     return [*splitter.split(q, groups=groups)]
 
 
-def _ordered(train: NDArray, groups: NDArray | None, rng: Any) -> NDArray:
+def _ordered(train: NDArray, groups: NDArray | None, rng: np.random.RandomState) -> NDArray:
     """Return the training rows in the order in which they are learned: motion by motion."""
     if groups is None:
         return rng.permutation(train)
@@ -253,5 +224,5 @@ def _sizes(sizes: Iterable[int] | None, most: int) -> NDArray:
     return chosen
 
 
-def _mean_distance(model: Any, q: Any, x: ArrayLike) -> float:
-    return float(distance(predicted(model, q), measured(model, x)).mean())
+def _mean_distance(model: Predictor, q: ArrayLike, x: ArrayLike) -> float:
+    return float(distance(predicted(model, q), positions(x)).mean())

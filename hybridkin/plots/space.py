@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Self
 
-from hybridkin.plots._body import body_of, mechanical_part
-from hybridkin.plots._canvas import (
-    COLORS,
-    axes_or_new,
-    distance,
-    label_space,
-    measured,
-    plain,
-    predicted,
-    scale_of,
-    tips,
-)
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
+from hybridkin.plots._arrays import distance, plain, shaped
+from hybridkin.plots._canvas import COLORS, Display, label_space, scale_of, space_or_new
+from hybridkin.plots._models import Model, body_of
+from hybridkin.plots._scene import Line
 
 __all__ = ["BackboneDisplay", "WorkspaceDisplay"]
 
@@ -35,19 +26,7 @@ _AXIS_LENGTH = 0.1  # of the backbone
 _TOP = 0.99  # share of the errors within the colour scale: one outlier would darken the rest
 
 
-class Line(NamedTuple):
-    """One part of a body in all configurations, several strokes with NaN between them."""
-
-    label: str
-    points: NDArray  # (K, M, 3)
-    color: str
-    width: float
-    alpha: float = 1.0
-    marker: str = ""
-    style: str = "-"
-
-
-class WorkspaceDisplay:
+class WorkspaceDisplay(Display):
     """Measured tips coloured by the model's error, with one robot among them (Fig. 2, left).
 
     Parameters
@@ -70,10 +49,12 @@ class WorkspaceDisplay:
 
     Examples
     --------
+    >>> import torch
     >>> from hybridkin import datasets, plots, robots
     >>> data = datasets.load_trunk()
     >>> chain = robots.bionic_handling_assistant()
-    >>> display = plots.WorkspaceDisplay.from_estimator(chain, data.q[:200], data.x[:200])
+    >>> predicted = chain(torch.from_numpy(data.q[:200]))
+    >>> display = plots.WorkspaceDisplay(data.x[:200], predicted)
     >>> figure, ax = plots.new_figure(5.0, 4.0, subplot_kw={"projection": "3d"})
     >>> display.plot(ax).ax_.get_zlabel()
     'z [cm]'
@@ -86,47 +67,14 @@ class WorkspaceDisplay:
         backbone: ArrayLike | None = None,
         row: int | None = None,
     ) -> None:
-        self.x = tips(x, "x")
-        self.predicted = tips(predicted, "predicted", len(self.x))
-        self.backbone = None if backbone is None else tips(backbone, "backbone")
+        self.x = shaped(x, "x", "N3")
+        self.predicted = shaped(predicted, "predicted", "N3", len(self.x))
+        self.backbone = None if backbone is None else shaped(backbone, "backbone", "P3")
         self.row = row
         if row is not None and not -len(self.x) <= row < len(self.x):
             raise ValueError(f"`row` must be one of the {len(self.x)} rows of `x`, got {row}.")
 
-    @classmethod
-    def from_estimator(
-        cls, model: Any, q: ArrayLike, x: ArrayLike, *, row: int | None = None
-    ) -> Self:
-        """Return the display of a fitted model, or a chain, on measured rows.
-
-        Parameters
-        ----------
-        model : estimator or nn.Module
-            A fitted estimator or a chain. Where it has a backbone, its own or its mechanical
-            part's, the robot is shown in one configuration.
-        q : array-like of shape (N, n)
-            Actuator vectors.
-        x : array-like of shape (N, 3)
-            Measured tips [m].
-        row : int, optional
-            The sample shown in full. Default: one that only 5 % of the rows err more than.
-
-        Returns
-        -------
-        WorkspaceDisplay
-            Not drawn yet.
-        """
-        x, p, q = tips(measured(model, x), "x"), predicted(model, q), plain(q, "q")
-        errors = distance(tips(p, "predicted", len(x)), x)
-        if row is None:
-            ranks = np.argsort(errors)[: np.isfinite(errors).sum()]
-            row = int(ranks[int(0.95 * len(ranks))]) if len(ranks) else None
-        backbone = None
-        if row is not None and hasattr(mechanical_part(model), "backbone"):
-            backbone = body_of(model, q[row]).points[0]
-        return cls(x, p, backbone, row)
-
-    def plot(self, ax: Any = None, *, unit: str = "cm") -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw into a 3-D axes and return self; the colours end where 1 % of the errors is larger.
 
         Parameters
@@ -141,32 +89,32 @@ class WorkspaceDisplay:
         WorkspaceDisplay
             Itself, drawn.
         """
-        scale, ax = scale_of(unit), axes_or_new(ax, projection="3d")
+        scale, space = scale_of(unit), space_or_new(ax)
         errors = scale * distance(self.predicted, self.x)
         known = np.isfinite(errors)
         order = np.flatnonzero(known)[np.argsort(errors[known])]  # the worst in front
         top = float(np.quantile(errors[order], _TOP)) if len(order) else 1.0
         look = {"c": errors[order], "s": 7, "cmap": "cividis", "vmin": 0.0, "vmax": top}
         look |= {"depthshade": False, "linewidths": 0.0, "alpha": 0.8, "rasterized": True}
-        ax.computed_zorder = False  # the robot in front of the cloud
-        dots = ax.scatter(*(scale * self.x[order].T), **look)
+        space.computed_zorder = False  # the robot in front of the cloud
+        dots = space.scatter(*(scale * self.x[order].T), **look)
         bar = {"label": f"tip error [{unit}]", "shrink": 0.7, "pad": 0.12, "extend": "max"}
-        ax.figure.colorbar(dots, ax=ax, **bar)
+        space.figure.colorbar(dots, ax=space, **bar)
         if self.backbone is not None:
-            ax.plot(*(scale * self.backbone.T), color=COLORS[0], linewidth=5, label="robot (model)")
+            robot = {"color": COLORS[0], "linewidth": 5, "label": "robot (model)"}
+            space.plot(*(scale * self.backbone.T), **robot)
         if self.row is not None:
             ends = scale * np.stack([self.x[self.row], self.predicted[self.row]])
-            ax.plot(*ends.T, color="black", linewidth=1.5)
-            ax.scatter(*ends[:1].T, color="black", s=30, label="measured tip", zorder=3)
-            ax.scatter(*ends[1:].T, color=COLORS[0], s=30, label="predicted tip", zorder=3)
+            space.plot(*ends.T, color="black", linewidth=1.5)
+            space.scatter(*ends[:1].T, color="black", s=30, label="measured tip", zorder=3)
+            space.scatter(*ends[1:].T, color=COLORS[0], s=30, label="predicted tip", zorder=3)
         if self.backbone is not None or self.row is not None:
-            ax.legend(frameon=False, loc="upper left")
-        label_space(ax, unit)
-        self.ax_, self.figure_ = ax, ax.figure
-        return self
+            space.legend(frameon=False, loc="upper left")
+        label_space(space, unit)
+        return self._drawn(space)
 
 
-class BackboneDisplay:
+class BackboneDisplay(Display):
     """A robot's body in space: backbone, actuators, end disks, frames; one or more configurations.
 
     Parameters
@@ -223,23 +171,21 @@ class BackboneDisplay:
         rigid: bool = False,
     ) -> None:
         points = plain(points, "points")
-        self.points = _shaped(points[None] if points.ndim == 2 else points, "points", "KP3")
+        self.points = shaped(points[None] if points.ndim == 2 else points, "points", "KP3")
         K = len(self.points)
-        self.actuators = tuple(_shaped(path, "actuators", "KP3", K) for path in actuators)
+        self.actuators = tuple(shaped(path, "actuators", "KP3", K) for path in actuators)
         self.segments = (0,) * len(self.actuators) if segments is None else tuple(segments)
-        if len(self.segments) != len(self.actuators):
-            raise ValueError(
-                f"`segments` must hold {len(self.actuators)} numbers, one per actuator, got "
-                f"{len(self.segments)}."
-            )
-        self.disks = None if disks is None else _shaped(disks, "disks", "KDC3", K)
-        self.frames = None if frames is None else _shaped(frames, "frames", "KF44", K)
-        self.tips = self.points[:, -1] if tips is None else _shaped(tips, "tips", "K3", K)
-        self.predicted = None if predicted is None else _shaped(predicted, "predicted", "K3", K)
+        n = len(self.actuators)
+        if len(self.segments) != n:
+            raise ValueError(f"`segments` must hold {n} numbers, one per actuator.")
+        self.disks = None if disks is None else shaped(disks, "disks", "KDC3", K)
+        self.frames = None if frames is None else shaped(frames, "frames", "KF44", K)
+        self.tips = self.points[:, -1] if tips is None else shaped(tips, "tips", "K3", K)
+        self.predicted = None if predicted is None else shaped(predicted, "predicted", "K3", K)
         self.rigid = rigid
 
     @classmethod
-    def from_estimator(cls, model: Any, q: ArrayLike, *, n_points: int = 12) -> Self:
+    def from_estimator(cls, model: Model, q: ArrayLike, *, n_points: int = 12) -> Self:
         """Return the body of a chain, or of a fitted hybrid model, in given configurations.
 
         Parameters
@@ -258,18 +204,12 @@ class BackboneDisplay:
         BackboneDisplay
             Not drawn yet.
         """
-        return cls(**body_of(model, q, n_points)._asdict())
+        return cls(**body_of(model, q, n_points))
 
-    def plot(
-        self,
-        ax: Any = None,
-        *,
-        unit: str = "cm",
-        actuators: bool = True,
-        disks: bool = True,
-        frames: bool | None = None,
-    ) -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw into a 3-D axes and return self.
+
+        A single configuration shows everything, several their backbones and tips.
 
         Parameters
         ----------
@@ -277,60 +217,50 @@ class BackboneDisplay:
             Default: those of a new figure of pyplot.
         unit : {"m", "cm", "mm"}, default="cm"
             Of the axes.
-        actuators, disks : bool, default=True
-            Whether to draw them, where there are any.
-        frames : bool, optional
-            Likewise. Default: for a single configuration.
 
         Returns
         -------
         BackboneDisplay
             Itself, drawn.
         """
-        scale, ax = scale_of(unit), axes_or_new(ax, projection="3d")
-        several = len(self.points) > 1
-        frames = not several if frames is None else frames
-        lines = self.lines(actuators=actuators, disks=disks)
+        scale, space = scale_of(unit), space_or_new(ax)
+        single = len(self.points) == 1
         for k in np.flatnonzero(np.isfinite(self.points).all(axis=(1, 2))):
-            for line in lines:
-                color = COLORS[k % 8] if several else line.color
-                label = "" if several else line.label
-                look = {"color": color, "linewidth": line.width, "alpha": line.alpha}
-                look |= {"linestyle": line.style, "marker": line.marker, "markersize": 6}
-                ax.plot(*(scale * line.points[k].T), **look, label=label or None)
-            if disks and not several and self.disks is not None and self.disks.size:
-                ax.add_collection3d(
-                    Poly3DCollection(scale * self.disks[k], alpha=0.15, facecolor="0.5", lw=0.0)
-                )
-            if frames and self.frames is not None:
-                self._draw_frames(ax, self.frames[k], scale)
-        if ax.get_legend_handles_labels()[1]:
-            ax.legend(frameon=False, loc="upper left", fontsize="small")
-        label_space(ax, unit)
-        self.ax_, self.figure_ = ax, ax.figure
-        return self
+            for line in self.lines(body=single):
+                look = line.look() | ({"label": line.label or None} if single else {})
+                look["color"] = line.color if single else COLORS[k % 8]
+                space.plot(*(scale * line.points[k].T), **look)
+            if single and self.disks is not None and self.disks.size:
+                disks = scale * self.disks[k]
+                space.add_collection3d(Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0))
+            if single and self.frames is not None:
+                self._draw_frames(space, self.frames[k], scale)
+        if space.get_legend_handles_labels()[1]:
+            space.legend(frameon=False, loc="upper left", fontsize="small")
+        label_space(space, unit)
+        return self._drawn(space)
 
-    def lines(self, *, actuators: bool = True, disks: bool = True, tip: bool = True) -> list[Line]:
-        """Return all strokes of the body, to be drawn by any means.
+    def lines(self, *, body: bool = True, tip: bool = True) -> list[Line]:
+        """Return all strokes of the robot, to be drawn by any means.
 
         Parameters
         ----------
-        actuators, disks, tip : bool, default=True
-            Whether to return those as well, where there are any.
+        body, tip : bool, default=True
+            Whether to return actuators and disks, where there are any, and the tip.
 
         Returns
         -------
         list of Line
-            Named tuples (label, points, color, width, alpha, marker, style), points of shape
+            Named tuples (label, points, color, width, marker, style), points of shape
             (K, M, 3) [m] with NaN between strokes.
         """
         name, marker = ("links and joints", "o") if self.rigid else ("backbone", "")
         found = [Line(name, self.points, _BODY, 4.0, marker=marker)]
-        for s in sorted(set(self.segments)) if actuators else ():
+        for s in sorted(set(self.segments)) if body else ():
             own = [p for p, of in zip(self.actuators, self.segments, strict=True) if of == s]
             label = f"actuators of segment {s + 1}"
-            found.append(Line(label, _joined(own), _SEGMENTS[s % len(_SEGMENTS)], 1.6, 0.9))
-        if disks and self.disks is not None and self.disks.size:
+            found.append(Line(label, _joined(own), _SEGMENTS[s % len(_SEGMENTS)], 1.6))
+        if body and self.disks is not None and self.disks.size:
             found.append(Line("", _joined(self.disks.swapaxes(0, 1)), "#808080", 1.0))
         if tip:
             found.append(Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none"))
@@ -355,13 +285,3 @@ def _joined(paths: Iterable[NDArray]) -> NDArray:
     for path in paths:
         parts += [path, np.full((*path.shape[:-2], 1, 3), np.nan)]
     return np.concatenate(parts[:-1], axis=-2)
-
-
-def _shaped(value: ArrayLike, name: str, letters: str, n_rows: int | None = None) -> NDArray:
-    """Return an array whose shape agrees with letters, digits being sizes; K is `n_rows`."""
-    array = plain(value, name)
-    need = [str(n_rows) if x == "K" and n_rows is not None else x for x in letters]
-    fits = array.ndim == len(need)
-    if not fits or any(x.isdigit() and int(x) != n for x, n in zip(need, array.shape, strict=True)):
-        raise ValueError(f"`{name}` must have shape ({', '.join(need)}), got {array.shape}.")
-    return array

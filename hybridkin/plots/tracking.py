@@ -1,31 +1,26 @@
-"""Paths followed: target and tracks in a plane, in space and over time, errors and actuators."""
+"""Paths followed: target and tracks in a plane and over time, errors and actuators."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Self
 
+from hybridkin.plots._arrays import distance, named, plain, shaped, times
 from hybridkin.plots._canvas import (
-    COLORS,
     LENGTHS,
-    STYLES,
+    Display,
     axes_or_new,
     decimals,
-    distance,
-    label_space,
-    named,
-    plain,
+    look_of,
     scale_of,
-    several_axes,
-    times,
-    tips,
+    steps_of,
 )
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 __all__ = ["ActuatorDisplay", "TrackingDisplay"]
 
@@ -33,7 +28,7 @@ _ACTUATOR_UNITS = {**LENGTHS, "rad": 1.0, "deg": 180.0 / np.pi}
 _PLANES = ("xy", "xz", "yx", "yz", "zx", "zy")
 
 
-class TrackingDisplay:
+class TrackingDisplay(Display):
     """A target path and how each model followed it (Fig. 3).
 
     Parameters
@@ -70,21 +65,22 @@ class TrackingDisplay:
     def __init__(
         self, target: ArrayLike, tracks: Mapping[str, ArrayLike], t: ArrayLike | None = None
     ) -> None:
-        self.target = tips(target, "target")
+        self.target = shaped(target, "target", "T3")
         T = len(self.target)
         self.tracks = {
-            name: tips(x, f"tracks[{name!r}]", T) for name, x in named(tracks, "tracks").items()
+            name: shaped(x, f"tracks[{name!r}]", "T3", T)
+            for name, x in named(tracks, "tracks").items()
         }
         self.t = times(t, T)
 
     @classmethod
-    def from_tracks(cls, tracks: Any) -> Self:
-        """Return the display of one or more results of `InverseKinematics.track`.
+    def from_tracks(cls, tracks: Mapping[str, Any]) -> Self:
+        """Return the display of results of `InverseKinematics.track`.
 
         Parameters
         ----------
-        tracks : Track, or mapping of str to Track
-            Of the same path. The measured tips are shown where a plant was there, else those of
+        tracks : mapping of str to Track
+            Of the same path. The measured tips are shown where there was a plant, else those of
             the model.
 
         Returns
@@ -92,15 +88,18 @@ class TrackingDisplay:
         TrackingDisplay
             Not drawn yet.
         """
-        tracks = named(tracks if isinstance(tracks, Mapping) else {"track": tracks}, "tracks")
-        first, *others = tracks.values()
-        target = tips(first.target, "target")
+        first, *others = named(tracks, "tracks").values()
+        target = shaped(first.target, "target", "T3")
         for other in others:
             if not np.array_equal(plain(other.target), target, equal_nan=True):
                 raise ValueError("`tracks` must follow one path, got different targets.")
-        return cls(target, {name: reached(track) for name, track in tracks.items()}, first.t)
+        reached = {
+            name: track.x if track.x_measured is None else track.x_measured
+            for name, track in tracks.items()
+        }
+        return cls(target, reached, first.t)
 
-    def plot(self, ax: Any = None, *, unit: str = "cm", plane: str = "xy") -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm", plane: str = "xy") -> Self:
         """Draw the paths in one plane of the task space and return self.
 
         Parameters
@@ -121,9 +120,9 @@ class TrackingDisplay:
             raise ValueError(f"`plane` must be one of {_PLANES}, got {plane!r}.")
         scale, ax = scale_of(unit), axes_or_new(ax)
         i, j = ("xyz".index(letter) for letter in plane)
-        for name, x, look in self._styled():
+        for k, (name, x) in enumerate(self.tracks.items()):
             label = self._summary(name, scale, unit)
-            ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look)
+            ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look_of(k))
         target = scale * self.target
         ax.plot(target[:, i], target[:, j], color="black", linewidth=1.0, label="target")
         ax.set(xlabel=f"{plane[0]} [{unit}]", ylabel=f"{plane[1]} [{unit}]")
@@ -131,22 +130,12 @@ class TrackingDisplay:
         ax.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16))
         return self._drawn(ax)
 
-    def plot_space(self, ax: Any = None, *, unit: str = "cm") -> Self:
-        """Draw the paths into a 3-D axes and return self; parameters as of `plot`."""
-        scale, ax = scale_of(unit), axes_or_new(ax, projection="3d")
-        for name, x, look in self._styled():
-            ax.plot(*(scale * x.T), label=self._summary(name, scale, unit), **look)
-        ax.plot(*(scale * self.target.T), color="black", linewidth=1.0, label="target")
-        label_space(ax, unit)
-        ax.legend(frameon=False, fontsize="small", loc="upper left")
-        return self._drawn(ax)
-
-    def plot_time(self, ax: Any = None, *, unit: str = "cm") -> Self:
+    def plot_time(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw the three coordinates over time and return self; parameters as of `plot`."""
         scale, ax = scale_of(unit), axes_or_new(ax)
-        steps = self._steps(ax)
-        for name, x, look in self._styled():
-            lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
+        steps, when = steps_of(self.t, len(self.target))
+        for i, (name, x) in enumerate(self.tracks.items()):
+            lines = ax.plot(steps, scale * x, **{**look_of(i), "linewidth": 1.2})
             lines[0].set_label(name)
         ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
         for letter, values in zip("xyz", scale * self.target.T, strict=True):
@@ -154,39 +143,26 @@ class TrackingDisplay:
                 top = int(np.nanargmax(values))
                 ax.annotate(letter, (steps[top], values[top]), (0, 3), textcoords="offset points")
         ax.margins(y=0.08)
-        ax.set(ylabel=f"tip [{unit}]")
+        ax.set(xlabel=when, ylabel=f"tip [{unit}]")
         return self._drawn(ax)
 
-    def plot_error(self, ax: Any = None, *, unit: str = "cm") -> Self:
+    def plot_error(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw the distances to the target over time and return self; parameters as of `plot`."""
         scale, ax = scale_of(unit), axes_or_new(ax)
-        steps = self._steps(ax)
-        for name, x, look in self._styled():
+        steps, when = steps_of(self.t, len(self.target))
+        for i, (name, x) in enumerate(self.tracks.items()):
             error = scale * distance(x, self.target)
-            ax.plot(steps, error, label=self._summary(name, scale, unit), **look)
-        ax.set(ylabel=f"tip error [{unit}]", xlim=(steps[0], steps[-1]) if len(steps) > 1 else None)
+            ax.plot(steps, error, label=self._summary(name, scale, unit), **look_of(i))
+        ax.set(xlabel=when, ylabel=f"tip error [{unit}]")
+        ax.set_xlim((steps[0], steps[-1]) if len(steps) > 1 else None)
         ax.set_ylim(bottom=0.0)
         ax.legend(frameon=False, fontsize="small")
         return self._drawn(ax)
-
-    def _styled(self) -> list[tuple[str, NDArray, dict[str, Any]]]:
-        return [
-            (name, x, {"color": COLORS[k % 8], "linestyle": STYLES[k % 4], "linewidth": 1.5})
-            for k, (name, x) in enumerate(self.tracks.items())
-        ]
 
     def _summary(self, name: str, scale: float, unit: str) -> str:
         error = scale * distance(self.tracks[name], self.target)
         mean = error[np.isfinite(error)].mean() if np.isfinite(error).any() else np.nan
         return f"{name}: mean error {mean:.{decimals(mean)}f} {unit}"
-
-    def _steps(self, ax: Any) -> NDArray:
-        ax.set(xlabel="time step" if self.t is None else "time [s]")
-        return np.arange(len(self.target)) if self.t is None else self.t
-
-    def _drawn(self, ax: Any) -> Self:
-        self.ax_, self.figure_ = ax, ax.figure
-        return self
 
 
 class ActuatorDisplay:
@@ -228,12 +204,12 @@ class ActuatorDisplay:
         self.t = times(t, rows)
 
     @classmethod
-    def from_tracks(cls, tracks: Any, actuators_per_segment: Sequence[int]) -> Self:
-        """Return the display of one or more results of `InverseKinematics.track`.
+    def from_tracks(cls, tracks: Mapping[str, Any], actuators_per_segment: Sequence[int]) -> Self:
+        """Return the display of results of `InverseKinematics.track`.
 
         Parameters
         ----------
-        tracks : Track, or mapping of str to Track
+        tracks : mapping of str to Track
             With the same times.
         actuators_per_segment : sequence of int
             As ``chain.actuators_per_segment``.
@@ -243,11 +219,10 @@ class ActuatorDisplay:
         ActuatorDisplay
             Not drawn yet.
         """
-        tracks = named(tracks if isinstance(tracks, Mapping) else {"track": tracks}, "tracks")
-        t = next(iter(tracks.values())).t
+        t = next(iter(named(tracks, "tracks").values())).t
         return cls({name: track.q for name, track in tracks.items()}, actuators_per_segment, t)
 
-    def plot(self, axes: Any = None, *, unit: str = "cm") -> Self:
+    def plot(self, axes: Sequence[Axes] | NDArray | None = None, *, unit: str = "cm") -> Self:
         """Draw one axes per segment, sharing time, and return self.
 
         Parameters
@@ -263,22 +238,21 @@ class ActuatorDisplay:
             Itself, drawn.
         """
         scale, n = scale_of(unit, _ACTUATOR_UNITS), len(self.actuators_per_segment)
-        axes = several_axes(axes, n, 6.0, 1.0 + 1.6 * n, rows=True)
+        if axes is None:
+            size = (6.0, 1.0 + 1.6 * n)
+            axes = plt.subplots(n, 1, figsize=size, sharex=True, layout="constrained")[1]
+        axes = np.ravel(np.asarray(axes, dtype=object))
+        if len(axes) != n:
+            raise ValueError(f"`axes` must hold {n} axes, got {len(axes)}.")
+        steps, when = steps_of(self.t, len(next(iter(self.paths.values()))))
         ends = np.cumsum(self.actuators_per_segment)
-        rows = len(next(iter(self.paths.values())))
-        steps = np.arange(rows) if self.t is None else self.t
         for k, ax in enumerate(axes):
             for i, (name, q) in enumerate(self.paths.items()):
                 part = scale * q[:, ends[k] - self.actuators_per_segment[k] : ends[k]]
-                lines = ax.plot(steps, part, STYLES[i % 4], color=COLORS[i % 8], linewidth=1.2)
+                lines = ax.plot(steps, part, **{**look_of(i), "linewidth": 1.2})
                 lines[0].set_label(name)
             ax.set(ylabel=f"segment {k + 1} [{unit}]")
         axes[0].legend(frameon=False, fontsize="small", ncols=len(self.paths))
-        axes[-1].set(xlabel="time step" if self.t is None else "time [s]")
+        axes[-1].set(xlabel=when)
         self.axes_, self.figure_ = axes, axes[0].figure
         return self
-
-
-def reached(track: Any) -> Any:
-    """Return the tips of a track: measured where there was a plant, else those of the model."""
-    return track.x if track.x_measured is None else track.x_measured

@@ -27,6 +27,8 @@ SERVO_GAINS = (2000.0, 4000.0)  # proportional [N/m], integral [N/(m s)]
 MAX_NEWTON, MIN_FRACTION, DIFFERENCE = 7, 1 / 128, 1e-6
 FORCE_TOL, LENGTH_TOL = 1e-8, 1e-10  # [N or N m], [m]
 
+_MAY_BE_ZERO = ("tilt", "gravity", "tip_mass", "cable_noise", "mocap_noise")
+
 
 class NotSettledError(RuntimeError):
     """The trunk did not come to rest at a stable shape; the message names the failed criterion."""
@@ -40,10 +42,10 @@ class TrunkPlant:
     segment (radii 0.100, 0.093 and 0.079 m, at 0, 120 and 240 degrees), and a servo drives every
     chamber to its commanded length. Shortening a chamber bends its segment towards it.
 
-    Gravity bends and twists a segment between its end plates, which the nine lengths cannot tell.
-    That, and a base that is not quite where it is believed to be, is what a constant-curvature
-    model misses. Without gravity and with ``base_error`` zero the trunk is a constant-curvature
-    arm to about a millimetre.
+    Gravity bends and twists a segment between its end plates, which the nine lengths do not
+    determine. That, and a base that differs from its nominal pose, is the residual of a
+    constant-curvature model. Without gravity and with ``base_error`` zero the trunk is a
+    constant-curvature arm to about a millimetre.
 
     `settle` solves for the static equilibrium: Newton's method on MuJoCo's forces, followed from
     the start shape to the command. It checks that the equilibrium is stable, then lets MuJoCo run
@@ -77,9 +79,6 @@ class TrunkPlant:
         Standard deviation of the measured lengths [m].
     mocap_noise : float, default=0.0
         Standard deviation of each coordinate of the measured tip position [m].
-    warm_start : bool, default=False
-        Start from the last settled shape instead of the rest shape. The result is the same, to
-        solver accuracy, wherever the equilibrium is unique.
     max_iter : int, default=200
         Newton iterations that one settling may take.
     random_state : int, Generator or None, default=None
@@ -125,7 +124,6 @@ class TrunkPlant:
         base_error: ArrayLike = (0.004, -0.003, 0.005, 0.015, -0.005, -0.015),
         cable_noise: float = 0.0,
         mocap_noise: float = 0.0,
-        warm_start: bool = False,
         max_iter: int = 200,
         random_state: int | np.random.Generator | None = None,
     ):
@@ -135,25 +133,14 @@ class TrunkPlant:
             raise ImportError(
                 "TrunkPlant needs MuJoCo; install it with `pip install hybridkin[sim]`."
             ) from error
-        for name, value, low in (
-            ("tilt", tilt, -np.inf),
-            ("gravity", gravity, 0),
-            ("tip_mass", tip_mass, 0),
-            ("cable_noise", cable_noise, 0),
-            ("mocap_noise", mocap_noise, 0),
-        ):
-            if not (isinstance(value, Real) and np.isfinite(value) and value >= low):
-                raise ValueError(f"`{name}` must be a finite number >= {low}, got {value!r}.")
-        for name, value in (
-            ("mass", mass),
-            ("bending_stiffness", bending_stiffness),
-            ("torsional_stiffness", torsional_stiffness),
-            ("axial_stiffness", axial_stiffness),
-            ("max_force", max_force),
-            ("max_iter", max_iter),
-        ):
-            if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
-                raise ValueError(f"`{name}` must be a finite number > 0, got {value!r}.")
+        stiffness = {"bending": bending_stiffness, "torsional": torsional_stiffness}
+        stiffness["axial"] = axial_stiffness
+        numbers = {f"{name}_stiffness": value for name, value in stiffness.items()}
+        numbers |= {"tilt": tilt, "gravity": gravity, "mass": mass, "tip_mass": tip_mass}
+        numbers |= {"max_force": max_force, "max_iter": max_iter}
+        numbers |= {"cable_noise": cable_noise, "mocap_noise": mocap_noise}
+        for name, value in numbers.items():
+            _check_number(name, value)
         error = np.asarray(base_error, dtype=float)
         if error.shape != (6,) or not np.isfinite(error).all():
             raise ValueError(
@@ -162,16 +149,10 @@ class TrunkPlant:
             )
         self._max_force, self._max_iter = float(max_force), int(max_iter)
         self._noise, self._random_state = (float(cable_noise), float(mocap_noise)), random_state
-        self._warm_start = bool(warm_start)
         self._T_mocap_base = np.eye(4)
         self._T_mocap_base[:3, :3] = Rotation.from_rotvec(error[3:]).as_matrix()
         self._T_mocap_base[:3, 3] = error[:3]
 
-        stiffness = {
-            "bending": bending_stiffness,
-            "torsional": torsional_stiffness,
-            "axial": axial_stiffness,
-        }
         down = (gravity * np.sin(tilt), gravity * np.cos(tilt))
         self._mujoco = mujoco
         self._model = mujoco.MjModel.from_xml_string(trunk_mjcf(down, mass, tip_mass, stiffness))
@@ -184,8 +165,7 @@ class TrunkPlant:
         self.reset()
 
     def reset(self) -> None:
-        """Bring the trunk back to its rest shape and the measurement noise back to its seed."""
-        self._state = self._rest
+        """Bring the measurement noise back to its seed."""
         self._rng = np.random.default_rng(self._random_state)
 
     def __call__(self, q_target: ArrayLike) -> NDArray[np.float64]:
@@ -235,11 +215,9 @@ class TrunkPlant:
             If the trunk did not come to rest at a stable shape.
         """
         target = self._check_lengths(q_target)
-        start = self._state if self._warm_start else self._rest
-        state, held = self._equilibrium(start, target, _Budget(self._max_iter))
+        state, held = self._equilibrium(self._rest, target, _Budget(self._max_iter))
         self._check_stable(state, held)
         lengths, T_base_tip = self._hold(state, target, held)
-        self._state = state
         rng = self._rng if random_state is None else np.random.default_rng(random_state)
         q = lengths + self._noise[0] * rng.standard_normal(9)
         pose = self._T_mocap_base @ T_base_tip
@@ -391,6 +369,14 @@ class TrunkPlant:
                     f"{name} is {value:.3g} and must be at most {limit:g}."
                 )
         return data.ten_length.copy(), T_base_tip
+
+
+def _check_number(name, value):
+    low = -np.inf if name == "tilt" else 0.0
+    enough = isinstance(value, Real) and np.isfinite(value) and value >= low
+    if not enough or (value == 0 and name not in _MAY_BE_ZERO):
+        sign = ">=" if name in _MAY_BE_ZERO else ">"
+        raise ValueError(f"`{name}` must be a finite number {sign} {low:g}, got {value!r}.")
 
 
 class _Budget:

@@ -4,19 +4,13 @@ import hybrid_cases as cases
 import numpy as np
 import pytest
 import torch
-from hybrids import (
-    data_demand,
-    extrapolation,
-    held_out_motions,
-    hybrids_report,
-    learning_curves,
-)
+from hybrids import extrapolation, held_out_motions, hybrids_report, learning_curves
 
 from hybridkin import ConstantCurvatureChain
 from hybridkin.datasets._recordings import FTDCR_FILES, FTDCR_SERVOS
 
-PAPER = "parallel paper's ELM"
-SHOWN = ("mechanical, raw", "mechanical", PAPER, "serial linear", "serial quadratic", "auto")
+PAPER, NOMINAL, CALIBRATED = cases.PAPER, cases.NOMINAL, cases.CALIBRATED
+SHOWN = (NOMINAL, CALIBRATED, PAPER, "serial, linear", "serial, quadratic", "auto")
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +31,15 @@ def curves(one_plant, folder):
     steps = []
     with pytest.warns(UserWarning, match="Left out: armlab_3cable"):
         table = learning_curves(
-            (25, 200),
+            (25, 120),
             1,
-            n_test=60,
-            models=(*SHOWN, "data, quadratic", "data, kernel"),
+            n_test=30,
+            models=(*SHOWN, *cases.DATA_ONLY),
             data_home=folder,
             folder=folder,
             progress=lambda *step: steps.append(step),
         )
-    assert steps == [("trunk 1, 25 rows", 1, 2), ("trunk 1, 200 rows", 2, 2)]
+    assert steps == [("trunk 1, 25 rows", 1, 2), ("trunk 1, 120 rows", 2, 2)]
     return table
 
 
@@ -106,32 +100,32 @@ def mean(table, model, n):
 
 def test_one_entry_for_every_model_and_size(curves):
     assert {(e["model"], e["n"]) for e in curves} == {
-        (model, n) for model in (*SHOWN, "data, quadratic", "data, kernel") for n in (25, 200)
+        (model, n) for model in (*SHOWN, *cases.DATA_ONLY) for n in (25, 120)
     }
     for e in curves:
         assert list(e["errors"]) == ["without noise", "with noise"]
         assert all(0 < found["mean"] <= found["max"] for found in e["errors"].values())
-        assert e["errors"]["with noise"]["n_test"] == 60
+        assert e["errors"]["with noise"]["n_test"] == 30
         assert ("chosen" in e) == (e["model"] == "auto")
-    assert set(entry(curves, "auto", 200)["promised"]) >= {"mechanical", "serial quadratic"}
+    assert set(entry(curves, "auto", 120)["scores"]) >= {"mechanical", "serial quadratic"}
 
 
 def test_serial_and_auto_beat_the_papers_hybrid(curves):
-    paper = mean(curves, PAPER, 200)
-    assert mean(curves, "serial quadratic", 200) < 0.8 * paper
-    assert mean(curves, "auto", 200) < 0.8 * paper
-    assert mean(curves, "auto", 200) < 0.6 * mean(curves, "mechanical", 200)
-    assert mean(curves, "auto", 200) < 0.6 * mean(curves, "data, kernel", 200)
-    assert mean(curves, "mechanical, raw", 25) == mean(curves, "mechanical, raw", 200)
+    paper = mean(curves, PAPER, 120)
+    assert mean(curves, "serial, quadratic", 120) < 0.8 * paper
+    assert mean(curves, "auto", 120) < 0.8 * paper
+    assert mean(curves, "auto", 120) < 0.6 * mean(curves, CALIBRATED, 120)
+    assert mean(curves, "auto", 120) < 0.6 * mean(curves, cases.DATA_ONLY[1], 120)
+    assert mean(curves, NOMINAL, 25) == mean(curves, NOMINAL, 120)
 
 
 def test_the_same_again_and_fewer_rows_are_part_of_more(curves, one_plant, folder):
     with pytest.warns(UserWarning, match="Left out"):
         again = learning_curves(
-            (25, 200), 1, n_test=60, models=[PAPER], data_home=folder, folder=folder
+            (25, 120), 1, n_test=30, models=[PAPER], data_home=folder, folder=folder
         )
-    assert [e["errors"] for e in again] == [entry(curves, PAPER, n)["errors"] for n in (25, 200)]
-    few, many = cases.trunk_cases((25, 200), 1, 60, folder, 1)
+    assert [e["errors"] for e in again] == [entry(curves, PAPER, n)["errors"] for n in (25, 120)]
+    few, many = cases.trunk_cases((25, 120), 1, 30, folder, 1)
     np.testing.assert_array_equal(few.q, many.q[:25])
     clean, noisy = (few.tests[name] for name in ("without noise", "with noise"))
     assert np.std(noisy[0] - clean[0]) == pytest.approx(1e-3, rel=0.1)
@@ -167,7 +161,7 @@ def test_lines_and_motions_are_held_out_whole(recordings):
     for case in folds:
         assert len(np.unique(case.groups)) + len(case.tests["5 folds"][0]) // 6 == 24
     for case, held in zip(found[5:8], ("pair12", "pair13", "pair23"), strict=True):
-        groups = case.tests["a pair of segments left out"][2]
+        groups = case.tests["a pair held out"][2]
         assert np.char.find(groups.astype(str), held).min() >= 0
         assert len(groups) == 4 * 6
         assert np.char.find(case.groups.astype(str), held).max() < 0
@@ -180,37 +174,23 @@ def test_lines_and_motions_are_held_out_whole(recordings):
 
 
 def test_report_of_all_three(curves, one_plant, recordings, folder, tmp_path):
-    models = ("mechanical, raw", "mechanical", "data, quadratic", "serial linear", "auto")
+    models = (NOMINAL, CALIBRATED, cases.DATA_ONLY[0], "serial, linear", "auto")
     outside = extrapolation(
         20, 1, n_test=20, models=models[:-1], data_home=recordings, folder=folder
     )
     assert {e["case"] for e in outside} == {"trunk 1", "armlab_3cable"}
-    pairs = cases.motion_cases(recordings, 0.9, 2)[8]
-    motions = cases.examined(pairs._replace(calibrate=()), ("mechanical", "auto", "auto, play"))
-    assert [entry["model"] for entry in motions] == ["mechanical", "auto", "auto, play"]
+    pairs = cases.motion_cases(recordings, 0.9, 4)[8]
+    motions = cases.examined(pairs._replace(calibrate=()), (CALIBRATED, "auto", cases.AUTO_PLAY))
+    assert [entry["model"] for entry in motions] == [CALIBRATED, "auto", cases.AUTO_PLAY]
     assert 0.0 <= motions[1]["errors"]["pairs from single segments"]["within"] <= 1.0
     report = hybrids_report(curves, outside, motions)
     paths = {path.name for path in report.write(tmp_path / "hybrids")}
     assert paths == {"report.md", "report.json", "hybrid_curves.png", "hybrid_outside.png"}
     text = (tmp_path / "hybrids" / "report.md").read_text()
-    assert "| rows | 25 | 200 |" in text
+    assert "| rows | 25 | 120 |" in text
     assert "| plain chain | 0 | " in text
 
 
 def test_absent_recordings_are_left_out(tmp_path):
     with pytest.warns(UserWarning, match="Left out: ftdcr_v4"):
         assert held_out_motions(data_home=tmp_path) == []
-
-
-def test_demand_lies_between_two_sizes():
-    def row(model, n, error):
-        errors = {"test": {"mean": error, "max": error, "n_test": 1}}
-        return {"case": "a", "draw": 0, "n": n, "model": model, "errors": errors}
-
-    data = [row(m, n, 8.0 / n) for m in ("data, quadratic", "data, kernel") for n in (1, 2, 4)]
-    demand = data_demand([*data, *(row("auto", n, 4.0 / n) for n in (1, 2, 4))])
-    assert demand["a", "test"] == pytest.approx((2.0, 2.0))
-    late = data_demand([*data, *(row("auto", n, 6.0 / n) for n in (1, 2, 4))])
-    assert late["a", "test"][1] == pytest.approx(3.0)
-    never = data_demand([*data, *(row("auto", n, 9.0 / n) for n in (1, 2, 4))])
-    assert never["a", "test"][1] == np.inf

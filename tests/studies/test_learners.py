@@ -5,6 +5,7 @@ from learners import (
     compare_learners,
     learners_report,
     learning_sets,
+    main,
     make_arm,
     time_learners,
 )
@@ -128,3 +129,13 @@ def test_the_speed_curve_stops_and_the_report_shows_all(tmp_path, table):
     text = (tmp_path / "learners" / "report.md").read_text()
     assert "| trunk, 300 x 9 | " in text
     assert text.count("**") == 2 * 6
+
+
+def test_runs_from_the_command_line(tmp_path, capsys):
+    out = tmp_path / "results"
+    options = ["--learners", "ELMRegressor", "RidgeCV", "--rows", "60"]
+    main(["--out", str(out), *options])
+    printed, shown = capsys.readouterr()
+    assert str(out / "report.md") in printed.splitlines()
+    assert "12/12 RidgeCV on trunk" in shown
+    assert "arm, 60 x 8" in (out / "report.md").read_text()

@@ -14,13 +14,10 @@ from hybridkin import (
     calibrate,
     datasets,
     load_model,
-    paper,
     robots,
     workflow,
 )
 from hybridkin.cli.main import main
-from hybridkin.paper.identifiability import ASKED, TELLABLE, identifiability
-from hybridkin.paper.paper import summary
 from hybridkin.saving.saved_model import model_header
 from hybridkin.workflow._domain import known_commands
 from hybridkin.workflow.report import geometry_entries
@@ -53,29 +50,6 @@ def log(tmp_path):
     header = "l1,l2,l3,l4,l5,l6,x,y,z,motion"
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
     return path, robot
-
-
-def test_the_kinds_of_spread_are_told_apart():
-    wide = [
-        [np.array([0.0, 2.0]), np.array([1.0, 3.0])],
-        [np.array([4.0, 6.0]), np.array([5.0, 7.0])],
-    ]
-    expected = {"mean": 3.5, "std": 1.0, "max": 7.0, "mean_max": 4.5}
-    expected |= {"std_splits": 2.0, "std_seeds": 0.5}
-    assert summary(wide) == pytest.approx(expected)
-
-
-def test_table1_orders_the_models_as_the_paper_does():
-    table = paper.table1(datasets.load_trunk(), n_splits=3, n_seeds=2, n_jobs=1)
-    test = {(e["model"], e["learner"]): e["test"]["mean"] for e in table}
-    train = {(e["model"], e["learner"]): e["train"]["mean"] for e in table}
-    mechanical = test["mechanical, nominal", "-"]
-    assert test["hybrid on nominal", "ELM"] < test["hybrid on nominal", "linear"] < mechanical
-    assert test["hybrid on nominal", "ELM"] < test["data-driven", "ELM"]
-    assert test["data-driven", "ELM"] < test["data-driven", "linear"]
-    assert mechanical > 1.8 * test["hybrid on nominal", "ELM"]
-    assert train["data-driven", "ELM"] < test["data-driven", "ELM"]
-    assert test["hybrid on calibrated", "ELM"] < test["mechanical, calibrated", "-"]
 
 
 def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
@@ -115,27 +89,6 @@ def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
         assert (out / name).stat().st_size > 500
         assert str(out / name) in printed
     assert [p.name for p in tmp_path.iterdir()] == ["results"]
-
-
-def test_what_the_protocol_tells_about_the_geometry():
-    found = identifiability(datasets.load_trunk())
-    assert (found["n_train"], found["n_single"], found["n_random"]) == (1900, 1500, 400)
-    told = {entry["name"]: entry["told"] for entry in found["asked"]["entries"]}
-    assert all(told[f"radii[{k}]"] for k in range(3))
-    # A turn of all rings is one of the base, a rest bend is what the zeros of its sensors say.
-    assert not told["base[rot z]"]
-    assert not any(told[f"turns[{k}]"] for k in range(3))
-    assert not any(told[f"actuator_zeros[{k}]"] for k in range(9))
-    sentences = found["asked"]["unidentified"]
-    assert sum("turns" in line and "base[rot z]" in line for line in sentences) == 1
-    assert sum("rest_bends" in line and "actuator_zeros" in line for line in sentences) == 9
-    assert len(sentences) == 10
-    # Asked for once each, all is told, and the tip errs no more.
-    assert set(TELLABLE) < set(ASKED)
-    assert all(entry["told"] for entry in found["tellable"]["entries"])
-    assert found["tellable"]["unidentified"] == ()
-    assert found["tellable"]["test"] == pytest.approx(found["asked"]["test"], rel=0.01)
-    assert found["tellable"]["test"] < found["default"]["test"]
 
 
 def test_entries_of_a_calibration_have_units_a_user_reads(rng):

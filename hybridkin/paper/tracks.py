@@ -1,0 +1,193 @@
+"""Figs. 3 and 4 of Reinhart & Steil (2016): paths followed on the simulated trunk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+from joblib import delayed
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from hybridkin import plots, robots, trajectories
+from hybridkin._core.model import ForwardModel
+from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.ik.results import Track
+from hybridkin.ik.solver import InverseKinematics
+from hybridkin.ik.trajectories import Trajectory
+from hybridkin.learning.elm import ELMRegressor
+from hybridkin.paper.tables import PAPER_ELM, cell, chains_of, run_all
+from hybridkin.simulation import TrunkPlant
+from hybridkin.workflow.report import Progress, Report, quiet
+
+PAPER_TRACKING = {"mechanical, nominal": 4.16, "hybrid on nominal": 1.67}
+"""Mean tracking error of the paper, both paths [cm]."""
+
+PREFERRED = 0.25
+"""The preferred posture: straight, at medium elongation [m] (section 4)."""
+
+MODELS = (
+    *("mechanical, nominal", "mechanical, calibrated"),
+    *("hybrid on nominal", "hybrid on calibrated", "serial on calibrated"),
+)
+"""Models that steer the trunk, in the order of the report."""
+
+_MEASURED_SEED = 7
+
+Tracks: TypeAlias = dict[str, dict[str, Track]]
+"""By path and model."""
+
+
+def tracking(
+    models: Mapping[str, ForwardModel],
+    paths: Mapping[str, Trajectory],
+    plant_parameters: Mapping[str, Any],
+    feedback: str | None = "model",
+    *,
+    n_jobs: int | None = -1,
+    progress: Progress = quiet,
+) -> Tracks:
+    """Return, by path and model, how the plant follows commands computed on each model.
+
+    Parameters
+    ----------
+    models : dict of str to nn.Module
+        Forward models q -> x.
+    paths : dict of str to Trajectory
+        Target paths [m].
+    plant_parameters : dict
+        Arguments of `simulation.TrunkPlant`.
+    feedback : {"model", "measured"} or None, default="model"
+        "model": feed-forward, the commands are computed on the model alone; "measured": the loop is
+        closed over the measured tips.
+    n_jobs, progress
+        As in `table1`.
+
+    Returns
+    -------
+    dict of dict of Track
+        ``result[path][model]``; errors are those of the plant.
+
+    References
+    ----------
+    Reinhart & Steil (2016), section 4, Figs. 3 and 4.
+    """
+    pairs = [(path, model) for path in paths for model in models]
+    jobs = [delayed(_one_track)(models[m], paths[p], plant_parameters, feedback) for p, m in pairs]
+    runs = iter(run_all(jobs, n_jobs, progress, "tracking on the simulated trunk"))
+    return {path: {model: next(runs) for model in models} for path in paths}
+
+
+def paper_paths(n_points: int = 151) -> dict[str, Trajectory]:
+    """Return the figure eight and the spiral that `run_paper` tracks, in the trunk's frame."""
+    center = (0.0, 0.0, 0.70)
+    timing: dict[str, Any] = {"duration": 15.0, "dt": 15.0 / (n_points - 1), "timing": "uniform"}
+    return {
+        "figure eight": trajectories.figure_eight(center, (0.50, 0.25), **timing),
+        "spiral": trajectories.spiral(center, (0.05, 0.25), rise=0.08, turns=3.0, **timing),
+    }
+
+
+def tracked_models(q: NDArray, x: NDArray) -> dict[str, HybridForwardModel]:
+    """Return the models that steer the trunk, fitted to rows of one split."""
+    chains, models = chains_of(q, x), {}
+    for name, chain in chains.items():
+        elm = ELMRegressor(**PAPER_ELM, random_state=0)
+        models[f"mechanical, {name}"] = HybridForwardModel(chain, "drop")
+        models[f"hybrid on {name}"] = HybridForwardModel(chain, elm)
+    models["serial on calibrated"] = HybridForwardModel(
+        chains["calibrated"], "quadratic", coupling="serial"
+    )
+    return {name: models[name].fit(q, x) for name in MODELS}
+
+
+@threadpool_limits.wrap(limits=1)
+def _one_track(
+    model: ForwardModel,
+    path: Trajectory,
+    plant_parameters: Mapping[str, Any],
+    feedback: str | None,
+) -> Track:
+    (low, high), dt = robots.BHA_LENGTH_LIMITS, float(path.t[1] - path.t[0])
+    ik = InverseKinematics(model, q_min=low, q_max=high, q_pref=PREFERRED, dt=dt)
+    plant = TrunkPlant(**plant_parameters, random_state=_MEASURED_SEED)
+    return ik.track(path, plant=plant, feedback=feedback)
+
+
+def write_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Tracks) -> None:
+    """Add the feed-forward tracks to a report."""
+    paper = {name: f"{value:.2f}" for name, value in PAPER_TRACKING.items()}
+    errors = {path: {n: track.error for n, track in runs.items()} for path, runs in tracks.items()}
+    errors["both"] = {n: np.concatenate([e[n] for e in errors.values()]) for n in MODELS}
+    rows, record = [], {}
+    for label, by_model in errors.items():
+        record[label] = {}
+        for name, error in by_model.items():
+            lost = int(np.isnan(error).sum())
+            record[label][name] = stats = {**_statistics(error), "lost_steps": lost}
+            cells = [cell(stats), f"{100 * stats['p95']:.2f}", str(lost)]
+            rows.append([label, name, *cells, paper.get(name, "") if label == "both" else ""])
+    report.record["tracking"], both = record, record["both"]
+    report.record["tracking_mechanical_over_hybrid"] = ratios = {
+        name: both[f"mechanical, {name}"]["mean"] / both[f"hybrid on {name}"]["mean"]
+        for name in ("nominal", "calibrated")
+    }
+    report.text(
+        "## Figs. 3 and 4: tracking on the simulated trunk",
+        f"Each path of {len(paths['spiral'].x)} points becomes chamber lengths by eq. (1) on the "
+        "model alone (feed-forward; preferred posture: straight, 0.25 m), then moves the simulated "
+        "trunk with its measurement noise. The networks are trained on the 1900 rows of one split. "
+        "Tip error in cm: mean ± standard deviation (maximum).",
+        f"Mechanical over hybrid: **{ratios['nominal']:.2f}** on the nominal model, "
+        f"{ratios['calibrated']:.2f} on the calibrated one (paper: 2.5, from 4.16 to 1.67 cm).",
+    )
+    header = ["path", "model", "tracking error", "95 %", "steps not settled", "paper: mean"]
+    report.table(header, rows)
+    _draw_tracking(report, paths, tracks)
+
+
+def _draw_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Tracks) -> None:
+    shown = ("mechanical, nominal", "hybrid on nominal")
+    figure, axes = plots.new_figure(8.0, 6.4, 2, 2)
+    for column, (label, path) in zip(axes.T, paths.items(), strict=True):
+        reached = {name: tracks[label][name].x_measured for name in shown}
+        plots.TrackingDisplay(path.x, reached).plot(column[0]).plot_time(column[1])
+        column[0].set_title(label)
+    report.figure("tracking", figure, "Targets (black) and reached tips (Fig. 3).")
+    figure, ax = plots.new_figure(6.0, 3.0)
+    plots.ErrorBoxDisplay({f"{p}, {n}": tracks[p][n].error for p in tracks for n in shown}).plot(ax)
+    report.figure("tracking_error", figure, "Tracking error on the simulated trunk (Fig. 4, left).")
+    figure, axes = plots.new_figure(6.0, 5.0, 3, 1, sharex=True)
+    commanded = {name: tracks["figure eight"][name].q for name in shown}
+    plots.ActuatorDisplay(commanded, (3, 3, 3)).plot(axes)
+    report.figure("configurations", figure, "Chamber lengths on the figure eight (Fig. 4, right).")
+
+
+def write_closed_loop(report: Report, feed_forward: Tracks, closed: Tracks) -> None:
+    """Add the tracks with the measured tip fed back to a report."""
+    rows, record = [], {}
+    for name in MODELS:
+        cells, record[name] = [], {}
+        for label, tracks in (("feed-forward", feed_forward), ("closed loop", closed)):
+            runs = [by_model[name] for by_model in tracks.values()]
+            stats = _statistics(np.concatenate([track.error for track in runs]))
+            stats["largest_step"] = step = max(track.largest_step for track in runs)
+            record[name][label] = stats
+            cells += [cell(stats), f"{100 * stats['p95']:.2f}", f"{1e3 * step:.1f}"]
+        rows.append([name, *cells])
+    report.record["closed_loop"] = record
+    report.text(
+        "## With the measured tip fed back",
+        "Both paths, in cm: mean ± standard deviation (maximum), 95 %; and the largest change of "
+        "a chamber from one time step to the next, in mm. In the closed loop every step takes the "
+        "tip measured after the last one, noise included. The serial model has its error inside "
+        "the robot; it is not in the paper.",
+    )
+    report.table(["model", "feed-forward", "95 %", "step", "closed loop", "95 %", "step"], rows)
+
+
+def _statistics(error: NDArray) -> dict[str, Any]:
+    """Return statistics of tip errors [m] over the steps that settled."""
+    found = {"mean": np.nanmean(error), "std": np.nanstd(error)}
+    return {**found, "p95": np.nanpercentile(error, 95), "max": np.nanmax(error)}

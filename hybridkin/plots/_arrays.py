@@ -1,0 +1,67 @@
+"""Arrays checked as they come in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+T = TypeVar("T")
+
+
+def plain(value: Any, name: str = "array") -> NDArray:
+    """Return numbers of any kind, torch tensors too, as a float array of their own."""
+    value = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
+
+
+def shaped(value: ArrayLike, name: str, letters: str, n_rows: int | None = None) -> NDArray:
+    """Return an array whose shape agrees with `letters`, such as "N3".
+
+    Digits are sizes; the first letter stands for `n_rows`, or any number of rows. NaN is allowed.
+    """
+    array = plain(value, name)
+    need = [*letters] if n_rows is None else [str(n_rows), *letters[1:]]
+    fits = array.ndim == len(need)
+    if not fits or any(x.isdigit() and int(x) != n for x, n in zip(need, array.shape, strict=True)):
+        raise ValueError(f"`{name}` must have shape ({', '.join(need)}), got {array.shape}.")
+    return array
+
+
+def times(value: ArrayLike | None, n_rows: int) -> NDArray | None:
+    """Return times (T,) [s] that increase, or None."""
+    if value is None:
+        return None
+    t = plain(value, "t")
+    if t.shape != (n_rows,):
+        raise ValueError(f"`t` must have shape ({n_rows},), one time per row, got {t.shape}.")
+    if not (np.diff(t) > 0.0).all():
+        raise ValueError("`t` must increase [s]; sort the rows and drop repeated or unknown times.")
+    return t
+
+
+def named(value: Mapping[str, T], name: str) -> dict[str, T]:
+    """Return a mapping as a dict, checked; a single object in its place raises."""
+    if not isinstance(value, Mapping) or not value:
+        raise ValueError(
+            f"`{name}` must be a mapping from names to arrays, at least one, got {value!r:.80}; "
+            f"write {{'model': ...}} for a single one."
+        )
+    return {str(key): item for key, item in value.items()}
+
+
+def positions(x: ArrayLike) -> NDArray:
+    """Return tips (N, m) [m]; of poses (N, 6) the position."""
+    x = plain(x, "x")
+    return x[:, :3] if x.ndim == 2 and x.shape[1] == 6 else x
+
+
+def distance(a: NDArray, b: NDArray) -> NDArray:
+    """Return the distances of rows, NaN where either is not known."""
+    return np.linalg.norm(a - b, axis=-1)

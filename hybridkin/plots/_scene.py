@@ -1,0 +1,80 @@
+"""What moves in a film or a page, as plain arrays, and the figure that shows it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from hybridkin.plots._canvas import COLORS, label_space
+
+
+class Line(NamedTuple):
+    """One part of a picture in all configurations, several strokes with NaN between them."""
+
+    label: str
+    points: NDArray  # (K, M, 3)
+    color: str
+    width: float
+    marker: str = ""
+    style: str = "-"
+
+    def look(self) -> dict[str, Any]:
+        """Return the look as matplotlib names it."""
+        look = {"color": self.color, "linewidth": self.width, "linestyle": self.style}
+        return look | {"marker": self.marker, "markersize": 6}
+
+
+class Scene(NamedTuple):
+    """A motion of T rows, K of them frames, in the unit of the axes."""
+
+    unit: str
+    low: NDArray  # (3,) corners of the box in which everything happens
+    high: NDArray
+    x: NDArray  # (T, 3) path reached
+    target: NDArray | None  # (T, 3)
+    error: NDArray | None  # (T,)
+    steps: NDArray  # (T,) of the time axis
+    when: str  # its name
+    rows: NDArray  # (K,) that are frames
+    moving: list[Line]
+    captions: list[str]
+
+
+class Stage:
+    """Axes that show one frame of a scene after another."""
+
+    def __init__(self, scene: Scene, ax: Any, error_ax: Axes | None = None) -> None:
+        self.scene, self.title_ax = scene, ax if error_ax is None else error_ax
+        for name, low, high in zip("xyz", scene.low, scene.high, strict=True):
+            ax.set(**{f"{name}lim": (low, high)})
+        label_space(ax, scene.unit)
+        if scene.target is not None:
+            ax.plot(*scene.target.T, color="black", linewidth=1.0, label="target")
+        self.trail = ax.plot([], [], [], color=COLORS[0], linewidth=1.2, linestyle="--")[0]
+        self.moving = [
+            (ax.plot([], [], [], label=line.label or None, **line.look())[0], line)
+            for line in scene.moving
+        ]
+        ax.legend(frameon=False, fontsize="small", loc="upper left", bbox_to_anchor=(-0.25, 1.0))
+        self.cursor = None
+        if error_ax is not None and scene.error is not None:
+            error_ax.plot(scene.steps, scene.error, color=COLORS[0], linewidth=1.5)
+            error_ax.set(xlabel=scene.when, ylabel=f"tip error [{scene.unit}]")
+            error_ax.set_ylim(bottom=0.0)
+            line = error_ax.axvline(scene.steps[0], color="black", linewidth=1.0)
+            self.cursor = (line, error_ax.plot([], [], "o", color=COLORS[0])[0])
+
+    def show(self, k: int) -> None:
+        """Move everything to frame k."""
+        scene, row = self.scene, self.scene.rows[k]
+        self.trail.set_data_3d(*scene.x[: row + 1].T)
+        for artist, line in self.moving:
+            artist.set_data_3d(*line.points[k].T)
+        self.title_ax.set_title(scene.captions[k], fontsize="medium")
+        if self.cursor is not None and scene.error is not None:
+            line, dot = self.cursor
+            line.set_xdata(np.repeat(scene.steps[row], 2))
+            dot.set_data([scene.steps[row]], [scene.error[row]])

@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+
+from hybridkin import datasets, paper
+from hybridkin.paper.identifiability import ASKED, IDENTIFIABLE, identifiability
+from hybridkin.paper.tables import summary
+
+
+def test_the_kinds_of_spread_differ():
+    wide = [
+        [np.array([0.0, 2.0]), np.array([1.0, 3.0])],
+        [np.array([4.0, 6.0]), np.array([5.0, 7.0])],
+    ]
+    expected = {"mean": 3.5, "std": 1.0, "max": 7.0, "mean_max": 4.5}
+    expected |= {"std_splits": 2.0, "std_seeds": 0.5}
+    assert summary(wide) == pytest.approx(expected)
+
+
+def test_table1_orders_the_models_as_the_paper_does():
+    table = paper.table1(datasets.load_trunk(), n_splits=3, n_seeds=2, n_jobs=1)
+    test = {(e["model"], e["learner"]): e["test"]["mean"] for e in table}
+    train = {(e["model"], e["learner"]): e["train"]["mean"] for e in table}
+    mechanical = test["mechanical, nominal", "-"]
+    assert test["hybrid on nominal", "ELM"] < test["hybrid on nominal", "linear"] < mechanical
+    assert test["hybrid on nominal", "ELM"] < test["data-driven", "ELM"]
+    assert test["data-driven", "ELM"] < test["data-driven", "linear"]
+    assert mechanical > 1.8 * test["hybrid on nominal", "ELM"]
+    assert train["data-driven", "ELM"] < test["data-driven", "ELM"]
+    assert test["hybrid on calibrated", "ELM"] < test["mechanical, calibrated", "-"]
+
+
+def test_which_geometry_the_protocol_identifies():
+    found = identifiability(datasets.load_trunk())
+    assert (found["n_train"], found["n_single"], found["n_random"]) == (1900, 1500, 400)
+    identified = {entry["name"]: entry["told"] for entry in found["asked"]["entries"]}
+    assert all(identified[f"radii[{k}]"] for k in range(3))
+    # A turn of all rings equals one of the base, a rest bend equals zeros of its sensors.
+    assert not identified["base[rot z]"]
+    assert not any(identified[f"turns[{k}]"] for k in range(3))
+    assert not any(identified[f"actuator_zeros[{k}]"] for k in range(9))
+    sentences = found["asked"]["unidentified"]
+    assert sum("turns" in line and "base[rot z]" in line for line in sentences) == 1
+    assert sum("rest_bends" in line and "actuator_zeros" in line for line in sentences) == 9
+    assert len(sentences) == 10
+    # Asked for once each, all are identified, and the tip error is the same.
+    assert set(IDENTIFIABLE) < set(ASKED)
+    assert all(entry["told"] for entry in found["identifiable"]["entries"])
+    assert found["identifiable"]["unidentified"] == ()
+    assert found["identifiable"]["test"] == pytest.approx(found["asked"]["test"], rel=0.01)
+    assert found["identifiable"]["test"] < found["default"]["test"]
