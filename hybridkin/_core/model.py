@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.stored import Stored
+
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
 
@@ -83,6 +85,22 @@ class ForwardModel(PortableModule):
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies within the domain of the model, shape (...), bool."""
         return self.domain_distance(q) <= 1.0
+
+    def stored(self) -> Stored:
+        """Return how the model describes itself: kind, settings, arrays and parts.
+
+        Its class builds it again with ``from_stored(stored)``.
+
+        Raises
+        ------
+        TypeError
+            For models that could only be stored as code.
+        """
+        raise TypeError(
+            f"a {type(self).__name__} could only be stored as code; a saved model is made of "
+            "chains (ConstantCurvatureChain, ElasticTendonChain, RigidChain) and of error models "
+            "given by name, ELMs, a LinearRegression or a KernelRidge with the kernel 'rbf'."
+        )
 
     # Serial coupling corrects a model inside, at coordinates z between q and x. By default z is q.
 

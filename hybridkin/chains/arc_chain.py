@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.stored import Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin.chains._arcs import arc_transforms, tip, tip_and_columns
 from hybridkin.chains._checks import check_replacements
@@ -31,6 +33,10 @@ class ArcChain(Chain):
     _structure: ClassVar[tuple[str, ...]] = (
         *("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at"),
     )
+
+    kind: ClassVar[str]  # of its description
+    _counts: ClassVar[str]  # what the constructor calls the actuators per segment
+    _options: ClassVar[dict[str, type]] = {"routing": str}
 
     n_segments: int
     actuators_per_segment: tuple[int, ...]
@@ -372,3 +378,26 @@ class ArcChain(Chain):
             return J.reshape(*q.shape[:-1], 3, self.n_actuators)
         J = torch.matmul(slope.T, columns)  # (3, n, N)
         return J.permute(2, 0, 1).reshape(*q.shape[:-1], 3, self.n_actuators)
+
+    def stored(self) -> Stored:
+        """Return how the chain describes itself: its geometry and how it is routed."""
+        names = ("actuators_per_segment", "tip_at", *self._options)
+        settings = {name: vars(self)[name] for name in names}
+        return Stored.of(self.kind, self.geometry(), **settings)
+
+    @classmethod
+    def from_stored(cls, stored: Stored) -> Self:
+        """Return the chain of a description."""
+        counts = stored.list_of(int, "actuators_per_segment")
+        entries: dict[str, Any] = {
+            name: stored.array(name)
+            for name in cls._entries
+            if name != "lengths" or name in stored.arrays
+        }
+        if sum(counts) != len(entries["angles"]):
+            raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
+        entries["angles"] = np.split(entries["angles"], np.cumsum(counts)[:-1])
+        entries |= {name: stored.value(name, kind) for name, kind in cls._options.items()}
+        dtype = torch.from_numpy(entries["base"]).dtype
+        chain = cls(**entries, **{cls._counts: counts}, dtype=dtype)
+        return chain.with_tip(stored.value("tip_at", float))

@@ -82,6 +82,8 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
+    kind = "constant_curvature"
+    _counts = "n_actuators"
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
 
     radii: Tensor

@@ -6,7 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -127,6 +127,9 @@ class ElasticTendonChain(ArcChain):
     tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
     """
 
+    kind = "elastic_tendons"
+    _counts = "n_tendons"
+    _options: ClassVar[dict[str, type]] = {"routing": str, "smoothing": float}
     _entries = (*_SHAPING, "lengths", "offsets", "base")
     _structure = (*ArcChain._structure, "smoothing", "_table")  # the table knows its geometry
 

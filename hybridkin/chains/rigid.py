@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.stored import Stored
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arm_files import Joint, chain_path, limits_of, mjcf_path, urdf_path
 from hybridkin.chains._checks import check_finite_rows, check_replacements, pose
@@ -595,6 +596,21 @@ class RigidChain(Chain):
         for step in steps[1:]:
             frames.append(frames[-1] @ step)
         return torch.stack(frames, dim=-3)
+
+    def stored(self) -> Stored:
+        """Return how the arm describes itself: its joints, their limits, tool and base."""
+        arrays = {"origins": self.origins, "axes": self.axes, "tip": self.tip, "tool": self.tool}
+        arrays |= {"q_min": self.q_min, "q_max": self.q_max, "base": self.base}
+        return Stored.of("rigid", arrays, kinds=self.kinds, names=self.names)
+
+    @classmethod
+    def from_stored(cls, stored: Stored) -> RigidChain:
+        """Return the arm of a description."""
+        geometry = {name: stored.array(name) for name in ("origins", "axes", "tip", "tool", "base")}
+        limits = {name: stored.array(name, finite=False) for name in ("q_min", "q_max")}
+        kinds, names = (stored.list_of(str, key) for key in ("kinds", "names"))
+        dtype = torch.from_numpy(geometry["base"]).dtype
+        return cls(**geometry, **limits, kinds=kinds, names=names, dtype=dtype)
 
 
 def _motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:

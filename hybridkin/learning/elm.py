@@ -11,6 +11,7 @@ from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
+from hybridkin._core.stored import Stored, estimator_of, feature_names, params_of
 from hybridkin.learning._ridge import Statistics, accumulate, fit_readout, merge
 from hybridkin.learning.network import ACTIVATIONS, ELM, LAYER, READOUT
 
@@ -463,3 +464,43 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             except RuntimeError:
                 device = torch.device("cpu")
             self._build(device)
+
+    def stored(self):
+        """Return how the fitted network describes itself, with what `partial_fit` goes on from."""
+        check_is_fitted(self, "module_")
+        arrays = {"mean": self._stats.mean, "scatter": self._stats.scatter}
+        return Stored.of(
+            "elm_regressor",
+            {**arrays, "noise_variance": self.noise_variance_},
+            {"network": self.module_.stored()},
+            params=params_of(self),
+            solver=self.solver_,
+            n_samples_seen=self.n_samples_seen_,
+            y_ndim=self._y_ndim,
+            feature_names_in=vars(self).get("feature_names_in_", []),
+        )
+
+    @classmethod
+    def from_stored(cls, stored):
+        """Return the fitted network of a description."""
+        elm = estimator_of(cls, stored.value("params", dict))
+        network = ELM.from_stored(stored.part("network"))
+        n_outputs, n_both = network.n_outputs, sum(network.output_weights.shape)
+        mean, scatter = stored.array("mean", (n_both,)), stored.array("scatter", (n_both, n_both))
+        seen, y_ndim = stored.value("n_samples_seen", float), stored.value("y_ndim", int)
+        if y_ndim not in (1, 2):
+            raise ValueError(f"`y_ndim` must be 1 or 2, got {y_ndim}")
+        state = {f"{name}_": value.numpy() for name, value in network.state_dict().items()}
+        state |= {
+            "noise_variance_": stored.array("noise_variance", (n_outputs,), finite=False),
+            "solver_": stored.value("solver", str),
+            "n_samples_seen_": seen,
+            "n_features_in_": network.n_actuators,
+            "_activation": network.activation,
+            "_y_ndim": y_ndim,
+            "_stats": Statistics(seen, mean, scatter),
+        }
+        names = feature_names(stored, network.n_actuators)
+        state |= {} if names is None else {"feature_names_in_": names}
+        elm.__setstate__({**elm.get_params(), **state})
+        return elm

@@ -19,10 +19,12 @@ from torch.autograd.function import once_differentiable
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.stored import Stored
 
 __all__ = ["AffineModule", "KernelModule", "PolynomialModule", "RegressorModule", "error_module"]
 
 _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
+_MOST_POWER = 100
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
 
 
@@ -95,6 +97,16 @@ class AffineModule(ForwardModel):
         """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
         coef, bias = (part.cpu().double().numpy().copy() for part in (self.coef, self.bias))
         return lambda q: (coef.dot(q) + bias, coef.copy())
+
+    def stored(self) -> Stored:
+        """Return how the module describes itself."""
+        return Stored.of("affine", {"coef": self.coef, "bias": self.bias})
+
+    @classmethod
+    def from_stored(cls, stored: Stored) -> AffineModule:
+        """Return the module of a description."""
+        arrays = stored.shaped(coef="mn", bias="m")
+        return cls(arrays["coef"], arrays["bias"])
 
 
 class PolynomialModule(ForwardModel):
@@ -181,6 +193,21 @@ class PolynomialModule(ForwardModel):
             phi = phi * table[..., j, :].index_select(-1, self.powers[:, j])
         return phi
 
+    def stored(self) -> Stored:
+        """Return how the module describes itself; its monomials include their derivatives."""
+        arrays = {"powers": self.powers.double(), "readout": self.readout}
+        arrays |= {"center": self.center, "scale": self.scale}
+        return Stored.of("polynomial", arrays)
+
+    @classmethod
+    def from_stored(cls, stored: Stored) -> PolynomialModule:
+        """Return the module of a description."""
+        arrays = stored.shaped(powers="pn", readout="pm", center="n", scale="n")
+        if not np.isin(arrays["powers"], range(_MOST_POWER)).all():
+            raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
+        coef = arrays["readout"].T
+        return cls(arrays["powers"], coef, 0.0, arrays["center"], arrays["scale"])
+
 
 class KernelModule(ForwardModel):
     """A sum of Gaussians ``weights' exp(-|(u - u_i) / widths|^2 / 2) + bias`` at training rows.
@@ -260,6 +287,17 @@ class KernelModule(ForwardModel):
         towards = (kernel @ self.tangent.to(q)).unflatten(-1, (-1, q.shape[-1]))
         J = (towards - value[..., None] * u[..., None, :]) / self.scale.to(q)
         return value + self.bias.to(q), J
+
+    def stored(self) -> Stored:
+        """Return how the module describes itself."""
+        arrays = {"rows": self.rows, "weights": self.weights, "bias": self.bias}
+        return Stored.of("kernel", {**arrays, "center": self.center, "scale": self.scale})
+
+    @classmethod
+    def from_stored(cls, stored: Stored) -> KernelModule:
+        """Return the module of a description, whose rows are in units of the widths."""
+        arrays = stored.shaped(rows="kn", weights="km", bias="m", center="n", scale="n")
+        return cls(**arrays, widths=1.0)
 
 
 class RegressorModule(ForwardModel):
