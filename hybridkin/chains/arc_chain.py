@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +20,16 @@ from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+class Frames(NamedTuple):
+    """The frames after all segments, offsets included, in the base frame; N rows come last."""
+
+    axes: Tensor  # (3, 3, S, N): axis, component
+    points: Tensor  # (3, S, N) origins [m]
+    moves: Tensor  # (3, 3, S, N): how the robot's end moves by lengths, x- and y-bendings
+    spins: Tensor  # (3, 3, S, N): how it turns by these
+    slope: Tensor  # of the arcs by q, (3 S, n) or (3 S, n, N)
 
 
 class ArcChain(Chain):
@@ -205,6 +215,21 @@ class ArcChain(Chain):
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)`."""
         return self.pose(q), self.pose_jacobian(q)
+
+    def frames_and_moves(self, rows: Tensor) -> Frames:
+        """Return the frames after all segments at rows q (N, n), and what moves the last one."""
+        arcs, slope = self._arcs_and_slope(rows)
+        length, bending = self._split(arcs)
+        S, offsets = len(length), self.offsets.to(arcs)
+        columns = tip_and_columns(length, bending, offsets, angular=True, rigid=True)[1]
+        moves, spins, z = columns.split([3 * S, 3 * S, S], dim=1)
+        # An arc of length l and bending b goes l c along c, the derivative by its length, and
+        # turns the axes across it by -b c.
+        along = moves[:, :S]
+        x, y = torch.eye(3).to(arcs)[:2, :, None, None] - (bending[:, None] * along).cumsum(2)
+        points = (length * along + offsets[:, None] * z).cumsum(1)
+        moves, spins = (part.unflatten(1, (3, S)) for part in (moves, spins))
+        return Frames(torch.stack([x, y, z]), points, moves, spins, slope)
 
     def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
         """Return points along the whole backbone, base to end.

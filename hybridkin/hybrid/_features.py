@@ -1,16 +1,22 @@
-"""Features of the actuators for linear readouts: a linear part and one that bends."""
+"""Features phi(q) of the actuators, linear ones first, and readouts W phi(q) of them."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from hybridkin._core.blocks import check_vectors
-from hybridkin._core.model import PortableModule
+from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin.chains.arc_chain import ArcChain, Frames
 from hybridkin.learning.network import ACTIVATIONS
+
+
+_POSE_BLOCK = 2048  # rows of pose features, whose temporaries stay in the cache
+_BLOCK = 2**18  # numbers in the features of a block of rows, which stay in the cache
 
 
 class Features(PortableModule):
@@ -140,3 +146,132 @@ class HiddenFeatures(Features):
     def _hidden(self, u: Tensor) -> tuple[Tensor, Tensor]:
         a = u @ self.input_weights.to(u).mT + self.input_bias.to(u)
         return a, ACTIVATIONS[self.activation][0](a)
+
+
+class PoseFeatures(Features):
+    """The linear features, then axes of the segments and moments of loads about the segments.
+
+    What bends a soft robot besides its actuators are mostly loads: its weight and what it carries.
+    A load of direction g at the robot's end turns the frame after segment s with the moment d x g,
+    d being the lever from that frame to the end. Seen in the frame itself, whose axes are a_i, it
+    has the components a_i . (d x g) = g . (a_i x d), and the load the components g . a_i. So the
+    features are, for S segments and with all vectors in the base frame,
+
+    - the lever from the base to the end: 3 numbers, which stand for the moments at the base;
+    - segment by segment the axes a_i of the frame after it, 9 numbers, and but for the last
+      segment the moments a_i x d about that frame, 9 numbers; a frame includes the rigid offset.
+
+    These are 18 S - 6 features. Levers are divided by the reach of the chain, so all are numbers
+    without unit and of the order of one. They need no direction of gravity: the weights learn it.
+    The pose of the base changes nothing here. Levers reach to the robot's end also where another
+    point is steered.
+
+    Parameters
+    ----------
+    center, scale : Tensor of shape (n,)
+        Map of the training range to [-1, 1] [unit of q].
+    chain : ArcChain
+        The robot; its parameters and buffers are those of the features, too.
+    """
+
+    def __init__(self, center: Tensor, scale: Tensor, chain: ArcChain) -> None:
+        super().__init__(center, scale)
+        self.chain = chain
+
+    def _bent(self, u: Tensor) -> tuple[Tensor, ...]:
+        return in_blocks(self._rows_bent, u, _POSE_BLOCK)
+
+    def _bent_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        value, slope = in_blocks(partial(self._rows_readout, weights=weights), u, _POSE_BLOCK)
+        return value, slope
+
+    def _rows_bent(self, u: Tensor) -> tuple[Tensor]:
+        vectors, lever, _ = self._vectors(u)
+        return (torch.cat([lever, *vectors]).mT,)
+
+    def _rows_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        # Virtual work: the weights are forces on vectors. Those of a frame turn as one with every
+        # segment before them; every segment after them moves the end of their lever.
+        vectors, lever, frames = self._vectors(u)
+        moves, spins, slope = frames.moves / self.chain.reach.to(u), frames.spins, frames.slope
+        C = len(weights)
+        at_base, *forces = weights.split([3, *(len(part) for part in vectors)], dim=1)
+        value = at_base @ lever
+        pulls = [at_base[:, :, None]]  # on the end, by the frames before a segment
+        turns = []  # by the frames after a segment
+        for force, part in zip(forces, vectors, strict=True):
+            value = value + force @ part
+            turning = _turning(force)
+            turns.append((turning @ part).unflatten(0, (C, 3)))
+            if len(turns) < len(vectors):
+                pulls.append(pulls[-1] - (turning[:, 9:] @ part[:9]).unflatten(0, (C, 3)))
+        work = []
+        for k in reversed(range(len(turns))):
+            if k + 1 < len(turns):
+                turns[k] += turns[k + 1]
+            own = pulls[k][:, 0, None] * moves[0, :, k]
+            for axis in (1, 2):
+                own.addcmul_(pulls[k][:, axis, None], moves[axis, :, k])
+            for axis in (0, 1, 2):  # a length turns nothing
+                own[:, 1:].addcmul_(turns[k][:, axis, None], spins[axis, 1:, k])
+            work.append(own)
+        by_arcs = torch.stack(work[::-1], 2).flatten(1, 2)  # (C, 3 S, N)
+        scale = self.scale.to(u)
+        if slope.ndim == 2:
+            by_inputs = ((slope * scale).mT @ by_arcs).flatten(0, 1)
+            return value.mT, by_inputs.mT.contiguous().unflatten(1, (C, -1))
+        return value.mT, by_arcs.permute(2, 0, 1) @ slope.permute(2, 0, 1) * scale
+
+    def _vectors(self, u: Tensor) -> tuple[list[Tensor], Tensor, Frames]:
+        """Return the features of every frame, the lever from the base, and the frames.
+
+        The features are axes and moments (18, N) of every frame, the last without moments (9, N);
+        the lever is (3, N), over the reach.
+        """
+        frames = self.chain.frames_and_moves(u * self.scale.to(u) + self.center.to(u))
+        reach = self.chain.reach.to(u)
+        a, b, c = (frames.points[:, -1:] - frames.points) / reach
+        x, y, z = frames.axes.unbind(1)
+        moments = torch.stack([y * c - z * b, z * a - x * c, x * b - y * a], 1)
+        vectors = torch.cat([frames.axes, moments]).flatten(0, 1).unbind(1)
+        return [*vectors[:-1], vectors[-1][:9]], frames.points[:, -1] / reach, frames
+
+
+def _turning(forces: Tensor) -> Tensor:
+    """Return the map (3 C, 3 Y) of vectors y to the moments sum y x f of forces f (C, 3 Y)."""
+    fx, fy, fz = forces.unflatten(1, (-1, 3)).unbind(2)
+    zero = torch.zeros_like(fx)
+    rows = [zero, fz, -fy, -fz, zero, fx, fy, -fx, zero]  # y x f, by the components of y
+    return torch.stack(rows, -1).unflatten(-1, (3, 3)).permute(0, 2, 1, 3).reshape(3 * len(fx), -1)
+
+
+class Readout(ForwardModel):
+    """The readout W phi(q) as a torch module q (..., n) -> (..., C).
+
+    Parameters
+    ----------
+    features : Features
+        phi, with its slope.
+    weights : Tensor of shape (C, P)
+        W [unit of the outputs].
+    """
+
+    weights: Tensor
+
+    def __init__(self, features: Features, weights: Tensor) -> None:
+        super().__init__()
+        self.features = features
+        self.register_buffer("weights", weights)
+        self.n_actuators, self.n_outputs = len(features.center), len(weights)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return W phi(q), shape (..., C)."""
+        return self.features(q) @ self.weights.to(q).mT
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return W phi(q) (..., C) and its derivative (..., C, n)."""
+        rows = min(4096, max(256, _BLOCK // self.weights.shape[1]))
+        value, slope = in_blocks(
+            partial(self.features.readout, weights=self.weights.to(q)), q, rows
+        )
+        return value, slope

@@ -1,41 +1,31 @@
-"""Where a learned error model may be trusted: smooth weights from leverage or from a box."""
+"""Where a learned correction is trusted: smooth weights from a leverage or from a box."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from typing import Any
-
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.linalg import lapack
-from torch import Tensor, nn
+from torch import Tensor
 
 from hybridkin._core.model import PortableModule, reverse_jacobian
-from hybridkin.ik._realtime import NumpyFunction, numpy_function
+from hybridkin.learning.network import LeverageModule
 
-__all__ = ["GUARDS", "BoxGuard", "Guard", "LeverageGuard", "QuadraticReadout", "fit_guard"]
-
-_STILL = 1e-3  # of the largest spread: the log does not go there
-_AS_IF = 0.1  # of the range: spread that is taken for granted there
+__all__ = ["GUARDS", "BoxGuard", "Guard", "LeverageGuard", "QuadraticLeverage", "fit_guard"]
 
 GUARDS = ("leverage", "box", None)
-
-NumpyStrangeness = Callable[[NDArray], tuple[float, "NDArray | None"]]
+_STILL = 1e-3  # of the largest spread: the log does not move in such a direction
+_AS_IF = 0.1  # of the range: the spread that is assumed in such a direction
 
 
 class Guard(PortableModule):
-    """Trust in an error model: a weight w(q), and a length that no correction goes far beyond.
+    """Trust in a correction: a weight g(q), and a length that no correction exceeds by far.
 
-    The weight is 1 where `strangeness` is at most 1, and fades beyond. Both are twice continuously
-    differentiable, so the full Jacobian stays continuous.
+    The weight is 1 where `domain_distance` is at most 1, and fades outside. Weight and shortening
+    are twice continuously differentiable, so the full Jacobian is continuous.
 
     Parameters
     ----------
     largest : Tensor of shape ()
-        The longest correction of a training row [m]. Longer ones are shortened, to less than
-        `MOST` times this: nowhere can the hybrid be farther than that from the mechanical model.
+        The longest correction of a training row [m]. Longer ones are shortened to less than
+        `MOST` times this: nowhere is the hybrid farther than that from the mechanical model.
     """
 
     MOST = 1.5
@@ -49,172 +39,105 @@ class Guard(PortableModule):
         """Return how far q is from the training rows, at most 1 among them, shape (...)."""
         raise NotImplementedError
 
+    def distance_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `domain_distance(q)` (N,) and its derivative (N, n) at rows q (N, n)."""
+        distance, gradient = reverse_jacobian(lambda rows: self.domain_distance(rows)[..., None], q)
+        return distance[:, 0], gradient[:, 0]
+
     def forward(self, q: Tensor) -> Tensor:
-        """Return w(q), shape (..., 1)."""
-        beyond = (self.domain_distance(q) - 1.0).clamp(min=0.0)
-        return self._weight(beyond)[..., None]
+        """Return g(q), shape (..., 1)."""
+        excess = (self.domain_distance(q) - 1.0).clamp(min=0.0)
+        return (1.0 / (1.0 + excess**3))[..., None]
 
     def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return w(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
-        strangeness, gradient = self._strangeness_and_gradient(q)
-        beyond = (strangeness - 1.0).clamp(min=0.0)
-        weight = self._weight(beyond)
-        slope = -3.0 * (beyond * weight) ** 2
+        """Return g(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
+        distance, gradient = self.distance_and_gradient(q)
+        excess = (distance - 1.0).clamp(min=0.0)
+        weight = 1.0 / (1.0 + excess**3)
+        slope = -3.0 * (excess * weight) ** 2
         return weight[:, None], (slope[:, None] * gradient)[:, None]
 
-    def _strangeness_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        strangeness, gradient = reverse_jacobian(
-            lambda rows: self.domain_distance(rows)[..., None], q
-        )
-        return strangeness[:, 0], gradient[:, 0]
+    def shortened(self, correction: Tensor) -> Tensor:
+        """Return corrections (..., m), those longer than the largest shortened [m]."""
+        relative = self._relative(correction)
+        return correction * (self._kept(relative)[0] / relative)
 
-    def numpy_function(self) -> NumpyStrangeness:
-        """Return a NumPy function q (n,) -> strangeness, and its gradient (n,) where above 1."""
-        raise NotImplementedError
-
-    def numpy_correction(self, error: nn.Module) -> NumpyFunction:
-        """Return a NumPy function q (n,) -> the guarded correction (m,) and its Jacobian (m, n)."""
-        correction = self._numpy_parts(error)
-        largest = float(self._unit(self.largest.double()))
-
-        def guarded(q: NDArray) -> tuple[NDArray, NDArray]:
-            x, J, strangeness, gradient = correction(q)
-            if strangeness > 1.0:
-                beyond = strangeness - 1.0
-                weight = self._weight(beyond)
-                slope = -3.0 * (beyond * weight) ** 2 * gradient
-                x, J = weight * x, weight * J + x[:, None] * slope
-            relative = math.sqrt(x.dot(x)) / largest
-            if relative > 1.0:
-                kept, slope = self._kept(relative, math.tanh)
-                factor = kept / relative
-                fading = (slope - factor) / (relative * largest) ** 2 * x.dot(J)
-                x, J = factor * x, factor * J + x[:, None] * fading
-            return x, J
-
-        return guarded
-
-    def _numpy_parts(self, error: nn.Module) -> Callable[[NDArray], Any]:
-        """Return a NumPy function q -> correction, Jacobian, strangeness and its gradient."""
-        correction, strangeness = numpy_function(error), self.numpy_function()
-        return lambda q: (*correction(q), *strangeness(q))
-
-    def shortened(self, error: Tensor) -> Tensor:
-        """Return corrections (..., m), those beyond the largest shortened [m]."""
-        relative = self._relative(error)
-        return error * (self._kept(relative)[0] / relative)
-
-    def shortened_with_jacobian(self, error: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the same of corrections (N, m), and their Jacobians (N, m, n)."""
-        long = (self._relative(error) > 1.0).nonzero()[:, 0]
+    def shortened_with_jacobian(self, correction: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `shortened` of corrections (N, m), and the Jacobians (N, m, n) of the result."""
+        long = self.is_long(correction).nonzero()[:, 0]
         if not len(long):
-            return error, J
-        own, J_own = error[long], J[long]
+            return correction, J
+        own, J_own = correction[long], J[long]
         relative = self._relative(own)
         kept, slope = self._kept(relative)
+        # d(factor c) = factor dc + c d(factor), and the factor depends on the length of c alone.
         factor = kept / relative
-        along = (own[:, None] @ J_own)[:, 0] / (relative * self._unit(own) ** 2)
-        fading = (slope - factor) / relative * along
-        J_own = factor[..., None] * J_own + own[..., None] * fading[:, None]
-        return error.index_copy(0, long, factor * own), J.index_copy(0, long, J_own)
+        d_relative = (own[:, None] @ J_own)[:, 0] / (relative * self._unit(own) ** 2)
+        d_factor = (slope - factor) / relative * d_relative
+        J_own = factor[..., None] * J_own + own[..., None] * d_factor[:, None]
+        return correction.index_copy(0, long, factor * own), J.index_copy(0, long, J_own)
 
-    def is_long(self, error: Tensor) -> Tensor:
+    def is_long(self, correction: Tensor) -> Tensor:
         """Return which corrections (..., m) are longer than the largest, shape (...)."""
-        return self._relative(error)[..., 0] > 1.0
+        return self._relative(correction)[..., 0] > 1.0
 
-    def _unit(self, error: Tensor) -> Tensor:
-        return self.largest.to(error).clamp(min=torch.finfo(error.dtype).tiny ** 0.25)
+    def _unit(self, correction: Tensor) -> Tensor:
+        return self.largest.to(correction).clamp(min=torch.finfo(correction.dtype).tiny ** 0.25)
 
-    def _relative(self, error: Tensor) -> Tensor:
-        # Up to the largest it counts as one: the root stays smooth, and nothing changes.
-        squares = (error / self._unit(error)).square().sum(-1, keepdim=True)
+    def _relative(self, correction: Tensor) -> Tensor:
+        # Lengths up to the largest count as one: the root stays smooth, and nothing changes.
+        squares = (correction / self._unit(correction)).square().sum(-1, keepdim=True)
         return squares.clamp(min=1.0).sqrt()
 
-    def _kept(self, relative: Any, tanh: Callable[[Any], Any] = torch.tanh) -> tuple[Any, Any]:
-        """Return the length kept of one, both in units of the largest, and its slope."""
-        over = self.MOST - 1.0
-        bent = tanh((relative - 1.0) / over)
-        return 1.0 + over * bent, 1.0 - bent * bent
-
-    @staticmethod
-    def _weight(beyond: Any) -> Any:
-        return 1.0 / (1.0 + beyond**3)
+    def _kept(self, relative: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the length kept of a relative length of at least 1, and its derivative."""
+        room = self.MOST - 1.0
+        bent = torch.tanh((relative - 1.0) / room)
+        return 1.0 + room * bent, 1.0 - bent * bent
 
 
 class LeverageGuard(Guard):
-    """Strangeness by the leverage phi^T (G + lambda 1)^-1 phi of a ridge readout.
+    """Distance from the training rows by the leverage phi^T (G + lambda 1)^-1 phi of a model.
 
     Parameters
     ----------
-    readout : nn.Module
-        With ``leverage(q)`` of shape (...).
+    model : LeverageModule
+        Gives the leverage: the error model itself, or a `QuadraticLeverage`.
     limit : Tensor of shape ()
-        The leverage that counts as strangeness 1.
+        The leverage at distance 1.
     largest : Tensor of shape ()
         The longest correction of a training row [m].
     """
 
     limit: Tensor
 
-    def __init__(self, readout: nn.Module, limit: Tensor, largest: Tensor) -> None:
+    def __init__(self, model: LeverageModule, limit: Tensor, largest: Tensor) -> None:
         super().__init__(largest)
-        self.readout = readout
+        self.model = model
         self.register_buffer("limit", limit)
 
     @classmethod
-    def fit(cls, readout: nn.Module, q: Tensor, largest: Tensor) -> LeverageGuard:
-        """Return the guard whose limit is the largest leverage of a training row, itself left out.
+    def fit(cls, model: LeverageModule, q: Tensor, largest: Tensor) -> LeverageGuard:
+        """Return the guard whose limit is the largest leave-one-out leverage of the rows q (N, n).
 
         That is h / (1 - h), with h the leverage of a row that took part in the fit.
         """
-        h = readout.leverage(q)  # pyright: ignore[reportCallIssue]
-        return cls(readout, (h / (1.0 - h).clamp(min=1e-9)).max(), largest)
-
-    def is_inside(self, features: Tensor) -> Tensor:
-        """Return where the strangeness is certainly below 1, from the readout's features."""
-        return self.readout.leverage_is_below(self.limit, features)  # pyright: ignore
-
-    def _strangeness_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        if not hasattr(self.readout, "leverage_and_gradient"):
-            return super()._strangeness_and_gradient(q)
-        leverage, gradient = self.readout.leverage_and_gradient(q)  # pyright: ignore
-        limit = self.limit.to(q)
-        return leverage / limit, gradient / limit
+        h = model.leverage(q)
+        return cls(model, (h / (1.0 - h).clamp(min=1e-9)).max(), largest)
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the leverage of q over the limit, shape (...)."""
-        return self.readout.leverage(q) / self.limit.to(q)  # pyright: ignore[reportCallIssue]
+        return self.model.leverage(q) / self.limit.to(q)
 
-    def numpy_function(self) -> NumpyStrangeness:
-        """Return a NumPy function q (n,) -> strangeness, and its gradient (n,) where above 1."""
-        limit, readout = float(self.limit), self.readout
-        if hasattr(readout, "numpy_leverage"):
-            leverage = readout.numpy_leverage(limit)  # pyright: ignore[reportCallIssue]
-        else:
-            by_torch = numpy_function(lambda q: readout.leverage(q)[..., None])  # pyright: ignore
-
-            def leverage(q: NDArray) -> tuple[float, NDArray]:
-                h, gradient = by_torch(q)
-                return float(h[0]), gradient[0]
-
-        return lambda q: _relative(*leverage(q), limit)
-
-    def _numpy_parts(self, error: nn.Module) -> Callable[[NDArray], Any]:
-        if self.readout is not error or not hasattr(error, "numpy_leverage"):
-            return super()._numpy_parts(error)
-        limit = float(self.limit)
-        # Its features serve both.
-        function = error.numpy_function(limit)  # pyright: ignore[reportCallIssue]
-
-        def parts(q: NDArray) -> Any:
-            x, J, leverage, gradient = function(q)
-            return x, J, *_relative(leverage, gradient, limit)
-
-        return parts
+    def distance_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `domain_distance(q)` (N,) and its derivative (N, n) at rows q (N, n)."""
+        leverage, gradient = self.model.leverage_and_gradient(q)
+        limit = self.limit.to(q)
+        return leverage / limit, gradient / limit
 
 
 class BoxGuard(Guard):
-    """Strangeness by the distance outside a box, in tenths of its width.
+    """Distance from the training rows by how far q is outside a box, in tenths of its width.
 
     Parameters
     ----------
@@ -239,20 +162,8 @@ class BoxGuard(Guard):
         outside = (low - q).clamp(min=0.0) + (q - high).clamp(min=0.0)
         return 1.0 + (100.0 * (outside / width).square()).sum(-1)
 
-    def numpy_function(self) -> NumpyStrangeness:
-        """Return a NumPy function q (n,) -> strangeness, and its gradient (n,) where above 1."""
-        low, high = _array(self.low), _array(self.high)
-        width = np.where(high > low, high - low, 1.0)
 
-        def strangeness(q: NDArray) -> tuple[float, NDArray | None]:
-            outside = (q - np.minimum(np.maximum(q, low), high)) / width
-            squares = float(outside.dot(outside))
-            return 1.0 + 100.0 * squares, 200.0 * outside / width if squares > 0.0 else None
-
-        return strangeness
-
-
-class QuadraticReadout(PortableModule):
+class QuadraticLeverage(LeverageModule):
     """Leverage in linear and squared inputs, for error models that have none of their own.
 
     Parameters
@@ -274,86 +185,69 @@ class QuadraticReadout(PortableModule):
         self.register_buffer("factor", factor)
 
     @classmethod
-    def fit(cls, q: Tensor, alpha: float = 0.1) -> QuadraticReadout:
-        """Return the readout of training rows q (N, n)."""
+    def fit(cls, q: Tensor, alpha: float = 0.1) -> QuadraticLeverage:
+        """Return the leverage of training rows q (N, n)."""
         low, high = q.amin(0), q.amax(0)
         half_width = 0.5 * (high - low)
         half_width = torch.where(half_width > 0, half_width, torch.ones_like(half_width))
-        readout = cls(0.5 * (low + high), half_width, torch.eye(2 * q.shape[1] + 1).to(q))
-        features = readout._features(q)
+        n = q.shape[1]
+        found = cls(0.5 * (low + high), half_width, torch.eye(2 * n + 1).to(q))
+        features = found.forward(q)
         gram = features.mT @ features
         gram.diagonal().add_(alpha)
         still = _unexcited(q)
-        n = q.shape[1]
         gram[1 : n + 1, 1 : n + 1] += _AS_IF**2 * len(q) * still @ still.mT
-        readout.factor = torch.linalg.cholesky(gram)
-        return readout
+        found.factor = torch.linalg.cholesky(gram)
+        return found
 
-    def _features(self, q: Tensor) -> Tensor:
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the features [1, u, u^2], shape (..., 2 n + 1)."""
         u = (q - self.center.to(q)) / self.half_width.to(q)
         return torch.cat([torch.ones_like(u[..., :1]), u, u * u], dim=-1)
 
     def leverage(self, q: Tensor) -> Tensor:
         """Return phi^T (Phi^T Phi + alpha 1)^-1 phi, shape (...)."""
-        features = self._features(q)[..., None]
-        white = torch.linalg.solve_triangular(self.factor.to(q), features, upper=False)
+        white = torch.linalg.solve_triangular(self.factor.to(q), self(q)[..., None], upper=False)
         return white.square().sum((-2, -1))
-
-    def numpy_leverage(self, limit: float) -> NumpyStrangeness:
-        """Return a NumPy function q (n,) -> leverage, and its gradient (n,) where above a limit."""
-        center, half_width = _array(self.center), _array(self.half_width)
-        factor, n = np.asfortranarray(_array(self.factor)), len(self.center)
-        solve: Any = lapack.dtrtrs  # pyright: ignore[reportAttributeAccessIssue]
-
-        def leverage(q: NDArray) -> tuple[float, NDArray | None]:
-            u = (q - center) / half_width
-            white, _ = solve(factor, np.concatenate(([1.0], u, u * u)), lower=1)
-            white = white.ravel()
-            h = float(white.dot(white))
-            if h <= limit:
-                return h, None
-            by_phi = 2.0 * solve(factor, white, lower=1, trans=1)[0].ravel()
-            return h, (by_phi[1 : n + 1] + 2.0 * u * by_phi[n + 1 :]) / half_width
-
-        return leverage
 
 
 def fit_guard(
-    kind: str | None, error_module: Callable[[Tensor], Tensor], q: Tensor
+    kind: str | None, corrections: Tensor, model: LeverageModule | None, q: Tensor
 ) -> Guard | None:
-    """Return the guard of an error model trained on rows q (N, n)."""
+    """Return the guard of an error model trained on rows q (N, n).
+
+    Parameters
+    ----------
+    kind : {"leverage", "box", None}
+        The guard.
+    corrections : Tensor of shape (N, m)
+        What the error model gives for these rows [m].
+    model : LeverageModule or None
+        The error model where it has a leverage of its own.
+    q : Tensor of shape (N, n)
+        The training rows.
+    """
     if kind is None:
         return None
+    largest = corrections.norm(dim=-1).max()
+    if kind == "box":
+        return BoxGuard(q.amin(0), q.amax(0), largest)
     with torch.no_grad():
-        largest = error_module(q).norm(dim=-1).max()
-        if kind == "box":
-            return BoxGuard(q.amin(0), q.amax(0), largest)
-        own = isinstance(error_module, nn.Module) and hasattr(error_module, "leverage")
-        own = own and not _unexcited(q).numel()
-        # Where the log went counts, not how often.
-        readout: Any = error_module if own else QuadraticReadout.fit(torch.unique(q, dim=0))
-        return LeverageGuard.fit(readout, q, largest)
+        if model is None or _unexcited(q).numel():
+            # Every configuration counts once, however often the log returns to it.
+            model = QuadraticLeverage.fit(torch.unique(q, dim=0))
+        return LeverageGuard.fit(model, q, largest)
 
 
 def _unexcited(q: Tensor) -> Tensor:
-    """Return the directions (n, k) of q over its range, that rows (N, n) do not go.
+    """Return the directions (n, k) of q, over its range, in which rows (N, n) do not move.
 
-    Balanced tendons leave the common pull of a segment alone, for example. Nothing is known of it,
-    but the mechanical model; were any step along it strange, an inverse could use the fading of the
-    error model as a way to move the tip.
+    Balanced tendons never change the common pull of a segment, for example. The data say nothing
+    about it, but the mechanical model does. If every small step along it left the domain, inverse
+    kinematics could use the fading of the error model as a way to move the tip.
     """
     spread = q - q.mean(0)
     half_width = 0.5 * (q.amax(0) - q.amin(0))
     spread = spread / torch.where(half_width > 0, half_width, 1.0)
     axes, variances, _ = torch.linalg.svd(spread.mT @ spread)
     return axes[:, variances < _STILL**2 * variances[0]]
-
-
-def _relative(
-    leverage: float, gradient: NDArray | None, limit: float
-) -> tuple[float, NDArray | None]:
-    return leverage / limit, None if gradient is None else gradient / limit
-
-
-def _array(tensor: Tensor) -> NDArray:
-    return tensor.detach().cpu().double().numpy().copy()

@@ -1,290 +1,332 @@
-"""Mechanical model and learned error as one torch module q -> x, with a guard between them."""
+"""Mechanical model and learned corrections as one torch module q -> x."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple, cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import ForwardModel, forward_and_jacobian
+from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin.hybrid._features import Readout
 from hybridkin.hybrid._guards import Guard, LeverageGuard
-from hybridkin.hybrid._serial import SerialModule
-from hybridkin.ik._realtime import NumpyFunction, by_torch, numpy_function
-from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import AffineModule
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
+__all__ = ["Correction", "HybridModule", "InnerCorrection", "TipCorrection"]
 
-__all__ = ["BlendModule", "HybridModule", "SerialHybridModule"]
+_ROUNDING = 1e-7  # of weights that sum to one
 
 
-class HybridModule(ForwardModel):
-    """The sum f_mech(q) + w(q) eps(q) as a torch module q (..., n) -> x (..., m).
+class Inside(NamedTuple):
+    """The mechanical model inside at rows q: its coordinates, their slope, and the tip."""
+
+    z: Tensor  # (N, C)
+    slope: Tensor  # dz/dq, (C, n) or (N, C, n)
+    x: Tensor  # f(q) = F(z), (N, m)
+
+
+class Fading(NamedTuple):
+    """The weight of a correction in the rows where it may be less than one."""
+
+    rows: Tensor  # (k,)
+    weight: Tensor  # g(q), (k, 1)
+    slope: Tensor  # dg/dq, (k, 1, n)
+
+
+class TipCorrection(PortableModule):
+    """A correction at the tip, c(q) = eps(q).
 
     Parameters
     ----------
-    mechanical, error : nn.Module or None
-        The parts; at least one of them.
-    guard : nn.Module or None
-        The weight w(q) in [0, 1], shape (..., 1). None: one everywhere.
-    drift : AffineModule or None
-        What has changed since, w(q) (B q + c), is added.
+    module : ForwardModel
+        eps, q (..., n) -> (..., m) [m]: the torch module of a regressor, or a `Readout`.
+    guard : Guard or None
+        Where it is trusted. None: everywhere.
+    """
+
+    def __init__(self, module: ForwardModel, guard: Guard | None = None) -> None:
+        super().__init__()
+        self.module = module
+        self.guard = guard
+
+    def value(self, q: Tensor, inside: Inside | None) -> Tensor:
+        """Return c(q), shape (N, m) [m]."""
+        return self.module(q)
+
+    def guarded_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor, Fading | None]:
+        """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and the rows that fade."""
+        guard = self.guard
+        if guard is None:
+            return *self.module.forward_and_jacobian(q), None
+        if isinstance(guard, LeverageGuard) and guard.model is self.module:
+            # Value and leverage share the features; a quick test passes most rows.
+            x, J, below = guard.model.forward_jacobian_and_below(q, guard.limit)
+            rows = (~below).nonzero()[:, 0]
+            rows = rows[_outside(guard, q[rows])] if len(rows) else rows
+        else:
+            x, J = self.module.forward_and_jacobian(q)
+            rows = _outside(guard, q).nonzero()[:, 0]
+        fading = None
+        if len(rows):
+            fading = Fading(rows, *guard.weight_and_jacobian(q[rows]))
+            own, J_own = _weighed(x[rows], J[rows], fading.weight, fading.slope)
+            x, J = x.index_copy(0, rows, own), J.index_copy(0, rows, J_own)
+        return *guard.shortened_with_jacobian(x, J), fading
+
+
+class InnerCorrection(PortableModule):
+    """A correction inside the robot, c(q) = F(z(q) + W phi(q)) - f(q); serial coupling.
+
+    z and F are `coordinates` and `from_coordinates` of the mechanical model, so f(q) = F(z(q)).
+
+    Parameters
+    ----------
+    mechanical : ForwardModel
+        f, the same object as that of the hybrid.
+    readout : Readout
+        W phi(q), the change of the inner coordinates [unit of z].
+    guard : Guard or None
+        Where it is trusted. None: everywhere.
     """
 
     def __init__(
-        self,
-        mechanical: nn.Module | None,
-        error: nn.Module | None,
-        guard: Guard | None = None,
-        drift: AffineModule | None = None,
+        self, mechanical: ForwardModel, readout: Readout, guard: Guard | None = None
     ) -> None:
         super().__init__()
         self.mechanical = mechanical
-        self.error = error
+        self.readout = readout
         self.guard = guard
-        self.drift = drift
-        self.n_actuators = 0 if mechanical is None else mechanical.n_actuators
 
-    def forward(self, q: Tensor) -> Tensor:
-        """Return x of shape (..., m) [m]."""
-        if self.mechanical is None:
-            return self.error_part(q)
-        if self.error is None and self.drift is None:
-            return self.mechanical(q)
-        return self.mechanical(q) + self.error_part(q)
+    def value(self, q: Tensor, inside: Inside | None) -> Tensor:
+        """Return c(q), shape (N, m) [m]."""
+        assert inside is not None
+        return self.mechanical.from_coordinates(inside.z + self.readout(q)) - inside.x
 
-    def mechanical_part(self, q: Tensor) -> Tensor:
-        """Return f_mech(q), zero without a mechanical model, shape (..., m) [m]."""
-        return self.mechanical(q) if self.mechanical is not None else 0.0 * self.error_part(q)
+    def tip_and_jacobian(
+        self, q: Tensor, inside: Inside, J_mech: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Fading | None]:
+        """Return f + s (N, m) and its derivative (N, m, n) at rows q, and the rows that fade.
 
-    def error_part(self, q: Tensor) -> Tensor:
-        """Return what is added to f_mech(q), w(q) eps(q) and the drift, shape (..., m) [m]."""
-        if self.error is None:
-            return 0.0 * self.mechanical_part(q) if self.drift is None else self.drift(q)
-        parts = [self.error(q)] if self.drift is None else [self.error(q), self.drift(q)]
-        if self.guard is not None:
-            weight = self.guard(q)
-            parts = [weight * part for part in parts]
-            parts[0] = self.guard.shortened(parts[0])
-        return sum(parts[1:], parts[0])
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return dx/dq of the sum, shape (..., m, n)."""
-        return self.forward_and_jacobian(q)[1]
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x (..., m) and dx/dq (..., m, n), closed form where the parts offer it."""
-        x, J = in_blocks(self._forward_and_jacobian, q)
-        return x, J
-
-    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        parts = []
-        if self.mechanical is not None:
-            parts.append(forward_and_jacobian(self.mechanical, q))
-        fading = None
-        if self.error is not None:
-            x, J, outside = self._error_and_outside(q)
-            if self.guard is not None and outside is not None and len(outside):
-                fading = outside, *self.guard.weight_and_jacobian(q[outside])
-                x, J = _faded(x, J, *fading)
-            if self.guard is not None:
-                x, J = self.guard.shortened_with_jacobian(x, J)
-            parts.append((x, J))
-        if self.drift is not None:
-            x, J = forward_and_jacobian(self.drift, q)
-            parts.append((x, J) if fading is None else _faded(x, J, *fading))
-        (x, J), *rest = parts
-        for x_part, J_part in rest:
-            x, J = x + x_part, J + J_part
-        return x, J
-
-    def _error_and_outside(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return eps, its Jacobian, and the rows where its weight may be less than one."""
-        guard = self.guard
-        if isinstance(guard, LeverageGuard) and guard.readout is self.error is not None:
-            if isinstance(self.error, ELM):  # its features serve both
-                x, J, inside = self.error.forward_jacobian_and(
-                    q, lambda features: guard.is_inside(features)[..., None]
-                )
-                unsure = (~inside[:, 0]).nonzero()[:, 0]
-                return x, J, unsure[~self.in_domain(q[unsure])] if len(unsure) else unsure
-        outside = None if guard is None else (~self.in_domain(q)).nonzero()[:, 0]
-        return *forward_and_jacobian(self.error, q), outside
-
-    def with_drift(self, drift: AffineModule | None) -> Self:
-        """Return the same with another drift; this one stays as it is."""
-        module = copy.copy(self)
-        module._modules = dict(self._modules)
-        module.drift = drift
-        return module
-
-    def numpy_function(self) -> NumpyFunction:
-        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n).
-
-        The sum of what the parts offer as ``numpy_function``, without torch's overhead; in float64,
-        with their present parameters.
+        `J_mech` gives df/dq of some rows: only those that are faded or shortened need it.
         """
-        if self.drift is not None:
-            return by_torch(self)
-        if self.error is None:
-            return numpy_function(self.mechanical)
+        delta, turn = self.readout.forward_and_jacobian(q)
+        x, columns = self.mechanical.from_coordinates_and_jacobian(inside.z + delta)
+        J = columns @ (inside.slope + turn)
         guard = self.guard
-        correction = (
-            numpy_function(self.error) if guard is None else guard.numpy_correction(self.error)
-        )
-        if self.mechanical is None:
-            return correction
-        mechanical = numpy_function(self.mechanical)
-
-        def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
-            x, J = mechanical(q)
-            more, slope = correction(q)
-            return x + more, J + slope
-
-        return tip_and_jacobian
-
-    def error_weight(self, q: Tensor) -> Tensor:
-        """Return the weight w(q) of the error model, shape (...)."""
-        return q.new_ones(q.shape[:-1]) if self.guard is None else self.guard(q)[..., 0]
-
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return how far q is from the training rows, at most 1 among them, shape (...)."""
-        if self.guard is None:
-            return q.new_zeros(q.shape[:-1])
-        return self.guard.domain_distance(q)
+        if guard is None:
+            return x, J, None
+        rows = (guard.is_long(x - inside.x) | _outside(guard, q)).nonzero()[:, 0]
+        if not len(rows):
+            return x, J, None
+        fading = Fading(rows, *guard.weight_and_jacobian(q[rows]))
+        f, J_f = inside.x[rows], J_mech(rows)
+        own, J_own = _weighed(x[rows] - f, J[rows] - J_f, fading.weight, fading.slope)
+        own, J_own = guard.shortened_with_jacobian(own, J_own)
+        return x.index_copy(0, rows, f + own), J.index_copy(0, rows, J_f + J_own), fading
 
 
-class SerialHybridModule(HybridModule):
-    """The tip f_mech(z(q) + delta(q)) as a torch module, fading to f_mech(q) out of its domain.
+Correction = TipCorrection | InnerCorrection
+
+
+class HybridModule(ForwardModel):
+    """The sum x = f(q) + sum_k w_k s_k(q) + t(q) d(q) as a torch module q (..., n) -> x (..., m).
+
+    f is the mechanical model. s_k is a learned correction c_k, faded by the weight g_k of its
+    guard and shortened where it is too long. d is a drift, weighed by the error weight
+    t(q) = 1 - sum_k w_k (1 - g_k(q)). f is evaluated once for any number of corrections.
+
+    A plain hybrid has one correction of weight 1, a blend has several; their weights sum to less
+    than 1 where the mechanical model alone has a share in the blend.
 
     Parameters
     ----------
-    error : SerialModule
-        The tip with the correction delta inside, unguarded; it holds the mechanical model.
-    guard, drift : nn.Module or None
-        As for `HybridModule`; the guard weighs the difference of the two tips.
-    """
-
-    error: SerialModule
-    mechanical: nn.Module
-
-    def __init__(
-        self, error: SerialModule, guard: Guard | None = None, drift: AffineModule | None = None
-    ) -> None:
-        super().__init__(error.mechanical, error, guard, drift)
-
-    def error_part(self, q: Tensor) -> Tensor:
-        """Return what is added to f_mech(q) at the tip, shape (..., m) [m]."""
-        part = self.error(q) - self.mechanical(q)
-        drift = None if self.drift is None else self.drift(q)
-        if self.guard is not None:
-            weight = self.guard(q)
-            part = self.guard.shortened(weight * part)
-            drift = None if drift is None else weight * drift
-        return part if drift is None else part + drift
-
-    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        x, J = self.error.forward_and_jacobian(q)
-        drift = None if self.drift is None else forward_and_jacobian(self.drift, q)
-        if self.guard is not None:
-            long = self.guard.is_long(x - self.mechanical(q))
-            rows = (long | ~self.in_domain(q)).nonzero()[:, 0]
-            if len(rows):
-                fading = self.guard.weight_and_jacobian(q[rows])
-                x_mech, J_mech = forward_and_jacobian(self.mechanical, q[rows])
-                own, J_own = _weighed(x[rows] - x_mech, J[rows] - J_mech, *fading)
-                own, J_own = self.guard.shortened_with_jacobian(own, J_own)
-                x = x.index_copy(0, rows, x_mech + own)
-                J = J.index_copy(0, rows, J_mech + J_own)
-                if drift is not None:
-                    drift = _faded(*drift, rows, *fading)
-        return (x, J) if drift is None else (x + drift[0], J + drift[1])
-
-    def numpy_function(self) -> NumpyFunction:
-        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
-        return by_torch(self)
-
-
-class BlendModule(HybridModule):
-    """The weighted mean of several hybrids over one mechanical model, as a torch module.
-
-    Parameters
-    ----------
-    parts : sequence of HybridModule
-        Each with the same mechanical model.
+    mechanical : ForwardModel or None
+        f; None: zero.
+    corrections : sequence of TipCorrection or InnerCorrection
+        c_k with their guards.
     weights : Tensor of shape (K,)
-        Sum to one.
+        w_k.
     drift : AffineModule or None
-        As for `HybridModule`; every part's guard weighs its share of it.
+        d, how the robot has changed since the fit.
     """
 
     weights: Tensor
 
     def __init__(
-        self, parts: Sequence[HybridModule], weights: Tensor, drift: AffineModule | None = None
+        self,
+        mechanical: ForwardModel | None,
+        corrections: Sequence[Correction],
+        weights: Tensor,
+        drift: AffineModule | None = None,
     ) -> None:
-        super().__init__(parts[0].mechanical, None, None, drift)
-        self.parts = nn.ModuleList(parts)
+        super().__init__()
+        self.mechanical = mechanical
+        self.corrections = nn.ModuleList(corrections)
         self.register_buffer("weights", weights)
+        self.drift = drift
+        if mechanical is not None:
+            self.n_actuators, self.n_outputs = mechanical.n_actuators, mechanical.n_outputs
+
+    def with_drift(self, drift: AffineModule | None) -> Self:
+        """Return the same model with another drift; this one stays as it is."""
+        return type(self)(self.mechanical, [c for _, c in self._parts()], self.weights, drift)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m) [m]."""
-        return self._mean(q, lambda part: part(q))
+        return in_blocks(self._forward, q)[0]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., m) and dx/dq (..., m, n), in closed form where the parts have one."""
+        x, J = in_blocks(self._forward_and_jacobian, q)
+        return x, J
+
+    def mechanical_part(self, q: Tensor) -> Tensor:
+        """Return f(q), zero without a mechanical model, shape (..., m) [m]."""
+        return 0.0 * self.error_part(q) if self.mechanical is None else self.mechanical(q)
 
     def error_part(self, q: Tensor) -> Tensor:
-        """Return what is added to f_mech(q), shape (..., m) [m]."""
-        return self._mean(q, lambda part: part.error_part(q))
-
-    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        x, J = zip(*(part._forward_and_jacobian(q) for part in self._shown()), strict=True)
-        weights = self.weights.to(q)
-        return torch.tensordot(weights, torch.stack(x), 1), torch.tensordot(
-            weights, torch.stack(J), 1
-        )
-
-    def numpy_function(self) -> NumpyFunction:
-        """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
-        weights = self.weights.cpu().numpy()
-        functions = [part.numpy_function() for part in self._shown()]
-
-        def tip_and_jacobian(q: NDArray) -> tuple[NDArray, NDArray]:
-            x, J = zip(*(function(q) for function in functions), strict=True)
-            return np.tensordot(weights, x, 1), np.tensordot(weights, J, 1)
-
-        return tip_and_jacobian
+        """Return what is added to f(q): corrections and drift, shape (..., m) [m]."""
+        return in_blocks(lambda rows: (self._learned(rows, self._inside(rows)),), q)[0]
 
     def error_weight(self, q: Tensor) -> Tensor:
-        """Return the mean weight w(q) of the error models, shape (...)."""
-        return self._mean(q, lambda part: part.error_weight(q))
+        """Return the error weight t(q), shape (...)."""
+        return in_blocks(lambda rows: (self._trust(rows),), q)[0][..., 0]
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return how far q is from the training rows of the part that knows least, shape (...)."""
-        return torch.stack([part.domain_distance(q) for part in self._shown()]).amax(0)
+        """Return the largest distance from the training rows of any guard, shape (...)."""
+        guards = [c.guard for _, c in self._parts() if c.guard is not None]
+        if not guards:
+            return super().domain_distance(q)
 
-    def _shown(self) -> list[HybridModule]:
-        parts: list[Any] = [*self.parts]
-        return [part.with_drift(self.drift) for part in parts]
+        def farthest(rows: Tensor) -> tuple[Tensor]:
+            return (
+                torch.stack([guard.domain_distance(rows) for guard in guards], 1).amax(1, True),
+            )
 
-    def _mean(self, q: Tensor, function: Callable[[HybridModule], Tensor]) -> Tensor:
-        values = torch.stack([function(part) for part in self._shown()])
-        return torch.tensordot(self.weights.to(q), values, 1)
+        return in_blocks(farthest, q)[0][..., 0]
+
+    def _parts(self) -> list[tuple[float, Correction]]:
+        """Return weight and correction, one by one."""
+        corrections = cast("list[Correction]", [*self.corrections])
+        return [*zip(self.weights.tolist(), corrections, strict=True)]
+
+    def _inside(self, q: Tensor) -> Inside | None:
+        """Return the mechanical model inside at rows q, where a correction acts there."""
+        mechanical = self.mechanical
+        if mechanical is None or not any(isinstance(c, InnerCorrection) for c in self.corrections):
+            return None
+        z, slope = mechanical.coordinates(q)
+        return Inside(z, slope, mechanical.from_coordinates(z))
+
+    def _forward(self, q: Tensor) -> tuple[Tensor]:
+        inside = self._inside(q)
+        if inside is None:
+            learned = self._learned(q, None)
+            return (learned if self.mechanical is None else self.mechanical(q) + learned,)
+        return (inside.x + self._learned(q, inside),)
+
+    def _learned(self, q: Tensor, inside: Inside | None) -> Tensor:
+        """Return the sum of corrections and drift at rows q, shape (N, m) [m]."""
+        trust, terms = q.new_ones(len(q), 1), []
+        for weight, correction in self._parts():
+            value, guard = correction.value(q, inside), correction.guard
+            if guard is not None:
+                own = guard(q)
+                value, trust = guard.shortened(own * value), trust - weight * (1.0 - own)
+            terms.append(weight * value)
+        if self.drift is not None:
+            terms.append(trust * self.drift(q))
+        return sum(terms[1:], terms[0]) if terms else self._nothing(q)
+
+    def _nothing(self, q: Tensor) -> Tensor:
+        """Return zeros in the shape of the corrections, (N, m)."""
+        return 0.0 * self.mechanical_part(q)
+
+    def _trust(self, q: Tensor) -> Tensor:
+        """Return the error weight t(q) at rows q, shape (N, 1)."""
+        guards = [(weight, c.guard) for weight, c in self._parts() if c.guard is not None]
+        return q.new_ones(len(q), 1) - sum(weight * (1.0 - guard(q)) for weight, guard in guards)
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        fadings: list[tuple[float, Fading]] = []
+        inside, total = self._inside(q), None
+        if inside is not None:
+            total = self._inner_and_jacobian(q, inside, fadings)
+        elif self.mechanical is not None:
+            total = self.mechanical.forward_and_jacobian(q)
+        total = self._add_tips_and_drift(total, q, fadings)
+        assert total is not None
+        return total
+
+    def _inner_and_jacobian(
+        self, q: Tensor, inside: Inside, fadings: list[tuple[float, Fading]]
+    ) -> tuple[Tensor, Tensor]:
+        """Return f and the corrections inside, and the derivative, at rows q.
+
+        With weights w_k that sum to one, f + sum_k w_k s_k = sum_k w_k (f + s_k), and f + s_k is
+        F(z + W_k phi) where nothing fades: df/dq is needed in the other rows alone.
+        """
+        mechanical = cast(ForwardModel, self.mechanical)
+        parts = [(w, c) for w, c in self._parts() if isinstance(c, InnerCorrection)]
+        share, total = 1.0 - sum(weight for weight, _ in parts), None
+
+        def J_mech(rows: Tensor | slice) -> Tensor:
+            slope = inside.slope if inside.slope.ndim == 2 else inside.slope[rows]
+            return mechanical.from_coordinates_and_jacobian(inside.z[rows])[1] @ slope
+
+        if share > _ROUNDING:
+            total = share * inside.x, share * J_mech(slice(None))
+        for weight, correction in parts:
+            x, J, fading = correction.tip_and_jacobian(q, inside, J_mech)
+            total = _plus(total, weight, x, J)
+            fadings += [] if fading is None else [(weight, fading)]
+        assert total is not None
+        return total
+
+    def _add_tips_and_drift(
+        self,
+        total: tuple[Tensor, Tensor] | None,
+        q: Tensor,
+        fadings: list[tuple[float, Fading]],
+    ) -> tuple[Tensor, Tensor] | None:
+        """Return a sum and its derivative with the corrections at the tip and the drift added.
+
+        `fadings` holds the fading of the other corrections, which the drift shares.
+        """
+        for weight, correction in self._parts():
+            if isinstance(correction, TipCorrection):
+                x, J, fading = correction.guarded_and_jacobian(q)
+                total = _plus(total, weight, x, J)
+                fadings += [] if fading is None else [(weight, fading)]
+        if self.drift is not None:
+            x, J = self.drift.forward_and_jacobian(q)
+            if fadings:
+                trust, slope = q.new_ones(len(q), 1), q.new_zeros(len(q), 1, q.shape[1])
+                for weight, (rows, own, own_slope) in fadings:
+                    trust = trust.index_add(0, rows, own - 1.0, alpha=weight)
+                    slope = slope.index_add(0, rows, own_slope, alpha=weight)
+                x, J = _weighed(x, J, trust, slope)
+            total = _plus(total, 1.0, x, J)
+        return total
+
+
+def _outside(guard: Guard, q: Tensor) -> Tensor:
+    """Return which rows q (N, n) lie outside the domain of a guard, NaN too, shape (N,)."""
+    return ~(guard.domain_distance(q) <= 1.0)
+
+
+def _plus(
+    total: tuple[Tensor, Tensor] | None, weight: float, x: Tensor, J: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return a sum with the weighed x and J added."""
+    if total is None:
+        return (x, J) if weight == 1.0 else (weight * x, weight * J)
+    return torch.add(total[0], x, alpha=weight), torch.add(total[1], J, alpha=weight)
 
 
 def _weighed(x: Tensor, J: Tensor, weight: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
     """Return x (k, m) and J (k, m, n) times a weight (k, 1) of slope (k, 1, n)."""
     return weight * x, weight[..., None] * J + x[..., None] * slope
-
-
-def _faded(
-    x: Tensor, J: Tensor, rows: Tensor, weight: Tensor, slope: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return x (N, m) and J (N, m, n), in some rows times a weight (k, 1) of slope (k, 1, n)."""
-    own, J_own = _weighed(x[rows], J[rows], weight, slope)
-    return x.index_copy(0, rows, own), J.index_copy(0, rows, J_own)

@@ -23,7 +23,7 @@ from hybridkin.hybrid._linearised import (
     moment,
     quasi_newton,
 )
-from hybridkin.hybrid._serial import SerialModule, coordinates, tip_and_columns
+from hybridkin.hybrid._features import Readout
 
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
@@ -31,10 +31,10 @@ _SETTLED = 1e-9  # of the gradient without a correction
 _RATIOS = torch.logspace(-2, 4, 25, dtype=torch.float64)  # of noise, over the mean of dx/dq squared
 
 
-class SerialFit(NamedTuple):
-    """What `fit_serial` found."""
+class ReadoutFit(NamedTuple):
+    """What `fit_readout` found."""
 
-    module: SerialModule
+    readout: Readout
     alphas: Pair  # of the linear and of the other features; infinity: none of them
     residual: NDArray  # (N, m) [m], of every row when it, or its group, was left out
     scores: dict[Pair, float]  # mean squared distance of rows left out [m^2], by alphas
@@ -54,7 +54,7 @@ class _Found(NamedTuple):
     gradient: float
 
 
-def fit_serial(
+def fit_readout(
     mechanical: nn.Module,
     features: Features,
     q: Tensor,
@@ -65,7 +65,7 @@ def fit_serial(
     groups: Any = None,
     alphas: Pair | None = None,
     noise_ratio: float = inf,
-) -> SerialFit:
+) -> ReadoutFit:
     """Return the readout that minimises the error of the tip plus a penalty on its weights.
 
     The objective sum_n w_n |x_n - f(z_n + D W phi_n)|^2 + alpha_1 |W_lin|^2 + alpha_2 |W_bent|^2 is
@@ -102,7 +102,7 @@ def fit_serial(
 
     Returns
     -------
-    SerialFit
+    ReadoutFit
         The model, and how it was found.
     """
     q, x = q.detach().double(), x.detach().double()
@@ -125,7 +125,7 @@ def fit_serial(
         penalty = found.problem.penalty(found.alphas)
         spread = found.linear.posterior(penalty, x.shape[1] * float(weight.sum()))
         module = found.problem.module(found.readout, *spread)
-    return SerialFit(
+    return ReadoutFit(
         *(module, found.alphas, residual.cpu().numpy(), found.scores, found.gradient),
         found.problem.noise_ratio,
     )

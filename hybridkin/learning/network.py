@@ -6,7 +6,7 @@ from scipy.special import expit
 from torch import nn
 
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import ForwardModel
+from hybridkin._core.model import ForwardModel, reverse_jacobian
 from hybridkin._core.stored import Stored
 
 _BLOCK = 2**17  # numbers in the hidden layer of a block of rows: a megabyte, so that it stays near
@@ -28,7 +28,24 @@ READOUT = ("output_weights", "intercept")
 READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
 
 
-class ELM(ForwardModel):
+class LeverageModule(ForwardModel):
+    """A model that gives the leverage of any row with respect to those that it learned from."""
+
+    def leverage(self, q):
+        """Return the leverage of `q`, shape (...), smooth; at most 1 on the training rows."""
+        raise NotImplementedError
+
+    def leverage_and_gradient(self, q):
+        """Return the leverage (...) and its derivative by `q` (..., n_inputs)."""
+        leverage, gradient = reverse_jacobian(lambda rows: self.leverage(rows)[..., None], q)
+        return leverage[..., 0], gradient[..., 0, :]
+
+    def forward_jacobian_and_below(self, q, limit):
+        """Return ``forward(q)``, ``jacobian(q)`` and where the leverage is surely below `limit`."""
+        return *self.forward_and_jacobian(q), self.leverage(q) < limit
+
+
+class ELM(LeverageModule):
     """A fitted network ``eps = phi(q) @ output_weights + intercept`` as a torch module.
 
     ``phi(q) = sigma(W u + b)`` with the scaled input ``u = (q - input_center) / input_scale``,
@@ -142,6 +159,16 @@ class ELM(ForwardModel):
             return self._readout(u, s), self._slope(a, s), function(self._features(u, s))
 
         return in_blocks(rows, q, max(1, _BLOCK // len(self.input_weights)))
+
+    def forward_jacobian_and_below(self, q, limit):
+        """Return ``forward(q)``, ``jacobian(q)`` and where the leverage is surely below `limit`.
+
+        The features serve all three.
+        """
+        x, J, below = self.forward_jacobian_and(
+            q, lambda features: self.leverage_is_below(limit, features)[..., None]
+        )
+        return x, J, below[..., 0]
 
     def leverage(self, q):
         """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
