@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -13,10 +14,31 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from torch import Tensor
 
-__all__ = ["Stored", "estimator_of", "feature_names", "params_of", "plain"]
+__all__ = ["Layout", "Restore", "Stored", "estimator_of", "feature_names", "params_of", "plain"]
 
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 _REQUIRED = object()
+
+
+class Layout(NamedTuple):
+    """What the description of a module holds, under the names of its constructor's parameters.
+
+    Parameters
+    ----------
+    kind : str
+        Names the class.
+    arrays : dict of str to str
+        Buffers, with one letter per axis as in `Stored.shaped`.
+    settings : dict of str to type
+        Plain attributes.
+    parts : tuple of str
+        Submodules, lists of them, or None.
+    """
+
+    kind: str
+    arrays: dict[str, str]
+    settings: Mapping[str, type] = MappingProxyType({})
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,6 +182,10 @@ class Stored:
         if name not in self.parts:
             raise ValueError(f"the part {name!r} of {self.kind!r} is missing")
         return self.parts[name]
+
+
+Restore = Callable[[Stored], Any]
+"""Returns the model of a description, of a list of them a list."""
 
 
 def plain(value: Any) -> Any:

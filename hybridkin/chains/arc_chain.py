@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors, in_blocks
-from hybridkin._core.stored import Stored
+from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin.chains._arcs import arc_transforms, tip, tip_and_columns
 from hybridkin.chains._checks import check_replacements
@@ -44,9 +44,7 @@ class ArcChain(Chain):
         *("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at"),
     )
 
-    kind: ClassVar[str]  # of its description
     _counts: ClassVar[str]  # what the constructor calls the actuators per segment
-    _options: ClassVar[dict[str, type]] = {"routing": str}
 
     n_segments: int
     actuators_per_segment: tuple[int, ...]
@@ -406,12 +404,12 @@ class ArcChain(Chain):
 
     def stored(self) -> Stored:
         """Return how the chain describes itself: its geometry and how it is routed."""
-        names = ("actuators_per_segment", "tip_at", *self._options)
+        names = ("actuators_per_segment", "tip_at", *self.layout.settings)
         settings = {name: vars(self)[name] for name in names}
-        return Stored.of(self.kind, self.geometry(), **settings)
+        return Stored.of(self.layout.kind, self.geometry(), **settings)
 
     @classmethod
-    def from_stored(cls, stored: Stored) -> Self:
+    def from_stored(cls, stored: Stored, restore: Restore) -> Self:
         """Return the chain of a description."""
         counts = stored.list_of(int, "actuators_per_segment")
         entries: dict[str, Any] = {
@@ -422,7 +420,7 @@ class ArcChain(Chain):
         if sum(counts) != len(entries["angles"]):
             raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
         entries["angles"] = np.split(entries["angles"], np.cumsum(counts)[:-1])
-        entries |= {name: stored.value(name, kind) for name, kind in cls._options.items()}
+        entries |= {name: stored.value(name, kind) for name, kind in cls.layout.settings.items()}
         dtype = torch.from_numpy(entries["base"]).dtype
         chain = cls(**entries, **{cls._counts: counts}, dtype=dtype)
         return chain.with_tip(stored.value("tip_at", float))

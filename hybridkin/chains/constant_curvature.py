@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hybridkin._core.stored import Layout
 from hybridkin._core.units import millimetres_message, warn_millimetres
 from hybridkin.chains._arcs import levers, reading_matrix, tip_and_columns_of_numbers
 from hybridkin.chains._checks import (
@@ -79,7 +80,7 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
-    kind = "constant_curvature"
+    layout = Layout("constant_curvature", {}, {"routing": str})
     _counts = "n_actuators"
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
 

@@ -6,11 +6,12 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.stored import Layout
 from hybridkin._core.units import millimetres_message, warn_millimetres
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import (
@@ -125,9 +126,8 @@ class ElasticTendonChain(ArcChain):
     tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
     """
 
-    kind = "elastic_tendons"
+    layout = Layout("elastic_tendons", {}, {"routing": str, "smoothing": float})
     _counts = "n_tendons"
-    _options: ClassVar[dict[str, type]] = {"routing": str, "smoothing": float}
     _entries = (*_SHAPING, "lengths", "offsets", "base")
     _structure = (*ArcChain._structure, "smoothing", "_table")  # the table knows its geometry
 

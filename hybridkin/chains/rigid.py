@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors, in_blocks
-from hybridkin._core.stored import Stored
+from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import millimetres_message, warn_millimetres
 from hybridkin.chains._arm_files import Joint, chain_path, limits_of, mjcf_path, urdf_path
 from hybridkin.chains._checks import check_replacements, pose
@@ -78,6 +78,7 @@ class RigidChain(Chain):
     tensor([0.2000, 0.3000, 0.0000])
     """
 
+    layout = Layout("rigid", {})
     origins: Tensor
     axes: Tensor
     q_min: Tensor
@@ -585,10 +586,10 @@ class RigidChain(Chain):
         """Return how the arm describes itself: its joints, their limits, tool and base."""
         arrays = {"origins": self.origins, "axes": self.axes, "tip": self.tip, "tool": self.tool}
         arrays |= {"q_min": self.q_min, "q_max": self.q_max, "base": self.base}
-        return Stored.of("rigid", arrays, kinds=self.kinds, names=self.names)
+        return Stored.of(self.layout.kind, arrays, kinds=self.kinds, names=self.names)
 
     @classmethod
-    def from_stored(cls, stored: Stored) -> RigidChain:
+    def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
         """Return the arm of a description."""
         geometry = {name: stored.array(name) for name in ("origins", "axes", "tip", "tool", "base")}
         limits = {name: stored.array(name, finite=False) for name in ("q_min", "q_max")}

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.model import forward_and_jacobian
-from hybridkin.hybrid._features import Features
+from hybridkin._core.stored import Restore, Stored
+from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import (
     Linearised,
     Pair,
@@ -23,7 +24,6 @@ from hybridkin.hybrid._linearised import (
     moment,
     quasi_newton,
 )
-from hybridkin.hybrid._features import Readout
 
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
@@ -40,6 +40,31 @@ class ReadoutFit(NamedTuple):
     scores: dict[Pair, float]  # mean squared distance of rows left out [m^2], by alphas
     gradient: float  # of the objective at the optimum, relative to that without a correction
     noise_ratio: float = inf  # variance of tips over that of actuators; infinity: of tips alone
+
+    def stored(self) -> Stored:
+        """Return how the fit describes itself; JSON has no infinity, so penalties are strings."""
+        return Stored.of(
+            "readout_fit",
+            {"residual": self.residual},
+            {"readout": self.readout.stored()},
+            alphas=[*map(str, self.alphas)],
+            scores=[[*map(str, alphas), score] for alphas, score in self.scores.items()],
+            gradient=self.gradient,
+            noise_ratio=str(self.noise_ratio),
+        )
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> ReadoutFit:
+        """Return the fit of a description; `restore` returns its readout."""
+        first, second = map(float, stored.list_of(str, "alphas"))
+        return cls(
+            restore(stored.part("readout")),
+            (first, second),
+            stored.array("residual", (None, None), finite=False),
+            {(float(a), float(b)): float(c) for a, b, c in stored.list_of(list, "scores")},
+            stored.value("gradient", float),
+            float(stored.value("noise_ratio", str)),
+        )
 
 
 class _Found(NamedTuple):

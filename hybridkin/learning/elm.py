@@ -481,10 +481,10 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
 
     @classmethod
-    def from_stored(cls, stored):
-        """Return the fitted network of a description."""
+    def from_stored(cls, stored, restore):
+        """Return the fitted network of a description; `restore` returns its module."""
         elm = estimator_of(cls, stored.value("params", dict))
-        network = ELM.from_stored(stored.part("network"))
+        network = restore(stored.part("network"))
         n_outputs, n_both = network.n_outputs, sum(network.output_weights.shape)
         mean, scatter = stored.array("mean", (n_both,)), stored.array("scatter", (n_both, n_both))
         seen, y_ndim = stored.value("n_samples_seen", float), stored.value("y_ndim", int)
@@ -503,4 +503,5 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         names = feature_names(stored, network.n_actuators)
         state |= {} if names is None else {"feature_names_in_": names}
         elm.__setstate__({**elm.get_params(), **state})
+        elm.module_ = network
         return elm

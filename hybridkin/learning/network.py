@@ -7,7 +7,7 @@ from torch import nn
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, reverse_jacobian
-from hybridkin._core.stored import Stored
+from hybridkin._core.stored import Layout
 
 _BLOCK = 2**17  # numbers in the hidden layer of a block of rows: a megabyte, so that it stays near
 
@@ -67,6 +67,13 @@ class ELM(LeverageModule):
         The function sigma.
     """
 
+    layout = Layout(
+        "elm",
+        {"input_weights": "hn", "input_bias": "h", "input_center": "n", "input_scale": "n"}
+        | {"output_weights": "fm", "intercept": "m", "leverage_offset": ""}
+        | {"leverage_center": "f", "leverage_factor": "ff"},
+        {"activation": str},
+    )
     input_weights: torch.Tensor
     input_bias: torch.Tensor
     input_center: torch.Tensor
@@ -240,27 +247,14 @@ class ELM(LeverageModule):
         function = self.numpy_function(limit)
         return lambda q: function(q)[2:]
 
-    def stored(self):
-        """Return how the network describes itself: the arrays of its state dict."""
-        return Stored.of("elm", self.state_dict(), activation=self.activation)
-
     @classmethod
-    def from_stored(cls, stored):
+    def from_stored(cls, stored, restore):
         """Return the network of a description."""
-        arrays = stored.shaped(
-            **{"input_weights": "hn", "input_bias": "h", "input_center": "n", "input_scale": "n"},
-            **{"output_weights": "fm", "intercept": "m"},
-            **{"leverage_center": "f", "leverage_factor": "ff", "leverage_offset": ""},
-        )
+        arrays = stored.tensors(**cls.layout.arrays)
         (n_hidden, n), n_features = arrays["input_weights"].shape, len(arrays["output_weights"])
         if n_features not in (n_hidden, n_hidden + n):
             raise ValueError(f"{n_hidden} hidden neurons cannot have {n_features} features")
-        activation = stored.value("activation", str)
-        if activation not in ACTIVATIONS:
-            raise ValueError(
-                f"`activation` must be one of {[*ACTIVATIONS]}, got {activation!r:.60}"
-            )
-        return cls(arrays, activation)
+        return cls(arrays, stored.value("activation", str))
 
 
 def _refresh_tangent(elm, incompatible_keys=None):

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel
-from hybridkin._core.stored import Stored
+from hybridkin._core.stored import Layout, Restore, Stored
 
 __all__ = ["AffineModule", "KernelModule", "PolynomialModule", "RegressorModule", "error_module"]
 
@@ -70,19 +70,20 @@ class AffineModule(ForwardModel):
     ----------
     coef : array-like of shape (m, n) or (n,)
         Coefficients.
-    intercept : array-like of shape (m,) or float
+    bias : array-like of shape (m,) or float
         Value at q = 0.
     """
 
+    layout = Layout("affine", {"coef": "mn", "bias": "m"})
     coef: Tensor
     bias: Tensor
 
-    def __init__(self, coef: ArrayLike, intercept: ArrayLike) -> None:
+    def __init__(self, coef: ArrayLike, bias: ArrayLike) -> None:
         super().__init__()
         matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64).contiguous()
-        bias = torch.tensor(np.asarray(intercept), dtype=torch.float64)
+        intercept = torch.tensor(np.asarray(bias), dtype=torch.float64)
         self.register_buffer("coef", matrix)
-        self.register_buffer("bias", bias.expand(len(matrix)).clone())
+        self.register_buffer("bias", intercept.expand(len(matrix)).clone())
 
     def forward(self, q: Tensor) -> Tensor:
         """Return coef q + bias, shape (..., m)."""
@@ -97,16 +98,6 @@ class AffineModule(ForwardModel):
         """Return a NumPy function of one configuration, q (n,) -> x (m,) and dx/dq (m, n)."""
         coef, bias = (part.cpu().double().numpy().copy() for part in (self.coef, self.bias))
         return lambda q: (coef.dot(q) + bias, coef.copy())
-
-    def stored(self) -> Stored:
-        """Return how the module describes itself."""
-        return Stored.of("affine", {"coef": self.coef, "bias": self.bias})
-
-    @classmethod
-    def from_stored(cls, stored: Stored) -> AffineModule:
-        """Return the module of a description."""
-        arrays = stored.shaped(coef="mn", bias="m")
-        return cls(arrays["coef"], arrays["bias"])
 
 
 class PolynomialModule(ForwardModel):
@@ -127,6 +118,7 @@ class PolynomialModule(ForwardModel):
         Map of the inputs [unit of q].
     """
 
+    layout = Layout("polynomial", {})
     powers: Tensor
     readout: Tensor
     slope: Tensor
@@ -197,10 +189,10 @@ class PolynomialModule(ForwardModel):
         """Return how the module describes itself; its monomials include their derivatives."""
         arrays = {"powers": self.powers.double(), "readout": self.readout}
         arrays |= {"center": self.center, "scale": self.scale}
-        return Stored.of("polynomial", arrays)
+        return Stored.of(self.layout.kind, arrays)
 
     @classmethod
-    def from_stored(cls, stored: Stored) -> PolynomialModule:
+    def from_stored(cls, stored: Stored, restore: Restore) -> PolynomialModule:
         """Return the module of a description."""
         arrays = stored.shaped(powers="pn", readout="pm", center="n", scale="n")
         if not np.isin(arrays["powers"], range(_MOST_POWER)).all():
@@ -222,10 +214,13 @@ class KernelModule(ForwardModel):
         Added to the sum.
     center, scale : array-like of shape (n,)
         ``u = (q - center) / scale`` [unit of q].
-    widths : array-like of shape (n,) or float
+    widths : array-like of shape (n,) or float, default=1.0
         Widths of the Gaussians along each u.
     """
 
+    layout = Layout(
+        "kernel", {"rows": "kn", "weights": "km", "bias": "m", "center": "n", "scale": "n"}
+    )
     rows: Tensor
     weights: Tensor
     tangent: Tensor
@@ -240,7 +235,7 @@ class KernelModule(ForwardModel):
         bias: ArrayLike,
         center: ArrayLike,
         scale: ArrayLike,
-        widths: ArrayLike,
+        widths: ArrayLike = 1.0,
     ) -> None:
         super().__init__()
         at, heights = np.asarray(rows) / np.asarray(widths), np.asarray(weights)
@@ -287,17 +282,6 @@ class KernelModule(ForwardModel):
         towards = (kernel @ self.tangent.to(q)).unflatten(-1, (-1, q.shape[-1]))
         J = (towards - value[..., None] * u[..., None, :]) / self.scale.to(q)
         return value + self.bias.to(q), J
-
-    def stored(self) -> Stored:
-        """Return how the module describes itself."""
-        arrays = {"rows": self.rows, "weights": self.weights, "bias": self.bias}
-        return Stored.of("kernel", {**arrays, "center": self.center, "scale": self.scale})
-
-    @classmethod
-    def from_stored(cls, stored: Stored) -> KernelModule:
-        """Return the module of a description, whose rows are in units of the widths."""
-        arrays = stored.shaped(rows="kn", weights="km", bias="m", center="n", scale="n")
-        return cls(**arrays, widths=1.0)
 
 
 class RegressorModule(ForwardModel):

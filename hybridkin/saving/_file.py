@@ -62,23 +62,30 @@ def packed(stored: Stored) -> tuple[Header, Arrays]:
 
 
 def unpacked(header: Header, arrays: Arrays) -> Stored:
-    """Return the description that `packed` wrote; a ValueError where it is none."""
+    """Return the description that `packed` wrote; a ValueError where it is none.
+
+    Parts that say the same are one object, as the parts of the model were.
+    """
+    found: dict[str, Stored] = {}
     kinds = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
-    if not isinstance(header, dict):
-        raise ValueError(f"a part must be an object, got {header!r:.60}")
-    for key, kind in kinds.items():
-        if not isinstance(header.get(key), kind):
-            raise ValueError(f"`{key}` must be a {kind.__name__}, got {header.get(key)!r:.60}")
-    names = header["arrays"]
-    missing = [name for name in names.values() if name not in arrays]
-    if missing:
-        raise ValueError(f"the array {missing[0]!r:.60} is missing")
-    return Stored(
-        header["kind"],
-        header["settings"],
-        {key: arrays[name] for key, name in names.items()},
-        {key: unpacked(part, arrays) for key, part in header["parts"].items()},
-    )
+
+    def described(header: Header) -> Stored:
+        if not isinstance(header, dict):
+            raise ValueError(f"a part must be an object, got {header!r:.60}")
+        for key, kind in kinds.items():
+            if not isinstance(header.get(key), kind):
+                raise ValueError(f"`{key}` must be a {kind.__name__}, got {header.get(key)!r:.60}")
+        missing = [name for name in header["arrays"].values() if name not in arrays]
+        if missing:
+            raise ValueError(f"the array {missing[0]!r:.60} is missing")
+        entry = json.dumps({key: header[key] for key in kinds}, sort_keys=True)
+        if entry not in found:
+            own = {key: arrays[name] for key, name in header["arrays"].items()}
+            parts = {key: described(part) for key, part in header["parts"].items()}
+            found[entry] = Stored(header["kind"], header["settings"], own, parts)
+        return found[entry]
+
+    return described(header)
 
 
 def write(path: Path, header: Header, arrays: Arrays) -> None:
