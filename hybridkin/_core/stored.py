@@ -212,16 +212,14 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
 
 
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
-    """Return an estimator with those of the parameters that it knows, checked."""
+    """Return an estimator with those of the parameters that it knows."""
     defaults = cls().get_params(deep=False)
     known = {
-        name: tuple(value) if isinstance(defaults[name], tuple) else value
+        name: tuple(value) if isinstance(defaults[name], tuple) and type(value) is list else value
         for name, value in params.items()
         if name in defaults
     }
-    estimator = cls(**known)
-    estimator._validate_params()
-    return estimator
+    return cls(**known)
 
 
 def feature_names(stored: Stored, n: int) -> NDArray | None:

@@ -1,4 +1,4 @@
-"""What has changed since a model was fitted: an affine correction, learned as it is measured."""
+"""A change of the robot since the fit: an affine correction, learned measurement by measurement."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from hybridkin.learning.regressor_modules import AffineModule
 
 
 class Drift(NamedTuple):
-    """Statistics of the residuals of a fitted model, earlier ones fading.
+    """Statistics of the residuals of a fitted model; earlier ones fade.
 
     The correction B [1, u], ``u = (q - center) / scale``, is the ridge regression of the residuals
-    with penalty `alpha`: it starts at zero, and is zero again where nothing has been measured for
-    long. So the fitted model stays what it was.
+    with penalty `alpha`. It starts at zero and returns to zero where nothing is measured for long.
 
     Parameters
     ----------
@@ -33,8 +33,9 @@ class Drift(NamedTuple):
     moment: NDArray
 
     @classmethod
-    def of_range(cls, low: NDArray, high: NDArray, n_outputs: int) -> Drift:
-        """Return the drift of no measurement, for a fit to rows in a box."""
+    def of_range(cls, q: Tensor, n_outputs: int) -> Drift:
+        """Return the drift before any measurement, for a fit to rows q (N, n)."""
+        low, high = q.amin(0).numpy(), q.amax(0).numpy()
         scale = 0.5 * (high - low)
         scale = np.where(scale > 0, scale, 1.0)
         n = len(scale) + 1

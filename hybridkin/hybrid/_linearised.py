@@ -1,13 +1,13 @@
-"""Ridge regression on features times Jacobians: its optimum, its rows left out, its penalties."""
+"""Ridge regression on features times Jacobians: optimum, leave-out residuals, penalties."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from math import inf, log10
-from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 Pair = tuple[float, float]
@@ -61,8 +61,8 @@ class Linearised:
     def left_out(self, penalty: Tensor, members: list[Tensor] | None = None) -> Tensor:
         """Return the residual (N, m) of every row from a fit without it, or without its group.
 
-        Exact: (1 - H_SS)^-1 r_S, with H the hat matrix and S the rows of a group; groups with
-        more rows than there are weights are taken out of the system instead.
+        Exact: (1 - H_SS)^-1 r_S, with H the hat matrix and S the rows of a group. Groups with
+        more rows than there are weights are subtracted from the system instead.
 
         Parameters
         ----------
@@ -90,21 +90,6 @@ class Linearised:
                 left = y - A @ torch.cholesky_solve(right[:, None], rest)[:, 0]
             result[rows] = left.view_as(own[rows])
         return result
-
-    def posterior(self, penalty: Tensor, count: float) -> tuple[Tensor, Tensor]:
-        """Return R (C, K, D) with R R' the covariance of W, and the variance of the noise.
-
-        The covariance is that for noise of variance 1; `count` is how many numbers were measured.
-        """
-        kept, L = self.factor(penalty)
-        C = len(self.gram)
-        half = torch.linalg.solve_triangular(L.mT, torch.eye(len(L)).to(L), upper=True)
-        factor = half.new_zeros(C, len(kept), len(L))
-        factor[:, kept] = half.unflatten(0, (C, -1))
-        squares = self.residual(solve_kept(self.moment, kept, L)).square().sum()
-        used = len(L) - (penalty[kept].repeat(C) * half.square().sum(1)).sum()
-        free = count - used
-        return factor, squares / torch.where(free > 0, free, torch.nan)
 
     def _spread(self, phi: Tensor, inverse: Tensor) -> Tensor:
         """Return the covariance (N, C, C) of W phi, from that of W."""
@@ -135,7 +120,7 @@ def design(J: Tensor, phi: Tensor) -> Tensor:
     return (J[..., None] * phi[..., None, None, :]).flatten(-2)
 
 
-def members_of(groups: Any) -> list[Tensor]:
+def members_of(groups: ArrayLike) -> list[Tensor]:
     """Return the rows of every group, from their labels (N,)."""
     _, of_row = np.unique(np.asarray(groups), return_inverse=True)
     order = torch.from_numpy(np.argsort(of_row, kind="stable"))

@@ -182,6 +182,10 @@ class HybridModule(ForwardModel):
         """Return the same model with another drift; this one stays as it is."""
         return type(self)(self.mechanical, [c for _, c in self._parts()], self.weights, drift)
 
+    def rows(self) -> HybridModule:
+        """Return the module whose outputs are the columns of measured y: for tips the same."""
+        return self
+
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m) [m]."""
         return in_blocks(self._forward, q)[0]

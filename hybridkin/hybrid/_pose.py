@@ -38,6 +38,11 @@ class PoseHybridModule(HybridModule, PoseModel):
     layout = HybridModule.layout._replace(kind="pose_hybrid_module")
     n_outputs = 3
 
+    def rows(self) -> HybridModule:
+        """Return the same model with poses as rows of six numbers."""
+        corrections = [correction for _, correction in self._parts()]
+        return PoseRows(self.mechanical, corrections, self.weights, self.drift)
+
     def error_part(self, q: Tensor) -> Tensor:
         """Return (e_p, e_r), shape (..., 6) [m]."""
         return super().error_part(q)

@@ -1,13 +1,17 @@
-"""How far off a tip may be: a radius that held-out motions have confirmed."""
+"""How far off a tip may be: a radius confirmed by held-out motions."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from sklearn.base import clone
 from sklearn.model_selection import GroupKFold, KFold
+
+from hybridkin.hybrid._fit import Rows, Spec
+from hybridkin.hybrid._kernel import distance
+from hybridkin.hybrid._selection import fit_selected
 
 _FOLDS = 5
 
@@ -25,20 +29,19 @@ class Radius(NamedTuple):
         return weight * self.inside + (1.0 - weight) * self.outside
 
 
-def conformal_radius(
-    model: Any, X: Any, y: NDArray, weights: NDArray | None, groups: Any, coverage: float
-) -> Radius:
-    """Return the radius that a share `coverage` of held-out tips lies within.
+def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> Radius:
+    """Return the radius that covers a share `coverage` of held-out tips.
 
-    Whole groups are held out, five times, and all is fitted anew without them, calibration
+    Whole groups are held out, five times, and everything is fitted anew without them, calibration
     included. The errors, over the rms of errors of their kind (of the hybrid where its error model
-    is trusted, of the mechanical model beyond), give the quantile.
+    is trusted, of the mechanical model outside), give the quantile.
 
     References
     ----------
     Papadopoulos et al., ECML (2002), normalised inductive conformal prediction; Vovk, Annals of
     Mathematics and AI 74 (2015), its pooling over folds.
     """
+    X, y, groups, weights = rows.X, rows.tips, rows.groups, rows.counts
     n_folds = min(_FOLDS, len(y) if groups is None else len(np.unique(groups)))
     if n_folds < 2:
         raise ValueError(
@@ -48,29 +51,20 @@ def conformal_radius(
     splitter = KFold(n_folds, shuffle=True, random_state=0) if groups is None else None
     trust, errors, mechanical = (np.full(len(y), np.nan) for _ in range(3))
     for train, test in (splitter or GroupKFold(n_folds)).split(X, y, groups):
-        part: Any = clone(model)
-        given = {"sample_weight": weights, "groups": groups}
-        given = {name: np.asarray(v)[train] for name, v in given.items() if v is not None}
-        part.set_params(coverage=None, play=None).fit(X[train], y[train], **given)
-        trust[test] = part.error_weight(X[test])
-        errors[test] = distance(part.predict(X[test]), y[test])
-        mechanical[test] = distance(part.predict_mechanical(X[test]), y[test])
-    weights = np.ones(len(y)) if weights is None else weights
+        module = fit_selected(spec, rows.take(train)).module
+        q = torch.from_numpy(X[test].astype(np.float64))
+        with torch.no_grad():
+            trust[test] = module.error_weight(q).numpy()
+            errors[test] = distance(module(q).numpy(), y[test])
+            mechanical[test] = distance(module.mechanical_part(q).numpy(), y[test])
     trusted = weights * (trust >= 0.5)
-    if not trusted.any():
-        trusted = weights
-    inside = _rms(errors, trusted)
-    outside = (
-        max(inside, _rms(mechanical, weights)) if model.mechanical_model is not None else inside
-    )
+    inside = _rms(errors, trusted if trusted.any() else weights)
+    outside = inside
+    if spec.mechanical is not None:
+        outside = max(inside, _rms(mechanical, weights))
     relative = errors / (trust * inside + (1.0 - trust) * outside)
     factor = _quantile(relative, weights, coverage)
     return Radius(factor * inside, factor * outside, coverage, len(y))
-
-
-def distance(a: Any, b: NDArray) -> NDArray:
-    """Return how far two sets of tips are apart, row by row, shape (N,)."""
-    return np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)
 
 
 def _rms(values: NDArray, weights: NDArray) -> float:
@@ -78,7 +72,7 @@ def _rms(values: NDArray, weights: NDArray) -> float:
 
 
 def _quantile(values: NDArray, weights: NDArray, coverage: float) -> float:
-    """Return the smallest value that covers the share asked for, one more row counted as missed."""
+    """Return the smallest value that covers the share, with one more row counted as not covered."""
     order = np.argsort(values)
     reached = np.cumsum(weights[order])
     wanted = coverage * (reached[-1] + 1.0)

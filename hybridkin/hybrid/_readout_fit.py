@@ -1,18 +1,18 @@
-"""The readout of a `SerialModule` from data: its optimum, its penalties, its errors left out."""
+"""The readout W phi(q) from data: its optimum, its penalties, its leave-out residuals."""
 
 from __future__ import annotations
 
 import copy
 from functools import partial
 from math import inf, nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
-from hybridkin._core.model import forward_and_jacobian
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Restore, Stored
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import (
@@ -25,6 +25,8 @@ from hybridkin.hybrid._linearised import (
     quasi_newton,
 )
 
+__all__ = ["ReadoutFit", "fit_readout"]
+
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
 _SETTLED = 1e-9  # of the gradient without a correction
@@ -32,12 +34,12 @@ _RATIOS = torch.logspace(-2, 4, 25, dtype=torch.float64)  # of noise, over the m
 
 
 class ReadoutFit(NamedTuple):
-    """What `fit_readout` found."""
+    """A fitted readout, and how it was found."""
 
     readout: Readout
     alphas: Pair  # of the linear and of the other features; infinity: none of them
-    residual: NDArray  # (N, m) [m], of every row when it, or its group, was left out
-    scores: dict[Pair, float]  # mean squared distance of rows left out [m^2], by alphas
+    residual: NDArray  # (N, m) [m], of every row from a fit without it, or without its group
+    scores: dict[Pair, float]  # mean squared leave-out distance [m^2], by alphas
     gradient: float  # of the objective at the optimum, relative to that without a correction
     noise_ratio: float = inf  # variance of tips over that of actuators; infinity: of tips alone
 
@@ -68,59 +70,75 @@ class ReadoutFit(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A fit before it is dressed up as one."""
+    """A fit in the variables of its problem."""
 
     problem: _Problem
-    linear: Linearised
-    readout: Tensor
+    weights: Tensor
     alphas: Pair
-    residual: Tensor  # (N, m) [m], left out
+    residual: Tensor  # (N, m) [m], leave-out
     scores: dict[Pair, float]
     gradient: float
 
 
+class _AtTip(ForwardModel):
+    """A model whose inner coordinates are its tip: a correction of them is one at the tip."""
+
+    def __init__(self, model: ForwardModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        return self.model.forward_and_jacobian(q)
+
+    def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        return self.model.forward_and_jacobian(q)
+
+    def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        return z, torch.eye(z.shape[1], dtype=z.dtype, device=z.device).expand(len(z), -1, -1)
+
+
 def fit_readout(
-    mechanical: nn.Module,
+    mechanical: ForwardModel,
     features: Features,
     q: Tensor,
     x: Tensor,
     *,
-    place: str = "coordinates",
+    coupling: str = "serial",
     sample_weight: Tensor | None = None,
-    groups: Any = None,
+    groups: ArrayLike | None = None,
     alphas: Pair | None = None,
     noise_ratio: float = inf,
 ) -> ReadoutFit:
     """Return the readout that minimises the error of the tip plus a penalty on its weights.
 
-    The objective sum_n w_n |x_n - f(z_n + D W phi_n)|^2 + alpha_1 |W_lin|^2 + alpha_2 |W_bent|^2 is
-    brought to its exact minimum by damped Gauss-Newton rounds, carried on by quasi-Newton ones.
-    D scales the coordinates, lengths and bendings, such that one unit of each moves the tip by 1 m
-    (rms over the rows): a penalty is the variance of the noise over that of a weight.
+    The objective sum_n w_n |x_n - F(z_n + D W phi_n)|^2 + alpha_1 |W_lin|^2 + alpha_2 |W_bent|^2 is
+    brought to its exact minimum by damped Gauss-Newton rounds, then by quasi-Newton ones.
+    D scales the coordinates such that one unit of each moves the tip by 1 m (rms over the rows):
+    a penalty is the variance of the noise over that of a weight.
 
     Noise of the actuators moves the tip by dx/dq: far in some directions, little in others, and
-    otherwise in every posture. Where the residuals of rows left out look like that, |.| is measured
-    in units of such noise (generalised least squares), if that lowers their mean distance.
+    differently in every posture. Where the leave-out residuals look like that, |.| is measured in
+    units of such noise (generalised least squares), if that lowers their mean distance.
 
     Parameters
     ----------
-    mechanical : nn.Module
-        Maps q to x.
+    mechanical : ForwardModel
+        f, with inner coordinates z and F(z(q)) = f(q).
     features : Features
-        phi; what its linear features explain of the others is taken off those.
+        phi; what its linear features explain of the others is subtracted from those.
     q : Tensor of shape (N, n)
         Actuator vectors.
     x : Tensor of shape (N, m)
         Measured tips [m].
-    place : {"coordinates", "tip"}, default="coordinates"
-        Where the correction acts, see `SerialModule`.
+    coupling : {"serial", "parallel"}, default="serial"
+        Whether W phi(q) is added to the inner coordinates, or to the tip.
     sample_weight : Tensor of shape (N,), optional
         How many times each row counts; residuals of rows that do not count are NaN.
     groups : array-like of shape (N,), optional
-        Motion of every row: what is left out together. Default: single rows.
+        Motion of every row, which is left out as a whole. Default: single rows.
     alphas : tuple of two floats, optional
-        The penalties; infinity: without these features. Default: those with the least error on
-        rows left out, which the linearised problem gives exactly without fitting again.
+        The penalties; infinity: without these features. Default: those with the least leave-out
+        error, which the linearised problem gives exactly without another fit.
     noise_ratio : float, default=inf
         With `alphas`: the variance of a tip's coordinate over that of an actuator, without the
         noise of this one [m^2 over the squared unit of q]. Infinity: the actuators are exact.
@@ -128,14 +146,15 @@ def fit_readout(
     Returns
     -------
     ReadoutFit
-        The model, and how it was found.
+        The readout, and how it was found.
     """
     q, x = q.detach().double(), x.detach().double()
     weight = torch.ones_like(q[:, 0]) if sample_weight is None else sample_weight.to(q)
     kept = weight > 0
     members = None if groups is None else members_of(np.asarray(groups)[kept.cpu().numpy()])
+    model = mechanical if coupling == "serial" else _AtTip(mechanical)
     with torch.no_grad():
-        problem = _Problem(mechanical, features, q[kept], x[kept], weight[kept], place)
+        problem = _Problem(model, features, q[kept], x[kept], weight[kept])
         if alphas is not None:
             found = _fitted(problem.in_noise(noise_ratio), members, alphas)
         else:
@@ -147,59 +166,55 @@ def fit_readout(
                     found = other
         residual = x.new_full(x.shape, nan)
         residual[kept] = found.residual
-        penalty = found.problem.penalty(found.alphas)
-        spread = found.linear.posterior(penalty, x.shape[1] * float(weight.sum()))
-        module = found.problem.module(found.readout, *spread)
+        readout = found.problem.readout(found.weights)
     return ReadoutFit(
-        *(module, found.alphas, residual.cpu().numpy(), found.scores, found.gradient),
+        readout,
+        found.alphas,
+        residual.cpu().numpy(),
+        found.scores,
+        found.gradient,
         found.problem.noise_ratio,
     )
 
 
-def _chosen(problem: _Problem, members: Any, start: Pair | None = None) -> _Found:
-    """Return the fit with the penalties that err least on rows left out."""
-    readout, alphas, scores = problem.nothing, start, {}
+def _chosen(problem: _Problem, members: list[Tensor] | None, start: Pair | None = None) -> _Found:
+    """Return the fit with the penalties of least leave-out error."""
+    weights, alphas, scores = problem.nothing, start, {}
     for _ in range(2):
-        # Linearised without a correction first, then where that has led.
+        # Linearised without a correction first, then about the one found.
         alphas, scores = choose(
-            partial(problem.score, problem.linearised(readout), members), alphas
+            partial(problem.score, problem.linearised(weights), members), alphas
         )
-        readout, _ = problem.minimum(readout, problem.penalty(alphas), _FACTORS)
+        weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
     assert alphas is not None
-    found = _fitted(problem, members, alphas, readout)._replace(scores=scores)
+    found = _fitted(problem, members, alphas, weights)._replace(scores=scores)
     if problem.mean_square(found.residual) > problem.mean_square(problem.rest):
-        # The linearised problem promised what the robot does not keep.
+        # The linearised problem predicted an improvement that the exact one does not show.
         return _fitted(problem, members, (inf, inf))._replace(scores=scores)
     return found
 
 
-def _fitted(problem: _Problem, members: Any, alphas: Pair, readout: Tensor | None = None) -> _Found:
-    """Return the fit with given penalties, from a readout to start at."""
+def _fitted(
+    problem: _Problem, members: list[Tensor] | None, alphas: Pair, start: Tensor | None = None
+) -> _Found:
+    """Return the fit with given penalties, from weights to start at."""
     penalty = problem.penalty(alphas)
-    start = problem.nothing if readout is None else readout
-    readout, gradient = problem.minimum(start, penalty)
-    linear = problem.linearised(readout)
-    residual = problem.in_metres(linear.left_out(penalty, members))
-    return _Found(problem, linear, readout, alphas, residual, {}, gradient)
+    weights, gradient = problem.minimum(problem.nothing if start is None else start, penalty)
+    left_out = problem.linearised(weights).left_out(penalty, members)
+    return _Found(problem, weights, alphas, problem.in_metres(left_out), {}, gradient)
 
 
 class _Problem:
     """The rows of a fit, in scaled coordinates and in a basis of the features without idle ones."""
 
     def __init__(
-        self,
-        mechanical: nn.Module,
-        features: Features,
-        q: Tensor,
-        x: Tensor,
-        weight: Tensor,
-        place: str,
+        self, mechanical: ForwardModel, features: Features, q: Tensor, x: Tensor, weight: Tensor
     ) -> None:
-        self.mechanical, self.features, self.place = mechanical, features, place
+        self.mechanical, self.features = mechanical, features
         self.q, self.x, self.root = q, x, weight.sqrt()[:, None]
         self.noise_ratio, self.whitening = inf, None
-        self.z = coordinates(mechanical, q, place)[0]
-        tips, J = tip_and_columns(mechanical, self.z, place)
+        self.z = mechanical.coordinates(q)[0]
+        tips, J = mechanical.from_coordinates_and_jacobian(self.z)
         self.rest = x - tips
         J = self.root[:, None] * J
         moved = (J.square().sum((0, 1)) / weight.sum()).sqrt()
@@ -241,7 +256,7 @@ class _Problem:
 
     def _principal_noise(self) -> tuple[Tensor, Tensor]:
         """Return variances (N, m) and axes (N, m, m) of what noise of the actuators does to x."""
-        J = forward_and_jacobian(self.mechanical, self.q)[1]
+        J = self.mechanical.forward_and_jacobian(self.q)[1]
         spread, axes = torch.linalg.eigh(J @ J.mT)
         return spread.clamp(min=0.0), axes
 
@@ -270,7 +285,7 @@ class _Problem:
         return Linearised(J, self.phi, rest + (J @ (self.phi @ readout.mT)[..., None])[..., 0])
 
     def score(self, linear: Linearised, members: list[Tensor] | None, alphas: Pair) -> float:
-        """Return the mean squared distance of rows left out [m^2]."""
+        """Return the mean squared leave-out distance [m^2]."""
         left = linear.left_out(self.penalty(alphas), members)
         return float(left.square().sum() / self.root.square().sum())
 
@@ -310,22 +325,14 @@ class _Problem:
             readout, value, slope = tried, new, new_slope
         return readout, float(slope.norm()) / scale
 
-    def module(self, readout: Tensor, factor: Tensor, noise_variance: Tensor) -> SerialModule:
-        """Return the model of the features themselves, in the units of the coordinates."""
-        factor = torch.einsum("c,pk,ckr->cpr", self.units, self.basis, factor).flatten(0, 1)
-        return SerialModule(
-            self.mechanical,
-            self.features,
-            self.units[:, None] * (readout @ self.basis.mT),
-            place=self.place,
-            factor=factor,
-            noise_variance=noise_variance,
-        )
+    def readout(self, weights: Tensor) -> Readout:
+        """Return the readout of the features themselves, in the units of the coordinates."""
+        return Readout(self.features, self.units[:, None] * (weights @ self.basis.mT))
 
     def _about(self, readout: Tensor) -> tuple[Tensor, Tensor]:
         """Return the Jacobians (N, m, C) by the scaled coordinates, and the residuals (N, m)."""
         z = self.z + self.units * (self.phi @ readout.mT)
-        tip, J = tip_and_columns(self.mechanical, z, self.place)
+        tip, J = self.mechanical.from_coordinates_and_jacobian(z)
         J, rest = self.root[:, None] * J * self.units, self.root * (self.x - tip)
         if self.whitening is None:
             return J, rest

@@ -1,35 +1,50 @@
-"""What the settings of a HybridForwardModel must be."""
+"""Checks of the settings of a HybridForwardModel."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from torch import nn
 
-from hybridkin.hybrid._couplings import COUPLINGS, READOUTS, Readout
+from hybridkin._core.model import PoseModel
+from hybridkin.hybrid._fit import NamedFeatures
 from hybridkin.hybrid._guards import GUARDS
-from hybridkin.hybrid._pose import check_pose_settings
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
-HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)
-"""Regressors whose features can act inside the robot."""
+if TYPE_CHECKING:
+    from hybridkin.hybrid.estimator import HybridForwardModel
 
-NAMED = (str, Readout)
-"""What names an error model rather than being one."""
+__all__ = ["COUPLINGS", "FEATURES", "check_settings", "resolved_error_model"]
+
+COUPLINGS = ("parallel", "serial")
+FEATURES = ("linear", "quadratic", "pose")
+"""Error models by the name of their features."""
+_REGRESSORS = ("elm", "kernel")
+_HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)  # whose features can act inside the robot
 
 
-def check_settings(model: Any) -> None:
-    """Raise where the settings of a HybridForwardModel cannot be met."""
+def resolved_error_model(error_model: Any, seed: int | np.random.RandomState | None) -> Any:
+    """Return a regressor, `NamedFeatures`, "kernel" or "drop" for the setting `error_model`."""
+    if error_model is None or error_model == "elm":
+        return ELMRegressor(random_state=seed)
+    return NamedFeatures(error_model) if error_model in FEATURES else error_model
+
+
+def check_settings(model: HybridForwardModel) -> None:
+    """Raise where the settings of a HybridForwardModel are not allowed."""
+    error_model, mechanical = model.error_model, model.mechanical_model
+    names = ("auto", "drop", *_REGRESSORS, *FEATURES)
     if model.coupling not in COUPLINGS:
         raise ValueError(f"`coupling` must be one of {[*COUPLINGS]}, got {model.coupling!r}.")
     if model.coverage is not None and not 0.0 < model.coverage < 1.0:
         raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}.")
-    names = model.calibrate
-    if (isinstance(names, str) and names != "default") or not isinstance(names, (str, Iterable)):
+    wanted = model.calibrate
+    if wanted != "default" and (isinstance(wanted, str) or not isinstance(wanted, Iterable)):
         raise ValueError(
-            f'`calibrate` must be a sequence of names or "default", got {names!r}; for example '
+            f'`calibrate` must be a sequence of names or "default", got {wanted!r}; for example '
             '["radii", "base"].'
         )
     if isinstance(model.play, str) and model.play != "auto":
@@ -39,33 +54,54 @@ def check_settings(model: Any) -> None:
     if model.output not in ("position", "pose"):
         raise ValueError(f"`output` must be 'position' or 'pose', got {model.output!r}.")
     if model.output == "pose":
-        check_pose_settings(model)
+        _check_pose_settings(model)
     if model.guard not in GUARDS:
         raise ValueError(f"`guard` must be one of {GUARDS}, got {model.guard!r}.")
-    named, names = isinstance(model.error_model, NAMED), ("auto", "drop", *READOUTS)
-    if isinstance(model.error_model, str) and model.error_model not in names:
+    if isinstance(error_model, str) and error_model not in names:
         raise ValueError(
-            f"`error_model` must be an estimator, None or one of {[*names]}, got "
-            f"{model.error_model!r}."
+            f"`error_model` must be an estimator, None or one of {[*names]}, got {error_model!r}."
         )
-    serial = model.coupling == "serial" and model.error_model != "drop"
+    serial = model.coupling == "serial" and error_model != "drop"
     if serial and not (
-        named or model.error_model is None or isinstance(model.error_model, HIDDEN_LAYERS)
+        error_model is None
+        or isinstance(error_model, _HIDDEN_LAYERS)
+        or (isinstance(error_model, str) and error_model != "kernel")
     ):
         raise TypeError(
             f"`error_model` must give features that can act inside the robot with "
-            f"coupling='serial': None, one of {[*READOUTS]}, an ELMRegressor or an "
-            f"ELMRegressorCV, got {type(model.error_model).__name__}; use coupling='parallel'."
+            f"coupling='serial': None, one of {['elm', *FEATURES]}, an ELMRegressor or an "
+            f"ELMRegressorCV, got {error_model!r}; use coupling='parallel'."
         )
-    if model.mechanical_model is None:
-        if named or serial:
+    if mechanical is None:
+        if serial or (isinstance(error_model, str) and error_model not in _REGRESSORS):
             raise ValueError(
                 f"`mechanical_model` must be given with coupling={model.coupling!r} and "
-                f"error_model={model.error_model!r}: the error is that of a mechanical model. "
+                f"error_model={error_model!r}: the error is that of a mechanical model. "
                 "For the data alone give an estimator as `error_model`."
             )
-    elif not isinstance(model.mechanical_model, nn.Module):
+    elif not isinstance(mechanical, nn.Module):
         raise TypeError(
             "`mechanical_model` must be a torch module q -> x or None, got "
-            f"{type(model.mechanical_model).__name__}; wrap a function in an nn.Module."
+            f"{type(mechanical).__name__}; wrap a function in an nn.Module."
+        )
+
+
+def _check_pose_settings(model: HybridForwardModel) -> None:
+    if not isinstance(model.mechanical_model, PoseModel):
+        raise TypeError(
+            "`mechanical_model` must be a PoseModel, with pose_and_jacobian(q), for output='pose', "
+            f"as all chains are, got {type(model.mechanical_model).__name__}; for positions use "
+            "output='position'."
+        )
+    named = isinstance(model.error_model, str) and model.error_model not in _REGRESSORS
+    if (model.coupling != "parallel" or named) and model.error_model != "drop":
+        raise ValueError(
+            "`coupling` must be 'parallel' and `error_model` a regressor, None, 'elm', 'kernel' or "
+            f"'drop' with output='pose', got {model.coupling!r} and {model.error_model!r}; "
+            "ELMRegressorCV() chooses its penalties, or use output='position'."
+        )
+    if model.coverage is not None:
+        raise ValueError(
+            f"`coverage` must be None with output='pose', got {model.coverage!r}; its radius is "
+            "for tip positions: fit a model with output='position' to y[:, :3]."
         )

@@ -2,44 +2,32 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils.validation import (
-    _check_sample_weight,
-    check_is_fitted,
-    has_fit_parameter,
-    validate_data,
-)
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import Tensor, nn
 
 from hybridkin._core.model import as_forward_model
-from hybridkin._core.units import warn_span
-from hybridkin.calibration.calibrate import CalibrationResult, calibrate
+from hybridkin._core.units import span_message
+from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
-from hybridkin.hybrid._couplings import blended, fit_coupled
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._guards import fit_guard
+from hybridkin.hybrid._fit import FittedHybrid, Part, Rows, Spec, fit_hybrid, residuals
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
-from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
 from hybridkin.hybrid._radius import Radius, conformal_radius
-from hybridkin.hybrid._selection import choose, choose_mechanics, rivals
-from hybridkin.hybrid._settings import NAMED, check_settings
-from hybridkin.ik._realtime import NumpyFunction
+from hybridkin.hybrid._selection import choose_mechanics, select
+from hybridkin.hybrid._settings import check_settings, resolved_error_model
 from hybridkin.learning.elm import ELMRegressor
-from hybridkin.learning.regressor_modules import error_module
 
 __all__ = ["HybridForwardModel"]
-
-_BLOCK = 65536
 
 
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -52,70 +40,72 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ----------
     mechanical_model : nn.Module, optional
         Maps q (..., n) to x (..., m), a `ConstantCurvatureChain` for example. It is copied, never
-        changed. None: there is no mechanical part, the data alone decide (f^dat of the paper).
+        changed. None: no mechanical part, the data alone decide (f^dat of the paper).
     error_model : estimator, str or None, default=None
-        Any scikit-learn regressor with as many outputs as x has; or by name "linear" or "quadratic"
-        features of all actuators, or "pose", features of a chain's shape that loads act by, linear
-        and other parts penalised apart by errors on rows, or groups, left out, down to no
-        correction at all; "drop" is the mechanical model alone. None is
-        ``ELMRegressor()``, with serial coupling "quadratic". "auto" tries these in
-        both couplings, an `ELMRegressorCV` and, up to 2000 rows, kernel ridge, and takes the blend
-        of them that errs least on groups, or rows, left out. Where tendons of a
-        `ConstantCurvatureChain` contradict each other and its geometry is calibrated, it tries an
-        `ElasticTendonChain` first. Let the groups be what will be new at work.
+        Any scikit-learn regressor with as many outputs as x has, or a name:
+
+        - "elm", which None means too: ``ELMRegressor(random_state=random_state)``;
+        - "linear" or "quadratic" features of all actuators, or "pose", features of a chain's shape
+          that loads act on. Linear and other features have separate penalties, which are chosen
+          by the leave-out error of rows, or groups; they may reject any correction;
+        - "kernel": Gaussian kernel ridge, its width and penalty chosen on 5 folds;
+        - "drop": the mechanical model alone;
+        - "auto": the blend of these, with linear and other features in both couplings, that has
+          the least error on held-out groups, or rows; kernel ridge up to 2000 rows. Where tendons
+          of a `ConstantCurvatureChain` contradict each other and its geometry is calibrated, an
+          `ElasticTendonChain` is tried first. Group rows by what will be new in use.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
         the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q
         itself for other mechanical models; delta is linear in features of q, so a regressor must
         be an ELMRegressor (its hidden layer and `alpha` are used) or an ELMRegressorCV. It needs
-        less data where what is missing in the model is simple inside.
+        less data where the error has a simple cause inside the robot.
     calibrate : sequence of str or "default", default=()
         Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
         in every fold of a cross-validation. "default": the chain's own list.
     guard : {"leverage", "box", None}, default="leverage"
         Where eps is trusted. "leverage": where the inputs are as close to the training rows, in
         the error model's features, as these are to each other; "box": within the training range;
-        None: everywhere. Beyond, eps fades out and f_mech remains. With a guard f_hyb is nowhere
+        None: everywhere. Outside, eps fades out and f_mech remains. With a guard f_hyb is nowhere
         farther from f_mech than 1.5 times the longest correction of a training row.
     play : float, array-like of shape (n,) or "auto", optional
-        Play of the actuators, backlash and dry friction [unit of q]: rows are taken as commands in
-        the order of time, and the model is one of what they do, see `PlayOperator`. "auto" takes
-        the width with which an `ELMRegressorCV` errs least on motions left out, or none. Each group
-        starts without a past; the inverse kinematics finds what the actuators are to do, and
-        ``play_.command`` what to send for it. Default: no play, rows in any order.
+        Play (backlash) of the actuators [unit of q]: rows are commands in the order of time, and
+        the model maps the motion of the actuators, see `PlayOperator`. "auto" takes the width with
+        the least held-out error of an `ELMRegressorCV`, or none. Each group starts without a past.
+        Inverse kinematics finds the motion of the actuators, ``play_.command`` the commands for
+        it. Default: no play, rows in any order.
     coverage : float, optional
-        Share of tips, 0.9 for example, that shall lie within the radius of
-        ``predict(Q, return_radius=True)``. It costs five more fits, each with a fifth of the
-        groups held out. Default: no radius.
+        Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``.
+        It costs five more fits, each with a fifth of the groups held out. Default: no radius.
     output : {"position", "pose"}, default="position"
         What y holds. "pose": rows of tip position [m] and rotation vector [rad] of the tip's frame
         in the measuring frame. The errors of both are learned as six numbers [m], a radian as the
-        reach of the chain, and set p = p_mech + eps_p and R = exp(eps_r / reach) R_mech. For chains
-        and regressors, parallel, without `coverage`; a calibration looks at the positions.
+        reach of the chain, and set p = p_mech + eps_p and R = exp(eps_r / reach) R_mech. For a
+        `PoseModel` and regressors, parallel, without `coverage`; a calibration uses the positions.
     random_state : int, RandomState or None, default=None
-        Seed of the default error model; one that is given brings its own.
+        Seed of the named error models; a given regressor has its own.
 
     Attributes
     ----------
     module_ : nn.Module
         q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``; of poses q
         -> tip position, with ``pose``, ``pose_jacobian`` and ``tip_transform`` as well.
-    mechanical_model_ : nn.Module or None
+    mechanical_model_ : ForwardModel or None
         The mechanical part, calibrated when asked.
-    error_model_ : estimator, SerialFit, Blend or None
-        The fitted error model; of a blend its ``weights`` and ``error_models``. Of serial
-        coupling, "linear" and "quadratic" it tells the ``alphas`` chosen and the ``residual`` of
-        every row from a fit without it or its group [m].
+    error_model_ : estimator, ReadoutFit, Blend or None
+        The fitted error model; of a blend its ``weights`` and ``error_models``. Of serial coupling
+        and of named features it holds the ``alphas`` chosen and the ``residual`` of every row from
+        a fit without it or its group [m].
     cv_results_ : dict or None
         Of error_model="auto": by candidate, the last of which is the blend, the mean distance on
-        rows left out, its spread over the folds [m] and the CPU time [s]; the ``weights`` of the
-        blend, what is ``chosen`` ("blend", or the only one of weight), and how the mechanical
-        models did, without play (``mechanical_model``). A blend is judged by weights that do not
-        know the fold. New motions that resemble none in the log are harder than those left out.
+        held-out rows, its spread over the folds [m] and the CPU time [s]; the ``weights`` of the
+        blend, what is ``chosen`` ("blend", or the only candidate with a weight), and the scores of
+        the mechanical models, without play (``mechanical_model``). The blend is judged by weights
+        chosen without the fold. New motions unlike all in the log are harder than held-out ones.
     calibration_ : CalibrationResult or None
-        What the calibration found.
+        The result of the calibration.
     play_ : PlayOperator or None
-        The play; None where there is none, and where "auto" found none worth its while.
+        The play; None where there is none, and where "auto" found no significant gain.
     radius_ : Radius or None
         Where a coverage was asked for: the radii ``inside`` and ``outside`` the domain [m].
     n_features_in_ : int
@@ -187,7 +177,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         sample_weight : array-like of shape (N,), optional
             How many times each row counts.
         groups : array-like of shape (N,), optional
-            Motion of every row: what is held out together, by the calibration
+            Motion of every row, which is held out as a whole: by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
 
         Returns
@@ -204,75 +194,35 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Warns
         -----
         UserWarning
-            Where tendons of a ConstantCurvatureChain contradict each other, as slack does; so do
-            `predict` and the Jacobians.
+            Where tendons of a ConstantCurvatureChain contradict each other, as slack does (so do
+            `predict` and the Jacobians), where numbers look like millimetres, and the warnings of
+            `calibrate`.
         """
         check_settings(self)
-        X, y = validate_data(self, X, y=y, multi_output=True, dtype=[np.float64, np.float32])
-        X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
-        y = np.asarray(y, dtype=np.float64)
-        groups = None if groups is None else _checked_groups(groups, len(X))
-        weights = None
-        if sample_weight is not None:
-            weights = _check_sample_weight(
-                sample_weight, X, dtype=np.float64, ensure_non_negative=True
-            )
-        mechanical: Any = copy.deepcopy(self.mechanical_model)
-        if mechanical is not None:
-            mechanical = as_forward_model(mechanical)
-        if hasattr(mechanical, "check_actuators"):
-            for message in mechanical.check_actuators(torch.from_numpy(X), "X"):
-                warnings.warn(message, stacklevel=2)
-        names = self.calibrate
-        if isinstance(names, str) and names == "default":
-            names = getattr(mechanical, "default_parameters", ())
-        names = () if mechanical is None else tuple(names)
-        mechanics, counts = None, np.ones(len(X)) if weights is None else weights
-        if isinstance(self.error_model, str) and self.error_model == "auto":
-            with _silence():
-                candidates = rivals(mechanical, names, X)
-                mechanics = choose_mechanics(self, candidates, X, y, counts, groups)
-            mechanical, names = copy.deepcopy(mechanics.model), mechanics.names
-        self.play_ = play_of(self.play, mechanical, names, X, y, weights, groups)
+        rows = self._checked_rows(X, y, sample_weight, groups)
+        spec = self._spec(rows)
+        asked, mechanics, self.cv_results_ = spec, None, None
+        if not asked.parts:
+            mechanics = choose_mechanics(spec, rows)
+            spec = mechanics.spec
+        self.play_, said = play_of(self.play, spec, rows)
         self._play_state: PlayState | None = None
         if self.play_ is not None:
-            X = self._effective(X, groups)
-            if mechanics is not None:
-                with _silence():
-                    again = choose_mechanics(self, [(mechanical, names)], X, y, counts, groups)
-                mechanics = again._replace(scores=mechanics.scores)  # of all, without play
-        q = torch.from_numpy(X.astype(np.float64))
-        self.calibration_: CalibrationResult | None = None
-        if len(names):
-            tips = y.reshape(len(y), -1)[:, :3] if self.output == "pose" else y
-            held_out = groups if mechanics is None else None  # else it has been done
-            self.calibration_ = calibrate(
-                mechanical, q, torch.from_numpy(tips), names, groups=held_out, sample_weight=weights
-            )
-            mechanical = self.calibration_.chain
-        else:
-            _warn_contradictory(mechanical, q)
-            reach = getattr(mechanical, "reach", None)
-            if reach is not None and y.ndim == 2:
-                warn_span("y", torch.from_numpy(y[:, :3]), float(reach))
-        self.mechanical_model_ = mechanical
-        self.cv_results_ = None
-        if mechanics is None:
-            model = self._default_error_model() if self.error_model is None else self.error_model
-            found = self._learned(self.coupling, model, X, y, weights, groups)
-        else:
-            with _silence():
-                parts, self.cv_results_ = choose(self, mechanical, mechanics, X, y, counts, groups)
-            fits = [self._learned(*part[1:], X, y, weights, groups) for part in parts]
-            found = blended([part.weight for part in parts], fits)
-        self.error_model_, self.module_ = found
-        self._single_output = y.ndim == 1
-        n_outputs = 1 if y.ndim == 1 else y.shape[1]
-        self._drift = Drift.of_range(q.amin(0).numpy(), q.amax(0).numpy(), n_outputs)
+            rows = rows._replace(X=self._effective(rows.X, rows.groups))
+            if mechanics is not None:  # the scores stay those of all models, without play
+                mechanics = mechanics.of(spec, rows)._replace(scores=mechanics.scores)
+        if mechanics is not None:
+            spec, self.cv_results_ = select(mechanics, rows)
+        fitted = fit_hybrid(spec, rows)
+        self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
+        self.error_model_, self.module_ = fitted.error_model, fitted.module
+        self._single_output = rows.y.ndim == 1
+        self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
         self.radius_: Radius | None = None
         if self.coverage is not None:
-            with _silence():
-                self.radius_ = conformal_radius(self, X, y, weights, groups, self.coverage)
+            self.radius_ = conformal_radius(asked, rows, self.coverage)
+        for message in (*said, *_messages(fitted, rows)):
+            warnings.warn(message, stacklevel=2)
         return self
 
     def partial_fit(
@@ -286,8 +236,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> HybridForwardModel:
         """Follow a change of the robot, a payload or wear, by new measurements in order of time.
 
-        Mechanical model and error model stay as they were fitted. What they now miss is learned as
-        an affine function of q that old measurements leave again: ``f_hyb(q) + B [1, q]``.
+        Mechanical model and error model stay as they were fitted. The new residual is learned as
+        an affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``.
 
         Parameters
         ----------
@@ -299,9 +249,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             How many times each row counts.
         decay : float, default=0.98
             Factor in (0, 1] on the weight of all earlier rows with every row: 0.98 forgets within
-            some fifty measurements.
+            about fifty measurements.
         alpha : float, default=1.0
-            Penalty on B, in measurements: how soon a single one is believed.
+            Penalty on B, in measurements: a small one follows single measurements.
 
         Returns
         -------
@@ -310,11 +260,6 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
-        if not hasattr(self, "_drift"):
-            raise ValueError(
-                "`partial_fit` needs the range of the fit, which this model was saved without by "
-                "an earlier version; call `fit` first."
-            )
         for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
             if not 0.0 < value <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
@@ -326,7 +271,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         q, y = torch.from_numpy(X.astype(np.float64)), np.asarray(y, dtype=np.float64)
         weights = _check_sample_weight(sample_weight, X, dtype=np.float64, ensure_non_negative=True)
         with torch.no_grad():
-            error = self._errors(q, y).reshape(len(y), -1)
+            error = residuals(self.mechanical_model_, q, y, self.output).reshape(len(y), -1)
             residual = error - self.module_.with_drift(None).error_part(q).numpy()
         self._drift = self._drift.learned(q.numpy(), residual, weights, decay)
         # What was handed out before stays as it was.
@@ -341,161 +286,121 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X : array-like of shape (N, n)
             Actuator vectors; with `play` those of a motion in the order of time.
         return_radius : bool, default=False
-            Whether to return how far off the tips may be as well; needs `coverage`.
+            Whether to return the estimated error radius as well; needs `coverage`.
         groups : array-like of shape (N,), optional
-            Motion of every row, which matters with `play` alone. Default: one motion.
+            Motion of every row; only `play` depends on it. Default: one motion.
 
         Returns
         -------
         x : ndarray of shape (N, m), or (N,) as in `fit`
-            Tips [m]; of poses rotation vectors up to pi long, too [rad].
+            Tips [m]; of poses also rotation vectors up to pi long [rad].
         radius : ndarray of shape (N,)
             Only if `return_radius`: a share `coverage` of the tips lies within [m], of motions like
-            those of the fit; wider where the error model is not trusted.
+            those of the fit; larger where the error model is not trusted.
         """
         if not return_radius:
-            return self._by_blocks(lambda module, q: (module(q),), X, groups)[0]
+            return self._evaluated(lambda m, q: (m(q),), X, groups)[0]
         check_is_fitted(self)
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9)."
             )
-        both = self._by_blocks(lambda module, q: (module(q), module.error_weight(q)), X, groups)
-        x, weight = both
+        x, weight = self._evaluated(lambda m, q: (m(q), m.error_weight(q)), X, groups)
         return x, self.radius_.at(weight.astype(np.float64)).astype(x.dtype)
 
     def predict_mechanical(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
-        return self._by_blocks(lambda module, q: (module.mechanical_part(q),), X, groups)[0]
+        return self._evaluated(lambda m, q: (m.mechanical_part(q),), X, groups)[0]
 
-    def predict_error(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
+    def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
-        return self._by_blocks(
-            lambda module, q: (module.error_part(q),), X, groups, mechanical=False
-        )[0]
+        return self._evaluated(lambda m, q: (m.error_part(q),), X, groups, warn=False)[0]
 
-    def jacobian(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
+    def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
         Of poses the last three rows give the angular velocity in the measuring frame.
         """
-        return self._by_blocks(lambda module, q: (module.jacobian(q),), X, groups)[0]
+        return self._evaluated(lambda m, q: (m.jacobian(q),), X, groups)[0]
 
     def predict_and_jacobian(
-        self, X: Any, groups: ArrayLike | None = None
+        self, X: ArrayLike, groups: ArrayLike | None = None
     ) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
-        x, J = self._by_blocks(lambda module, q: module.forward_and_jacobian(q), X, groups)
+        x, J = self._evaluated(lambda m, q: m.forward_and_jacobian(q), X, groups)
         return x, J
 
-    def numpy_function(self) -> NumpyFunction:
-        """Return a NumPy function of one configuration, for control loops.
-
-        Returns
-        -------
-        function
-            Maps q of shape (n,) to `predict` (m,) [m] and its Jacobian (m, n), in float64 and some
-            ten times faster. It is not told by a later `fit`.
-        """
-        return self._rows().numpy_function()
-
-    def in_domain(self, X: Any, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
+    def in_domain(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
-        return self._by_blocks(
-            lambda module, q: (module.in_domain(q),), X, groups, mechanical=False
-        )[0]
+        return self._evaluated(lambda m, q: (m.in_domain(q),), X, groups, warn=False)[0]
 
-    def error_weight(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
+    def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
-        return self._by_blocks(
-            lambda module, q: (module.error_weight(q),), X, groups, mechanical=False
-        )[0]
+        return self._evaluated(lambda m, q: (m.error_weight(q),), X, groups, warn=False)[0]
 
-    def _errors(self, q: Tensor, y: NDArray) -> NDArray:
-        """Return what the mechanical model lacks to y, in the rows that an error model learns."""
-        mechanical = self.mechanical_model_
-        if mechanical is None:
-            return y
-        if self.output == "pose":
-            return pose_errors(mechanical, q, y)
-        with torch.no_grad():
-            tips = mechanical(q).numpy()
-        if tips.shape != (y.shape if y.ndim == 2 else (len(y), 1)):
-            raise ValueError(
-                f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
-                f"shape {y.shape}."
+    def _checked_rows(
+        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None, groups: ArrayLike | None
+    ) -> Rows:
+        """Return the measured rows, checked."""
+        X, y = validate_data(self, X, y=y, multi_output=True, dtype=[np.float64, np.float32])
+        X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
+        groups = None if groups is None else _checked_groups(groups, len(X))
+        if sample_weight is not None:
+            sample_weight = _check_sample_weight(
+                sample_weight, X, dtype=np.float64, ensure_non_negative=True
             )
-        return y - tips.reshape(y.shape)
+        return Rows(X, np.asarray(y, dtype=np.float64), sample_weight, groups)
 
-    def _rows(self) -> Any:
-        """Return the fitted module whose outputs are the columns of y."""
-        check_is_fitted(self)
-        return getattr(self.module_, "rows", self.module_)
-
-    def _by_blocks(
-        self,
-        function: Callable[[Any, Tensor], tuple[Tensor, ...]],
-        X: Any,
-        groups: Any,
-        mechanical: bool = True,
-    ) -> list[NDArray]:
-        module = self._rows()
-        X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
-        X = self._effective(X, groups)
-        if mechanical:
-            _warn_contradictory(self.mechanical_model_, torch.from_numpy(X.astype(np.float64)))
-        blocks = []
-        with torch.no_grad():
-            for start in range(0, len(X), _BLOCK):
-                q = torch.from_numpy(X[start : start + _BLOCK].astype(np.float64))
-                blocks.append(function(module, q))
-        results = []
-        for parts in zip(*blocks, strict=True):
-            array = torch.cat(parts).numpy()
-            if array.dtype != bool:
-                array = array.astype(X.dtype, copy=False)
-            results.append(array[:, 0] if self._single_output and array.ndim > 1 else array)
-        return results
-
-    def _learned(
-        self, coupling: str, model: Any, X: NDArray, y: NDArray, weights: Any, groups: Any
-    ) -> tuple[Any, Any]:
-        """Return the error model fitted to what the mechanical model lacks, and the hybrid."""
-        q, mechanical = torch.from_numpy(X.astype(np.float64)), self.mechanical_model_
-        build = PoseHybridModule if self.output == "pose" else HybridModule
-        error = self._errors(q, y)
-        if isinstance(model, str) and model == "drop":
-            return None, build(mechanical, None)
-        if mechanical is not None and (coupling == "serial" or isinstance(model, NAMED)):
-            tips = torch.from_numpy(y.reshape(len(y), -1))
-            return fit_coupled(model, coupling, mechanical, q, tips, weights, groups, self.guard)
-        fitted = _fit_regressor(clone(model), X, error, weights, groups)
-        error_part = error_module(fitted, q)
-        kept = q if weights is None else q[torch.from_numpy(weights > 0)]
-        guard = None  # without a mechanical model there is nothing to fall back on
+    def _spec(self, rows: Rows) -> Spec:
+        """Return what the settings ask for, with a copy of the mechanical model."""
+        mechanical, names = copy.deepcopy(self.mechanical_model), ()
         if mechanical is not None:
-            guard = fit_guard(self.guard, error_part, kept)
-        return fitted, build(mechanical, error_part, guard)
+            mechanical = as_forward_model(mechanical)
+        if isinstance(mechanical, Chain):
+            mechanical.check_actuators(rows.q, "X")
+            names = self.calibrate
+            names = mechanical.default_parameters if isinstance(names, str) else tuple(names)
+        parts = ()
+        if self.error_model != "auto":
+            model = resolved_error_model(self.error_model, self.random_state)
+            parts = (Part(1.0, self.coupling, model),)
+        return Spec(mechanical, parts, names, self.guard, self.output, self.random_state)
 
-    def _effective(self, X: NDArray, groups: Any) -> NDArray:
-        """Return what the actuators do, where there is play."""
+    def _effective(self, X: NDArray, groups: ArrayLike | None) -> NDArray:
+        """Return the motion of the actuators, where there is play."""
         if self.play_ is None or not len(X):
             return X
         return self.play_.apply_by_group(X, np.zeros(len(X)) if groups is None else groups)
 
-    def _default_error_model(self) -> Any:
-        if self.coupling == "serial":
-            return "quadratic"
-        return ELMRegressor(random_state=self.random_state)
+    def _evaluated(
+        self,
+        function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]],
+        X: ArrayLike,
+        groups: ArrayLike | None,
+        warn: bool = True,
+    ) -> list[NDArray]:
+        """Return what a function of the module gives for the rows of X, in the dtype of X."""
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
+        q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
+        if warn and isinstance(self.mechanical_model_, Chain):
+            self.mechanical_model_.warn_contradictory(q, "X", stacklevel=4)
+        with torch.no_grad():
+            arrays = [part.numpy() for part in function(self.module_.rows(), q)]
+        arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
+        return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Leave unsaid of parts of the data what is said of all of them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
+def _messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
+    """Return the warnings of a fit: of its calibration, or of the rows of an uncalibrated chain."""
+    chain = fitted.mechanical
+    if fitted.calibration is not None or not isinstance(chain, Chain):
+        return fitted.messages
+    found = [*chain.check_actuators(rows.q, "X"), chain.contradiction(rows.q, "X")]
+    if rows.y.ndim == 2:
+        found.append(span_message("y", torch.from_numpy(rows.y[:, :3]), float(chain.reach)))
+    return tuple(message for message in found if message is not None)
 
 
 def _checked_groups(groups: ArrayLike, n: int) -> NDArray:
@@ -505,17 +410,3 @@ def _checked_groups(groups: ArrayLike, n: int) -> NDArray:
             f"`groups` must have shape ({n},), one entry for each row of `X`, got {groups.shape}."
         )
     return groups
-
-
-def _fit_regressor(
-    regressor: Any, X: Any, error: NDArray, weights: NDArray | None, groups: Any
-) -> Any:
-    given: dict[str, Any] = {} if weights is None else {"sample_weight": weights}
-    if groups is not None and has_fit_parameter(regressor, "groups"):
-        given["groups"] = groups
-    return regressor.fit(X, error, **given)
-
-
-def _warn_contradictory(mechanical: Any, q: Tensor) -> None:
-    if hasattr(mechanical, "warn_contradictory"):
-        mechanical.warn_contradictory(q, "X", stacklevel=5)

@@ -484,6 +484,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def from_stored(cls, stored, restore):
         """Return the fitted network of a description; `restore` returns its module."""
         elm = estimator_of(cls, stored.value("params", dict))
+        elm._validate_params()
         network = restore(stored.part("network"))
         n_outputs, n_both = network.n_outputs, sum(network.output_weights.shape)
         mean, scatter = stored.array("mean", (n_both,)), stored.array("scatter", (n_both, n_both))

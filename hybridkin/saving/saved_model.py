@@ -18,7 +18,7 @@ from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import plain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.rigid import RigidChain
-from hybridkin.hybrid.description import hybrid_of, restored, stored_hybrid, training_of
+from hybridkin.hybrid.description import hybrid_of, restorer, stored_hybrid, training_of
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor, device_named
 from hybridkin.learning.elm_cv import ELMRegressorCV
@@ -128,11 +128,11 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
             hybrid.module_ = hybrid.module_.to(at)
             return hybrid
         if stored.kind == "elm_regressor":
-            elm = ELMRegressor.from_stored(stored)
+            elm = ELMRegressor.from_stored(stored, restorer())
             elm.device = None if device is None else str(at)
             elm.module_ = elm.module_.to(at)
             return elm
-        return restored(stored).to(at)
+        return restorer()(stored).to(at)
     except _DAMAGE as error:
         raise ValueError(f"{path} is damaged: {error or repr(error)}.") from error
 

@@ -1,0 +1,263 @@
+"""One pure fit of a hybrid: from a specification and measured rows to models and a module."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, clone
+from sklearn.utils.validation import has_fit_parameter
+from torch import Tensor
+
+from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.hybrid._features import Features, HiddenFeatures, PoseFeatures, QuadraticFeatures
+from hybridkin.hybrid._guards import fit_guard
+from hybridkin.hybrid._kernel import tuned_kernel
+from hybridkin.hybrid._linearised import Pair
+from hybridkin.hybrid._module import Correction, HybridModule, InnerCorrection, TipCorrection
+from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
+from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
+from hybridkin.learning.elm import ELMRegressor, draw_layer
+from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.learning.network import LeverageModule
+from hybridkin.learning.regressor_modules import error_module
+
+__all__ = ["Blend", "FittedHybrid", "NamedFeatures", "Part", "Rows", "Spec", "fit_hybrid"]
+
+
+class Rows(NamedTuple):
+    """Measured rows as an estimator gets them."""
+
+    X: NDArray  # (N, n) actuator vectors, float64 or float32
+    y: NDArray  # (N, m) or (N,) [m]
+    weights: NDArray | None = None  # (N,), how many times each row counts
+    groups: NDArray | None = None  # (N,), motion of every row
+
+    @property
+    def q(self) -> Tensor:
+        """Actuator vectors (N, n) in double precision."""
+        return torch.from_numpy(self.X.astype(np.float64))
+
+    @property
+    def tips(self) -> NDArray:
+        """Measured tips as a matrix (N, m) [m]."""
+        return self.y.reshape(len(self.y), -1)
+
+    @property
+    def counts(self) -> NDArray:
+        """How many times each row counts, (N,)."""
+        return np.ones(len(self.X)) if self.weights is None else self.weights
+
+    def take(self, rows: NDArray) -> Rows:
+        """Return some of the rows."""
+        return Rows(*(None if part is None else part[rows] for part in self))  # pyright: ignore
+
+
+class NamedFeatures(NamedTuple):
+    """An error model by the name of its features, with its penalties where they are chosen."""
+
+    kind: str  # "linear", "quadratic" or "pose"
+    alphas: Pair | None = None
+    noise_ratio: float = inf
+
+
+class Part(NamedTuple):
+    """One error model of a hybrid, where it acts, and its share."""
+
+    weight: float
+    coupling: str  # "parallel" or "serial"
+    error_model: NamedFeatures | BaseEstimator | str  # "drop" and "kernel" are names
+
+
+class Blend(NamedTuple):
+    """Several fitted error models, whose hybrids are averaged."""
+
+    weights: tuple[float, ...]
+    error_models: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What to fit: the settings of a HybridForwardModel, resolved."""
+
+    mechanical: ForwardModel | None
+    parts: tuple[Part, ...]  # empty: not chosen yet, see `select`
+    calibrate: tuple[str, ...] = ()  # geometry that is still to be calibrated
+    guard: str | None = "leverage"
+    output: str = "position"
+    random_state: int | np.random.RandomState | None = None
+    calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
+    messages: tuple[str, ...] = ()  # warnings of that calibration
+
+
+class FittedHybrid(NamedTuple):
+    """What a fit found; nothing was issued, its warnings are `messages`."""
+
+    mechanical: ForwardModel | None
+    calibration: CalibrationResult | None
+    error_model: Any  # fitted estimator, ReadoutFit, Blend or None
+    module: HybridModule
+    messages: tuple[str, ...]
+
+
+def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
+    """Return the hybrid: calibrate the mechanical model, fit every error model to its residuals.
+
+    A pure function: it changes none of its arguments and issues no warning.
+    """
+    spec = calibrated(spec, rows, rows.groups)
+    error = residuals(spec.mechanical, rows.q, rows.y, spec.output)
+    fits = [_fit_part(part, spec, rows, error) for part in spec.parts]
+    weights = tuple(part.weight for part in spec.parts)
+    error_model = fits[0][0] if len(fits) == 1 else Blend(weights, tuple(one for one, _ in fits))
+    shares = [w for w, (_, found) in zip(weights, fits, strict=True) if found is not None]
+    module = (PoseHybridModule if spec.output == "pose" else HybridModule)(
+        spec.mechanical,
+        [found for _, found in fits if found is not None],
+        torch.tensor(shares, dtype=torch.float64),
+    )
+    return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
+
+
+def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
+    """Return the specification with the calibrated mechanical model; `groups` for its `cv_rmse`."""
+    if not spec.calibrate:
+        return spec
+    tips = rows.tips[:, :3] if spec.output == "pose" else rows.tips
+    result, messages = fit_geometry(
+        cast(Chain, spec.mechanical),
+        rows.q,
+        torch.from_numpy(tips),
+        spec.calibrate,
+        groups=groups,
+        sample_weight=rows.weights,
+    )
+    return replace(
+        spec,
+        mechanical=result.chain,
+        calibrate=(),
+        calibration=result,
+        messages=tuple(messages),
+    )
+
+
+def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str) -> NDArray:
+    """Return measured minus mechanical model, in the rows that an error model learns [m]."""
+    if mechanical is None:
+        return y
+    if output == "pose":
+        return pose_errors(cast(PoseModel, mechanical), q, y)
+    with torch.no_grad():
+        tips = mechanical(q).numpy()
+    if tips.shape != (y.shape if y.ndim == 2 else (len(y), 1)):
+        raise ValueError(
+            f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
+            f"shape {y.shape}."
+        )
+    return y - tips.reshape(y.shape)
+
+
+def _fit_part(part: Part, spec: Spec, rows: Rows, error: NDArray) -> tuple[Any, Correction | None]:
+    """Return the fitted error model and its guarded correction."""
+    model, mechanical, q = part.error_model, spec.mechanical, rows.q
+    if isinstance(model, str) and model == "drop":
+        return None, None
+    counted = q[torch.from_numpy(rows.counts > 0)]
+    readout = part.coupling == "serial" or isinstance(model, NamedFeatures)
+    if mechanical is not None and readout:
+        fitted = _fit_features(part, mechanical, rows, counted)
+        correction = (
+            InnerCorrection(mechanical, fitted.readout)
+            if part.coupling == "serial"
+            else TipCorrection(fitted.readout)
+        )
+    else:
+        fitted = _fit_regressor(model, rows, error)
+        correction = TipCorrection(error_module(fitted, q))
+    if mechanical is None:
+        return fitted, correction  # without a mechanical model there is nothing to fall back on
+    alone = HybridModule(mechanical, [correction], torch.ones(1, dtype=torch.float64))
+    with torch.no_grad():
+        own = correction.module if isinstance(correction, TipCorrection) else None
+        own = own if isinstance(own, LeverageModule) else None
+        correction.guard = fit_guard(spec.guard, alone.error_part(counted), own, counted)
+    return fitted, correction
+
+
+def _fit_regressor(model: Any, rows: Rows, error: NDArray) -> Any:
+    if isinstance(model, str):  # "kernel"
+        model = tuned_kernel(rows.X, error, rows.counts, rows.groups)
+    given: dict[str, NDArray] = {}
+    if rows.weights is not None:
+        given["sample_weight"] = rows.weights
+    if rows.groups is not None and has_fit_parameter(model, "groups"):
+        given["groups"] = rows.groups
+    return clone(model).fit(rows.X, error, **given)
+
+
+def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, counted: Tensor) -> ReadoutFit:
+    """Return the readout of named features, or of the hidden layer of an ELM.
+
+    An ELMRegressor brings its `alpha` as the penalty; of an ELMRegressorCV the penalties are
+    chosen.
+    """
+    model = part.error_model
+    if isinstance(model, NamedFeatures):
+        features, alphas, noise_ratio = _named(model.kind, mechanical, counted), *model[1:]
+    else:
+        features, alphas = _hidden(cast("ELMRegressor | ELMRegressorCV", model), counted)
+        noise_ratio = inf
+    return fit_readout(
+        mechanical,
+        features,
+        rows.q,
+        torch.from_numpy(rows.tips),
+        coupling=part.coupling,
+        sample_weight=None if rows.weights is None else torch.from_numpy(rows.weights),
+        groups=rows.groups,
+        alphas=alphas,
+        noise_ratio=noise_ratio,
+    )
+
+
+def _named(kind: str, mechanical: ForwardModel, q: Tensor) -> Features:
+    if kind == "linear":
+        return Features.of_range(q)
+    if kind == "quadratic":
+        return QuadraticFeatures.of_range(q)
+    if not isinstance(mechanical, ArcChain):
+        raise TypeError(
+            f"`mechanical_model` must be a chain of arcs, a ConstantCurvatureChain or an "
+            f"ElasticTendonChain, with error_model='pose', got {type(mechanical).__name__}; use "
+            "error_model='quadratic'."
+        )
+    return PoseFeatures.of_range(q, mechanical)
+
+
+def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, Pair | None]:
+    params, alphas = model, None
+    if isinstance(model, ELMRegressorCV):
+        params = ELMRegressor(
+            n_hidden=int(np.max(model.n_hidden)),
+            activation=model.activation,
+            random_state=model.random_state,
+        )
+    elif np.ndim(model.alpha):
+        raise ValueError(
+            "`alpha` of the error model must be one number where it acts inside the robot, got "
+            f"{model.alpha!r}: no output of its own belongs to a coordinate there."
+        )
+    else:
+        alphas = float(model.alpha), float(model.alpha)
+    layer = draw_layer(params, q.numpy(), None)
+    features = HiddenFeatures.of_range(
+        q, layer.input_weights, layer.input_bias, activation=layer.activation
+    )
+    return features, alphas
