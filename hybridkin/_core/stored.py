@@ -28,7 +28,7 @@ class Layout(NamedTuple):
     kind : str
         Names the class.
     arrays : dict of str to str
-        Buffers, with one letter per axis as in `Stored.shaped`.
+        Buffers, with one letter per axis as in `Stored.tensors`.
     settings : dict of str to type
         Plain attributes.
     parts : tuple of str
@@ -156,26 +156,22 @@ class Stored:
             raise ValueError(f"{name!r} must be finite")
         return array
 
-    def shaped(self, **shapes: str) -> dict[str, NDArray]:
-        """Return finite arrays whose shapes fit together.
+    def tensors(self, **shapes: str) -> dict[str, Tensor]:
+        """Return finite arrays whose shapes fit together, as tensors of their own memory.
 
         Parameters
         ----------
         **shapes
             For every array one letter per axis; the same letter stands for the same length:
-            ``shaped(coef="mn", bias="m")``.
+            ``tensors(coef="mn", bias="m")``.
         """
         lengths: dict[str, int] = {}
         found = {}
         for name, letters in shapes.items():
             array = self.array(name, tuple(lengths.get(letter) for letter in letters))
             lengths |= dict(zip(letters, array.shape, strict=True))
-            found[name] = array
+            found[name] = torch.tensor(array)
         return found
-
-    def tensors(self, **shapes: str) -> dict[str, Tensor]:
-        """Return the same as tensors that share no memory with the description."""
-        return {name: torch.tensor(array) for name, array in self.shaped(**shapes).items()}
 
     def part(self, name: str) -> Stored:
         """Return the description of a part."""

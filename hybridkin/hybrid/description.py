@@ -105,9 +105,6 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     check_settings(model)
     model.module_ = restore(stored.part("module"))
     model.mechanical_model_ = model.module_.mechanical
-    for chain in (model.mechanical_model, model.mechanical_model_):
-        if isinstance(chain, PortableModule) and chain.n_actuators != n:
-            raise ValueError(f"a chain of {chain.n_actuators} actuators cannot take {n}")
     model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
     model.n_features_in_, names = n, feature_names(stored, n)
     if names is not None:
@@ -115,8 +112,6 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model._single_output = stored.value("single_output", bool)
     with torch.no_grad():  # arrays that do not fit together fail here, not in use
         x, _ = model.module_.rows().forward_and_jacobian(torch.ones(1, n, dtype=torch.float64))
-    if model._single_output and x.shape[1] != 1:
-        raise ValueError(f"`single_output` must be false with {x.shape[1]} outputs")
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]))
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))

@@ -488,9 +488,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         network = restore(stored.part("network"))
         n_outputs, n_both = network.n_outputs, sum(network.output_weights.shape)
         mean, scatter = stored.array("mean", (n_both,)), stored.array("scatter", (n_both, n_both))
-        seen, y_ndim = stored.value("n_samples_seen", float), stored.value("y_ndim", int)
-        if y_ndim not in (1, 2):
-            raise ValueError(f"`y_ndim` must be 1 or 2, got {y_ndim}")
+        seen = stored.value("n_samples_seen", float)
         state = {f"{name}_": value.numpy() for name, value in network.state_dict().items()}
         state |= {
             "noise_variance_": stored.array("noise_variance", (n_outputs,), finite=False),
@@ -498,7 +496,7 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             "n_samples_seen_": seen,
             "n_features_in_": network.n_actuators,
             "_activation": network.activation,
-            "_y_ndim": y_ndim,
+            "_y_ndim": stored.value("y_ndim", int),
             "_stats": Statistics(seen, mean, scatter),
         }
         names = feature_names(stored, network.n_actuators)

@@ -194,7 +194,7 @@ class PolynomialModule(ForwardModel):
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> PolynomialModule:
         """Return the module of a description."""
-        arrays = stored.shaped(powers="pn", readout="pm", center="n", scale="n")
+        arrays = stored.tensors(powers="pn", readout="pm", center="n", scale="n")
         if not np.isin(arrays["powers"], range(_MOST_POWER)).all():
             raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
         coef = arrays["readout"].T
