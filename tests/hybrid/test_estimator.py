@@ -346,7 +346,10 @@ def test_guard_in_single_precision_never_errs(alpha):
     low, high = data.q.min(0), data.q.max(0)
     wide = low + (high - low) * rng.uniform(-0.7, 1.7, (4000, 9))
     q = torch.from_numpy(np.concatenate([data.q, wide]))
-    passed = module.guard.is_inside(module.error.features(q))
+    (correction,) = module.corrections
+    passed = correction.module.leverage_is_below(
+        correction.guard.limit, correction.module.features(q)
+    )
     inside = module.in_domain(q)
     assert not (passed & ~inside).any()
     assert (passed & inside).sum() > 0.5 * inside.sum()
@@ -408,7 +411,8 @@ def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
 )
 def test_weight_and_its_derivative(kind, error_model):
     data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
-    guard = HybridForwardModel(chain, error_model, guard=kind).fit(data.q, data.x).module_.guard
+    model = HybridForwardModel(chain, error_model, guard=kind).fit(data.q, data.x)
+    guard = model.module_.corrections[0].guard
     rng = np.random.default_rng(0)
     away = rng.uniform(-0.2, 0.2, (40, 9)) * np.linspace(0, 1, 40)[:, None]
     q = torch.from_numpy(data.q[:40] + away)

@@ -25,7 +25,7 @@ from hybridkin import (
 )
 
 SETTINGS = {
-    "serial": {"coupling": "serial"},
+    "serial quadratic": {"coupling": "serial", "error_model": "quadratic"},
     "serial pose": {"coupling": "serial", "error_model": "pose"},
     "serial linear": {"coupling": "serial", "error_model": "linear"},
     "serial ELM": {"coupling": "serial", "error_model": ELMRegressor(40, 1e-3, random_state=0)},
@@ -61,7 +61,7 @@ def test_inside_is_better_than_at_the_tip(trunk):
     mechanical = HybridForwardModel(bha(), "drop", calibrate="default")
     parallel = HybridForwardModel(bha(), "quadratic", calibrate="default")
     network = HybridForwardModel(bha(), ELMRegressorCV(random_state=0), calibrate="default")
-    serial = HybridForwardModel(bha(), coupling="serial", calibrate="default")
+    serial = HybridForwardModel(bha(), "quadratic", coupling="serial", calibrate="default")
     models = (serial, parallel, network, mechanical)
     errors = [error(model.fit(q[:250], x[:250]), q[250:], x[250:]) for model in models]
     assert errors[0] < 0.97 * min(errors[1:])

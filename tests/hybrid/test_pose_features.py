@@ -6,11 +6,10 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
-from hybridkin.hybrid._features import Features
+from hybridkin.hybrid._features import Features, PoseFeatures, Readout
 from hybridkin.hybrid._linearised import basis
-from hybridkin.hybrid._pose_features import PoseFeatures
-from hybridkin.hybrid._readout_fit import fit_serial
-from hybridkin.hybrid._serial import SerialModule, coordinates, tip_and_columns
+from hybridkin.hybrid._module import HybridModule, InnerCorrection
+from hybridkin.hybrid._readout_fit import fit_readout
 
 TURNED = torch.tensor(
     [[0.0, -1.0, 0.0, 0.3], [0.6, 0.0, -0.8, 0.1], [0.8, 0.0, 0.6, -0.2], [0.0, 0.0, 0.0, 1.0]],
@@ -40,6 +39,11 @@ ROBOTS = {
     "smoothed tendons": lambda: (elastic(smoothing=1e-4), 0.0, 0.002),
 }
 every_robot = pytest.mark.parametrize("robot", ROBOTS)
+
+
+def hybrid(chain, readout):
+    correction = InnerCorrection(chain, readout)
+    return HybridModule(chain, [correction], torch.ones(1, dtype=torch.float64))
 
 
 def uniform(rng, *shape):
@@ -154,19 +158,20 @@ def test_batches_equal_loops(robot, rng):
 def test_planted_correction_is_found(robot, rng):
     chain, q = rows_of(robot, rng, 700)
     features = features_of(chain, q)
-    z = coordinates(chain, q, "coordinates")[0]
-    moved = tip_and_columns(chain, z, "coordinates")[1].square().sum(1).mean(0).sqrt()
+    z = chain.coordinates(q)[0]
+    moved = chain.from_coordinates_and_jacobian(z)[1].square().sum(1).mean(0).sqrt()
     # What features that are all but the same say against each other, no fit takes up.
     kept = basis(features(q[:500]), features.n_linear, 1000)
     weights = 0.003 * uniform(rng, len(moved), kept.shape[1]) @ kept.mT / (0.1 + moved[:, None])
-    truth = SerialModule(chain, features, weights)
-    fit = fit_serial(chain, features, q[:500], truth(q[:500]), alphas=(1e-10, 1e-10))
+    truth = hybrid(chain, Readout(features, weights))
+    fit = fit_readout(chain, features, q[:500], truth(q[:500]), alphas=(1e-10, 1e-10))
+    module = hybrid(chain, fit.readout)
     size = (truth(q) - chain(q)).norm(dim=1).mean()
     assert size > 1e-3
-    assert (fit.module(q) - truth(q)).norm(dim=1).max() < 1e-6 * size
-    x, J = fit.module.forward_and_jacobian(q[:9])
-    assert_close(x, fit.module(q[:9]))
-    near = central_differences(fit.module, q[:9])
+    assert (module(q) - truth(q)).norm(dim=1).max() < 1e-6 * size
+    x, J = module.forward_and_jacobian(q[:9])
+    assert_close(x, module(q[:9]))
+    near = central_differences(module, q[:9])
     assert_close(J, near, atol=1e-7, rtol=1e-5)
 
 
