@@ -172,15 +172,15 @@ def predictions(model: Any, q: Any) -> dict[str, Any]:
     return said
 
 
-def write_models(folder: Path) -> None:
-    """Write a file for every kind of model that has none in a folder, and what it predicts.
+def write_models(folder: Path, models: dict[str, tuple[Any, Any]]) -> None:
+    """Write a file for every model that has none in a folder, and what it predicts.
 
     Call it once for a new kind of model. Files that exist stay as they are: they stand for the
     files that users have.
     """
     folder.mkdir(parents=True, exist_ok=True)
     said = dict(np.load(folder / "predictions.npz")) if any(folder.iterdir()) else {}
-    for name, (model, q) in models().items():
+    for name, (model, q) in models.items():
         path = folder / f"{name}.safetensors"
         if not path.exists():
             save_model(model, path)

@@ -13,7 +13,6 @@ from saved_models import (
     arm,
     bent_chain,
     elastic_chain,
-    models,
     predictions,
     tendon_chain,
     trunk,
@@ -44,7 +43,7 @@ KINDS = (
     *("chain", "chain_of_all_parts", "elastic_chain", "rigid", "elm", "elm_cv", "mechanical"),
     *("parallel_elm", "parallel_kernel", "parallel_regression", "parallel_linear"),
     *("parallel_quadratic", "serial_quadratic", "serial_pose", "serial_elm", "pose_output"),
-    *("data_only", "drift_and_radius", "rigid_hybrid", "elastic_hybrid", "auto"),
+    *("data_only", "drift_and_radius", "rigid_hybrid", "elastic_hybrid", "blend", "play"),
 )
 
 
@@ -56,13 +55,6 @@ def log():
         20 * q[:, :3]
     )
     return q, x
-
-
-@pytest.fixture(scope="module")
-def fitted():
-    chosen = HybridForwardModel(trunk(), "auto", random_state=0)
-    q, x, groups = trunk_log()
-    return {**models(), "auto": (chosen.fit(q, x, groups=groups), q)}
 
 
 def rewrite(path, arrays, **changes):
@@ -302,7 +294,7 @@ def settings(model):
     return {**params, "error_model": type(error) if error else error, "chain": repr(chain)}
 
 
-@pytest.mark.parametrize("kind", ["serial_elm", "parallel_elm", "parallel_kernel", "auto"])
+@pytest.mark.parametrize("kind", ["serial_elm", "parallel_elm", "parallel_kernel", "blend"])
 def test_a_loaded_hybrid_is_fitted_again_as_what_it_was(tmp_path, kind, fitted):
     model, q = fitted[kind]
     _, x, groups = trunk_log()
@@ -350,9 +342,9 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     found = model_header(path)["training"]
     assert found["rows"] == 16
     assert found["calibration"]["rmse"] == fitted["parallel_elm"][0].calibration_.rmse
-    save_model(fitted["auto"][0], path)
+    save_model(fitted["blend"][0], path)
     chosen = model_header(path)["training"]["cv_results"]["chosen"]
-    assert chosen == fitted["auto"][0].cv_results_["chosen"]
+    assert chosen == fitted["blend"][0].cv_results_["chosen"]
     save_model(arm(), path)
     assert model_header(path)["units"] == {"q": ["rad", "m", "rad"], "x": "m"}
     save_model(fitted["pose_output"][0], path)
