@@ -22,7 +22,7 @@ from hybridkin.learning.regressor_modules import error_module
         Ridge(),
         ELMRegressor(4, direct_link=True, random_state=0),
         make_pipeline(StandardScaler(), PolynomialFeatures(3), Ridge()),
-        GaussianProcessRegressor(RBF([0.05, 0.1, 0.2]), alpha=1e-6, optimizer=None),
+        GaussianProcessRegressor(RBF([0.05, 0.1, 0.2]), alpha=0.01, optimizer=None),
     ],
     ids=["affine", "network", "polynomial", "kernel"],
 )
