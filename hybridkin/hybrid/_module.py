@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import torch
@@ -21,12 +22,25 @@ __all__ = ["Correction", "HybridModule", "InnerCorrection", "TipCorrection"]
 _ROUNDING = 1e-7  # of weights that sum to one
 
 
-class Inside(NamedTuple):
-    """The mechanical model inside at rows q: its coordinates, their slope, and the tip."""
+@dataclass(frozen=True, eq=False)
+class Inside:
+    """The mechanical model at rows q: inner coordinates, their slope, and the tip f(q) = F(z)."""
 
+    mechanical: ForwardModel
     z: Tensor  # (N, C)
     slope: Tensor  # dz/dq, (C, n) or (N, C, n)
-    x: Tensor  # f(q) = F(z), (N, m)
+    x: Tensor  # (N, m)
+
+    @classmethod
+    def of(cls, mechanical: ForwardModel, q: Tensor) -> Inside:
+        """Return the model at rows q (N, n)."""
+        z, slope = mechanical.coordinates(q)
+        return cls(mechanical, z, slope, mechanical.from_coordinates(z))
+
+    def jacobian(self, rows: Tensor | slice = slice(None)) -> Tensor:
+        """Return df/dq of some rows, (k, m, n)."""
+        slope = self.slope if self.slope.ndim == 2 else self.slope[rows]
+        return self.mechanical.from_coordinates_and_jacobian(self.z[rows])[1] @ slope
 
 
 class Fading(NamedTuple):
@@ -37,7 +51,32 @@ class Fading(NamedTuple):
     slope: Tensor  # dg/dq, (k, 1, n)
 
 
-class TipCorrection(PortableModule):
+class Correction(PortableModule):
+    """A learned correction c(q) and its guard.
+
+    Parameters
+    ----------
+    guard : Guard or None
+        Where c is trusted: s(q) is c faded by the guard's weight g(q), and shortened where it is
+        too long. None: s = c.
+    """
+
+    def __init__(self, guard: Guard | None) -> None:
+        super().__init__()
+        self.guard = guard
+
+    def value(self, q: Tensor, inside: Inside | None) -> Tensor:
+        """Return c(q) at rows q (N, n), shape (N, m) [m]."""
+        raise NotImplementedError
+
+    def guarded_and_jacobian(
+        self, q: Tensor, inside: Inside | None
+    ) -> tuple[Tensor, Tensor, Fading | None]:
+        """Return s, inside the robot f + s, (N, m), its derivative (N, m, n), and what fades."""
+        raise NotImplementedError
+
+
+class TipCorrection(Correction):
     """A correction at the tip, c(q) = eps(q).
 
     Parameters
@@ -51,15 +90,16 @@ class TipCorrection(PortableModule):
     layout = Layout("tip_correction", {}, parts=("module", "guard"))
 
     def __init__(self, module: ForwardModel, guard: Guard | None = None) -> None:
-        super().__init__()
+        super().__init__(guard)
         self.module = module
-        self.guard = guard
 
     def value(self, q: Tensor, inside: Inside | None) -> Tensor:
-        """Return c(q), shape (N, m) [m]."""
+        """Return eps(q) at rows q (N, n), shape (N, m) [m]."""
         return self.module(q)
 
-    def guarded_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor, Fading | None]:
+    def guarded_and_jacobian(
+        self, q: Tensor, inside: Inside | None
+    ) -> tuple[Tensor, Tensor, Fading | None]:
         """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and the rows that fade."""
         guard = self.guard
         if guard is None:
@@ -80,7 +120,7 @@ class TipCorrection(PortableModule):
         return *guard.shortened_with_jacobian(x, J), fading
 
 
-class InnerCorrection(PortableModule):
+class InnerCorrection(Correction):
     """A correction inside the robot, c(q) = F(z(q) + W phi(q)) - f(q); serial coupling.
 
     z and F are `coordinates` and `from_coordinates` of the mechanical model, so f(q) = F(z(q)).
@@ -100,40 +140,36 @@ class InnerCorrection(PortableModule):
     def __init__(
         self, mechanical: ForwardModel, readout: Readout, guard: Guard | None = None
     ) -> None:
-        super().__init__()
+        super().__init__(guard)
         self.mechanical = mechanical
         self.readout = readout
-        self.guard = guard
 
     def value(self, q: Tensor, inside: Inside | None) -> Tensor:
-        """Return c(q), shape (N, m) [m]."""
+        """Return F(z + W phi) - f at rows q (N, n), shape (N, m) [m]."""
         assert inside is not None
         return self.mechanical.from_coordinates(inside.z + self.readout(q)) - inside.x
 
-    def tip_and_jacobian(
-        self, q: Tensor, inside: Inside, J_mech: Callable[[Tensor], Tensor]
+    def guarded_and_jacobian(
+        self, q: Tensor, inside: Inside | None
     ) -> tuple[Tensor, Tensor, Fading | None]:
-        """Return f + s (N, m) and its derivative (N, m, n) at rows q, and the rows that fade.
+        """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and what fades.
 
-        `J_mech` gives df/dq of some rows: only those that are faded or shortened need it.
+        It is F(z + W phi) but for rows that fade or are too long: only these need df/dq.
         """
+        assert inside is not None
         delta, turn = self.readout.forward_and_jacobian(q)
         x, columns = self.mechanical.from_coordinates_and_jacobian(inside.z + delta)
-        J = columns @ (inside.slope + turn)
-        guard = self.guard
+        J, guard = columns @ (inside.slope + turn), self.guard
         if guard is None:
             return x, J, None
         rows = (guard.is_long(x - inside.x) | _outside(guard, q)).nonzero()[:, 0]
         if not len(rows):
             return x, J, None
         fading = Fading(rows, *guard.weight_and_jacobian(q[rows]))
-        f, J_f = inside.x[rows], J_mech(rows)
+        f, J_f = inside.x[rows], inside.jacobian(rows)
         own, J_own = _weighed(x[rows] - f, J[rows] - J_f, fading.weight, fading.slope)
         own, J_own = guard.shortened_with_jacobian(own, J_own)
         return x.index_copy(0, rows, f + own), J.index_copy(0, rows, J_f + J_own), fading
-
-
-Correction = TipCorrection | InnerCorrection
 
 
 class HybridModule(ForwardModel):
@@ -209,16 +245,7 @@ class HybridModule(ForwardModel):
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the largest distance from the training rows of any guard, shape (...)."""
-        guards = [c.guard for _, c in self._parts() if c.guard is not None]
-        if not guards:
-            return super().domain_distance(q)
-
-        def farthest(rows: Tensor) -> tuple[Tensor]:
-            return (
-                torch.stack([guard.domain_distance(rows) for guard in guards], 1).amax(1, True),
-            )
-
-        return in_blocks(farthest, q)[0][..., 0]
+        return in_blocks(lambda rows: (self._distance(rows),), q)[0][..., 0]
 
     def _parts(self) -> list[tuple[float, Correction]]:
         """Return weight and correction, one by one."""
@@ -227,18 +254,15 @@ class HybridModule(ForwardModel):
 
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""
-        mechanical = self.mechanical
-        if mechanical is None or not any(isinstance(c, InnerCorrection) for c in self.corrections):
-            return None
-        z, slope = mechanical.coordinates(q)
-        return Inside(z, slope, mechanical.from_coordinates(z))
+        inner = any(isinstance(correction, InnerCorrection) for correction in self.corrections)
+        return Inside.of(self.mechanical, q) if inner and self.mechanical is not None else None
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         inside = self._inside(q)
-        if inside is None:
-            learned = self._learned(q, None)
-            return (learned if self.mechanical is None else self.mechanical(q) + learned,)
-        return (inside.x + self._learned(q, inside),)
+        learned = self._learned(q, inside)
+        if self.mechanical is None:
+            return (learned,)
+        return ((self.mechanical(q) if inside is None else inside.x) + learned,)
 
     def _learned(self, q: Tensor, inside: Inside | None) -> Tensor:
         """Return the sum of corrections and drift at rows q, shape (N, m) [m]."""
@@ -262,57 +286,33 @@ class HybridModule(ForwardModel):
         guards = [(weight, c.guard) for weight, c in self._parts() if c.guard is not None]
         return q.new_ones(len(q), 1) - sum(weight * (1.0 - guard(q)) for weight, guard in guards)
 
+    def _distance(self, q: Tensor) -> Tensor:
+        """Return the largest distance of any guard at rows q, shape (N, 1)."""
+        guards = [c.guard for _, c in self._parts() if c.guard is not None]
+        distances = [guard.domain_distance(q) for guard in guards] or [q.new_zeros(len(q))]
+        return torch.stack(distances, 1).amax(1, keepdim=True)
+
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        fadings: list[tuple[float, Fading]] = []
         inside, total = self._inside(q), None
         if inside is not None:
-            total = self._inner_and_jacobian(q, inside, fadings)
+            # Inner corrections bring f along. df/dq is needed where their weights leave a share.
+            inner = (weight for weight, c in self._parts() if isinstance(c, InnerCorrection))
+            share = 1.0 - sum(inner)
+            if share > _ROUNDING:
+                total = share * inside.x, share * inside.jacobian()
         elif self.mechanical is not None:
             total = self.mechanical.forward_and_jacobian(q)
-        total = self._add_tips_and_drift(total, q, fadings)
-        assert total is not None
-        return total
+        return self._added(total, q, inside)
 
-    def _inner_and_jacobian(
-        self, q: Tensor, inside: Inside, fadings: list[tuple[float, Fading]]
+    def _added(
+        self, total: tuple[Tensor, Tensor] | None, q: Tensor, inside: Inside | None
     ) -> tuple[Tensor, Tensor]:
-        """Return f and the corrections inside, and the derivative, at rows q.
-
-        With weights w_k that sum to one, f + sum_k w_k s_k = sum_k w_k (f + s_k), and f + s_k is
-        F(z + W_k phi) where nothing fades: df/dq is needed in the other rows alone.
-        """
-        mechanical = cast(ForwardModel, self.mechanical)
-        parts = [(w, c) for w, c in self._parts() if isinstance(c, InnerCorrection)]
-        share, total = 1.0 - sum(weight for weight, _ in parts), None
-
-        def J_mech(rows: Tensor | slice) -> Tensor:
-            slope = inside.slope if inside.slope.ndim == 2 else inside.slope[rows]
-            return mechanical.from_coordinates_and_jacobian(inside.z[rows])[1] @ slope
-
-        if share > _ROUNDING:
-            total = share * inside.x, share * J_mech(slice(None))
-        for weight, correction in parts:
-            x, J, fading = correction.tip_and_jacobian(q, inside, J_mech)
+        """Return a sum and its derivative at rows q, with all corrections and the drift added."""
+        fadings: list[tuple[float, Fading]] = []
+        for weight, correction in self._parts():
+            x, J, fading = correction.guarded_and_jacobian(q, inside)
             total = _plus(total, weight, x, J)
             fadings += [] if fading is None else [(weight, fading)]
-        assert total is not None
-        return total
-
-    def _add_tips_and_drift(
-        self,
-        total: tuple[Tensor, Tensor] | None,
-        q: Tensor,
-        fadings: list[tuple[float, Fading]],
-    ) -> tuple[Tensor, Tensor] | None:
-        """Return a sum and its derivative with the corrections at the tip and the drift added.
-
-        `fadings` holds the fading of the other corrections, which the drift shares.
-        """
-        for weight, correction in self._parts():
-            if isinstance(correction, TipCorrection):
-                x, J, fading = correction.guarded_and_jacobian(q)
-                total = _plus(total, weight, x, J)
-                fadings += [] if fading is None else [(weight, fading)]
         if self.drift is not None:
             x, J = self.drift.forward_and_jacobian(q)
             if fadings:
@@ -322,6 +322,7 @@ class HybridModule(ForwardModel):
                     slope = slope.index_add(0, rows, own_slope, alpha=weight)
                 x, J = _weighed(x, J, trust, slope)
             total = _plus(total, 1.0, x, J)
+        assert total is not None, "a hybrid needs a mechanical model or a correction"
         return total
 
 

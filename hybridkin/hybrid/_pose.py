@@ -63,8 +63,7 @@ class PoseHybridModule(HybridModule, PoseModel):
         return q.new_zeros(len(q), 6)
 
     def _learned_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        found = self._add_tips_and_drift(None, q, [])
-        return (self._nothing(q), q.new_zeros(len(q), 6, q.shape[1])) if found is None else found
+        return self._added((self._nothing(q), q.new_zeros(len(q), 6, q.shape[1])), q, None)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         x, J = self._poser.forward_and_jacobian(q)
