@@ -110,8 +110,9 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     if names is not None:
         model.feature_names_in_ = names
     model._single_output = stored.value("single_output", bool)
+    center = torch.tensor(stored.array("drift_center", (n,)))
     with torch.no_grad():  # arrays that do not fit together fail here, not in use
-        x, _ = model.module_.rows().forward_and_jacobian(torch.ones(1, n, dtype=torch.float64))
+        x, _ = model.module_.rows().forward_and_jacobian(center[None])
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]))
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
