@@ -20,7 +20,7 @@ chain = robots.bionic_handling_assistant()
 models = {
     "mechanical, nominal": HybridForwardModel(chain, "drop"),
     "mechanical, calibrated": HybridForwardModel(chain, "drop", calibrate="default"),
-    "hybrid, serial": HybridForwardModel(chain, coupling="serial", calibrate="default"),
+    "hybrid, serial": HybridForwardModel(chain, "quadratic", coupling="serial", calibrate="default"),
 }
 found = {
     name: model.fit(data.q[train], data.x[train]).predict(data.q[test])

@@ -28,7 +28,7 @@ payload_from = len(path.x)
 def fitted():
     """Return the hybrid model, serial: the error acts inside the robot."""
     chain = robots.bionic_handling_assistant()
-    model = HybridForwardModel(chain, coupling="serial", calibrate="default")
+    model = HybridForwardModel(chain, "quadratic", coupling="serial", calibrate="default")
     return model.fit(data.q, data.x)
 
 

@@ -19,7 +19,7 @@ chain = robots.bionic_handling_assistant()
 models = {
     "mechanical, nominal": HybridForwardModel(chain, "drop"),
     "hybrid, as in the paper": HybridForwardModel(chain, random_state=0),
-    "hybrid, error inside": HybridForwardModel(chain, coupling="serial", calibrate="default"),
+    "hybrid, error inside": HybridForwardModel(chain, "quadratic", coupling="serial", calibrate="default"),
 }
 path = trajectories.figure_eight((0.0, 0.0, 0.70), (0.50, 0.25), dt=0.125)
 

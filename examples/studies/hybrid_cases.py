@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from hybridkin import datasets, robots
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
-from hybridkin.hybrid._couplings import COUPLINGS, READOUTS
+from hybridkin.hybrid.estimator import COUPLINGS, FEATURES
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.paper.paper import PAPER_ELM
@@ -110,9 +110,9 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
         "parallel kernel": lambda: hybrid(_kernel(q, x - calibrated.predict(q), folds)),
     }
     for coupling in COUPLINGS:
-        for kind in READOUTS:
+        for kind in FEATURES:
             learners[f"{coupling} {kind}"] = partial(hybrid, kind, coupling=coupling)
-    for kind in READOUTS:
+    for kind in FEATURES:
         free = partial(hybrid, kind, coupling="serial", guard=None)
         learners[f"serial {kind}, no guard"] = free
     auto = partial(HybridForwardModel, case.chain, AUTO, calibrate=case.calibrate)

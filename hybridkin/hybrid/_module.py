@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, cast
 
 import torch
@@ -22,20 +22,17 @@ __all__ = ["Correction", "HybridModule", "InnerCorrection", "TipCorrection"]
 _ROUNDING = 1e-7  # of weights that sum to one
 
 
-@dataclass(frozen=True, eq=False)
 class Inside:
-    """The mechanical model at rows q: inner coordinates, their slope, and the tip f(q) = F(z)."""
+    """The mechanical model at rows q (N, n): inner coordinates z (N, C) and their slope dz/dq."""
 
-    mechanical: ForwardModel
-    z: Tensor  # (N, C)
-    slope: Tensor  # dz/dq, (C, n) or (N, C, n)
-    x: Tensor  # (N, m)
+    def __init__(self, mechanical: ForwardModel, q: Tensor) -> None:
+        self.mechanical = mechanical
+        self.z, self.slope = mechanical.coordinates(q)
 
-    @classmethod
-    def of(cls, mechanical: ForwardModel, q: Tensor) -> Inside:
-        """Return the model at rows q (N, n)."""
-        z, slope = mechanical.coordinates(q)
-        return cls(mechanical, z, slope, mechanical.from_coordinates(z))
+    @cached_property
+    def x(self) -> Tensor:
+        """The tip f(q) = F(z), (N, m)."""
+        return self.mechanical.from_coordinates(self.z)
 
     def jacobian(self, rows: Tensor | slice = slice(None)) -> Tensor:
         """Return df/dq of some rows, (k, m, n)."""
@@ -255,7 +252,7 @@ class HybridModule(ForwardModel):
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""
         inner = any(isinstance(correction, InnerCorrection) for correction in self.corrections)
-        return Inside.of(self.mechanical, q) if inner and self.mechanical is not None else None
+        return Inside(self.mechanical, q) if inner and self.mechanical is not None else None
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         inside = self._inside(q)

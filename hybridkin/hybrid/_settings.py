@@ -17,7 +17,7 @@ from hybridkin.learning.elm_cv import ELMRegressorCV
 if TYPE_CHECKING:
     from hybridkin.hybrid.estimator import HybridForwardModel
 
-__all__ = ["COUPLINGS", "FEATURES", "check_settings", "resolved_error_model"]
+__all__ = ["COUPLINGS", "FEATURES", "GUARDS", "check_settings", "resolved_error_model"]
 
 COUPLINGS = ("parallel", "serial")
 FEATURES = ("linear", "quadratic", "pose")

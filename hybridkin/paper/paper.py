@@ -221,7 +221,7 @@ def _tracked_models(q: NDArray, x: NDArray) -> dict[str, HybridForwardModel]:
         models[f"mechanical, {name}"] = HybridForwardModel(chain, "drop").fit(q, x)
         models[f"hybrid on {name}"] = HybridForwardModel(chain, elm).fit(q, x)
         if name == "calibrated":
-            models[SERIAL] = HybridForwardModel(chain, coupling="serial").fit(q, x)
+            models[SERIAL] = HybridForwardModel(chain, "quadratic", coupling="serial").fit(q, x)
     return {name: models[name] for name in (*TRACKED, SERIAL)}
 
 

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from hybridkin import robots
 from hybridkin.calibration.calibrate import calibrate
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
-from hybridkin.hybrid._guards import GUARDS
+from hybridkin.hybrid.estimator import GUARDS
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.saving.saved_model import save_model

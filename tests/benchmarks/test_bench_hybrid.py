@@ -45,7 +45,7 @@ def test_price_of_the_guard(race, hybrids, draw, trunk, batch, rows):
     q = draw(batch)
     if rows == "training rows":
         q = torch.from_numpy(trunk.q)[torch.arange(batch) % len(trunk.q)]
-    inside = guarded.in_domain(q) & ~guarded.guard.is_long(guarded.error_part(q))
+    inside = guarded.in_domain(q) & ~guarded.corrections[0].guard.is_long(guarded.error_part(q))
     assert_close(guarded.forward_and_jacobian(q)[1][inside], plain.jacobian(q)[inside])
     race(
         f"{WHAT}, guard, {rows}",

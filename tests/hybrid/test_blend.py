@@ -87,3 +87,20 @@ def test_single_precision_and_inversion(blend, q):
     ik = InverseKinematics(blend, q_min=0.1, q_max=0.4, q_pref=0.25)
     target = blend(q[:5]).numpy()
     assert np.abs(ik.solve(target).x - target).max() < 1e-4
+
+
+def test_a_blend_of_a_hybrid_with_itself_is_the_hybrid():
+    data, rng = datasets.load_trunk(), np.random.default_rng(0)
+    chain = robots.bionic_handling_assistant()
+    for settings in ({}, {"error_model": "quadratic", "coupling": "serial"}):
+        model = HybridForwardModel(chain, random_state=0, **settings).fit(data.q, data.x).module_
+        twice = blended([model, model], torch.tensor([0.5, 0.5], dtype=torch.float64))
+        q = torch.from_numpy(rng.uniform(0.1, 0.4, (400, 9)))
+        assert_close(twice.domain_distance(q), model.domain_distance(q), rtol=0.0, atol=0.0)
+        assert (twice.in_domain(q) == model.in_domain(q)).all()
+        assert_close(twice.forward_and_jacobian(q), model.forward_and_jacobian(q))
+        targets = model(q).detach()
+        options = dict(q_min=0.1, q_max=0.4, q_pref=0.33)
+        found = [InverseKinematics(one, **options).solve(targets) for one in (model, twice)]
+        assert (found[0].status == found[1].status).all()
+        assert 0.3 < found[0].converged.double().mean() < 1.0

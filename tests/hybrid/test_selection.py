@@ -1,16 +1,19 @@
 """The error model that is chosen by motions left out: what it takes, and what it says of it."""
 
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
+from sklearn.kernel_ridge import KernelRidge
 
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    ELMRegressor,
     HybridForwardModel,
     RigidChain,
     datasets,
@@ -121,6 +124,56 @@ def test_other_mechanical_models_and_single_outputs():
     plain = HybridForwardModel(arm, "drop").fit(q[:80], x[:80])
     errors = [np.linalg.norm(m.predict(q[80:]) - x[80:], axis=1).mean() for m in (model, plain)]
     assert errors[0] < 0.3 * errors[1]
+
+
+def test_fits_in_threads_are_independent():
+    """The filters for warnings belong to the process: no fit may touch them."""
+    rng, groups = np.random.default_rng(0), np.arange(40) // 8
+    chain = ConstantCurvatureChain([0.012], lengths=[0.1])
+    logs = []
+    for _ in range(2):
+        q = rng.uniform(-0.005, 0.005, (40, 3))
+        x = chain(torch.from_numpy(q + 20.0 * q[:, ::-1] ** 2)).numpy()
+        logs.append((q, x + 1e-3 * rng.standard_normal(x.shape)))
+
+    def predicted(k):
+        start = ConstantCurvatureChain([0.01], lengths=[0.1])
+        model = HybridForwardModel(start, "auto", calibrate=("radii",), random_state=0)
+        model.fit(*logs[k % 2], groups=groups)
+        return model.module_(torch.from_numpy(logs[0][0])).numpy()
+
+    one_by_one = [predicted(k) for k in range(2)]
+    filters = [*warnings.filters]
+    with ThreadPoolExecutor(4) as pool:
+        at_once = [*pool.map(predicted, range(8))]
+    assert warnings.filters == filters
+    assert_allclose(at_once, 4 * one_by_one, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("coupling", ["parallel", "serial"])
+def test_the_default_error_model_is_a_network(trunk, coupling):
+    q, x = trunk
+    elm = ELMRegressor(random_state=3)
+    models = [
+        HybridForwardModel(bha(), one, coupling=coupling, random_state=3).fit(q[:200], x[:200])
+        for one in (None, "elm", elm)
+    ]
+    for model in models[:2]:
+        assert_array_equal(model.predict(q), models[2].predict(q))
+
+
+def test_kernel_by_name_is_tuned_on_motions(trunk):
+    q, x = trunk
+    groups = np.arange(250) // 5
+    model = HybridForwardModel(bha(), "kernel").fit(q[:250], x[:250], groups=groups)
+    assert model.error_model_.kernel == "rbf"
+    errors = [
+        np.linalg.norm(m.fit(q[:250], x[:250]).predict(q[250:]) - x[250:], axis=1).mean()
+        for m in (model, HybridForwardModel(bha(), KernelRidge(kernel="rbf")))
+    ]
+    assert errors[0] < 0.9 * errors[1]
+    with pytest.raises(TypeError, match="inside the robot"):
+        HybridForwardModel(bha(), "kernel", coupling="serial").fit(q, x)
 
 
 def test_clear_errors(trunk):

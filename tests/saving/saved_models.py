@@ -141,7 +141,7 @@ def models() -> dict[str, tuple[Any, Any]]:
         "parallel_regression": _hybrid(LinearRegression(), guard="box"),
         "parallel_linear": _hybrid("linear"),
         "parallel_quadratic": _hybrid("quadratic"),
-        "serial_quadratic": _hybrid(coupling="serial"),
+        "serial_quadratic": _hybrid("quadratic", coupling="serial"),
         "serial_pose": _hybrid("pose", coupling="serial"),
         "serial_elm": _hybrid(small, coupling="serial"),
         "pose_output": _hybrid(small, output="pose"),
