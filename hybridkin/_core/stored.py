@@ -91,7 +91,7 @@ class Stored:
             kind,
             plain(settings),
             {
-                name: value.detach().cpu().numpy() if isinstance(value, Tensor) else np.array(value)
+                name: value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
                 for name, value in tensors.items()
             },
             {name: part for name, part in (parts or {}).items() if part is not None},

@@ -139,7 +139,8 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
         known["rows"] = int(np.isfinite(squares).sum())
         known["left_out_rmse"] = float(np.sqrt(np.nanmean(squares)))
     elif isinstance(error, (ELMRegressor, ELMRegressorCV)):
-        known["rows"] = error.stored().settings["n_samples_seen"]
+        network = error.best_estimator_ if isinstance(error, ELMRegressorCV) else error
+        known["rows"] = network.n_samples_seen_
     elif isinstance(error, KernelRidge):
         known["rows"] = len(vars(error)["X_fit_"])
     elif model.radius_ is not None:
