@@ -91,7 +91,7 @@ class Stored:
             kind,
             plain(settings),
             {
-                name: value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
+                name: np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
                 for name, value in tensors.items()
             },
             {name: part for name, part in (parts or {}).items() if part is not None},
