@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.stored import Layout, Restore, Stored
+
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
+    from typing_extensions import Self
 
 __all__ = ["ForwardModel", "FunctionModel", "PortableModule", "PoseModel", "as_forward_model"]
 
@@ -18,8 +21,38 @@ class PortableModule(nn.Module):
     """A module of buffers whose pickle and joblib hash are the same in every process.
 
     Buffers are stored as plain arrays and come back on their device, or on the CPU where that
-    device does not exist.
+    device does not exist. A class with a `layout` describes itself, for files and compilers.
     """
+
+    layout: ClassVar[Layout] = Layout("", {})  # without a kind: it could only be stored as code
+
+    def stored(self) -> Stored:
+        """Return how the module describes itself: kind, settings, arrays and parts.
+
+        Raises
+        ------
+        TypeError
+            For modules that could only be stored as code.
+        """
+        kind, arrays, settings, parts = self.layout
+        if not kind:
+            raise TypeError(_only_code(self))
+        return Stored.of(
+            kind,
+            {name: self._buffers[name] for name in arrays},
+            {name: _described(self._modules.get(name)) for name in parts},
+            **{name: vars(self)[name] for name in settings},
+        )
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> Self:
+        """Return the module of a description; `restore` returns its parts."""
+        parts = {name: stored.parts.get(name) for name in cls.layout.parts}
+        return cls(
+            **stored.tensors(**cls.layout.arrays),
+            **{name: stored.value(name, kind) for name, kind in cls.layout.settings.items()},
+            **{name: None if part is None else restore(part) for name, part in parts.items()},
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
@@ -284,3 +317,19 @@ def _checked(x: Any) -> Tensor:
             "`tasks.PositionTask.from_numpy(function, jacobian)`."
         )
     return x
+
+
+def _described(module: nn.Module | None) -> Stored | None:
+    if module is None or isinstance(module, PortableModule):
+        return None if module is None else module.stored()
+    if not isinstance(module, nn.ModuleList):
+        raise TypeError(_only_code(module))
+    return Stored.of("list", parts={str(k): _described(part) for k, part in enumerate(module)})
+
+
+def _only_code(module: nn.Module) -> str:
+    return (
+        f"a {type(module).__name__} could only be stored as code; a saved model is made of chains "
+        "(ConstantCurvatureChain, ElasticTendonChain, RigidChain) and of error models given by "
+        "name, ELMs, a LinearRegression or a KernelRidge with the kernel 'rbf'."
+    )

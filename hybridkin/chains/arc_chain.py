@@ -5,13 +5,15 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
@@ -41,6 +43,8 @@ class ArcChain(Chain):
     """
 
     _structure = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
+
+    _counts: ClassVar[str]  # what the constructor calls the actuators per segment
 
     n_segments: int
     actuators_per_segment: tuple[int, ...]
@@ -414,3 +418,26 @@ class ArcChain(Chain):
             return J.reshape(*q.shape[:-1], 3, self.n_actuators)
         J = torch.matmul(slope.T, columns)  # (3, n, N)
         return J.permute(2, 0, 1).reshape(*q.shape[:-1], 3, self.n_actuators)
+
+    def stored(self) -> Stored:
+        """Return how the chain describes itself: its geometry and how it is routed."""
+        names = ("actuators_per_segment", "tip_at", *self.layout.settings)
+        settings = {name: vars(self)[name] for name in names}
+        return Stored.of(self.layout.kind, self.geometry(), **settings)
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> Self:
+        """Return the chain of a description."""
+        counts = stored.list_of(int, "actuators_per_segment")
+        entries: dict[str, Any] = {
+            name: stored.array(name)
+            for name in cls._entries
+            if name != "lengths" or name in stored.arrays
+        }
+        if sum(counts) != len(entries["angles"]):
+            raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
+        entries["angles"] = np.split(entries["angles"], np.cumsum(counts)[:-1])
+        entries |= {name: stored.value(name, kind) for name, kind in cls.layout.settings.items()}
+        dtype = torch.from_numpy(entries["base"]).dtype
+        chain = cls(**entries, **{cls._counts: counts}, dtype=dtype)
+        return chain.with_tip(stored.value("tip_at", float))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.stored import Layout
 from hybridkin._core.units import millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled
@@ -70,6 +71,8 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
+    layout = Layout("constant_curvature", {}, {"routing": str})
+    _counts = "n_actuators"
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
 
     lengths: Tensor | None

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.stored import Layout
 from hybridkin._core.units import millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled
@@ -115,6 +116,8 @@ class ElasticTendonChain(ArcChain):
     tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
     """
 
+    layout = Layout("elastic_tendons", {}, {"routing": str})
+    _counts = "n_tendons"
     _entries = (*_SHAPING, "lengths", "offsets", "base")
     _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints, urdf_path
 from hybridkin.chains._checks import pose, rigid_pose, shaped
@@ -83,6 +84,7 @@ class RigidChain(Chain):
 
     _entries = ("base", "tool")
     _structure = ("n_actuators", "kinds", "names")
+    layout = Layout("rigid", {})
 
     origins: Tensor
     axes: Tensor
@@ -426,3 +428,18 @@ class RigidChain(Chain):
     def _end(self, q: Tensor) -> Tensor:
         """Return the tool in the last joint's moving frame, homogeneous, shape (4,)."""
         return self.tip.to(q) @ nn.functional.pad(self.tool.to(q), (0, 1), value=1.0)
+
+    def stored(self) -> Stored:
+        """Return how the arm describes itself: its joints, their limits, tool and base."""
+        arrays = {"origins": self.origins, "axes": self.axes, "tip": self.tip, "tool": self.tool}
+        arrays |= {"q_min": self.q_min, "q_max": self.q_max, "base": self.base}
+        return Stored.of(self.layout.kind, arrays, kinds=self.kinds, names=self.names)
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
+        """Return the arm of a description."""
+        geometry = {name: stored.array(name) for name in ("origins", "axes", "tip", "tool", "base")}
+        limits = {name: stored.array(name, finite=False) for name in ("q_min", "q_max")}
+        kinds, names = (stored.list_of(str, key) for key in ("kinds", "names"))
+        dtype = torch.from_numpy(geometry["base"]).dtype
+        return cls(**geometry, **limits, kinds=kinds, names=names, dtype=dtype)

@@ -11,6 +11,7 @@ from typing_extensions import Self
 
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin._core.stored import Layout
 from hybridkin.chains.arc_chain import ArcChain, Frames
 from hybridkin.learning.network import ACTIVATIONS
 
@@ -29,6 +30,7 @@ class Features(PortableModule):
         Map of the training range to [-1, 1] [unit of q].
     """
 
+    layout = Layout("linear_features", {"center": "n", "scale": "n"})
     center: Tensor
     scale: Tensor
 
@@ -86,6 +88,8 @@ class QuadraticFeatures(Features):
     The squares have no mean over the range, so their penalty leaves the constant alone.
     """
 
+    layout = Layout("quadratic_features", {"center": "n", "scale": "n"})
+
     def _bent(self, u: Tensor) -> tuple[Tensor, ...]:
         i, j = torch.triu_indices(len(self.center), len(self.center), 1, device=u.device)
         return u[..., i] * u[..., j], 1.5 * u.square() - 0.5
@@ -117,6 +121,11 @@ class HiddenFeatures(Features):
         The function sigma.
     """
 
+    layout = Layout(
+        "hidden_features",
+        {"center": "n", "scale": "n", "input_weights": "hn", "input_bias": "h"},
+        {"activation": str},
+    )
     input_weights: Tensor
     input_bias: Tensor
 
@@ -172,6 +181,8 @@ class PoseFeatures(Features):
     chain : ArcChain
         The robot; its parameters and buffers are those of the features, too.
     """
+
+    layout = Layout("pose_features", {"center": "n", "scale": "n"}, parts=("chain",))
 
     def __init__(self, center: Tensor, scale: Tensor, chain: ArcChain) -> None:
         super().__init__(center, scale)
@@ -255,6 +266,7 @@ class Readout(ForwardModel):
         W [unit of the outputs].
     """
 
+    layout = Layout("readout", {"weights": "cp"}, parts=("features",))
     weights: Tensor
 
     def __init__(self, features: Features, weights: Tensor) -> None:

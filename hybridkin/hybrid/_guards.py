@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.model import PortableModule, reverse_jacobian
+from hybridkin._core.stored import Layout
 from hybridkin.learning.network import LeverageModule
 
 __all__ = ["GUARDS", "BoxGuard", "Guard", "LeverageGuard", "QuadraticLeverage", "fit_guard"]
@@ -109,6 +110,7 @@ class LeverageGuard(Guard):
         The longest correction of a training row [m].
     """
 
+    layout = Layout("leverage_guard", {"limit": "", "largest": ""}, parts=("model",))
     limit: Tensor
 
     def __init__(self, model: LeverageModule, limit: Tensor, largest: Tensor) -> None:
@@ -147,6 +149,7 @@ class BoxGuard(Guard):
         The longest correction of a training row [m].
     """
 
+    layout = Layout("box_guard", {"low": "n", "high": "n", "largest": ""})
     low: Tensor
     high: Tensor
 
@@ -174,6 +177,7 @@ class QuadraticLeverage(LeverageModule):
         Lower Cholesky factor of the features' Gram matrix plus the penalty.
     """
 
+    layout = Layout("quadratic_leverage", {"center": "n", "half_width": "n", "factor": "ff"})
     center: Tensor
     half_width: Tensor
     factor: Tensor

@@ -12,6 +12,7 @@ from typing_extensions import Self
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin._core.stored import Layout
 from hybridkin.hybrid._features import Readout
 from hybridkin.hybrid._guards import Guard, LeverageGuard
 from hybridkin.learning.regressor_modules import AffineModule
@@ -83,6 +84,8 @@ class TipCorrection(Correction):
         Where it is trusted. None: everywhere.
     """
 
+    layout = Layout("tip_correction", {}, parts=("module", "guard"))
+
     def __init__(self, module: ForwardModel, guard: Guard | None = None) -> None:
         super().__init__(guard)
         self.module = module
@@ -128,6 +131,8 @@ class InnerCorrection(Correction):
     guard : Guard or None
         Where it is trusted. None: everywhere.
     """
+
+    layout = Layout("inner_correction", {}, parts=("mechanical", "readout", "guard"))
 
     def __init__(
         self, mechanical: ForwardModel, readout: Readout, guard: Guard | None = None
@@ -186,6 +191,7 @@ class HybridModule(ForwardModel):
         d, how the robot has changed since the fit.
     """
 
+    layout = Layout("hybrid_module", {"weights": "k"}, parts=("mechanical", "corrections", "drift"))
     weights: Tensor
 
     def __init__(

@@ -35,6 +35,7 @@ class PoseHybridModule(HybridModule, PoseModel):
         As for `HybridModule`.
     """
 
+    layout = HybridModule.layout._replace(kind="pose_hybrid_module")
     n_outputs = 3
 
     def rows(self) -> HybridModule:

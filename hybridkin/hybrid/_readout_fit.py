@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.stored import Restore, Stored
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import (
     Linearised,
@@ -41,6 +42,31 @@ class ReadoutFit(NamedTuple):
     scores: dict[Pair, float]  # mean squared leave-out distance [m^2], by alphas
     gradient: float  # of the objective at the optimum, relative to that without a correction
     noise_ratio: float = inf  # variance of tips over that of actuators; infinity: of tips alone
+
+    def stored(self) -> Stored:
+        """Return how the fit describes itself; JSON has no infinity, so penalties are strings."""
+        return Stored.of(
+            "readout_fit",
+            {"residual": self.residual},
+            {"readout": self.readout.stored()},
+            alphas=[*map(str, self.alphas)],
+            scores=[[*map(str, alphas), score] for alphas, score in self.scores.items()],
+            gradient=self.gradient,
+            noise_ratio=str(self.noise_ratio),
+        )
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> ReadoutFit:
+        """Return the fit of a description; `restore` returns its readout."""
+        first, second = map(float, stored.list_of(str, "alphas"))
+        return cls(
+            restore(stored.part("readout")),
+            (first, second),
+            stored.array("residual", (None, None), finite=False),
+            {(float(a), float(b)): float(c) for a, b, c in stored.list_of(list, "scores")},
+            stored.value("gradient", float),
+            float(stored.value("noise_ratio", str)),
+        )
 
 
 class _Found(NamedTuple):

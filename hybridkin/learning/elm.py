@@ -11,6 +11,7 @@ from sklearn.utils import gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from hybridkin._core.stored import Stored, estimator_of, feature_names, params_of
 from hybridkin.learning._ridge import Statistics, fit_readout, merge
 from hybridkin.learning.hidden_layer import (
     BLOCK_ELEMENTS,
@@ -382,3 +383,43 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             except RuntimeError:
                 device = torch.device("cpu")
             self._build(device)
+
+    def stored(self):
+        """Return how the fitted network describes itself, with what `partial_fit` goes on from."""
+        check_is_fitted(self, "module_")
+        arrays = {"mean": self._stats.mean, "scatter": self._stats.scatter}
+        return Stored.of(
+            "elm_regressor",
+            {**arrays, "noise_variance": self.noise_variance_},
+            {"network": self.module_.stored()},
+            params=params_of(self),
+            solver=self.solver_,
+            n_samples_seen=self.n_samples_seen_,
+            y_ndim=self._y_ndim,
+            feature_names_in=vars(self).get("feature_names_in_", []),
+        )
+
+    @classmethod
+    def from_stored(cls, stored, restore):
+        """Return the fitted network of a description; `restore` returns its module."""
+        elm = estimator_of(cls, stored.value("params", dict))
+        elm._validate_params()
+        network = restore(stored.part("network"))
+        n_outputs, n_both = network.n_outputs, sum(network.output_weights.shape)
+        mean, scatter = stored.array("mean", (n_both,)), stored.array("scatter", (n_both, n_both))
+        seen = stored.value("n_samples_seen", float)
+        state = {f"{name}_": value.numpy() for name, value in network.state_dict().items()}
+        state |= {
+            "noise_variance_": stored.array("noise_variance", (n_outputs,), finite=False),
+            "solver_": stored.value("solver", str),
+            "n_samples_seen_": seen,
+            "n_features_in_": network.n_actuators,
+            "_activation": network.activation,
+            "_y_ndim": stored.value("y_ndim", int),
+            "_stats": Statistics(seen, mean, scatter),
+        }
+        names = feature_names(stored, network.n_actuators)
+        state |= {} if names is None else {"feature_names_in_": names}
+        elm.__setstate__({**elm.get_params(), **state})
+        elm.module_ = network
+        return elm

@@ -11,6 +11,7 @@ from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from hybridkin._core.stored import plain
 from hybridkin.learning._left_out import LeftOut
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer, gather
@@ -241,6 +242,12 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def leverage(self, X):
         """Return the leverage, as `ELMRegressor.leverage` does."""
         return self._best().leverage(self._checked(X))
+
+    def stored(self):
+        """Return the description of the chosen ELMRegressor."""
+        chosen = self._best().stored()
+        chosen.settings["feature_names_in"] = plain(vars(self).get("feature_names_in_", []))
+        return chosen
 
     def _best(self):
         check_is_fitted(self, "best_estimator_")

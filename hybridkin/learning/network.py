@@ -5,6 +5,7 @@ from torch import nn
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, reverse_jacobian
+from hybridkin._core.stored import Layout
 
 _BLOCK = 2**17  # numbers in the hidden layer of a block of rows: a megabyte, so that it stays near
 
@@ -59,6 +60,13 @@ class ELM(LeverageModule):
         The function sigma.
     """
 
+    layout = Layout(
+        "elm",
+        {"input_weights": "hn", "input_bias": "h", "input_center": "n", "input_scale": "n"}
+        | {"output_weights": "fm", "intercept": "m", "leverage_offset": ""}
+        | {"leverage_center": "f", "leverage_factor": "ff"},
+        {"activation": str},
+    )
     input_weights: torch.Tensor
     input_bias: torch.Tensor
     input_center: torch.Tensor
@@ -187,6 +195,15 @@ class ELM(LeverageModule):
         rounding = 8 * len(center) ** 0.5 * torch.finfo(torch.float32).eps * factor.norm()
         bound = half.norm(dim=-1) + rounding * (single.norm(dim=-1) + center.norm())
         return bound < (limit - self.leverage_offset).clamp(min=0.0).sqrt()
+
+    @classmethod
+    def from_stored(cls, stored, restore):
+        """Return the network of a description."""
+        arrays = stored.tensors(**cls.layout.arrays)
+        (n_hidden, n), n_features = arrays["input_weights"].shape, len(arrays["output_weights"])
+        if n_features not in (n_hidden, n_hidden + n):
+            raise ValueError(f"{n_hidden} hidden neurons cannot have {n_features} features")
+        return cls(arrays, stored.value("activation", str))
 
 
 def _refresh_tangent(elm, incompatible_keys=None):

@@ -18,10 +18,12 @@ from torch.autograd.function import once_differentiable
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.stored import Layout, Restore, Stored
 
 __all__ = ["AffineModule", "KernelModule", "PolynomialModule", "RegressorModule", "error_module"]
 
 _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
+_MOST_POWER = 100
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
 
 
@@ -72,19 +74,20 @@ class AffineModule(ForwardModel):
     ----------
     coef : array-like of shape (m, n) or (n,)
         Coefficients.
-    intercept : array-like of shape (m,) or float
+    bias : array-like of shape (m,) or float
         Value at q = 0.
     """
 
+    layout = Layout("affine", {"coef": "mn", "bias": "m"})
     coef: Tensor
     bias: Tensor
 
-    def __init__(self, coef: ArrayLike, intercept: ArrayLike) -> None:
+    def __init__(self, coef: ArrayLike, bias: ArrayLike) -> None:
         super().__init__()
         matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64).contiguous()
-        bias = torch.tensor(np.asarray(intercept), dtype=torch.float64)
+        intercept = torch.tensor(np.asarray(bias), dtype=torch.float64)
         self.register_buffer("coef", matrix)
-        self.register_buffer("bias", bias.expand(len(matrix)).clone())
+        self.register_buffer("bias", intercept.expand(len(matrix)).clone())
         self.n_outputs, self.n_actuators = matrix.shape
 
     def forward(self, q: Tensor) -> Tensor:
@@ -114,6 +117,7 @@ class PolynomialModule(ForwardModel):
         Map of the inputs [unit of q].
     """
 
+    layout = Layout("polynomial", {})
     powers: Tensor
     readout: Tensor
     slope: Tensor
@@ -172,6 +176,21 @@ class PolynomialModule(ForwardModel):
             phi = phi * table[..., j, :].index_select(-1, self.powers[:, j])
         return phi
 
+    def stored(self) -> Stored:
+        """Return how the module describes itself; its monomials include their derivatives."""
+        arrays = {"powers": self.powers.double(), "readout": self.readout}
+        arrays |= {"center": self.center, "scale": self.scale}
+        return Stored.of(self.layout.kind, arrays)
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> PolynomialModule:
+        """Return the module of a description."""
+        arrays = stored.tensors(powers="pn", readout="pm", center="n", scale="n")
+        if not np.isin(arrays["powers"], range(_MOST_POWER)).all():
+            raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
+        coef = arrays["readout"].T
+        return cls(arrays["powers"], coef, 0.0, arrays["center"], arrays["scale"])
+
 
 class KernelModule(ForwardModel):
     """A sum of Gaussians ``weights' exp(-|(u - u_i) / widths|^2 / 2) + bias`` at training rows.
@@ -186,10 +205,13 @@ class KernelModule(ForwardModel):
         Added to the sum.
     center, scale : array-like of shape (n,)
         ``u = (q - center) / scale`` [unit of q].
-    widths : array-like of shape (n,) or float
+    widths : array-like of shape (n,) or float, default=1.0
         Widths of the Gaussians along each u.
     """
 
+    layout = Layout(
+        "kernel", {"rows": "kn", "weights": "km", "bias": "m", "center": "n", "scale": "n"}
+    )
     rows: Tensor
     weights: Tensor
     tangent: Tensor
@@ -204,7 +226,7 @@ class KernelModule(ForwardModel):
         bias: ArrayLike,
         center: ArrayLike,
         scale: ArrayLike,
-        widths: ArrayLike,
+        widths: ArrayLike = 1.0,
     ) -> None:
         super().__init__()
         at, heights = np.asarray(rows) / np.asarray(widths), np.asarray(weights)

@@ -1,4 +1,4 @@
-"""One small model of every kind that can be saved, and the stored files made of them."""
+"""One small model of every kind that can be saved, and the files stored of them."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def models() -> dict[str, tuple[Any, Any]]:
 
 
 def predictions(model: Any, q: Any) -> dict[str, Any]:
-    """Return what a model says of rows q (N, n), by name."""
+    """Return what a model predicts for rows q (N, n), by name."""
     if isinstance(model, torch.nn.Module):
         chain: Any = model
         x, J = (part.numpy() for part in chain.forward_and_jacobian(torch.from_numpy(q)))
@@ -172,15 +172,15 @@ def predictions(model: Any, q: Any) -> dict[str, Any]:
     return said
 
 
-def write_models(folder: Path) -> None:
-    """Write a file of every kind of model that has none in a folder, and what they predict.
+def write_models(folder: Path, models: dict[str, tuple[Any, Any]]) -> None:
+    """Write a file for every model that has none in a folder, and what it predicts.
 
-    Of a new format version, or a new kind of model, it is called once, when that is released.
-    Files that are there stay as they are: they stand for the files that users have.
+    Call it once for a new kind of model. Files that exist stay as they are: they stand for the
+    files that users have.
     """
     folder.mkdir(parents=True, exist_ok=True)
     said = dict(np.load(folder / "predictions.npz")) if any(folder.iterdir()) else {}
-    for name, (model, q) in models().items():
+    for name, (model, q) in models.items():
         path = folder / f"{name}.safetensors"
         if not path.exists():
             save_model(model, path)

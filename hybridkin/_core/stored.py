@@ -1,0 +1,231 @@
+"""How a model describes itself: its kind, settings, arrays and parts; read back with checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator
+from torch import Tensor
+
+__all__ = ["Layout", "Restore", "Stored", "estimator_of", "feature_names", "params_of", "plain"]
+
+_Estimator = TypeVar("_Estimator", bound=BaseEstimator)
+_REQUIRED = object()
+
+
+class Layout(NamedTuple):
+    """What the description of a module holds, under the names of its constructor's parameters.
+
+    Parameters
+    ----------
+    kind : str
+        Names the class.
+    arrays : dict of str to str
+        Buffers, with one letter per axis as in `Stored.tensors`.
+    settings : dict of str to type
+        Plain attributes.
+    parts : tuple of str
+        Submodules, lists of them, or None.
+    """
+
+    kind: str
+    arrays: dict[str, str]
+    settings: Mapping[str, type] = MappingProxyType({})
+    parts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A model as data: what a file holds of it, and what a kernel needs to compute it.
+
+    The methods read entries and check them, so that damaged data raise a ValueError that names
+    the entry.
+
+    Parameters
+    ----------
+    kind : str
+        Names the class.
+    settings : dict
+        JSON values by name.
+    arrays : dict of str to ndarray
+        float64 or float32 arrays by name.
+    parts : dict of str to Stored
+        The models that this one is made of.
+    """
+
+    kind: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, NDArray] = field(default_factory=dict)
+    parts: dict[str, Stored] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        kind: str,
+        arrays: Mapping[str, Any] | None = None,
+        parts: Mapping[str, Stored | None] | None = None,
+        **settings: Any,
+    ) -> Stored:
+        """Return the description of a model; arrays and parts that are None are left out.
+
+        Parameters
+        ----------
+        kind : str
+            Names the class.
+        arrays : mapping of str to Tensor or array-like, optional
+            Numbers, on any device.
+        parts : mapping of str to Stored, optional
+            The models that it is made of.
+        **settings
+            Values that JSON can express; arrays become lists, tuples too.
+        """
+        tensors = {name: value for name, value in (arrays or {}).items() if value is not None}
+        return cls(
+            kind,
+            plain(settings),
+            {
+                name: np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+                for name, value in tensors.items()
+            },
+            {name: part for name, part in (parts or {}).items() if part is not None},
+        )
+
+    def value(self, key: str, kinds: Any, default: Any = _REQUIRED) -> Any:
+        """Return a setting of one of these types.
+
+        Parameters
+        ----------
+        key : str
+            Its name.
+        kinds : type or tuple of types and None
+            The types allowed. An int counts as a float; a bool is neither.
+        default : optional
+            Returned where the setting is missing. Without a default it must be there.
+        """
+        if key not in self.settings and default is not _REQUIRED:
+            return default
+        if key not in self.settings:
+            raise ValueError(f"`{key}` of {self.kind!r} is missing")
+        value, kinds = self.settings[key], kinds if isinstance(kinds, tuple) else (kinds,)
+        if type(value) is int and float in kinds and int not in kinds:
+            value = float(value)
+        if type(value) not in [type(None) if kind is None else kind for kind in kinds]:
+            names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
+            raise ValueError(f"`{key}` of {self.kind!r} must be {names}, got {value!r:.60}")
+        return value
+
+    def list_of(self, kind: type, key: str) -> list[Any]:
+        """Return a setting that is a list of one type."""
+        values = self.value(key, list)
+        if not all(type(value) is kind for value in values):
+            raise ValueError(
+                f"`{key}` of {self.kind!r} must be a list of {kind.__name__}, got {values!r:.60}"
+            )
+        return values
+
+    def array(
+        self, name: str, shape: tuple[int | None, ...] | None = None, *, finite: bool = True
+    ) -> NDArray:
+        """Return an array of floating-point numbers.
+
+        Parameters
+        ----------
+        name : str
+            Its name.
+        shape : tuple of int or None, optional
+            The shape that it must have; None stands for any length.
+        finite : bool, default=True
+            Whether NaN and infinite entries are refused.
+        """
+        if name not in self.arrays:
+            raise ValueError(f"the array {name!r} of {self.kind!r} is missing")
+        array = self.arrays[name]
+        if array.dtype not in (np.float32, np.float64):
+            raise ValueError(f"{name!r} must be float32 or float64, got {array.dtype}")
+        if shape is not None and not _fits(array.shape, shape):
+            wanted = str(shape).replace("None", "any")
+            raise ValueError(f"{name!r} must have shape {wanted}, got {array.shape}")
+        if finite and not np.isfinite(array).all():
+            raise ValueError(f"{name!r} must be finite")
+        return array
+
+    def tensors(self, **shapes: str) -> dict[str, Tensor]:
+        """Return finite arrays whose shapes fit together, as tensors of their own memory.
+
+        Parameters
+        ----------
+        **shapes
+            For every array one letter per axis; the same letter stands for the same length:
+            ``tensors(coef="mn", bias="m")``.
+        """
+        lengths: dict[str, int] = {}
+        found = {}
+        for name, letters in shapes.items():
+            array = self.array(name, tuple(lengths.get(letter) for letter in letters))
+            lengths |= dict(zip(letters, array.shape, strict=True))
+            found[name] = torch.tensor(array)
+        return found
+
+    def part(self, name: str) -> Stored:
+        """Return the description of a part."""
+        if name not in self.parts:
+            raise ValueError(f"the part {name!r} of {self.kind!r} is missing")
+        return self.parts[name]
+
+
+Restore = Callable[[Stored], Any]
+"""Returns the model of a description, of a list of them a list."""
+
+
+def plain(value: Any) -> Any:
+    """Return a value in JSON terms: arrays as lists, numbers that are not finite as null."""
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, (np.ndarray, np.generic, Tensor)):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def params_of(estimator: BaseEstimator) -> dict[str, Any]:
+    """Return the parameters of an estimator as JSON values.
+
+    A random state that is not a number becomes None, and so does the device.
+    """
+    params = plain(estimator.get_params(deep=False))
+    params |= {"device": None} if "device" in params else {}
+    if not isinstance(params.get("random_state"), int):
+        params |= {"random_state": None} if "random_state" in params else {}
+    return params
+
+
+def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
+    """Return an estimator with those of the parameters that it knows."""
+    defaults = cls().get_params(deep=False)
+    known = {
+        name: tuple(value) if isinstance(defaults[name], tuple) and type(value) is list else value
+        for name, value in params.items()
+        if name in defaults
+    }
+    return cls(**known)
+
+
+def feature_names(stored: Stored, n: int) -> NDArray | None:
+    """Return the names of n columns as scikit-learn keeps them; None where there are none."""
+    names = stored.list_of(str, "feature_names_in")
+    if names and len(names) != n:
+        raise ValueError(f"`feature_names_in` must be {n} names, got {len(names)}")
+    return np.array(names, dtype=object) if names else None
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    pairs = zip(shape, wanted, strict=False)
+    return len(shape) == len(wanted) and all(n is None or m == n for m, n in pairs)

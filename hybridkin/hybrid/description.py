@@ -1,0 +1,226 @@
+"""How a fitted HybridForwardModel describes itself: its settings, and what its fit found."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import torch
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import LinearRegression
+
+from hybridkin._core.model import PortableModule, as_forward_model
+from hybridkin._core.stored import Restore, Stored, estimator_of, feature_names, params_of, plain
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.chains.play import PlayOperator
+from hybridkin.chains.rigid import RigidChain
+from hybridkin.hybrid import _features, _guards, _module
+from hybridkin.hybrid._drift import Drift
+from hybridkin.hybrid._fit import Blend
+from hybridkin.hybrid._pose import PoseHybridModule
+from hybridkin.hybrid._radius import Radius
+from hybridkin.hybrid._readout_fit import ReadoutFit
+from hybridkin.hybrid._settings import check_settings
+from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.learning.elm import ELMRegressor
+from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.learning.network import ELM
+from hybridkin.learning.regressor_modules import AffineModule, KernelModule, PolynomialModule
+
+__all__ = ["hybrid_of", "restorer", "stored_hybrid", "training_of"]
+
+# Every module that a description may hold, by its kind.
+_MODULES: dict[str, type[PortableModule]] = {
+    module.layout.kind: module
+    for module in (
+        *(ConstantCurvatureChain, ElasticTendonChain, RigidChain),
+        *(ELM, AffineModule, PolynomialModule, KernelModule, _features.Readout),
+        *(_features.Features, _features.QuadraticFeatures),
+        *(_features.HiddenFeatures, _features.PoseFeatures),
+        *(_guards.BoxGuard, _guards.LeverageGuard, _guards.QuadraticLeverage),
+        *(_module.TipCorrection, _module.InnerCorrection),
+        *(_module.HybridModule, PoseHybridModule),
+    )
+}
+# Fitted error models that describe themselves, and others that a hybrid may be given.
+_FITS = {"elm_regressor": ELMRegressor.from_stored, "readout_fit": ReadoutFit.from_stored}
+_REGRESSORS = {
+    cls.__name__: cls for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
+}
+
+
+def restorer() -> Restore:
+    """Return a function from descriptions to models, to one model from one description."""
+    found: dict[int, Any] = {}
+
+    def restore(stored: Stored) -> Any:
+        if stored.kind == "list":
+            return [restore(part) for part in stored.parts.values()]
+        if stored.kind not in _MODULES:
+            raise ValueError(f"unknown kind {stored.kind!r:.60}")
+        if id(stored) not in found:
+            found[id(stored)] = _MODULES[stored.kind].from_stored(stored, restore)
+        return found[id(stored)]
+
+    return restore
+
+
+def stored_hybrid(model: HybridForwardModel) -> Stored:
+    """Return how a fitted hybrid describes itself."""
+    if "module_" not in vars(model):
+        raise TypeError("`model` must be fitted before it is saved; call `fit` first.")
+    nominal = model.mechanical_model
+    params = params_of(model)
+    del params["mechanical_model"], params["error_model"]
+    return Stored.of(
+        "hybrid",
+        {
+            **{f"drift_{name}": array for name, array in model._drift._asdict().items()},
+            "play_width": None if model.play_ is None else model.play_.width,
+            "radius": model.radius_,
+        },
+        {
+            "module": model.module_.stored(),
+            "nominal": None if nominal is None else as_forward_model(nominal).stored(),
+            "error_model": _stored_error(model.error_model_),
+        },
+        params=params,
+        error_model=_setting(model.error_model, model.error_model_),
+        n_features_in=model.n_features_in_,
+        feature_names_in=vars(model).get("feature_names_in_", []),
+        single_output=model._single_output,
+    )
+
+
+def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
+    """Return the fitted hybrid of a description and of what `training_of` returned."""
+    n, restore = stored.value("n_features_in", int), restorer()
+    model = estimator_of(HybridForwardModel, stored.value("params", dict))
+    if "nominal" in stored.parts:
+        model.mechanical_model = restorer()(stored.part("nominal"))
+    asked = stored.value("error_model", (str, dict, None))
+    model.error_model = _estimator(asked) if isinstance(asked, dict) else asked
+    check_settings(model)
+    model.module_ = restore(stored.part("module"))
+    model.mechanical_model_ = model.module_.mechanical
+    model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
+    model.n_features_in_, names = n, feature_names(stored, n)
+    if names is not None:
+        model.feature_names_in_ = names
+    model._single_output = stored.value("single_output", bool)
+    center = torch.tensor(stored.array("drift_center", (n,)))
+    with torch.no_grad():  # arrays that do not fit together fail here, not in use
+        x, _ = model.module_.rows().forward_and_jacobian(center[None])
+    shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]))
+    names = [f"drift_{name}" for name in Drift._fields]
+    model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
+    model.calibration_, model.play_, model.radius_ = None, None, None
+    model._play_state = None
+    if "play_width" in stored.arrays:
+        width = stored.array("play_width")
+        model.play_ = PlayOperator(stored.array("play_width", (n,) if width.ndim else ()))
+    if "radius" in stored.arrays:
+        inside, outside, coverage, n_rows = map(float, stored.array("radius", (4,)))
+        model.radius_ = Radius(inside, outside, coverage, int(n_rows))
+    results = training.get("cv_results") if isinstance(training, dict) else None
+    model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
+    return model
+
+
+def training_of(model: HybridForwardModel) -> dict[str, Any]:
+    """Return what a fitted hybrid knows about its training as JSON values, errors in metres."""
+    known: dict[str, Any] = {}
+    error = model.error_model_
+    error = error.error_models[0] if isinstance(error, Blend) else error
+    if isinstance(error, ReadoutFit):
+        squares = np.square(error.residual).sum(axis=1)
+        known["rows"] = int(np.isfinite(squares).sum())
+        known["left_out_rmse"] = float(np.sqrt(np.nanmean(squares)))
+    elif isinstance(error, (ELMRegressor, ELMRegressorCV)):
+        network = error.best_estimator_ if isinstance(error, ELMRegressorCV) else error
+        known["rows"] = network.n_samples_seen_
+    elif isinstance(error, KernelRidge):
+        known["rows"] = len(vars(error)["X_fit_"])
+    elif model.radius_ is not None:
+        known["rows"] = model.radius_.n_rows
+    if model.calibration_ is not None:
+        found = model.calibration_
+        known["calibration"] = {"rmse": found.rmse, "held_out_rmse": found.cv_rmse}
+        known["calibration"] |= {"converged": found.converged}
+    if model.cv_results_ is not None:
+        known["cv_results"] = model.cv_results_
+    return plain(known)
+
+
+def _setting(asked: Any, fitted: Any) -> Any:
+    """Return `error_model` as JSON: as it was asked for, else as what the fit led to."""
+    if asked is None or isinstance(asked, str):
+        return asked
+    if type(asked).__name__ in _REGRESSORS:
+        try:
+            return json.loads(json.dumps(_described(asked), allow_nan=False))
+        except (TypeError, ValueError):
+            pass  # a splitter, for example
+    if isinstance(fitted, ELMRegressorCV):
+        return _described(fitted.best_estimator_)
+    if isinstance(fitted, ReadoutFit):
+        features = fitted.readout.features.stored()
+        if "activation" in features.settings:
+            params = {"n_hidden": len(features.arrays["input_bias"]), **features.settings}
+            return {"class": "ELMRegressorCV", "params": params}
+    raise TypeError(f"`error_model` {asked!r} could only be stored as code.")
+
+
+def _described(estimator: Any) -> dict[str, Any]:
+    """Return class and parameters of an estimator."""
+    return {"class": type(estimator).__name__, "params": params_of(estimator)}
+
+
+def _estimator(setting: dict[str, Any]) -> Any:
+    """Return the unfitted estimator of a setting."""
+    asked = Stored("error_model", setting)
+    name = asked.value("class", str)
+    if name not in _REGRESSORS:
+        raise ValueError(f"unknown error model {name!r:.60}")
+    estimator = estimator_of(_REGRESSORS[name], asked.value("params", dict))
+    estimator._validate_params()
+    return estimator
+
+
+def _stored_error(error: Any) -> Stored | None:
+    """Return how a fitted error model describes itself; None where there is none."""
+    if error is None or isinstance(error, (ReadoutFit, ELMRegressor, ELMRegressorCV)):
+        return None if error is None else error.stored()
+    if isinstance(error, Blend):
+        models = {str(k): _stored_error(one) for k, one in enumerate(error.error_models)}
+        return Stored.of("blend", parts=models, weights=error.weights)
+    learned = {name: np.asarray(value) for name, value in vars(error).items() if name[-1] == "_"}
+    arrays = {name: value for name, value in learned.items() if value.dtype.kind == "f"}
+    return Stored.of("regressor", arrays, **_described(error))
+
+
+def _restored_error(stored: Stored | None, restore: Restore, n: int) -> Any:
+    """Return the fitted error model of a description, for n actuators."""
+    if stored is None:
+        return None
+    if stored.kind == "blend":
+        weights = tuple(stored.list_of(float, "weights"))
+        parts = [stored.parts.get(str(k)) for k in range(len(weights))]
+        return Blend(weights, tuple(_restored_error(part, restore, n) for part in parts))
+    if stored.kind in _FITS:
+        return _FITS[stored.kind](stored, restore)
+    error = _estimator(stored.settings)
+    vars(error).update({name: stored.array(name) for name in stored.arrays}, n_features_in_=n)
+    if error.predict(np.ones((1, n))).ndim > 2:
+        raise ValueError("the arrays of the error model do not fit together")
+    return error
+
+
+def _array(value: Any) -> Any:
+    """Return a list of numbers, null for NaN, or of such lists, as an array; others as they are."""
+    if not isinstance(value, list) or any(isinstance(entry, str) for entry in value):
+        return value
+    array = np.array(value)
+    return array.astype(np.float64) if array.dtype == object else array

@@ -1,0 +1,119 @@
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from safetensors.numpy import load_file
+from saved_models import trunk_log
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF
+from sklearn.linear_model import Ridge
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from torch.testing import assert_close
+
+from hybridkin import ELMRegressor, HybridForwardModel, as_forward_model, load_model, save_model
+from hybridkin._core.stored import Stored
+from hybridkin.learning.regressor_modules import error_module
+
+
+@pytest.mark.parametrize(
+    "regressor",
+    [
+        Ridge(),
+        ELMRegressor(4, direct_link=True, random_state=0),
+        make_pipeline(StandardScaler(), PolynomialFeatures(3), Ridge()),
+        GaussianProcessRegressor(RBF([0.05, 0.1, 0.2]), alpha=0.01, optimizer=None),
+    ],
+    ids=["affine", "network", "polynomial", "kernel"],
+)
+def test_modules_of_regressors_come_back(tmp_path, regressor):
+    q, x, _ = trunk_log()
+    rows = torch.from_numpy(q)
+    module = error_module(regressor.fit(q, x), rows)
+    save_model(module, tmp_path / "module")
+    twin = load_model(tmp_path / "module")
+    assert type(twin) is type(module)
+    # Arrays come back in C order, which may change the last bit of a matrix product.
+    was, came = module.forward_and_jacobian(rows), twin.forward_and_jacobian(rows)
+    assert_close(came, was, rtol=1e-12, atol=1e-13)
+
+
+def test_a_description_describes_the_same_model(fitted):
+    module = fitted["parallel_elm"][0].module_
+    stored = module.stored()
+    assert stored.kind == "hybrid_module"
+    assert {*stored.parts} == {"mechanical", "corrections"}
+    (correction,) = stored.parts["corrections"].parts.values()
+    network = module.corrections[0].module
+    assert_array_equal(correction.parts["module"].arrays["input_weights"], network.input_weights)
+    assert_array_equal(stored.part("mechanical").array("radii"), module.mechanical.radii)
+
+
+@pytest.mark.parametrize("kind", ["parallel_elm", "serial_pose", "drift_and_radius", "blend"])
+def test_equal_arrays_are_written_once(tmp_path, kind, fitted):
+    save_model(fitted[kind][0], tmp_path / "model")
+    arrays = load_file(tmp_path / "model").values()
+    assert len({(a.shape, a.dtype.name, a.tobytes()) for a in arrays}) == len(arrays)
+
+
+def test_shared_parts_are_shared_again(tmp_path, fitted):
+    for kind in ("parallel_elm", "serial_pose"):
+        save_model(fitted[kind][0], tmp_path / kind)
+    network = load_model(tmp_path / "parallel_elm")
+    correction = network.module_.corrections[0]
+    assert correction.guard.model is correction.module is network.error_model_.module_
+    serial = load_model(tmp_path / "serial_pose")
+    correction = serial.module_.corrections[0]
+    assert correction.mechanical is serial.module_.mechanical is serial.mechanical_model_
+    assert correction.readout is serial.error_model_.readout
+    assert correction.readout.features.chain is serial.mechanical_model_
+    assert serial.mechanical_model is not serial.mechanical_model_
+
+
+def test_error_models_come_back_fitted(tmp_path, fitted):
+    for kind in ("parallel_elm", "parallel_kernel", "parallel_regression"):
+        model, q = fitted[kind]
+        save_model(model, tmp_path / "model")
+        error = load_model(tmp_path / "model").error_model_
+        assert type(error) is type(model.error_model_)
+        assert_allclose(error.predict(q), model.error_model_.predict(q), rtol=1e-12)
+    save_model(fitted["blend"][0], tmp_path / "model")
+    was, came = fitted["blend"][0].error_model_, load_model(tmp_path / "model").error_model_
+    assert came.weights == was.weights
+    assert [type(one) for one in came.error_models] == [type(one) for one in was.error_models]
+
+
+def test_models_of_code_say_so():
+    with pytest.raises(TypeError, match="FunctionModel could only be stored as code"):
+        as_forward_model(torch.sin).stored()
+    q, x, _ = trunk_log()
+    model = HybridForwardModel(torch.nn.Identity(), LinearOfCode()).fit(q, x)
+    with pytest.raises(TypeError, match="could only be stored as code"):
+        save_model(model, "model")
+
+
+class LinearOfCode(Ridge):
+    pass
+
+
+def test_entries_are_checked_when_they_are_read():
+    arrays = {"a": np.zeros((2, 3)), "b": np.zeros(3), "n": np.full(2, np.nan)}
+    stored = Stored.of("thing", {**arrays, "i": np.arange(3)}, count=3, flag=True, names=["x", 1])
+    assert stored.value("count", float) == 3.0
+    assert stored.value("missing", str, "default") == "default"
+    assert {*stored.tensors(a="kn", b="n")} == {"a", "b"}
+    assert np.isnan(stored.array("n", (None,), finite=False)).all()
+    wrong = [
+        ("`missing` of 'thing' is missing", lambda: stored.value("missing", str)),
+        ("`flag` of 'thing' must be int or null", lambda: stored.value("flag", (int, None))),
+        ("must be a list of str", lambda: stored.list_of(str, "names")),
+        ("the part 'x' of 'thing' is missing", lambda: stored.part("x")),
+        ("the array 'x' of 'thing' is missing", lambda: stored.array("x")),
+        ("'i' must be float32 or float64", lambda: stored.array("i")),
+        (r"'a' must have shape \(2,\)", lambda: stored.array("a", (2,))),
+        (r"'b' must have shape \(2,\), got \(3,\)", lambda: stored.tensors(a="nk", b="n")),
+        ("'n' must be finite", lambda: stored.array("n")),
+    ]
+    for message, read in wrong:
+        with pytest.raises(ValueError, match=message):
+            read()
