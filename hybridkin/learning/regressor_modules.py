@@ -324,13 +324,11 @@ class _Differenced(torch.autograd.Function):
         return (grad[..., None, :] @ ctx.module.differences(q))[..., 0, :], None
 
 
-def _affine(step: Any) -> tuple[Any, Any] | None:
+def _affine(step: object) -> tuple[Any, Any] | None:
     """Return center and scale of a fitted scaler, u = (q - center) / scale."""
-    settings = step.get_params() if isinstance(step, (StandardScaler, MinMaxScaler)) else {}
     if isinstance(step, StandardScaler):
-        center = step.mean_ if settings["with_mean"] else 0.0
-        return center, step.scale_ if settings["with_std"] else 1.0
-    if isinstance(step, MinMaxScaler) and not settings["clip"]:
+        return step.mean_ if step.with_mean else 0.0, step.scale_ if step.with_std else 1.0
+    if isinstance(step, MinMaxScaler) and not step.clip:
         return -step.min_ / step.scale_, 1.0 / step.scale_
     return None
 
@@ -352,7 +350,7 @@ def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
     return None
 
 
-def _gaussian(kernel: Any) -> tuple[float, Any] | None:
+def _gaussian(kernel: gp.Kernel) -> tuple[float, Any] | None:
     """Return height and widths of a kernel, if between different rows it is a Gaussian."""
     if type(kernel) is gp.RBF:  # a Matern kernel is one to isinstance
         return 1.0, kernel.length_scale
