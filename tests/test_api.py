@@ -20,7 +20,7 @@ FLOORS = [
     {"chains", "learning", "ik"},
     {"_core", "datasets", "plots", "simulation"},
 ]
-BESIDE = {"datasets": {"simulation"}, "plots": set(), "simulation": set(), "_core": set()}
+BESIDE = {"datasets": {"simulation", "_core"}, "plots": set(), "simulation": set(), "_core": set()}
 
 
 def folder_of(path):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridkin._core.units import METRES
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
@@ -38,7 +39,6 @@ BHA_LENGTH_LIMITS = (0.10, 0.40)
 BHA_WORKING_BOX = (0.19, 0.31)
 """Chamber lengths it works in: 0.25 m, give or take 0.06 m."""
 
-_UNITS = ("m", "cm", "mm")
 _MODELS = ("constant-curvature", "elastic-tendon")
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
 
@@ -368,8 +368,8 @@ def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
             raise ValueError(f"`{key}` in [log] must name {size} columns, got {value!r}.")
         columns[key] = tuple(str(name) for name in value)
     for key in ("q_unit", "x_unit"):
-        if table.get(key, "m") not in _UNITS:
-            raise ValueError(f"`{key}` in [log] must be one of {[*_UNITS]}, got {table[key]!r}.")
+        if table.get(key, "m") not in METRES:
+            raise ValueError(f"`{key}` in [log] must be one of {[*METRES]}, got {table[key]!r}.")
     if table.get("q_sign", 1) not in (1, -1):
         raise ValueError(f"`q_sign` in [log] must be 1 or -1, got {table['q_sign']!r}.")
     for key in ("group_suffix", "groups", "time"):

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from hybridkin._core.units import METRES
+
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
 
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _FAR = 20.0  # no tip is that far from where it is measured [m]
 
 
@@ -298,8 +299,8 @@ def from_csv(
     Trajectory
         In metres and seconds, as timed in the file.
     """
-    if unit not in _UNITS:
-        raise ValueError(f"`unit` must be one of {tuple(_UNITS)}, got {unit!r}.")
+    if unit not in METRES:
+        raise ValueError(f"`unit` must be one of {tuple(METRES)}, got {unit!r}.")
     with open(path, encoding="utf-8-sig") as file:
         lines = [text.strip() for text in file]
     rows = [text.split(delimiter) for text in lines if text and not text.startswith("#")]
@@ -321,7 +322,7 @@ def from_csv(
     else:
         _check_positive(dt, "dt")
         t = dt * np.arange(len(table))
-    return Trajectory(t, _UNITS[unit] * table[:, -3:])
+    return Trajectory(t, METRES[unit] * table[:, -3:])
 
 
 def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.ndarray]:

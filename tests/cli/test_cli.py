@@ -331,7 +331,7 @@ def test_evaluate_tells_errors_by_motion(fitted, tmp_path, capsys):
     assert code == 0
     assert len(record["motions"]) == 10
     model = load_model(fitted / "model" / "model.safetensors")
-    data = datasets.load_csv(
+    data = datasets.load_log(
         fitted / "log.csv", COLUMNS, ["x", "y", "z"], "motion", q_unit="mm", x_unit="mm", q_sign=-1
     )
     errors = np.linalg.norm(model.predict(data.q) - data.x, axis=1)
@@ -377,7 +377,7 @@ def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
     assert record["play"] is None
     assert record["columns"]["x"] == ["x", "y", "z"]
     # What the file says, in the robot's units and sign, leads the model where it says.
-    data = datasets.load_csv(
+    data = datasets.load_log(
         out / "track.csv",
         COLUMNS,
         ["target_x", "target_y", "target_z"],
