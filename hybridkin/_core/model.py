@@ -178,9 +178,9 @@ def as_forward_model(model: Any) -> ForwardModel:
     Parameters
     ----------
     model : ForwardModel, nn.Module, callable, (callable, callable) or fitted estimator
-        A function or module maps q ``(..., n)`` to x ``(..., m)`` row by row, torch to torch; a pair
-        is such a function and its Jacobian ``(..., m, n)``. Of a fitted estimator its ``module_``
-        is taken.
+        A function or module maps q ``(..., n)`` to x ``(..., m)`` row by row, torch to torch; a
+        pair is such a function and its Jacobian ``(..., m, n)``. Of a fitted estimator its
+        ``module_`` is taken.
 
     Returns
     -------

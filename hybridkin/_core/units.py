@@ -14,22 +14,36 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _SPANS = 10.0  # a tip moves within two lengths of its robot; millimetres look like 2000
 
 
+def span_message(name: str, tips: Tensor, reach: float) -> str | None:
+    """Return a warning where tips (N, 3) lie further apart than a robot of that size reaches."""
+    span = float((tips.amax(dim=0) - tips.amin(dim=0)).max())
+    if span <= _SPANS * reach:
+        return None
+    return (
+        f"`{name}` spans {span:.4g} m, but the robot is only {reach:.3g} m long; hybridkin "
+        "works in metres: divide millimetres by 1000, or read the log with x_unit='mm'."
+    )
+
+
 def warn_span(name: str, tips: Tensor, reach: float) -> None:
     """Warn where tips (N, 3) of a log lie further apart than a robot of that size can reach."""
-    span = float((tips.amax(dim=0) - tips.amin(dim=0)).max())
-    if span > _SPANS * reach:
-        warnings.warn(
-            f"`{name}` spans {span:.4g} m, but the robot is only {reach:.3g} m long; hybridkin "
-            "works in metres: divide millimetres by 1000, or read the log with x_unit='mm'.",
-            stacklevel=4,
-        )
+    message = span_message(name, tips, reach)
+    if message is not None:
+        warnings.warn(message, stacklevel=4)
+
+
+def millimetres_message(name: str, value: Tensor, limit: float) -> str | None:
+    """Return a warning where values are too large to be metres."""
+    if not value.numel() or float(value.max()) <= limit:
+        return None
+    return (
+        f"`{name}` reaches {float(value.max()):.4g}, which looks like millimetres; hybridkin "
+        "works in metres."
+    )
 
 
 def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
     """Warn where values are too large to be metres."""
-    if value.numel() and float(value.max()) > limit:
-        warnings.warn(
-            f"`{name}` reaches {float(value.max()):.4g}, which looks like millimetres; hybridkin "
-            "works in metres.",
-            stacklevel=3,
-        )
+    message = millimetres_message(name, value, limit)
+    if message is not None:
+        warnings.warn(message, stacklevel=3)

@@ -10,16 +10,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
 from hybridkin._core.arrays import as_tensor
-from hybridkin._core.units import warn_span
+from hybridkin._core.units import span_message
 from hybridkin.calibration._initial_guesses import Start, starts
 from hybridkin.calibration._least_squares import Fit, Rows, solve
 from hybridkin.calibration._parameters import ALIASES, Problem, parameter_names
 from hybridkin.calibration._unidentified import sentences
+from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
 
@@ -100,16 +101,16 @@ def _shown(value: Any) -> str:
 
 
 def calibrate(
-    chain: Any,
-    q: Any,
-    x: Any,
+    chain: Chain,
+    q: ArrayLike | Tensor,
+    x: ArrayLike | Tensor,
     parameters: Sequence[str] = ("radii", "base"),
     *,
     loss: str = "linear",
     bounds: Mapping[str, tuple[float, float]] | None = None,
     prior: float | Mapping[str, float] = 0.5,
-    groups: Any = None,
-    sample_weight: Any = None,
+    groups: ArrayLike | None = None,
+    sample_weight: ArrayLike | Tensor | None = None,
 ) -> CalibrationResult:
     """Return the chain whose geometry explains measured tips best.
 
@@ -183,11 +184,40 @@ def calibrate(
     >>> result.values["radii"]
     tensor([0.0500, 0.0400], dtype=torch.float64)
     """
+    result, messages = fit_geometry(
+        chain,
+        q,
+        x,
+        parameters,
+        loss=loss,
+        bounds=bounds,
+        prior=prior,
+        groups=groups,
+        sample_weight=sample_weight,
+    )
+    for message in messages:
+        warnings.warn(message, stacklevel=2)
+    return result
+
+
+def fit_geometry(
+    chain: Chain,
+    q: ArrayLike | Tensor,
+    x: ArrayLike | Tensor,
+    parameters: Sequence[str],
+    *,
+    loss: str = "linear",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    prior: float | Mapping[str, float] = 0.5,
+    groups: ArrayLike | None = None,
+    sample_weight: ArrayLike | Tensor | None = None,
+) -> tuple[CalibrationResult, list[str]]:
+    """Return what `calibrate` returns, and the messages of its warnings; nothing is issued."""
     names = _check_parameters(chain, parameters, bounds, prior)
     if loss not in _LOSSES:
         raise ValueError(f"`loss` must be one of {_LOSSES}, got {loss!r}.")
     torch_given = isinstance(q, Tensor)
-    q, x = _check_data(chain, q, x)
+    q, x, messages = _check_data(chain, q, x)
     if groups is not None:
         groups = np.asarray(groups)
         if groups.shape != (len(q),):
@@ -207,17 +237,15 @@ def calibrate(
         problem = Problem.of(start.chain, names, bounds or {}, stds)
         first = _first_theta(problem, start)
         fits.append(solve(problem, rows, first, loss, roughly=len(candidates) > 1))
-    best = _best(fits, candidates, bool({"angles", "turns"} & {*names}))
+    best, message = _best(fits, candidates, bool({"angles", "turns"} & {*names}))
     if len(candidates) > 1:
         best = solve(best.problem, rows, best.theta, loss)
-    _warn_unphysical(best)
-    result_chain = best.chain()
-    if hasattr(result_chain, "warn_contradictory"):
-        result_chain.warn_contradictory(q)
+    messages += [message, _unphysical(best), best.chain().contradiction(q)]
     cv_rmse = None
     if groups is not None:
         cv_rmse = _cross_validate(best, rows, groups[kept.numpy()], loss)
-    return _result(best, rows, cv_rmse, torch_given)
+    result = _result(best, rows, cv_rmse, torch_given)
+    return result, [message for message in messages if message is not None]
 
 
 def _first_theta(problem: Problem, start: Start) -> NDArray:
@@ -228,8 +256,11 @@ def _first_theta(problem: Problem, start: Start) -> NDArray:
     return np.clip(np.concatenate(theta), problem.low, problem.high)
 
 
-def _best(fits: list[Fit], candidates: list[Start], free_angles: bool) -> Fit:
-    """Return the best fit: of equals the first, and a mirror image only where clearly better."""
+def _best(fits: list[Fit], candidates: list[Start], free_angles: bool) -> tuple[Fit, str | None]:
+    """Return the best fit, and a warning where it is a mirror image that nobody asked for.
+
+    Of equals the first is the best, a mirror image only where it is clearly better.
+    """
     best, image = fits[0], None
     for fit, start in zip(fits[1:], candidates[1:], strict=True):
         if not any(start.mirrored):
@@ -237,18 +268,18 @@ def _best(fits: list[Fit], candidates: list[Start], free_angles: bool) -> Fit:
         elif image is None or fit.rmse < image.rmse:
             image = fit
     if image is None or image.rmse >= (_BETTER if free_angles else _FAR_BETTER) * best.rmse:
-        return best
-    if not free_angles:
-        warnings.warn(
-            f"the actuators run the other way round than `chain` says: its mirror image leaves "
-            f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
-            "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`.",
-            stacklevel=3,
-        )
-    return image
+        return best, None
+    if free_angles:
+        return image, None
+    return image, (
+        f"the actuators run the other way round than `chain` says: its mirror image leaves "
+        f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
+        "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`."
+    )
 
 
-def _warn_unphysical(fit: Fit) -> None:
+def _unphysical(fit: Fit) -> str | None:
+    """Return a warning where values ran into a bound or left what is physical."""
     problem, theta = fit.problem, fit.theta
     words = []
     for label, at, low, high in zip(problem.labels, theta, problem.low, problem.high, strict=True):
@@ -267,13 +298,13 @@ def _warn_unphysical(fit: Fit) -> None:
             for k in worse.nonzero().flatten().tolist():
                 label = "tool" if part.name == "tool" else part.labels[k]
                 words.append(f"{label} became {1e3 * float(offsets[k]):.3g} mm")
-    if words:
-        warnings.warn(
-            f"calibration left what is physical: {'; '.join(words)}. Check the units and the "
-            "start, narrow the `prior`, or fit less; the robot may do what this model does not "
-            "know (slack tendons, gravity, twist).",
-            stacklevel=3,
-        )
+    if not words:
+        return None
+    return (
+        f"calibration left what is physical: {'; '.join(words)}. Check the units and the start, "
+        "narrow the `prior`, or fit less; the robot may do what this model does not know (slack "
+        "tendons, gravity, twist)."
+    )
 
 
 def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> CalibrationResult:
@@ -361,7 +392,10 @@ def _check_parameters(
     return names
 
 
-def _check_data(chain: Any, q: Any, x: Any) -> tuple[Tensor, Tensor]:
+def _check_data(
+    chain: Chain, q: ArrayLike | Tensor, x: ArrayLike | Tensor
+) -> tuple[Tensor, Tensor, list[str | None]]:
+    """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q, x = as_tensor(q, "q").to(dtype), as_tensor(x, "x").to(dtype)
     if q.ndim != 2:
@@ -373,12 +407,11 @@ def _check_data(chain: Any, q: Any, x: Any) -> tuple[Tensor, Tensor]:
         )
     if len(q) == 0:
         raise ValueError("`q` must hold at least one row, got none.")
-    chain.check_actuators(q)
+    messages = chain.check_actuators(q)
     if not torch.isfinite(x).all():
         rows = int((~torch.isfinite(x).all(dim=1)).sum())
         raise ValueError(f"`x` must be finite, got NaN or infinity in {rows} rows; drop them.")
-    warn_span("x", x, float(chain.reach.detach()))
-    return q, x
+    return q, x, [*messages, span_message("x", x, float(chain.reach.detach()))]
 
 
 def _check_weights(sample_weight: Any, q: Tensor) -> Tensor:

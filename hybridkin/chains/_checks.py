@@ -125,13 +125,3 @@ def check_replacements(values: Mapping[str, Tensor], current: Mapping[str, Tenso
             raise ValueError(
                 f"`{name}` must have shape {tuple(current[name].shape)}, got {tuple(value.shape)}."
             )
-
-
-def check_finite_rows(rows: Tensor, name: str) -> None:
-    """Raise where rows (N, n) of a log hold NaN or infinity."""
-    bad = ~torch.isfinite(rows).all(dim=1)
-    if bad.any():
-        raise ValueError(
-            f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of {len(rows)} rows "
-            f"(first: row {int(bad.nonzero()[0])}); drop those rows."
-        )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from hybridkin._core.blocks import check_vectors
 from hybridkin._core.model import PoseModel
 
 if TYPE_CHECKING:
@@ -71,9 +73,54 @@ class Chain(PoseModel):
         """Return points (..., P, 3) along the robot, base to end [m]."""
         raise NotImplementedError
 
-    def check_actuators(self, q: Tensor, name: str = "q") -> None:
-        """Raise where q (..., n) cannot be a log of this robot, warn where its unit looks wrong."""
-        raise NotImplementedError
+    def check_actuators(self, q: Tensor, name: str = "q") -> list[str]:
+        """Raise where q cannot be a log of this robot; return warnings about its units.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator vectors [m], of revolute joints [rad].
+        name : str, default="q"
+            What to call `q` in a message.
+
+        Returns
+        -------
+        list of str
+            One message for each unit that looks wrong: millimetres, degrees.
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape, for NaN or infinite entries, and for absolute actuator lengths that
+            are not positive.
+        """
+        check_vectors(q, self.n_actuators, name, self._why_shape())
+        rows = q.detach().reshape(-1, self.n_actuators)
+        bad = ~torch.isfinite(rows).all(dim=1)
+        if bad.any():
+            raise ValueError(
+                f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of {len(rows)} "
+                f"rows (first: row {int(bad.nonzero()[0])}); drop those rows."
+            )
+        return [message for message in self._check_rows(rows, name) if message is not None]
+
+    def _why_shape(self) -> str:
+        """Return the reason why q needs its shape, for messages."""
+        return f"this robot has {self.n_actuators} actuators"
+
+    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
+        """Return warnings about the units of finite rows (N, n); raise where they are no log."""
+        return []
+
+    def contradiction(self, q: Tensor, name: str = "q") -> str | None:
+        """Return a warning where the actuators of q (..., n) contradict each other, else None.
+
+        None for a robot whose actuators cannot contradict each other.
+        """
+        return None
 
     def warn_contradictory(self, q: Tensor, name: str = "q", stacklevel: int = 3) -> None:
-        """Warn where the actuators contradict each other; most chains do not know of it."""
+        """Warn where `contradiction` has a warning."""
+        message = self.contradiction(q, name)
+        if message is not None:
+            warnings.warn(message, stacklevel=stacklevel)

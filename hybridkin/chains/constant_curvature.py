@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,12 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hybridkin._core.blocks import check_vectors
-from hybridkin._core.units import warn_millimetres
+from hybridkin._core.units import millimetres_message, warn_millimetres
 from hybridkin.chains._arcs import levers, reading_matrix, tip_and_columns_of_numbers
 from hybridkin.chains._checks import (
     actuator_counts,
-    check_finite_rows,
     filled,
     flat_angles,
     pose,
@@ -218,8 +215,8 @@ class ConstantCurvatureChain(ArcChain):
         tall = residual > _WORTH_A_WORD * self.radii.to(q)
         return tall & (residual > _CONTRADICTED * explained)
 
-    def warn_contradictory(self, q: Tensor, name: str = "q", stacklevel: int = 3) -> None:
-        """Warn where the tendons of an inextensible chain contradict each other, as slack does.
+    def contradiction(self, q: Tensor, name: str = "q") -> str | None:
+        """Return a warning where the tendons of an inextensible chain contradict each other.
 
         Parameters
         ----------
@@ -227,31 +224,28 @@ class ConstantCurvatureChain(ArcChain):
             Tendon length changes [m].
         name : str, default="q"
             What to call `q` in the message.
-        stacklevel : int, default=3
-            Of `warnings.warn`.
 
-        Warns
-        -----
-        UserWarning
-            Once, with the number of rows that are `contradictory`, and the worst of them.
+        Returns
+        -------
+        str or None
+            The number of rows that are `contradictory`, and the worst of them. None where there
+            are none, and for extensible segments.
         """
         if self.lengths is None:
-            return
+            return None
         with torch.no_grad():
             rows = q.reshape(-1, self.n_actuators)
             wrong = self.contradictory(rows)
             if not wrong.any():
-                return
+                return None
             residual = self.consistency(rows) * wrong
         row, segment = divmod(int(residual.argmax()), self.n_segments)
-        warnings.warn(
+        return (
             f"{int(wrong.any(-1).sum())} of {len(rows)} rows of `{name}` pull the tendons of a "
             "segment together or let them go, which bends nothing in a ConstantCurvatureChain "
             "but compresses a robot or leaves tendons slack: worst is row "
             f"{row}, segment {segment + 1}, {1e3 * float(residual[row, segment]):.3g} mm rms. "
-            "ElasticTendonChain knows tendons "
-            "that can only pull.",
-            stacklevel=stacklevel,
+            "ElasticTendonChain knows tendons that can only pull."
         )
 
     def numpy_function(self) -> Callable[[NDArray], tuple[NDArray, NDArray]]:
@@ -285,32 +279,15 @@ class ConstantCurvatureChain(ArcChain):
 
         return tip_and_jacobian
 
-    def check_actuators(self, q: Tensor, name: str = "q") -> None:
-        """Raise where q cannot be a log of this robot, and warn where it looks like millimetres.
-
-        Parameters
-        ----------
-        q : Tensor of shape (..., n_actuators)
-            Actuator lengths, or tendon length changes [m].
-        name : str, default="q"
-            What to call `q` in a message.
-
-        Raises
-        ------
-        ValueError
-            For NaN or infinite entries, and for absolute lengths that are not positive.
-        """
-        check_vectors(q, self.n_actuators, name, self._why_shape())
-        rows = q.detach().reshape(-1, self.n_actuators)
-        check_finite_rows(rows, name)
+    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
         if self.lengths is None and (rows <= 0).any():
             row = int((rows <= 0).any(dim=1).nonzero()[0])
             raise ValueError(
                 f"`{name}` must hold positive actuator lengths [m], got {rows[row].min():.6g} in "
                 f"row {row}; for tendon length changes build the chain with `lengths=`."
             )
-        reach = 10.0 if self.lengths is None else 10.0 * float(self.lengths.detach().sum())
-        warn_millimetres(name, rows.abs(), reach)
+        largest = 10.0 if self.lengths is None else 10.0 * float(self.lengths.detach().sum())
+        return [millimetres_message(name, rows.abs(), largest)]
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""

@@ -11,12 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.blocks import check_vectors
-from hybridkin._core.units import warn_millimetres
+from hybridkin._core.units import millimetres_message, warn_millimetres
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import (
     actuator_counts,
-    check_finite_rows,
     filled,
     flat_angles,
     pose,
@@ -311,25 +309,8 @@ class ElasticTendonChain(ArcChain):
         stretch = self._balance(rows).shape @ readings.T - rows + zeros
         return q - (minimum - stretch).clamp(min=0.0).reshape(q.shape)
 
-    def check_actuators(self, q: Tensor, name: str = "q") -> None:
-        """Raise where q cannot be a log of this robot, and warn where it looks like millimetres.
-
-        Parameters
-        ----------
-        q : Tensor of shape (..., n_actuators)
-            Tendon length changes [m].
-        name : str, default="q"
-            What to call `q` in a message.
-
-        Raises
-        ------
-        ValueError
-            For NaN or infinite entries.
-        """
-        check_vectors(q, self.n_actuators, name, self._why_shape())
-        rows = q.detach().reshape(-1, self.n_actuators)
-        check_finite_rows(rows, name)
-        warn_millimetres(name, rows.abs(), 10.0 * float(self.lengths.detach().sum()))
+    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
+        return [millimetres_message(name, rows.abs(), 10.0 * float(self.lengths.detach().sum()))]
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""

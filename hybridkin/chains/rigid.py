@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -14,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors, in_blocks
-from hybridkin._core.units import warn_millimetres
+from hybridkin._core.units import millimetres_message, warn_millimetres
 from hybridkin.chains._arm_files import Joint, chain_path, limits_of, mjcf_path, urdf_path
-from hybridkin.chains._checks import check_finite_rows, check_replacements, pose
+from hybridkin.chains._checks import check_replacements, pose
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -484,26 +483,11 @@ class RigidChain(Chain):
         t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
         return torch.cat([corners[..., :1, :], torch.lerp(start, end, t).flatten(-3, -2)], dim=-2)
 
-    def check_actuators(self, q: Tensor, name: str = "q") -> None:
-        """Raise where q cannot be a log of this arm, warn where it looks like degrees or mm.
-
-        Parameters
-        ----------
-        q : Tensor of shape (..., n_actuators)
-            Joint positions [rad], of prismatic joints [m].
-        name : str, default="q"
-            What to call `q` in a message.
-
-        Raises
-        ------
-        ValueError
-            For NaN or infinite entries.
-        """
-        check_vectors(q, self.n_actuators, name, self._why_shape())
-        rows = q.detach().reshape(-1, self.n_actuators)
-        check_finite_rows(rows, name)
-        _warn_degrees(name, rows[:, ~self.slides].abs())
-        warn_millimetres(name, rows[:, self.slides].abs(), _FAR)
+    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
+        return [
+            _degrees_message(name, rows[:, ~self.slides].abs()),
+            millimetres_message(name, rows[:, self.slides].abs(), _FAR),
+        ]
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
@@ -647,11 +631,11 @@ def _rigid(value: Any, name: str) -> Tensor:
     return matrix
 
 
-def _warn_degrees(name: str, turns: Tensor) -> None:
-    """Warn where angles are too large to be radians."""
-    if turns.numel() and float(turns.max()) > _MANY_TURNS:
-        warnings.warn(
-            f"`{name}` reaches {float(turns.max()):.4g} on a revolute joint, which looks like "
-            "degrees; hybridkin works in radians.",
-            stacklevel=3,
-        )
+def _degrees_message(name: str, turns: Tensor) -> str | None:
+    """Return a warning where angles are too large to be radians."""
+    if not turns.numel() or float(turns.max()) <= _MANY_TURNS:
+        return None
+    return (
+        f"`{name}` reaches {float(turns.max()):.4g} on a revolute joint, which looks like "
+        "degrees; hybridkin works in radians."
+    )

@@ -221,7 +221,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if mechanical is not None:
             mechanical = as_forward_model(mechanical)
         if hasattr(mechanical, "check_actuators"):
-            mechanical.check_actuators(torch.from_numpy(X), "X")
+            for message in mechanical.check_actuators(torch.from_numpy(X), "X"):
+                warnings.warn(message, stacklevel=2)
         names = self.calibrate
         if isinstance(names, str) and names == "default":
             names = getattr(mechanical, "default_parameters", ())

@@ -844,5 +844,6 @@ def test_angles_in_degrees_are_noticed():
 
 
 def test_lengths_in_millimetres_are_noticed():
-    with pytest.warns(UserWarning, match="millimetres"):
-        bha().check_actuators(1000 * STRAIGHT)
+    (message,) = bha().check_actuators(1000 * STRAIGHT)
+    assert "`q` reaches 250, which looks like millimetres" in message
+    assert bha().check_actuators(STRAIGHT) == []

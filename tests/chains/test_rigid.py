@@ -518,10 +518,10 @@ def test_missing_files_and_branching_chains():
 
 def test_degrees_and_millimetres_are_noticed():
     slider = planar(kinds=["revolute", "prismatic"])
-    with pytest.warns(UserWarning, match="degrees"):
-        slider.check_actuators(torch.tensor([[90.0, 0.1]]))
-    with pytest.warns(UserWarning, match="millimetres"):
-        slider.check_actuators(torch.tensor([[0.9, 100.0]]), "X")
+    (message,) = slider.check_actuators(torch.tensor([[90.0, 0.1]]))
+    assert "`q` reaches 90 on a revolute joint, which looks like degrees" in message
+    (message,) = slider.check_actuators(torch.tensor([[0.9, 100.0]]), "X")
+    assert "`X` reaches 100, which looks like millimetres" in message
     with pytest.warns(UserWarning, match="millimetres"):
         RigidChain.from_urdf(URDF.replace("0.33", "330"), "flange")
-    slider.check_actuators(torch.tensor([[-6.0, 0.1]]))
+    assert slider.check_actuators(torch.tensor([[-6.0, 0.1]])) == []
