@@ -6,7 +6,7 @@ import difflib
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +119,29 @@ class Limits:
     q_max: np.ndarray | None = None
     dq_max: np.ndarray | None = None
 
+    def intersect(self, other: Limits) -> Limits:
+        """Return the limits that keep to both; what one does not know the other decides."""
+        return Limits(
+            _tighter(np.maximum, self.q_min, other.q_min),
+            _tighter(np.minimum, self.q_max, other.q_max),
+            _tighter(np.minimum, self.dq_max, other.dq_max),
+        )
+
+    def narrowed(self, by: float | np.ndarray) -> Limits:
+        """Return the limits with the range of every actuator smaller by `by` at both ends [m]."""
+        low, high = self.q_min, self.q_max
+        return Limits(
+            None if low is None else low + by, None if high is None else high - by, self.dq_max
+        )
+
+
+def _tighter(
+    choose: np.ufunc, one: np.ndarray | None, other: np.ndarray | None
+) -> np.ndarray | None:
+    if one is None or other is None:
+        return one if other is None else other
+    return choose(one, other)
+
 
 @dataclass(frozen=True)
 class RobotDescription:
@@ -136,6 +159,8 @@ class RobotDescription:
         How its logs are written.
     limits : Limits
         What its actuators can do, as far as it is known.
+    path : Path or None
+        The file it was read from.
     """
 
     name: str
@@ -143,6 +168,7 @@ class RobotDescription:
     calibrate: tuple[str, ...]
     log: LogFormat | None
     limits: Limits = Limits()
+    path: Path | None = None
 
 
 def from_toml(path: str | Path) -> Chain:
@@ -245,7 +271,7 @@ def read_description(path: str | Path) -> RobotDescription:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not a TOML file: {error}.") from error
     try:
-        return _description(content, path.stem)
+        return replace(_description(content, path.stem), path=path)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
 

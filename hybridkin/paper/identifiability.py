@@ -11,7 +11,7 @@ from hybridkin import datasets, robots
 from hybridkin.calibration.calibrate import calibrate
 from hybridkin.workflow.report import (
     GEOMETRY_HEADER,
-    TOLD,
+    IDENTIFIED,
     Report,
     distance,
     geometry_entries,
@@ -73,22 +73,22 @@ def write_identifiability(report: Report, data: Any, found: dict[str, Any]) -> N
     """Add what `identifiability` found to a report."""
     report.record["identifiability"] = found
     asked, tellable, default = (found[label] for label in ("asked", "tellable", "default"))
-    told = sum(entry["told"] for entry in asked["entries"])
+    identified = sum(entry["identified"] for entry in asked["entries"])
     report.text(
         "## What the samples tell about the geometry",
         f"Everything asked at once ({', '.join(ASKED)}) of the {found['n_train']} training rows of "
         f"one split of the **simulated** data: {found['n_single']} rows of one segment moving "
-        f"alone and {found['n_random']} fully random ones. A parameter is told where the rows "
-        f"narrow its prior at least {TOLD:.0f} times; other values are assumptions, near the "
-        f"published geometry. Told: {told} of {len(asked['entries'])} parameters. The base by its "
-        "turn from the start and its position.",
+        f"alone and {found['n_random']} fully random ones. A parameter is identified where the "
+        f"rows narrow its prior at least {IDENTIFIED:.0f} times; other values are assumptions, near "
+        f"the published geometry. Identified: {identified} of {len(asked['entries'])} parameters. "
+        "The base by its turn from the start and its position.",
     )
     report.table(GEOMETRY_HEADER, geometry_rows(asked["entries"]))
     report.text("What the samples leave open, and what settles it:")
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
     report.text(
-        f"Without turns and actuator zeros ({', '.join(TELLABLE)}) all is told:"
-        if all(entry["told"] for entry in tellable["entries"])
+        f"Without turns and actuator zeros ({', '.join(TELLABLE)}) all is identified:"
+        if all(entry["identified"] for entry in tellable["entries"])
         else f"Without turns and actuator zeros ({', '.join(TELLABLE)}):"
     )
     report.table(GEOMETRY_HEADER, geometry_rows(tellable["entries"]))
