@@ -186,19 +186,17 @@ def load_log(
             "drop_invalid=True."
         )
     if invalid.all():
-        raise ValueError(
-            f"{str(path)!r} has no valid row left: all {len(values)} have a missing, NaN or "
-            "infinite value."
-        )
-    labels, values, n = labels[~invalid], values[~invalid], len(q)
-    for name, unit, part in (("q", q_unit, values[:, :n]), ("x", x_unit, values[:, n : n + 3])):
-        if unit == "m":
-            _warn_if_millimetres(name, part)
+        raise ValueError(f"{str(path)!r} has no valid row left of {len(values)}.")
+    valid, n = values[~invalid], len(q)
+    if q_unit == "m":
+        _warn_if_millimetres("q", valid[:, :n])
+    if x_unit == "m":
+        _warn_if_millimetres("x", valid[:, n : n + 3])
     return Log(
-        values[:, :n] * q_scale * sign,
-        values[:, n : n + 3] * x_scale,
-        groups=None if groups is None else labels,
-        time=None if time is None else values[:, -1],
+        valid[:, :n] * q_scale * sign,
+        valid[:, n : n + 3] * x_scale,
+        groups=None if groups is None else labels[~invalid],
+        time=None if time is None else valid[:, -1],
         line=places[~invalid],
         invalid_lines=places[invalid],
         q_names=q,

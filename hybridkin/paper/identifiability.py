@@ -79,9 +79,9 @@ def write_identifiability(report: Report, data: Any, found: dict[str, Any]) -> N
         f"Everything asked at once ({', '.join(ASKED)}) of the {found['n_train']} training rows of "
         f"one split of the **simulated** data: {found['n_single']} rows of one segment moving "
         f"alone and {found['n_random']} fully random ones. A parameter is identified where the "
-        f"rows narrow its prior at least {IDENTIFIED:.0f} times; other values are assumptions, near "
-        f"the published geometry. Identified: {identified} of {len(asked['entries'])} parameters. "
-        "The base by its turn from the start and its position.",
+        f"rows narrow its prior at least {IDENTIFIED:.0f} times; other values are assumptions, "
+        f"near the published geometry. Identified: {identified} of {len(asked['entries'])} "
+        "parameters. The base by its turn from the start and its position.",
     )
     report.table(GEOMETRY_HEADER, geometry_rows(asked["entries"]))
     report.text("What the samples leave open, and what settles it:")

@@ -12,11 +12,9 @@ from scipy.spatial.transform import Rotation
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.workflow._fit_report import auto_entry, auto_in_short, write_errors
+from hybridkin.workflow._fit_report import auto_entry, auto_in_short
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report, millimetres
-
-_COLUMNS = {"mean": "mean", "p95": "95 %", "max": "max"}
 
 
 def describe(loaded: LoadedModel) -> Report:
@@ -143,35 +141,26 @@ def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
 def _write_model(report: Report) -> None:
     """Add error model, radius, play, domain, limits and the format of the logs."""
     record = report.record
-    error, radius, domain, log = (
-        record[name] for name in ("error_model", "radius", "domain", "log_format")
-    )
-    if error is not None:
-        parts = [error["kind"], error["coupling"], f"guard {error['guard'] or 'none'}"]
+    if record["error_model"] is not None:
+        kind, coupling, guard, _ = record["error_model"].values()
+        parts = [kind, coupling, f"guard {guard or 'none'}"]
         report.text(f"Error model: {', '.join(part for part in parts if part)}.")
-    if radius is not None:
+    if record["radius"] is not None:
+        coverage, inside, outside = (record["radius"][k] for k in ("coverage", "inside", "outside"))
         report.text(
-            f"Estimated error radius for {100 * radius['coverage']:.0f} % of the tips: "
-            f"{1e3 * radius['inside']:.3g} mm inside the domain, {1e3 * radius['outside']:.3g} mm "
-            "outside."
+            f"Estimated error radius for {100 * coverage:.0f} % of the tips: {1e3 * inside:.3g} mm "
+            f"inside the domain, {1e3 * outside:.3g} mm outside."
         )
     if record["play"] is not None:
         report.text(f"Backlash (play) of the actuators: {millimetres(record['play'])}.")
-    if domain is not None:
-        spans = zip(domain["q_min"], domain["q_max"], strict=True)
-        report.text(
-            "Fitted for q [mm]: "
-            + ", ".join(f"{1e3 * a:.3g} to {1e3 * b:.3g}" for a, b in spans)
-            + "."
-        )
-    for name, value in (record["limits"] or {}).items():
-        if value is not None:
-            report.text(f"{name} [mm]: {_millimetres(value)}.")
-    if log is not None:
-        report.text(
-            f"Logs: q in {log['q_unit']}, q_sign {log['q_sign']} ({', '.join(log['q'])}), x in "
-            f"{log['x_unit']} ({', '.join(log['x'])})."
-        )
+    for what, limits in (("Fitted for", record["domain"]), ("Limits:", record["limits"])):
+        for name, value in (limits or {}).items():
+            if value is not None:
+                report.text(f"{what} {name} = {_millimetres(value)} mm.")
+    if record["log_format"] is not None:
+        q, x, q_unit, x_unit, q_sign, *_ = record["log_format"].values()
+        columns = f"q in {q_unit}, q_sign {q_sign} ({', '.join(q)}), x in {x_unit} ({', '.join(x)})"
+        report.text(f"Logs: {columns}.")
 
 
 def _write_training(report: Report, training: dict[str, Any]) -> None:
@@ -181,9 +170,9 @@ def _write_training(report: Report, training: dict[str, Any]) -> None:
         report.text(
             f"Fitted to {training['log']}: {training['rows']}{thinned} rows, "
             f"{training['n_motions']} motions. Model: {training['saved']}, {training['chosen']}. "
-            "Tip error on held-out motions in mm:"
+            "Errors on held-out motions:"
         )
-        write_errors(report, training["held_out"], _COLUMNS)
+        report.errors(training["held_out"], ("mean", "p95", "max"))
     elif "rows" in training:
         report.text(f"Fitted to {training['rows']} rows.")
     if report.record["auto"] is not None:

@@ -69,38 +69,30 @@ def path_limits(
     half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
     described = robots.Limits() if loaded.description is None else loaded.description.limits
     trained = loaded.trained_range or robots.Limits()
-    found = described.narrowed(half_play).intersect(trained)
     given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
-    arrays = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
-    asked = robots.Limits(**arrays).narrowed(half_play)
-    found = replace(found, **{name: vars(asked)[name] for name in arrays})
+    asked = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
+    overrides = vars(robots.Limits(**asked).narrowed(half_play))
+    found = described.narrowed(half_play).intersect(trained)
+    found = replace(found, **{name: overrides[name] for name in asked})
     if found.q_min is None or found.q_max is None:
         raise ValueError(
             "`q_min` and `q_max` must be given (--q-min, --q-max), or stand as [limits] in the "
             "robot description: this model does not know the range of its actuators."
         )
-    speed = np.inf if found.dq_max is None else found.dq_max
-    low, high, fast = (
-        np.broadcast_to(value, loaded.n_actuators).astype(float)
-        for value in (found.q_min, found.q_max, speed)
-    )
+    n = loaded.n_actuators
+    low, high = (np.broadcast_to(v, n).astype(float) for v in (found.q_min, found.q_max))
+    fast = None if found.dq_max is None else np.broadcast_to(found.dq_max, n).astype(float)
     if (low > high).any():
         raise ValueError(
             "`q_min` must not exceed `q_max`, with half the play and the range of the fit counted "
             f"in, got {low.tolist()} and {high.tolist()} m."
         )
-    sources = [
-        "given" if name in arrays else _source(vars(described)[name], vars(trained)[name])
-        for name in ("q_min", "q_max")
-    ]
-    speeds = None if found.dq_max is None else fast
-    return PathLimits(low, high, speeds, " and ".join(dict.fromkeys(sources)))
-
-
-def _source(described: NDArray | None, trained: NDArray | None) -> str:
-    if described is None:
-        return "range of the fit"
-    return "robot description" + ("" if trained is None else ", within the range of the fit")
+    sources = {"robot description": described, "range of the fit": trained}
+    known = [words for words, limits in sources.items() if limits.q_min is not None]
+    asked_for = ["given"] if {"q_min", "q_max"} & {*asked} else []
+    if not {"q_min", "q_max"} <= {*asked}:
+        asked_for.append(", within the ".join(known))
+    return PathLimits(low, high, fast, " and ".join(asked_for))
 
 
 def preferred(loaded: LoadedModel, limits: PathLimits) -> NDArray:

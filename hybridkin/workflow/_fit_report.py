@@ -19,10 +19,10 @@ from hybridkin.workflow.report import (
     geometry_entries,
     geometry_rows,
     millimetres,
+    statistics,
 )
 
 _SHOWN = ("mechanical, calibrated", "hybrid, ELM", "hybrid, auto")
-_COLUMNS = {"mean": "mean", "std": "std over rows", "p95": "95 %", "max": "max"}
 
 
 def write_check(report: Report, log: MeasuredLog) -> None:
@@ -42,25 +42,18 @@ def write_comparison(
     report.text(
         "## Errors on held-out motions",
         f"{n} rows{thinned}, {len(np.unique(log.motions))} {log.split}, held out whole in "
-        f"{n_folds} folds. The ridge weight and the guard of the ELM are chosen by cross-validation over "
-        f"motions within the training part; the errors are the mean over "
-        f"{report.record['n_seeds']} random hidden layers. "
-        '"Auto" chooses coupling, features and penalties in the same way. '
-        '"Nominal" has the geometry of the robot description with only the base pose fitted, '
-        "when that is among the calibrated parameters. Tip error in mm.",
+        f"{n_folds} folds. Cross-validation over motions within the training part chooses the "
+        "ridge weight and the guard of the ELM, and coupling, features and penalties of "
+        f'"auto"; the errors of the ELM are the mean over {report.record["n_seeds"]} random hidden '
+        'layers. "Nominal" has the geometry of the robot description with only the base pose '
+        "fitted, when that is among the calibrated parameters.",
     )
     record: dict[str, dict[str, Any]] = {}
     for name, values in errors.items():
         by_fold = np.array([values[fold == k].mean() for k in range(n_folds)])
-        spread = {"mean": values.mean(), "std": values.std(), "p95": np.percentile(values, 95)}
-        record[name] = {
-            **spread,
-            "max": values.max(),
-            "std_folds": by_fold.std(),
-            "by_fold": by_fold,
-        }
+        record[name] = {**statistics(values), "std_folds": by_fold.std(), "by_fold": by_fold}
     report.record["held_out"] = record
-    write_errors(report, record, {**_COLUMNS, "std_folds": "std over folds"})
+    report.errors(record, ("mean", "std", "p95", "max", "std_folds"))
     present = [name for name in _SHOWN if name in record]
     calibrated, *hybrids = (record[name]["mean"] for name in present)
     ratios = [
@@ -83,16 +76,6 @@ def write_comparison(
         for i in worst
     ]
     report.table(["motion", "rows", *present], rows)
-
-
-def write_errors(
-    report: Report, record: dict[str, dict[str, Any]], columns: dict[str, str]
-) -> None:
-    """Add a table of errors [mm]: a row for each model, and columns by key."""
-    rows = [
-        [name, *(f"{1000 * entry[key]:.2f}" for key in columns)] for name, entry in record.items()
-    ]
-    report.table(["model", *columns.values()], rows)
 
 
 def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, str]) -> None:

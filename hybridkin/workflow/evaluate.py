@@ -12,10 +12,9 @@ from hybridkin import datasets, plots
 from hybridkin.workflow._fit_report import write_check
 from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.model import LoadedModel
-from hybridkin.workflow.report import Report, check_out, distance
+from hybridkin.workflow.report import Report, check_out, distance, statistics
 
-_COLUMNS = {"mean": "mean", "median": "median", "p95": "95 %", "max": "max"}
-_SHARES = {"share_in_domain": "in domain [%]", "share_in_radius": "in radius [%]"}
+_SHARES = ("share_in_domain", "share_in_radius")
 
 
 def evaluate_log(
@@ -93,27 +92,19 @@ def evaluate_log(
 
 
 def _entry(columns: dict[str, NDArray]) -> dict[str, Any]:
-    errors, *shares = columns.values()
-    entry: dict[str, Any] = {"rows": len(errors), "mean": errors.mean()}
-    entry |= {"median": np.median(errors), "p95": np.percentile(errors, 95), "max": errors.max()}
-    return entry | {k: v.mean() for k, v in zip([*columns][1:], shares, strict=True)}
+    shares = {key: values.mean() for key, values in columns.items() if key in _SHARES}
+    return {"rows": len(columns["error"]), **statistics(columns["error"]), **shares}
 
 
 def _write_errors(report: Report) -> None:
-    shares = {key: words for key, words in _SHARES.items() if key in report.record["all"]}
+    everything = report.record["all"]
     motions = sorted(report.record["motions"].items(), key=lambda item: -item[1]["mean"])
-    rows = []
-    for name, entry in [("all rows", report.record["all"]), *motions]:
-        cells = [f"{1000 * entry[key]:.2f}" for key in _COLUMNS]
-        cells += [f"{100 * entry[key]:.0f}" for key in shares]
-        rows.append([name, str(entry["rows"]), *cells])
-    report.text("## Tip errors [mm] by motion, largest first")
-    report.table(["motion", "rows", *_COLUMNS.values(), *shares.values()], rows)
+    report.text("## Errors by motion, largest first")
+    columns = ["rows", "mean", "median", "p95", "max", *(s for s in _SHARES if s in everything)]
+    report.errors({"all rows": everything, **dict(motions)}, columns)
     if "coverage_asked" in report.record:
         asked = 100 * report.record["coverage_asked"]
-        report.text(
-            f"The estimated error radius should cover {asked:.0f} % of tips of new motions."
-        )
+        report.text(f"The estimated error radius should cover {asked:.0f} % of the tips.")
 
 
 def _add_figures(

@@ -127,23 +127,14 @@ def read_log(
     ValueError
         If columns or motions are not there.
     """
-    log = datasets.load_log(
-        path,
-        log_format.q,
-        log_format.x,
-        log_format.groups,
-        time=log_format.time,
-        q_unit=log_format.q_unit,
-        x_unit=log_format.x_unit,
-        q_sign=log_format.q_sign,
-        delimiter=delimiter,
-        drop_invalid=True,
-    )
+    columns = dict(vars(log_format))
+    suffix = columns.pop("group_suffix")
+    log = datasets.load_log(path, **columns, delimiter=delimiter, drop_invalid=True)
     if log.groups is None:
         if exclude:
             raise ValueError("`exclude` needs `groups`, the column that names the motions.")
     else:
-        motions = [str(name).removesuffix(log_format.group_suffix) for name in log.groups]
+        motions = [str(name).removesuffix(suffix) for name in log.groups]
         kept = np.array([not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions])
         if not kept.any():
             raise ValueError(

@@ -33,6 +33,18 @@ _UNITS = {
     **dict.fromkeys(("angles", "turns", "rest_bends"), _DEGREES),
 }
 
+_COLUMNS = {  # of tables of errors: heading, factor, format
+    "rows": ("rows", 1, ".0f"),
+    "mean": ("mean", 1e3, ".2f"),
+    "median": ("median", 1e3, ".2f"),
+    "std": ("std over rows", 1e3, ".2f"),
+    "p95": ("95 %", 1e3, ".2f"),
+    "max": ("max", 1e3, ".2f"),
+    "std_folds": ("std over folds", 1e3, ".2f"),
+    "share_in_domain": ("in domain [%]", 100, ".0f"),
+    "share_in_radius": ("in radius [%]", 100, ".0f"),
+}
+
 IDENTIFIED = 10.0
 """The data identify a parameter whose prior they narrow at least so many times."""
 
@@ -55,6 +67,12 @@ def distance(a: NDArray, b: NDArray) -> NDArray:
     return np.linalg.norm(a - b, axis=-1)
 
 
+def statistics(errors: NDArray) -> dict[str, Any]:
+    """Return mean, standard deviation, median, 95 % quantile and maximum of errors (N,)."""
+    spread = {"mean": errors.mean(), "std": errors.std(), "median": np.median(errors)}
+    return {**spread, "p95": np.percentile(errors, 95), "max": errors.max()}
+
+
 def millimetres(lengths: Sequence[float]) -> str:
     """Return the largest of some lengths [m] in words."""
     return f"{1e3 * max(lengths):.3g} mm"
@@ -69,32 +87,23 @@ def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, 
         "name"; "unit", "mm", "deg", "mm²/rad²" or "-"; "start", "value" and "std_error" in that
         unit, of the base its turn from the start and its position; "narrowing" and "identified".
     """
-    values, stds, starts, units = [], [], [], []
+    entries = []
+    labels, narrowing = iter(result.names), iter(result.narrowing.tolist())
     for name, value in result.values.items():
         before, value = _start_value(start, name), np.asarray(value)
-        stds += np.ravel(result.std_errors[name]).tolist()
+        units = value.size * [_UNITS.get(name, _MILLIMETRES)]
         if name == "base":
             turn = Rotation.from_matrix(value[:3, :3] @ before[:3, :3].T).as_rotvec()
             before, value = np.append(np.zeros(3), before[:3, 3]), np.append(turn, value[:3, 3])
-            units += 3 * [_DEGREES] + 3 * [_MILLIMETRES]
-        else:
-            units += value.size * [_UNITS.get(name, _MILLIMETRES)]
-        values += value.ravel().tolist()
-        starts += before.ravel().tolist()
-    return [
-        {
-            "name": name,
-            "unit": unit,
-            "start": scale * before,
-            "value": scale * value,
-            "std_error": scale * std,
-            "narrowing": narrowing,
-            "identified": narrowing >= IDENTIFIED,
-        }
-        for name, (scale, unit), before, value, std, narrowing in zip(
-            result.names, units, starts, values, stds, result.narrowing.tolist(), strict=True
-        )
-    ]
+            units = 3 * [_DEGREES] + 3 * [_MILLIMETRES]
+        columns = (before, value, np.asarray(result.std_errors[name]))
+        for (scale, unit), *numbers in zip(units, *map(np.ravel, columns), strict=True):
+            entry: dict[str, Any] = {"name": next(labels), "unit": unit}
+            entry["start"], entry["value"], entry["std_error"] = np.multiply(scale, numbers)
+            entry["narrowing"] = next(narrowing)
+            entry["identified"] = entry["narrowing"] >= IDENTIFIED
+            entries.append(entry)
+    return entries
 
 
 def _start_value(start: Chain, name: str) -> NDArray:
@@ -122,12 +131,7 @@ def geometry_rows(entries: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 
 GEOMETRY_HEADER = (
-    "parameter",
-    "start",
-    "calibrated",
-    "standard error",
-    "prior narrowed",
-    "identified",
+    *("parameter", "start", "calibrated", "standard error", "prior narrowed", "identified"),
 )
 
 
@@ -177,6 +181,15 @@ class Report:
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Add a table."""
         self._blocks.append(_Table(header, rows))
+
+    def errors(self, record: dict[str, dict[str, Any]], columns: Sequence[str]) -> None:
+        """Add a table of tip errors [mm] by name, with some of their `statistics`."""
+        titles, factors, formats = zip(*(_COLUMNS[key] for key in columns), strict=True)
+        rows = []
+        for name, entry in record.items():
+            values = [factor * entry[key] for key, factor in zip(columns, factors, strict=True)]
+            rows.append([name, *map(format, values, formats)])
+        self.table(["tip error [mm]", *titles], rows)
 
     def figure(self, name: str, figure: Any, caption: str) -> None:
         """Add a figure that becomes `name`.png."""

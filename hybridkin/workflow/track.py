@@ -261,17 +261,13 @@ def _read_track(
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
-    time = next((name for name in (TIME, log_format.time) if name in header), None)
     has_targets = set(TARGET) <= set(header)
-    log = datasets.load_log(
-        file,
-        log_format.q,
-        TARGET if has_targets else log_format.x,
-        time=time,
-        q_unit=log_format.q_unit,
-        x_unit=log_format.x_unit,
-        q_sign=log_format.q_sign,
-    )
+    columns = dict(vars(log_format), groups=None)
+    del columns["group_suffix"]
+    columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
+    if has_targets:
+        columns["x"] = TARGET
+    log = datasets.load_log(file, **columns)
     return log.q, log.x if has_targets else None, log.time
 
 
@@ -333,13 +329,10 @@ def _write_summary(report: Report) -> None:
     if record["in_domain"] is not None:
         report.text(f"{100 * record['in_domain']:.0f} % of the points lie in the model's domain.")
     sign = ", shortening positive" if columns["q_sign"] < 0 else ""
-    report.text(
-        f"track.csv: q in {columns['q_unit']}{sign}; x, target and error in {columns['x_unit']}; t "
-        "in s."
-    )
+    units = f"q in {columns['q_unit']}{sign}; x, target and error in {columns['x_unit']}; t in s."
+    report.text(f"track.csv: {units}")
     if record["play"] is not None:
         report.text(
             f"Backlash (play) {millimetres(record['play'])}: a command jumps by that where its "
-            "actuator turns back. q is what to send, the columns effective_... are what the "
-            "actuators do."
+            "actuator turns back. q is what to send, effective_... what the actuators do."
         )
