@@ -302,6 +302,15 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
     log.check(force)
 
 
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Suppress warnings on parts of the log; the calibration to all of it repeats them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+@_without_warnings()
 def _fit_saved(saved: str, rows: _Rows, calibrated: Chain) -> tuple[HybridForwardModel, str]:
     """Return the model to save, fitted to all rows, and what was chosen for it."""
     chosen = {CALIBRATED: "no correction", LINEAR: "linear"}.get(saved, "")
@@ -312,8 +321,7 @@ def _fit_saved(saved: str, rows: _Rows, calibrated: Chain) -> tuple[HybridForwar
         model, chosen = choice.model(calibrated, 0), str(choice)
     else:
         model = HybridForwardModel(calibrated, linear() if saved == LINEAR else "drop")
-    with _without_warnings():  # the calibration to all rows has warned
-        model.set_params(coverage=rows.settings.coverage).fit(rows.q, rows.x, groups=rows.groups)
+    model.set_params(coverage=rows.settings.coverage).fit(rows.q, rows.x, groups=rows.groups)
     return model, auto_in_short(auto_entry(model)) if saved == AUTO else chosen
 
 
@@ -372,14 +380,6 @@ def _add_model(
         source = robot.path
         report.file("robot.toml", lambda path: shutil.copyfile(source, path))
         report.text("`robot.toml` is the description it was made from.")
-
-
-@contextlib.contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Suppress warnings on parts of the log; the calibration to all of it repeats them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
 
 
 @_without_warnings()
