@@ -169,9 +169,7 @@ def load_log(
         raise ValueError(f"`x` must name 3 columns, got {len(x)}: {x}.")
     q_scale = _scale("q_unit", q_unit, {**LENGTHS, **ANGLES, **UNITLESS})
     x_scale = _scale("x_unit", x_unit, LENGTHS)
-    sign = np.asarray(q_sign, dtype=float)
-    if sign.shape not in ((), (len(q),)) or not np.isin(sign, (-1, 1)).all():
-        raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
+    sign = _signs(q_sign, len(q))
     wanted = [*q, *x, *([] if time is None else [time])]
     if columns is None:
         labels, values, places, kind = _read_text(path, wanted, groups, delimiter)
@@ -186,7 +184,9 @@ def load_log(
             "drop_invalid=True."
         )
     if invalid.all():
-        raise ValueError(f"{str(path)!r} has no valid row left of {len(values)}.")
+        raise ValueError(
+            f"{str(path)!r} has no valid row left: all have a missing, NaN or infinite value."
+        )
     valid, n = values[~invalid], len(q)
     if q_unit == "m":
         _warn_if_millimetres("q", valid[:, :n])
@@ -230,6 +230,13 @@ def _scale(argument: str, unit: str, known: dict[str, float]) -> float:
     if unit not in known:
         raise ValueError(f"`{argument}` must be one of {list(known)}, got {unit!r}.")
     return known[unit]
+
+
+def _signs(q_sign: ArrayLike, n: int) -> NDArray:
+    sign = np.asarray(q_sign, dtype=float)
+    if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
+        raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
+    return sign
 
 
 def _delimiter(path: Path) -> str:
