@@ -324,3 +324,60 @@ def test_an_actuator_that_never_moved_is_held_where_it_was():
     assert limits.q_max == pytest.approx(q.max(axis=0))
     assert limits.source == "range of the fit"
     assert model.module_.in_domain(torch.from_numpy(sample_domain(loaded, limits)[0])).all()
+
+
+def test_limits_intersect_where_both_are_known():
+    one = robots.Limits(q_min=np.array([-1.0, 0.0]), q_max=np.array([2.0, 3.0]))
+    other = robots.Limits(q_max=np.array([1.0, 4.0]), dq_max=np.array([0.5, 0.5]))
+    both = one.intersect(other)
+    assert both.q_min.tolist() == [-1.0, 0.0]
+    assert both.q_max.tolist() == [1.0, 3.0]
+    assert both.dq_max.tolist() == [0.5, 0.5]
+    narrow = both.narrowed(0.25)
+    assert narrow.q_min.tolist() == [-0.75, 0.25]
+    assert narrow.q_max.tolist() == [0.75, 2.75]
+    assert narrow.dq_max.tolist() == [0.5, 0.5]
+
+
+def test_given_limits_replace_those_of_the_description():
+    chain = ConstantCurvatureChain([0.005], lengths=[0.1])
+    limits = robots.Limits(np.full(3, -0.01), np.full(3, 0.01), np.full(3, 0.02))
+    robot = robots.RobotDescription("robot", chain, (), None, limits)
+    loaded = workflow.LoadedModel("robot", Path("robot.toml"), chain, robot)
+    found = workflow.path_limits(loaded, q_max=0.002)
+    assert found.q_min.tolist() == [-0.01] * 3
+    assert found.q_max.tolist() == [0.002] * 3
+    assert found.dq_max.tolist() == [0.02] * 3
+    assert found.source == "given and robot description"
+    with pytest.raises(ValueError, match="`q_min` must not exceed `q_max`"):
+        workflow.path_limits(loaded, q_min=0.02)
+    with pytest.raises(ValueError, match="--q-min"):
+        workflow.path_limits(workflow.LoadedModel("robot", Path("robot.toml"), chain))
+
+
+def test_a_report_prints_what_it_writes():
+    report = workflow.Report("A title")
+    report.text("## Part", "Some **bold** words.", "- " + "word " * 30)
+    report.table(["name", "a"], [["x", "1"], ["longer", "22"]])
+    assert "**bold**" in report.markdown()
+    assert "| longer | 22 |" in report.markdown()
+    printed = report.plain()
+    assert printed.startswith("A title\n\nPart\n\nSome bold words.\n\n- word")
+    assert printed.endswith("  name     a\n  x        1\n  longer  22")
+    assert max(map(len, printed.splitlines())) <= 98
+
+
+def test_a_log_that_does_not_pass_its_check_stops_the_fit(log, tmp_path):
+    path, robot = log
+    description = robots.read_description(robot)
+    measured = workflow.read_log(path, description.log)
+    x = measured.x.copy()
+    x[20:60] = x[20]
+    spoilt = datasets.Log(measured.q, x, np.repeat(np.arange(6), 30))
+    with pytest.raises(workflow.LogError, match="did not pass its check") as caught:
+        workflow.fit_log(spoilt, description, tmp_path / "m")
+    assert [f.kind for f in caught.value.report.errors] == ["frozen tip"]
+    settings = workflow.FitSettings(auto=False, play="auto")
+    with pytest.raises(ValueError, match="`play` requires `auto=True`"):
+        workflow.fit_log(measured, description, tmp_path / "m", settings)
+    assert not (tmp_path / "m").exists()
