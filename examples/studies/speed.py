@@ -40,7 +40,7 @@ def median_time(job: Callable[[], object], seconds: float) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Measure how fast a model is on this machine.")
     parser.add_argument("model", nargs="?", help="as for `hybridkin describe`")
     parser.add_argument("--robot", help="robot description (TOML)")
     parser.add_argument("--batches", default="1,100,10000,100000", help="rows at once")
