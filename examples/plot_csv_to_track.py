@@ -14,7 +14,7 @@ from hybridkin import HybridForwardModel, InverseKinematics, datasets, plots, ro
 
 # %%
 # A log holds actuator vectors q (N, 9) and tip positions x (N, 3), all in metres. Your own comes
-# from ``datasets.load_csv("log.csv", q=[...], x=[...], q_unit="mm", groups="motion")``.
+# from ``datasets.load_log("log.csv", q=[...], x=[...], q_unit="mm", groups="motion")``.
 
 data = datasets.load_trunk()
 train, test = datasets.paper_split(data, random_state=0)

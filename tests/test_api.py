@@ -21,7 +21,7 @@ FLOORS = [
     {"_core", "datasets", "plots", "simulation"},
 ]
 BESIDE = {
-    "datasets": {"simulation"},
+    "datasets": {"simulation", "_core"},
     "plots": {"_core", "chains"},
     "simulation": set(),
     "_core": set(),

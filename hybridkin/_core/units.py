@@ -1,11 +1,16 @@
-"""Warnings where numbers look like millimetres instead of metres."""
+"""Units of length, and warnings where numbers look like millimetres instead of metres."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from typing import TYPE_CHECKING
 
-from torch import Tensor
+if TYPE_CHECKING:  # the command line reads the table before torch is loaded
+    from torch import Tensor
+
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+"""Metres in each unit of length that logs, paths and options are given in."""
 
 _TURNS = 4.0 * math.pi  # [rad]; a joint or an angle that goes further is more likely in degrees
 _SPANS = 10.0  # a tip moves within two lengths of its robot; millimetres look like 2000

@@ -6,13 +6,14 @@ import difflib
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridkin._core.units import METRES
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
@@ -34,7 +35,6 @@ __all__ = [
 BHA_LENGTH_LIMITS = (0.10, 0.40)
 """Shortest and longest chamber of the Bionic Handling Assistant [m]."""
 
-_UNITS = ("m", "cm", "mm")
 _MODELS = ("constant-curvature", "elastic-tendon")
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
 
@@ -113,6 +113,29 @@ class Limits:
     q_max: np.ndarray | None = None
     dq_max: np.ndarray | None = None
 
+    def intersect(self, other: Limits) -> Limits:
+        """Return the limits that keep to both; what one does not know the other decides."""
+        return Limits(
+            _tighter(np.maximum, self.q_min, other.q_min),
+            _tighter(np.minimum, self.q_max, other.q_max),
+            _tighter(np.minimum, self.dq_max, other.dq_max),
+        )
+
+    def narrowed(self, by: float | np.ndarray) -> Limits:
+        """Return the limits with the range of every actuator smaller by `by` at both ends [m]."""
+        low, high = self.q_min, self.q_max
+        return Limits(
+            None if low is None else low + by, None if high is None else high - by, self.dq_max
+        )
+
+
+def _tighter(
+    choose: np.ufunc, one: np.ndarray | None, other: np.ndarray | None
+) -> np.ndarray | None:
+    if one is None or other is None:
+        return one if other is None else other
+    return choose(one, other)
+
 
 @dataclass(frozen=True)
 class RobotDescription:
@@ -130,6 +153,8 @@ class RobotDescription:
         How its logs are written.
     limits : Limits
         What its actuators can do, as far as it is known.
+    path : Path or None
+        The file it was read from.
     """
 
     name: str
@@ -137,6 +162,7 @@ class RobotDescription:
     calibrate: tuple[str, ...]
     log: LogFormat | None
     limits: Limits = Limits()
+    path: Path | None = None
 
 
 def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
@@ -239,7 +265,7 @@ def read_description(path: str | Path) -> RobotDescription:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not a TOML file: {error}.") from error
     try:
-        return _description(content, path.stem)
+        return replace(_description(content, path.stem), path=path)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -362,8 +388,8 @@ def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
             raise ValueError(f"`{key}` in [log] must name {size} columns, got {value!r}.")
         columns[key] = tuple(str(name) for name in value)
     for key in ("q_unit", "x_unit"):
-        if table.get(key, "m") not in _UNITS:
-            raise ValueError(f"`{key}` in [log] must be one of {[*_UNITS]}, got {table[key]!r}.")
+        if table.get(key, "m") not in METRES:
+            raise ValueError(f"`{key}` in [log] must be one of {[*METRES]}, got {table[key]!r}.")
     if table.get("q_sign", 1) not in (1, -1):
         raise ValueError(f"`q_sign` in [log] must be 1 or -1, got {table['q_sign']!r}.")
     for key in ("group_suffix", "groups", "time"):

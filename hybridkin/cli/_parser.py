@@ -1,290 +1,260 @@
-"""The commands, their options and their help; `__main__` runs them."""
+"""The commands, their options and their help; `main` runs them.
+
+The docstring of each function that adds a command is its help; the first line stands in the list of
+commands.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hybridkin
+from hybridkin._core.units import METRES
 
 EXIT_CODES = """\
-exit codes: 0 all is well; 1 what was asked for did not come out (points not reached, errors above
+exit codes: 0 success; 1 the result is not as asked for (points not reached, errors above
 --fail-above, a log that does not pass its check in `describe`); 2 an error of input, a log among
 them that does not pass its check before a fit; 130 interrupted."""
 
-_EPILOG = f"""\
-a model is a file that `fit` wrote, its folder, or a robot description (TOML) for the mechanical
-model alone.
-
-examples:
-  hybridkin fit log.csv --robot robot.toml --groups motion --out model
-  hybridkin evaluate model other_log.csv
-  hybridkin track model --shape figure-eight --size 40,20 --unit mm --out track
-  hybridkin animate model track --out track.mp4
-
-{EXIT_CODES}
-"""
-
-_PAPER = """\
-Reproduce the paper on the simulated trunk: Table 1, error histogram, workspace, a figure eight and
-a spiral tracked with the mechanical and with the hybrid model, and what the paper's samples tell
-about the trunk's geometry. Needs the extra `sim` (MuJoCo)."""
-
-_FIT = """\
-Check a measured log, calibrate the robot to it, compare mechanical, data-driven and hybrid models
-on motions that they have not seen, and save the best with a report."""
-
-_FIT_EXAMPLES = """\
-examples:
-  hybridkin fit log.csv --robot robot.toml --groups motion --out model
-  hybridkin fit log.npz --robot robot.toml --q cables --x tip --q-unit mm --out model
-
-The robot description names its geometry and the columns and units of its logs:
-
-  [[segment]]
-  radius = 0.0045       # of the tendon circle [m]
-  length = 0.060        # [m]; leave out for extensible segments
-  repeat = 3
-
-  [log]
-  q = ["t1", "t2", "t3", "t4", "t5", "t6", "t7", "t8", "t9"]
-  x = ["tip_x", "tip_y", "tip_z"]
-  q_unit = "mm"
-  x_unit = "mm"
-  q_sign = -1           # the log counts a pulled tendon as positive
-  groups = "motion"     # column that names the motion of a row
-
-With --play auto the rows of a motion are commands in the order of time, and backlash and dry
-friction are looked for: the tip then depends on where the tendons came from. Kept only where that
-predicts other motions better. Poses taken in any order have no play to find.
-
-All keys: python -c "import hybridkin; help(hybridkin.robots.read_description)"
-
-The log is checked first. Errors (a frozen sensor, wrong units, NaN) stop the fit with advice and
-exit code 2; warnings are printed and stand in the report.
-"""
-
-_EVALUATE = "Tell the errors of a model on a log, motion by motion, and draw where it errs."
-_EVALUATE_EXAMPLES = """\
-examples:
-  hybridkin evaluate model log.csv --out evaluation
-  hybridkin evaluate robot.toml log.csv            # the mechanical model alone
-  hybridkin evaluate model log.csv --json --fail-above 3.5 > errors.json
-"""
-
-_TRACK = """\
-Compute the commands that lead the tip along a path, a CSV file of points or a shape, and write them
-as track.csv in the units, names and sign of the robot's logs, with a figure."""
-_TRACK_EXAMPLES = """\
-examples:
-  hybridkin track model path.csv --unit mm --out track
-  hybridkin track model --shape figure-eight --size 40,20 --unit mm --duration 8 --out track
-  hybridkin track model --shape spiral --size 5,20 --unit mm --turns 3 --out track
-  hybridkin track model --shape line --size 0,30,0 --unit mm --q-min=-8 --q-max 8 --out track
-
-A path file has columns t, x, y, z, or x, y, z together with --dt. --q-min and --q-max are in the
-unit and sign of the robot's logs (m without a description), one number or one for each actuator.
-By default the robot keeps to its limits and to the range that the model was fitted on. Of a model
-with play, track.csv has what to send, and in the columns effective_... what the actuators do.
-"""
-
-_ANIMATE = "Make a film (mp4, gif) or an interactive page (html) of a robot that follows a track."
-_ANIMATE_EXAMPLES = """\
-examples:
-  hybridkin animate model track --out track.mp4
-  hybridkin animate model track/track.csv --out track.html --frames 80
-  hybridkin animate robot.toml log.csv --out log.gif      # the commands of a log
-"""
-
-_BENCHMARK = "Measure how fast a model is on this machine, by default that of the paper's trunk."
-_BENCHMARK_EXAMPLES = """\
-examples:
-  hybridkin benchmark
-  hybridkin benchmark model --batches 1,1000 --json
-"""
-
-_DESCRIBE = """\
-Tell what a model is: geometry, what it was fitted on, where it may be trusted, its errors and what
-was chosen. Of a log, with --robot: what its check finds."""
-_DESCRIBE_EXAMPLES = """\
-examples:
-  hybridkin describe model
-  hybridkin describe robot.toml
-  hybridkin describe log.csv --robot robot.toml
-"""
-
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line; ``command`` is the name of what to run."""
-    top = _Parser(
-        prog="hybridkin",
-        description="Hybrid mechanical and data-driven kinematics of soft robots.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    """Hybrid mechanical and data-driven kinematics of soft robots.
+
+    A model is a file that `fit` wrote, its folder, or a robot description (TOML) for the mechanical
+    model alone.
+
+    Some examples:
+      hybridkin fit log.csv --robot robot.toml --groups motion --out model
+      hybridkin evaluate model other_log.csv
+      hybridkin track model --shape figure-eight --size 40,20 --unit mm --out track
+      hybridkin animate model track --out track.mp4
+    """
+    top = _Parser(prog="hybridkin", **_help(parser))
     top.add_argument("--version", action="version", version=f"hybridkin {hybridkin.__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    _paper(commands)
-    _fit(commands)
-    _evaluate(commands)
-    _track(commands)
-    _animate(commands)
-    _benchmark(commands)
-    _describe(commands)
+    for add_options in (_paper, _fit, _evaluate, _track, _animate, _describe):
+        text = _help(add_options)
+        line = text["description"].partition("\n")[0].rstrip(".")
+        command = commands.add_parser(add_options.__name__[1:], help=line, **text)
+        command.add_argument(
+            "--json", action="store_true", help="print one JSON document and nothing else"
+        )
+        add_options(command)
     return top
 
 
-class _Parser(argparse.ArgumentParser):
-    """Errors as the rest of the command line tells them."""
+def _help(function: Callable[..., Any]) -> dict[str, Any]:
+    return {
+        "description": inspect.getdoc(function),
+        "epilog": EXIT_CODES,
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
 
-    def error(self, message: str) -> Any:
+
+class _Parser(argparse.ArgumentParser):
+    """Errors in the form of all others of the command line."""
+
+    def error(self, message: str) -> NoReturn:
         self.exit(2, f"hybridkin: error: {message}; see `{self.prog} --help`\n")
 
 
-def _paper(commands: Any) -> None:
-    paper = _command(commands, "paper", "reproduce the paper on the simulated trunk", _PAPER, "")
-    paper.add_argument("--out", type=Path, default=Path("results"), help="folder (results)")
-    paper.add_argument("--splits", type=count, default=20, help="random test sets (20)")
-    paper.add_argument("--points", type=count, default=151, help="time steps per path (151)")
-    _work(paper)
+def _paper(command: argparse.ArgumentParser) -> None:
+    """Reproduce the paper on the simulated trunk.
+
+    Table 1, error histogram, workspace, a figure eight and a spiral tracked with the mechanical and
+    with the hybrid model, and how well the paper's samples identify the trunk's geometry. Needs the
+    extra `sim` (MuJoCo).
+    """
+    command.add_argument("--out", type=Path, default=Path("results"), help="folder (results)")
+    command.add_argument("--splits", type=_count, default=20, help="random test sets (20)")
+    command.add_argument("--points", type=_count, default=151, help="time steps per path (151)")
+    _add_work(command)
 
 
-def _fit(commands: Any) -> None:
-    fit = _command(commands, "fit", "fit a hybrid model to a measured log", _FIT, _FIT_EXAMPLES)
-    fit.add_argument("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
-    fit.add_argument("--robot", type=Path, required=True, metavar="ROBOT.toml")
-    fit.add_argument("--out", type=Path, required=True, help="folder for model and report")
-    _log(fit)
-    fit.add_argument(
+def _fit(command: argparse.ArgumentParser) -> None:
+    """Fit a hybrid model to a measured log.
+
+    Check the log, calibrate the robot to it, compare mechanical, data-driven and hybrid models on
+    held-out motions, and save the best with a report.
+
+    Some examples:
+      hybridkin fit log.csv --robot robot.toml --groups motion --out model
+      hybridkin fit log.npz --robot robot.toml --q cables --x tip --q-unit mm --out model
+
+    The robot description names its geometry and the columns and units of its logs:
+
+      [[segment]]
+      radius = 0.0045       # of the tendon circle [m]
+      length = 0.060        # [m]; leave out for extensible segments
+      repeat = 3
+
+      [log]
+      q = ["t1", "t2", "t3", "t4", "t5", "t6", "t7", "t8", "t9"]
+      x = ["tip_x", "tip_y", "tip_z"]
+      q_unit = "mm"
+      x_unit = "mm"
+      q_sign = -1           # the log counts a pulled tendon as positive
+      groups = "motion"     # column that names the motion of a row
+
+    With --play auto the rows of a motion are commands in the order of time, and the fit looks for
+    backlash and dry friction: the tip then depends on where the tendons came from. They are kept
+    only where they predict held-out motions better. Poses taken in any order have no play to find.
+
+    All keys: python -c "import hybridkin; help(hybridkin.robots.read_description)"
+
+    The log is checked first. Errors (a frozen sensor, wrong units, NaN) stop the fit with advice
+    and exit code 2; warnings are printed and stand in the report.
+    """
+    command.add_argument("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
+    command.add_argument("--robot", type=Path, required=True, metavar="ROBOT.toml")
+    command.add_argument("--out", type=Path, required=True, help="folder for model and report")
+    _add_log(command)
+    command.add_argument(
         "--loss",
         default="linear",
         choices=("linear", "soft_l1", "huber", "cauchy", "arctan"),
         help="loss of the calibration; all but linear bound outliers (linear)",
     )
-    fit.add_argument(
+    command.add_argument(
         "--coverage",
-        type=share,
-        help="share of tips, such as 0.9, that the model shall tell a radius for; slow",
+        type=_share,
+        help="estimate an error radius that covers this share of tips, such as 0.9; slow",
     )
-    fit.add_argument("--folds", type=count, default=5, help="parts to hold out in turn (5)")
-    fit.add_argument(
+    command.add_argument("--folds", type=_count, default=5, help="parts to hold out in turn (5)")
+    command.add_argument(
         "--no-auto", action="store_true", help="leave out the hybrid that chooses for itself: fast"
     )
-    fit.add_argument(
+    command.add_argument(
         "--play",
-        type=play,
+        type=_play,
         metavar="auto|WIDTH",
-        help="play of the actuators that the hybrid which chooses for itself knows: total width in "
-        "the unit of q, or auto, found by motions left out; the rows of a motion must be in the "
+        help="backlash (play) of the actuators in the hybrid that chooses for itself: total width "
+        "in the unit of q, or auto, found on held-out motions; the rows of a motion must be in the "
         "order of time (none)",
     )
-    fit.add_argument(
+    command.add_argument(
         "--max-rows",
         type=int,
         default=2000,
         metavar="N",
         help="of a longer log take every k-th row, N at most; 0: all (2000)",
     )
-    _work(fit)
+    _add_work(command)
 
 
-def _evaluate(commands: Any) -> None:
-    line = "errors of a model on a log"
-    evaluate = _command(commands, "evaluate", line, _EVALUATE, _EVALUATE_EXAMPLES)
-    evaluate.add_argument("model", type=Path, metavar="MODEL")
-    evaluate.add_argument("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
-    _robot(evaluate)
-    evaluate.add_argument("--out", type=Path, help="folder for report and figures (none)")
-    evaluate.add_argument(
+def _evaluate(command: argparse.ArgumentParser) -> None:
+    """Show the errors of a model on a log.
+
+    Motion by motion, with figures of where it errs.
+
+    Some examples:
+      hybridkin evaluate model log.csv --out evaluation
+      hybridkin evaluate robot.toml log.csv            # the mechanical model alone
+      hybridkin evaluate model log.csv --json --fail-above 3.5 > errors.json
+    """
+    command.add_argument("model", type=Path, metavar="MODEL")
+    command.add_argument("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
+    _add_robot(command)
+    command.add_argument("--out", type=Path, help="folder for report and figures (none)")
+    command.add_argument(
         "--fail-above", type=float, metavar="MM", help="exit with 1 if the mean error is larger"
     )
-    _log(evaluate)
+    _add_log(command)
 
 
-def _track(commands: Any) -> None:
-    track = _command(commands, "track", "commands that follow a path", _TRACK, _TRACK_EXAMPLES)
-    track.add_argument("model", type=Path, metavar="MODEL")
-    track.add_argument("path", type=Path, nargs="?", metavar="PATH.csv", help="points to pass")
-    _robot(track)
-    track.add_argument("--out", type=Path, required=True, help="folder for commands and figure")
-    track.add_argument("--shape", choices=("figure-eight", "spiral", "line"))
-    track.add_argument(
+def _track(command: argparse.ArgumentParser) -> None:
+    """Compute the commands that lead the tip along a path.
+
+    The path is a CSV file of points or a shape. The commands go to track.csv in the units, names
+    and sign of the robot's logs, with a figure.
+
+    Some examples:
+      hybridkin track model path.csv --unit mm --out track
+      hybridkin track model --shape figure-eight --size 40,20 --unit mm --duration 8 --out track
+      hybridkin track model --shape spiral --size 5,20 --unit mm --turns 3 --out track
+      hybridkin track model --shape line --size 0,30,0 --unit mm --q-min=-8 --q-max 8 --out track
+
+    A path file has columns t, x, y, z, or x, y, z together with --dt. --q-min and --q-max are in
+    the unit and sign of the robot's logs (m without a description), one number or one for each
+    actuator. By default the robot keeps to its limits and to the range that the model was fitted
+    on. Of a model with play, track.csv has what to send, and in the columns effective_... what the
+    actuators do.
+    """
+    command.add_argument("model", type=Path, metavar="MODEL")
+    command.add_argument("path", type=Path, nargs="?", metavar="PATH.csv", help="points to pass")
+    _add_robot(command)
+    command.add_argument("--out", type=Path, required=True, help="folder for commands and figure")
+    command.add_argument("--shape", choices=("figure-eight", "spiral", "line"))
+    command.add_argument(
         "--center",
-        type=numbers,
+        type=_numbers,
         metavar="X,Y,Z",
-        help="centre of the shape (the mean tip of random commands)",
-    )
-    track.add_argument(
-        "--size",
-        type=numbers,
-        help="W,H of a figure eight; radii R0,R1 of a spiral; X,Y,Z from end to end of a line",
-    )
-    track.add_argument("--normal", type=numbers, metavar="X,Y,Z", help="of its plane (base z)")
-    track.add_argument("--turns", type=float, default=3.0, help="of a spiral (3)")
-    track.add_argument("--rise", type=float, default=0.0, help="of a spiral, along the normal (0)")
-    track.add_argument("--duration", type=positive, default=10.0, help="of the shape [s] (10)")
-    track.add_argument("--dt", type=positive, help="time between points [s] (0.02 of a shape)")
-    track.add_argument("--unit", choices=("m", "cm", "mm"), help="of path and shape (the log's x)")
-    track.add_argument("--q-min", type=numbers, help="least q, in the unit and sign of the log")
-    track.add_argument("--q-max", type=numbers, help="largest q")
-    track.add_argument("--dq-max", type=numbers, help="largest speed of an actuator, per second")
-    track.add_argument("--tol", type=positive, default=0.1, help="error that is reached [mm] (0.1)")
-
-
-def _animate(commands: Any) -> None:
-    animate = _command(commands, "animate", "film of a track", _ANIMATE, _ANIMATE_EXAMPLES)
-    animate.add_argument("model", type=Path, metavar="MODEL")
-    animate.add_argument("track", type=Path, metavar="TRACK", help="track.csv or its folder")
-    _robot(animate)
-    animate.add_argument("--out", type=Path, required=True, metavar="FILE", help=".mp4 .gif .html")
-    animate.add_argument("--unit", choices=("m", "cm", "mm"), default="mm", help="of the axes (mm)")
-    animate.add_argument("--speed", type=positive, default=1.0, help="times real time (1)")
-    animate.add_argument("--frames", type=count, default=150, help="at most (150)")
-
-
-def _benchmark(commands: Any) -> None:
-    line = "speed of a model on this machine"
-    benchmark = _command(commands, "benchmark", line, _BENCHMARK, _BENCHMARK_EXAMPLES)
-    benchmark.add_argument("model", type=Path, nargs="?", metavar="MODEL")
-    _robot(benchmark)
-    benchmark.add_argument(
-        "--batches", type=counts, default=(1, 100, 10_000, 100_000), help="(1,100,10000,100000)"
-    )
-    benchmark.add_argument(
-        "--seconds", type=positive, default=0.3, help="of every measurement (0.3)"
-    )
-
-
-def _describe(commands: Any) -> None:
-    line = "what a model is, or what is wrong with a log"
-    describe = _command(commands, "describe", line, _DESCRIBE, _DESCRIBE_EXAMPLES)
-    describe.add_argument("what", type=Path, metavar="MODEL|ROBOT.toml|LOG")
-    _robot(describe)
-    _log(describe)
-
-
-def _command(commands: Any, name: str, line: str, text: str, examples: str) -> Any:
-    command = commands.add_parser(
-        name,
-        help=line,
-        description=text,
-        epilog=f"{examples}\n{EXIT_CODES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        help="centre of the shape (a tip in the middle of the workspace)",
     )
     command.add_argument(
-        "--json", action="store_true", help="print one JSON document and nothing else"
+        "--size",
+        type=_numbers,
+        help="W,H of a figure eight; radii R0,R1 of a spiral; X,Y,Z from end to end of a line",
     )
-    return command
+    command.add_argument("--normal", type=_numbers, metavar="X,Y,Z", help="of its plane (base z)")
+    command.add_argument("--turns", type=float, default=3.0, help="of a spiral (3)")
+    command.add_argument(
+        "--rise", type=float, default=0.0, help="of a spiral, along the normal (0)"
+    )
+    command.add_argument("--duration", type=_positive, default=10.0, help="of the shape [s] (10)")
+    command.add_argument("--dt", type=_positive, help="time between points [s] (0.02 of a shape)")
+    command.add_argument("--unit", choices=METRES, help="of path and shape (the log's x)")
+    command.add_argument("--q-min", type=_numbers, help="least q, in the unit and sign of the log")
+    command.add_argument("--q-max", type=_numbers, help="largest q")
+    command.add_argument("--dq-max", type=_numbers, help="largest speed of an actuator, per second")
+    command.add_argument(
+        "--tol", type=_positive, default=0.1, help="error that is reached [mm] (0.1)"
+    )
 
 
-def _work(command: Any) -> None:
-    command.add_argument("--seeds", type=count, default=5, help="random networks (5)")
+def _animate(command: argparse.ArgumentParser) -> None:
+    """Make a film (mp4, gif) or an interactive page (html) of a track.
+
+    Some examples:
+      hybridkin animate model track --out track.mp4
+      hybridkin animate model track/track.csv --out track.html --frames 80
+      hybridkin animate robot.toml log.csv --out log.gif      # the commands of a log
+    """
+    command.add_argument("model", type=Path, metavar="MODEL")
+    command.add_argument("track", type=Path, metavar="TRACK", help="track.csv or its folder")
+    _add_robot(command)
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help=".mp4 .gif .html")
+    command.add_argument("--unit", choices=METRES, default="mm", help="of the axes (mm)")
+    command.add_argument("--speed", type=_positive, default=1.0, help="times real time (1)")
+    command.add_argument("--frames", type=_count, default=150, help="at most (150)")
+
+
+def _describe(command: argparse.ArgumentParser) -> None:
+    """Describe a model, or check a log.
+
+    Of a model: its geometry, what it was fitted on, its domain, its errors and what was chosen. Of
+    a log, with --robot: what its check finds.
+
+    Some examples:
+      hybridkin describe model
+      hybridkin describe robot.toml
+      hybridkin describe log.csv --robot robot.toml
+    """
+    command.add_argument("log", type=Path, metavar="MODEL|ROBOT.toml|LOG")
+    _add_robot(command)
+    _add_log(command)
+
+
+def _add_work(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--seeds", type=_count, default=5, help="random networks (5)")
     command.add_argument("--jobs", type=int, default=-1, help="processes; -1: all cores (-1)")
 
 
-def _robot(command: Any) -> None:
+def _add_robot(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--robot",
         type=Path,
@@ -293,12 +263,12 @@ def _robot(command: Any) -> None:
     )
 
 
-def _log(command: Any) -> None:
+def _add_log(command: argparse.ArgumentParser) -> None:
     log = command.add_argument_group("how the log is written, over what [log] of the robot says")
-    log.add_argument("--q", type=names, metavar="A,B,...", help="columns of the actuators")
-    log.add_argument("--x", type=names, metavar="X,Y,Z", help="columns of the tip")
-    log.add_argument("--q-unit", choices=("m", "cm", "mm"))
-    log.add_argument("--x-unit", choices=("m", "cm", "mm"))
+    log.add_argument("--q", type=_names, metavar="A,B,...", help="columns of the actuators")
+    log.add_argument("--x", type=_names, metavar="X,Y,Z", help="columns of the tip")
+    log.add_argument("--q-unit", choices=METRES)
+    log.add_argument("--x-unit", choices=METRES)
     log.add_argument("--q-sign", type=int, choices=(1, -1), help="-1: pulled counts as positive")
     log.add_argument("--groups", metavar="COLUMN", help="column that names the motion of a row")
     log.add_argument("--time", metavar="COLUMN", help="column of the time stamp [s]")
@@ -317,31 +287,22 @@ def _log(command: Any) -> None:
     log.add_argument("--force", action="store_true", help="go on in spite of errors in the log")
 
 
-def count(text: str) -> int:
-    """Return a whole number of at least 1."""
+def _count(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
     return value
 
 
-def counts(text: str) -> Sequence[int]:
-    """Return whole numbers of at least 1, separated by commas."""
-    return tuple(count(part) for part in text.split(","))
-
-
-def numbers(text: str) -> Sequence[float]:
-    """Return numbers separated by commas."""
+def _numbers(text: str) -> Sequence[float]:
     return tuple(float(part) for part in text.split(","))
 
 
-def names(text: str) -> Sequence[str]:
-    """Return names separated by commas."""
+def _names(text: str) -> Sequence[str]:
     return tuple(part.strip() for part in text.split(","))
 
 
-def play(text: str) -> float | str:
-    """Return "auto" or a width, zero or more."""
+def _play(text: str) -> float | str:
     if text == "auto":
         return text
     value = float(text)
@@ -350,16 +311,14 @@ def play(text: str) -> float | str:
     return value
 
 
-def positive(text: str) -> float:
-    """Return a positive number."""
+def _positive(text: str) -> float:
     value = float(text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"must be positive, got {text}")
     return value
 
 
-def share(text: str) -> float:
-    """Return a number between 0 and 1."""
+def _share(text: str) -> float:
     value = float(text)
     if not 0.0 < value < 1.0:
         raise argparse.ArgumentTypeError(f"must lie between 0 and 1, got {text}")

@@ -8,31 +8,39 @@ import math
 import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tqdm import tqdm
 
-import hybridkin  # its rooms are opened when used: help comes at once
-from hybridkin.cli import _parser, _text
+import hybridkin  # its folders are opened when used: help comes at once
+from hybridkin._core.units import METRES
+from hybridkin.cli._parser import parser
+
+if TYPE_CHECKING:
+    from hybridkin.chains.robots import LogFormat, RobotDescription
+    from hybridkin.workflow import MeasuredLog, Report
 
 _LOGS = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _DT = 0.02
 
 
 class _Outcome(NamedTuple):
-    record: Any
-    lines: Callable[[Any], Any]
+    record: dict[str, Any]
+    text: str
     paths: Sequence[Path] = ()
     code: int = 0
+
+    @classmethod
+    def of(cls, report: Report, paths: Sequence[Path] = (), code: int = 0) -> _Outcome:
+        return cls(report.record, report.plain(), paths, code)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, see `hybridkin --help`."""
-    arguments = _parser.parser().parse_args(argv)
+    arguments = parser().parse_args(argv)
     bars = _Bars()
     try:
         with warnings.catch_warnings():
@@ -47,28 +55,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         bars.close()
         if not _is_of_input(error):
             raise
-        if hasattr(error, "report"):
-            print(error.report, file=sys.stderr)  # pyright: ignore[reportAttributeAccessIssue]
         print(f"hybridkin: error: {error}", file=sys.stderr)
         return 2
     bars.close()
     if arguments.json:
-        record = outcome.record
-        if isinstance(record, dict) and outcome.paths:
-            record = {**record, "written": [str(path) for path in outcome.paths]}
-        print(json.dumps(_plain(record), indent=2, allow_nan=False))
+        written = {"written": [str(path) for path in outcome.paths]} if outcome.paths else {}
+        print(json.dumps(_plain({**outcome.record, **written}), indent=2, allow_nan=False))
         return outcome.code
-    for line in outcome.lines(outcome.record):
-        print(line)
+    print(outcome.text)
     if outcome.paths:
-        print("\nWrote")
-        for path in outcome.paths:
-            print(f"  {path}")
+        print("\nWrote", *outcome.paths, sep="\n  ")
     return outcome.code
 
 
 class _Bars:
-    """Progress bars on standard error, one for each kind of work."""
+    """Progress bars on standard error, one for each kind of work, and warnings between them."""
 
     def __init__(self) -> None:
         self._bar: Any = None
@@ -84,14 +85,12 @@ class _Bars:
         self._bar.update(done - self._bar.n)
 
     def warn(self, message: Any, *_: Any) -> None:
+        """Print a warning, of those that differ in numbers only the first."""
         text = str(message)
         kind = re.sub(r"[\d.]+", "", text)
         if kind not in self._seen:
             self._seen.add(kind)
             tqdm.write(f"hybridkin: warning: {text}", file=sys.stderr)
-
-    def check(self, report: Any) -> None:
-        tqdm.write(f"{report}\n", file=sys.stderr)
 
     def close(self) -> None:
         if self._bar is not None:
@@ -100,13 +99,13 @@ class _Bars:
 
 
 def _is_of_input(error: Exception) -> bool:
-    """Return whether the user can mend it: such errors are told without a traceback."""
+    """Return whether the user can correct it: such errors are printed without a traceback."""
     if isinstance(error, (ValueError, TypeError, OSError, ImportError)):
         return True
     return isinstance(error, hybridkin.simulation.NotSettledError)
 
 
-def _run_paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     report, paths = hybridkin.paper.run_paper(
         arguments.out,
         n_splits=arguments.splits,
@@ -115,68 +114,85 @@ def _run_paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         n_jobs=arguments.jobs,
         progress=bars,
     )
-    return _Outcome(report.record, _text.paper, paths)
+    return _Outcome.of(report, paths)
 
 
-def _run_fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    description = hybridkin.robots.read_description(arguments.robot)
-    log_format = _log_format(arguments, description.log, arguments.robot)
+def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    robot = hybridkin.robots.read_description(arguments.robot)
+    log_format = _log_format(arguments, robot.log, arguments.robot)
     play = arguments.play
-    report, paths = hybridkin.workflow.fit_log(
-        arguments.log,
-        arguments.robot,
-        arguments.out,
-        log_format=log_format,
+    settings = hybridkin.workflow.FitSettings(
         loss=arguments.loss,
         coverage=arguments.coverage,
         n_folds=arguments.folds,
         n_seeds=arguments.seeds,
         auto=not arguments.no_auto,
-        play=_METRES[log_format.q_unit] * play if isinstance(play, float) else play,
+        play=METRES[log_format.q_unit] * play if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
+    )
+    log = _read_for(robot, arguments, log_format)
+    print(f"{log.report}\n", file=sys.stderr)
+    report, paths = hybridkin.workflow.fit_log(
+        log,
+        robot,
+        arguments.out,
+        settings=settings,
+        force=arguments.force,
         n_jobs=arguments.jobs,
         progress=bars,
-        **_reading(arguments, bars),
     )
-    return _Outcome(report.record, _text.fit, paths)
+    return _Outcome.of(report, paths)
 
 
-def _run_evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    opened = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+def _evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    known = None if loaded.description is None else loaded.description.log
+    nominal = loaded.chain if loaded.header is None else None
+    log_format = _log_format(arguments, known, arguments.model)
+    log = _read(arguments, log_format, chain=nominal, base_is_free=False)
+    print(f"{log.report}\n", file=sys.stderr)
     report, paths = hybridkin.workflow.evaluate_log(
-        opened,
-        arguments.log,
-        arguments.out,
-        log_format=_log_format(arguments, _known_format(opened), arguments.model),
-        **_reading(arguments, bars),
+        loaded, log, arguments.out, force=arguments.force
     )
     limit = arguments.fail_above
     code = 1 if limit is not None and 1000 * report.record["all"]["mean"] > limit else 0
-    return _Outcome(report.record, _text.evaluate, paths, code)
+    return _Outcome.of(report, paths, code)
 
 
-def _run_track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    opened = hybridkin.workflow.open_model(arguments.model, arguments.robot)
-    log_format = opened.log_format()
+def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    workflow = hybridkin.workflow
+    loaded = workflow.open_model(arguments.model, arguments.robot)
+    log_format = loaded.log_format()
     if (arguments.path is None) == (arguments.shape is None):
         raise ValueError("give either a file of points or --shape, one of the two.")
-    limits = _limits(arguments, log_format)
+    limits = workflow.path_limits(loaded, **_limits(arguments, log_format))
     unit = arguments.unit or log_format.x_unit
     if arguments.path is not None:
-        path = hybridkin.workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
+        path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
     else:
-        path = _shape(arguments, opened, limits, _METRES[unit])
-    report, paths = hybridkin.workflow.track_path(
-        opened, path, arguments.out, tol=1e-3 * arguments.tol, progress=bars, **limits
+        center, metre = arguments.center, METRES[unit]
+        path = workflow.shape_path(
+            loaded,
+            limits,
+            arguments.shape,
+            [metre * v for v in arguments.size or ()],
+            center=None if center is None else [metre * v for v in center],
+            normal=arguments.normal,
+            turns=arguments.turns,
+            rise=metre * arguments.rise,
+            duration=arguments.duration,
+            dt=arguments.dt or _DT,
+        )
+    report, paths = workflow.track_path(
+        loaded, path, arguments.out, limits=limits, tol=1e-3 * arguments.tol, progress=bars
     )
     code = 0 if report.record["reached"] == report.record["n"] else 1
-    return _Outcome(report.record, _text.track, paths, code)
+    return _Outcome.of(report, paths, code)
 
 
-def _run_animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    opened = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     record = hybridkin.workflow.animate_track(
-        opened,
+        hybridkin.workflow.open_model(arguments.model, arguments.robot),
         arguments.track,
         arguments.out,
         unit=arguments.unit,
@@ -184,47 +200,50 @@ def _run_animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         n_frames=arguments.frames,
         progress=bars,
     )
-    return _Outcome(record, _text.animate, [arguments.out])
-
-
-def _run_benchmark(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    workflow = hybridkin.workflow
-    if arguments.model is None:
-        opened = workflow.trunk_model()
-    else:
-        opened = workflow.open_model(arguments.model, arguments.robot)
-    record = workflow.measure_speed(
-        opened, batches=arguments.batches, seconds=arguments.seconds, progress=bars
+    text = (
+        f"{record['frames']} frames, {record['fps']:.3g} a second, {record['bytes'] / 1e6:.2f} MB"
     )
-    return _Outcome(record, _text.benchmark)
+    return _Outcome(record, text, [arguments.out])
 
 
-def _run_describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    workflow = hybridkin.workflow
-    if arguments.what.suffix.lower() not in _LOGS:
-        opened = workflow.open_model(arguments.what, arguments.robot)
-        return _Outcome(workflow.describe_model(opened), _text.describe)
+def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    if arguments.log.suffix.lower() not in _LOGS:
+        loaded = hybridkin.workflow.open_model(arguments.log, arguments.robot)
+        return _Outcome.of(hybridkin.workflow.describe(loaded))
     if arguments.robot is None:
-        raise ValueError(f"{arguments.what} is a log; name its robot: --robot ROBOT.toml.")
-    description = hybridkin.robots.read_description(arguments.robot)
-    given = _reading(arguments, bars)
-    log = workflow.read_log(
-        arguments.what,
-        _log_format(arguments, description.log, arguments.robot),
-        chain=description.chain,
-        base_is_free="base" in description.calibrate,
-        **{name: given[name] for name in given if name not in ("force", "on_check")},
-    )
-    code = 0 if log.report.ok else 1
-    return _Outcome(log.report.to_dict(), lambda _: [str(log.report)], code=code)
+        raise ValueError(f"{arguments.log} is a log; name its robot: --robot ROBOT.toml.")
+    robot = hybridkin.robots.read_description(arguments.robot)
+    log_format = _log_format(arguments, robot.log, arguments.robot)
+    found = _read_for(robot, arguments, log_format).report
+    return _Outcome(found.to_dict(), str(found), code=0 if found.ok else 1)
 
 
-def _reading(arguments: argparse.Namespace, bars: _Bars) -> dict[str, Any]:
-    names = ("exclude", "drop_invalid", "drop_frozen", "delimiter", "force")
-    return {name: getattr(arguments, name) for name in names} | {"on_check": bars.check}
+_RUN = {
+    "paper": _paper,
+    "fit": _fit,
+    "evaluate": _evaluate,
+    "track": _track,
+    "animate": _animate,
+    "describe": _describe,
+}
 
 
-def _log_format(arguments: argparse.Namespace, known: Any, source: Path) -> Any:
+def _read(arguments: argparse.Namespace, log_format: LogFormat, **check: Any) -> MeasuredLog:
+    """Return the log of the arguments, read and checked."""
+    names = ("exclude", "drop_invalid", "drop_frozen", "delimiter")
+    options = {name: getattr(arguments, name) for name in names}
+    return hybridkin.workflow.read_log(arguments.log, log_format, **options, **check)
+
+
+def _read_for(
+    robot: RobotDescription, arguments: argparse.Namespace, log_format: LogFormat
+) -> MeasuredLog:
+    """Return the log, checked against the robot's nominal chain."""
+    free = "base" in robot.calibrate
+    return _read(arguments, log_format, chain=robot.chain, base_is_free=free)
+
+
+def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: Path) -> LogFormat:
     """Return how the log is written: what is known, with what the options say instead."""
     names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time")
     given = {name: getattr(arguments, name) for name in names}
@@ -239,57 +258,19 @@ def _log_format(arguments: argparse.Namespace, known: Any, source: Path) -> Any:
     return hybridkin.robots.LogFormat(**given)
 
 
-def _known_format(opened: Any) -> Any:
-    return None if opened.description is None else opened.description.log
-
-
-def _limits(arguments: argparse.Namespace, log_format: Any) -> dict[str, Any]:
+def _limits(arguments: argparse.Namespace, log_format: LogFormat) -> dict[str, Any]:
     """Return the limits [m] as the model counts them, from options in the log's unit and sign."""
-    scale = _METRES[log_format.q_unit]
-    found: dict[str, Any] = {}
-    for name in ("q_min", "q_max", "dq_max"):
-        value = getattr(arguments, name)
+    given = {name: getattr(arguments, name) for name in ("q_min", "q_max", "dq_max")}
+    signs = {"q_min": log_format.q_sign, "q_max": log_format.q_sign, "dq_max": 1}
+    scale, found = METRES[log_format.q_unit], {}
+    for name, value in given.items():
         if value is not None:
-            found[name] = [scale * v for v in value]
-            if len(value) == 1:
-                found[name] = found[name][0]
-    if log_format.q_sign < 0:
-        flipped = {"q_min": found.pop("q_max", None), "q_max": found.pop("q_min", None)}
-        for name, value in flipped.items():
-            if value is not None:
-                found[name] = [-v for v in value] if isinstance(value, list) else -value
+            numbers = [signs[name] * scale * v for v in value]
+            found[name] = numbers if len(numbers) > 1 else numbers[0]
+    if log_format.q_sign < 0:  # the least of one sign is the largest of the other
+        other = {"q_min": "q_max", "q_max": "q_min", "dq_max": "dq_max"}
+        found = {other[name]: value for name, value in found.items()}
     return found
-
-
-def _shape(arguments: argparse.Namespace, opened: Any, limits: dict[str, Any], metre: float) -> Any:
-    """Return the path of a named shape, about the middle of the workspace by default."""
-    shapes, workflow = hybridkin.trajectories, hybridkin.workflow
-    center = arguments.center
-    if center is None:
-        found = workflow.path_limits(opened, **limits)
-        center = workflow.middle_tip(opened, found)
-    else:
-        center = [metre * v for v in center]
-    normal = arguments.normal
-    if normal is None:
-        base = getattr(opened.chain, "base", None)
-        normal = (0.0, 0.0, 1.0) if base is None else base[:3, 2].tolist()
-    n_sizes = 3 if arguments.shape == "line" else 2
-    if arguments.size is None or len(arguments.size) != n_sizes:
-        raise ValueError(f"--size must be {n_sizes} numbers for a {arguments.shape}, as in --help.")
-    size = [metre * v for v in arguments.size]
-    timing = {"duration": arguments.duration, "dt": arguments.dt or _DT}
-    if arguments.shape == "figure-eight":
-        return shapes.figure_eight(center, size, normal=normal, **timing)
-    if arguments.shape == "spiral":
-        rise = metre * arguments.rise
-        return shapes.spiral(
-            center, size, normal=normal, turns=arguments.turns, rise=rise, **timing
-        )
-    start, end = (
-        [c + sign * 0.5 * s for c, s in zip(center, size, strict=True)] for sign in (-1, 1)
-    )
-    return shapes.line(start, end, **timing)
 
 
 def _plain(value: Any) -> Any:
@@ -303,14 +284,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
-
-
-_RUN = {
-    "paper": _run_paper,
-    "fit": _run_fit,
-    "evaluate": _run_evaluate,
-    "track": _run_track,
-    "animate": _run_animate,
-    "benchmark": _run_benchmark,
-    "describe": _run_describe,
-}

@@ -1,18 +1,18 @@
 """Measured and simulated data: pairs of actuator vectors and tip positions, in SI units."""
 
 from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
-from hybridkin.datasets._logs import load_csv, load_log
+from hybridkin.datasets._logs import Log, load_log
 from hybridkin.datasets._protocol import paper_protocol, paper_split
 from hybridkin.datasets._recordings import load_armlab, load_asl_trunk, load_ftdcr
 from hybridkin.datasets._trunk import load_trunk, make_trunk
 
 __all__ = [
+    "Log",
     "LogFinding",
     "LogReport",
     "check_log",
     "load_armlab",
     "load_asl_trunk",
-    "load_csv",
     "load_ftdcr",
     "load_log",
     "load_trunk",

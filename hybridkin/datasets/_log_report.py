@@ -87,14 +87,18 @@ class LogReport:
 
     def accepting(self, kind: str) -> LogReport:
         """Return the report with findings of a kind, whose rows were left out, as notes."""
-        changed = []
-        for f in self.findings:
-            if f.kind == kind:
-                told = f"{f.message} They were left out."
-                f = replace(f, severity="note", message=told, advice="find out why.")
-            changed.append(f)
-        changed.sort(key=lambda finding: SEVERITIES.index(finding.severity))
-        return replace(self, findings=tuple(changed))
+        others = [f for f in self.findings if f.kind != kind]
+        notes = [
+            replace(
+                f,
+                severity="note",
+                message=f"{f.message} They were left out.",
+                advice="find out why.",
+            )
+            for f in self.findings
+            if f.kind == kind
+        ]
+        return replace(self, findings=(*others, *notes))
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as numbers, text and lists, for JSON."""
@@ -108,26 +112,15 @@ class LogReport:
             "q_range": self.q_range.tolist(),
             "x_range": self.x_range.tolist(),
             "findings": [
-                {
-                    "kind": f.kind,
-                    "severity": f.severity,
-                    "message": f.message,
-                    "advice": f.advice,
-                    "n_rows": len(f.rows),
-                    "rows": f.rows.tolist(),
-                }
-                for f in self.findings
+                {**vars(f), "rows": f.rows.tolist(), "n_rows": len(f.rows)} for f in self.findings
             ],
         }
 
     def summary(self) -> str:
         """Return one sentence: how many errors and warnings."""
-        found = [
-            f"{n} {name}{'s' if n > 1 else ''}"
-            for name, n in (("error", len(self.errors)), ("warning", len(self.warnings)))
-            if n
-        ]
-        return " and ".join(found) if found else "nothing to object to"
+        counts = {"error": len(self.errors), "warning": len(self.warnings)}
+        found = [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
+        return " and ".join(found) or "no errors and no warnings"
 
     def __str__(self) -> str:
         """Return the report as text, one paragraph for each finding."""
@@ -148,14 +141,9 @@ class LogReport:
 
 
 def _filled(head: str, text: str) -> str:
-    return textwrap.fill(
-        text,
-        _WIDTH,
-        initial_indent=head,
-        subsequent_indent=" " * 14,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    lines = textwrap.TextWrapper(_WIDTH, head, " " * 14, break_on_hyphens=False)
+    lines.break_long_words = False
+    return lines.fill(text)
 
 
 def named_rows(rows: ArrayLike, places: NDArray, kind: str = "line") -> str:

@@ -7,19 +7,21 @@ import difflib
 import os
 import re
 import warnings
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.utils import Bunch
+from typing_extensions import Self
 
-__all__ = ["load_csv", "load_log"]
+from hybridkin._core.units import METRES
 
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
+__all__ = ["Log", "load_log"]
+
+LENGTHS = {**METRES, "um": 1e-6, "in": 0.0254}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 UNITLESS = {"1": 1.0}
 
@@ -27,24 +29,58 @@ _PARQUET = (".parquet", ".pq")
 _DELIMITERS = (",", ";", "\t")
 
 
-class _Table(NamedTuple):
-    """Columns as read: labels (N,), values (N, k) with NaN for gaps, and where each row stands."""
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A measured log: actuator vectors and tip positions, row by row, in SI units.
 
-    labels: NDArray
-    values: NDArray
-    places: NDArray
-    kind: str  # of place: "line" or "row"
+    Attributes
+    ----------
+    q : ndarray of shape (N, n)
+        Actuator vectors [m], or in the unit that `units` says.
+    x : ndarray of shape (N, 3)
+        Tip positions [m].
+    groups : ndarray of shape (N,) or None
+        Motion, run or day of each row.
+    time : ndarray of shape (N,) or None
+        Time stamps [s].
+    line : ndarray of shape (N,) of int or None
+        Line of each row in a text file, its number from 0 in other files.
+    invalid_lines : ndarray of shape (k,) of int
+        The lines that were left out because a value is missing, NaN or infinite.
+    q_names, x_names : tuple of str
+        Names of the columns.
+    q_sign : int or sequence of int
+        Factor of the actuator columns of the file.
+    units, file_units : mapping of str to str
+        Units of "q" and "x" here and in the file.
+    source : str
+        Where the log comes from.
+    """
 
+    q: NDArray
+    x: NDArray
+    groups: NDArray | None = None
+    time: NDArray | None = None
+    line: NDArray | None = None
+    invalid_lines: Sequence[int] | NDArray = ()
+    q_names: Sequence[str] = ()
+    x_names: Sequence[str] = ()
+    q_sign: ArrayLike = 1
+    units: Mapping[str, str] = field(default_factory=lambda: {"q": "m", "x": "m"})
+    file_units: Mapping[str, str] = field(default_factory=lambda: {"q": "m", "x": "m"})
+    source: str = "in memory"
 
-class _Settings(NamedTuple):
-    q: list[str]
-    x: list[str]
-    groups: str | None
-    time: str | None
-    q_unit: str
-    x_unit: str
-    q_sign: Any
-    drop_invalid: bool
+    def __post_init__(self) -> None:
+        if np.ndim(self.q) != 2 or np.shape(self.x) != (len(self.q), 3) or len(self.q) == 0:
+            raise ValueError(
+                f"A log needs q of shape (N, n) and x of shape (N, 3), got {np.shape(self.q)} and "
+                f"{np.shape(self.x)}."
+            )
+
+    def rows(self, kept: NDArray | slice) -> Self:
+        """Return a log of some of the rows."""
+        columns = {name: vars(self)[name] for name in ("q", "x", "groups", "time", "line")}
+        return replace(self, **{k: v[kept] for k, v in columns.items() if v is not None})
 
 
 def load_log(
@@ -59,8 +95,7 @@ def load_log(
     q_sign: ArrayLike = 1,
     delimiter: str | None = None,
     drop_invalid: bool = False,
-    return_X_y: bool = False,
-) -> Any:
+) -> Log:
     r"""Return actuator vectors and tip positions from a log: a CSV, npz or parquet file.
 
     Parameters
@@ -89,16 +124,11 @@ def load_log(
         Separator of a text file. None: comma, semicolon or tab, whichever the header has most of.
     drop_invalid : bool, default=False
         Leave out rows with a missing, NaN or infinite value instead of raising.
-    return_X_y : bool, default=False
-        If True, return ``(q, x)`` only.
 
     Returns
     -------
-    data : :class:`~sklearn.utils.Bunch`
-        ``q`` (n_samples, n_actuators) and ``x`` (n_samples, 3) in SI units; ``groups`` (strings)
-        and ``time``, None if not asked for; ``line`` (n_samples,), line of each row in a text
-        file, else its number from 0; ``invalid_lines`` of the rows left out; ``q_names``,
-        ``x_names``, ``units``, ``file_units``, ``source``, ``DESCR``.
+    Log
+        In SI units; ``groups`` are strings, None like ``time`` if not asked for.
 
     Raises
     ------
@@ -121,125 +151,30 @@ def load_log(
     Examples
     --------
     >>> import pathlib, tempfile
-    >>> import numpy as np
     >>> from hybridkin.datasets import load_log
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = pathlib.Path(folder) / "log.npz"
-    ...     np.savez(path, cables=np.ones((4, 3)), tip=np.zeros((4, 3)))
-    ...     data = load_log(path, q=["cables"], x=["tip"], q_unit="mm")
-    >>> data.q[0], data.q_names
-    (array([0.001, 0.001, 0.001]), ['cables[0]', 'cables[1]', 'cables[2]'])
+    ...     path = pathlib.Path(folder) / "log.csv"
+    ...     _ = path.write_text("a,b,c,X,Y,Z\n1,2,3,10,20,30\n")
+    ...     log = load_log(path, q=["a", "b", "c"], x=["X", "Y", "Z"], q_unit="mm", x_unit="mm")
+    >>> log.x, log.q_names
+    (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
-    suffix, q, x = path.suffix.lower(), _names("q", q), _names("x", x)
-    if suffix == ".npz" or suffix in _PARQUET:
-        columns = _npz_columns(path) if suffix == ".npz" else _parquet_columns(path)
-        q, x = _expanded(q, columns), _expanded(x, columns)
-        for name in (*q, *x):
-            _column(name, [*columns], path)
-        read: Any = partial(_picked, columns=columns)
-    else:
-        read = partial(_read_text, delimiter=delimiter or _delimiter(path))
-    settings = _Settings(q, x, groups, time, q_unit, x_unit, q_sign, drop_invalid)
-    return _loaded(path, read, settings, return_X_y)
-
-
-def load_csv(
-    path: str | os.PathLike[str],
-    q: Sequence[str],
-    x: Sequence[str],
-    groups: str | None = None,
-    *,
-    time: str | None = None,
-    q_unit: str = "m",
-    x_unit: str = "m",
-    q_sign: ArrayLike = 1,
-    delimiter: str = ",",
-    drop_invalid: bool = False,
-    return_X_y: bool = False,
-) -> Any:
-    r"""Return actuator vectors and tip positions from a CSV log with a header line.
-
-    Parameters
-    ----------
-    path : path-like
-        The file, UTF-8.
-    q : sequence of str
-        Columns of the actuator vector, in the order of the robot model.
-    x : sequence of 3 str
-        Columns of the tip position.
-    groups : str or None, default=None
-        Column that names the motion, run or day of a row, for splitting by groups.
-    time : str or None, default=None
-        Column of the time stamp [s].
-    q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
-        Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
-        left as it is.
-    x_unit : {"m", "cm", "mm", "um", "in"}, default="m"
-        Unit of the tip columns in the file.
-    q_sign : 1, -1 or sequence of them, default=1
-        Factor of the actuator columns: -1 where the file counts a pulled tendon as positive, since
-        length changes here are negative for shortening.
-    delimiter : str, default=","
-        Separator of the columns.
-    drop_invalid : bool, default=False
-        Leave out rows with a missing, NaN or infinite value instead of raising.
-    return_X_y : bool, default=False
-        If True, return ``(q, x)`` only.
-
-    Returns
-    -------
-    data : :class:`~sklearn.utils.Bunch`
-        ``q`` (n_samples, n_actuators) and ``x`` (n_samples, 3) in SI units; ``groups`` (strings)
-        and ``time``, None if not asked for; ``line`` (n_samples,), line of each row in the file;
-        ``invalid_lines`` of the rows left out; ``q_names``, ``x_names``, ``units``, ``file_units``,
-        ``source``, ``DESCR``.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If a column is unknown, a cell is not a number, rows are invalid or none is left.
-
-    Warns
-    -----
-    UserWarning
-        If values look like millimetres where metres were declared.
-
-    Examples
-    --------
-    >>> import pathlib, tempfile
-    >>> from hybridkin.datasets import load_csv
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = pathlib.Path(folder) / "log.csv"
-    ...     _ = path.write_text("a,b,c,X,Y,Z\n1,2,3,10,20,30\n")
-    ...     data = load_csv(path, q=["a", "b", "c"], x=["X", "Y", "Z"], q_unit="mm", x_unit="mm")
-    >>> data.x
-    array([[0.01, 0.02, 0.03]])
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"`path` must be a CSV file, there is none at {str(path)!r}.")
-    q, x = _names("q", q), _names("x", x)
-    settings = _Settings(q, x, groups, time, q_unit, x_unit, q_sign, drop_invalid)
-    return _loaded(path, partial(_read_text, delimiter=delimiter), settings, return_X_y)
-
-
-def _loaded(path: Path, read: Any, settings: _Settings, return_X_y: bool) -> Any:
-    """Return what the reader finds in the wanted columns, checked and in SI units."""
-    q, x, groups, time, q_unit, x_unit, q_sign, drop_invalid = settings
+    q, x, columns = _names("q", q), _names("x", x), _columns(path)
+    if columns is not None:
+        q, x = _expanded(q, columns, path), _expanded(x, columns, path)
     if len(x) != 3:
         raise ValueError(f"`x` must name 3 columns, got {len(x)}: {x}.")
-    q_scale = _scale("q_unit", q_unit, {**METRES, **ANGLES, **UNITLESS})
-    x_scale = _scale("x_unit", x_unit, METRES)
-    sign = np.asarray(q_sign, dtype=float)
-    if sign.shape not in ((), (len(q),)) or not np.isin(sign, (-1, 1)).all():
-        raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
+    q_scale = _scale("q_unit", q_unit, {**LENGTHS, **ANGLES, **UNITLESS})
+    x_scale = _scale("x_unit", x_unit, LENGTHS)
+    sign = _signs(q_sign, len(q))
     wanted = [*q, *x, *([] if time is None else [time])]
-    labels, values, places, kind = read(path, wanted=wanted, groups=groups)
+    if columns is None:
+        labels, values, places, kind = _read_text(path, wanted, groups, delimiter)
+    else:
+        labels, values, places, kind = _picked(path, wanted, groups, columns)
     invalid = ~np.isfinite(values).all(axis=1)
     if invalid.any() and not drop_invalid:
         first = ", ".join(map(str, places[invalid][:5]))
@@ -250,37 +185,40 @@ def _loaded(path: Path, read: Any, settings: _Settings, return_X_y: bool) -> Any
         )
     if invalid.all():
         raise ValueError(
-            f"{str(path)!r} has no valid row left: all {len(values)} have a missing, NaN or "
-            "infinite value."
+            f"{str(path)!r} has no valid row left: all have a missing, NaN or infinite value."
         )
-    labels, values = labels[~invalid], values[~invalid]
-    n = len(q)
-    for name, unit, part in (("q", q_unit, values[:, :n]), ("x", x_unit, values[:, n : n + 3])):
-        if unit == "m":
-            _warn_if_millimetres(name, part)
-    data_q, data_x = values[:, :n] * q_scale * sign, values[:, n : n + 3] * x_scale
-    if return_X_y:
-        return data_q, data_x
-    return Bunch(
-        q=data_q,
-        x=data_x,
-        groups=None if groups is None else labels,
-        time=None if time is None else values[:, -1],
+    valid, n = values[~invalid], len(q)
+    if q_unit == "m":
+        _warn_if_millimetres("q", valid[:, :n])
+    if x_unit == "m":
+        _warn_if_millimetres("x", valid[:, n : n + 3])
+    return Log(
+        valid[:, :n] * q_scale * sign,
+        valid[:, n : n + 3] * x_scale,
+        groups=None if groups is None else labels[~invalid],
+        time=None if time is None else valid[:, -1],
         line=places[~invalid],
         invalid_lines=places[invalid],
         q_names=q,
         x_names=x,
-        units={"q": "m" if q_unit in METRES else "rad" if q_unit in ANGLES else "1", "x": "m"},
+        q_sign=q_sign,
+        units={"q": "m" if q_unit in LENGTHS else "rad" if q_unit in ANGLES else "1", "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
-        DESCR=f"{len(data_q)} rows of {path.name}; {invalid.sum()} invalid rows left out.",
     )
 
 
-def _names(argument: str, names: Any) -> list[str]:
-    if isinstance(names, str):
-        names = [names]
-    names = list(names)
+class _Table(NamedTuple):
+    """Columns as read: labels (N,), values (N, k) with NaN for gaps, and where each row stands."""
+
+    labels: NDArray
+    values: NDArray
+    places: NDArray
+    kind: str  # of place: "line" or "row"
+
+
+def _names(argument: str, names: Sequence[str]) -> list[str]:
+    names = [names] if isinstance(names, str) else list(names)
     if not names or not all(isinstance(name, str) for name in names):
         raise ValueError(f"`{argument}` must be column names, got {names!r}.")
     if len(set(names)) < len(names):
@@ -294,14 +232,22 @@ def _scale(argument: str, unit: str, known: dict[str, float]) -> float:
     return known[unit]
 
 
+def _signs(q_sign: ArrayLike, n: int) -> NDArray:
+    sign = np.asarray(q_sign, dtype=float)
+    if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
+        raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
+    return sign
+
+
 def _delimiter(path: Path) -> str:
     with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
         header = file.readline()
     return max(_DELIMITERS, key=header.count)
 
 
-def _read_text(path: Path, wanted: list[str], groups: str | None, delimiter: str) -> _Table:
+def _read_text(path: Path, wanted: list[str], groups: str | None, delimiter: str | None) -> _Table:
     labels, values, lines = [], [], []
+    delimiter = delimiter or _delimiter(path)
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, delimiter=delimiter)
@@ -331,6 +277,14 @@ def _read_text(path: Path, wanted: list[str], groups: str | None, delimiter: str
     if not values:
         raise ValueError(f"{str(path)!r} has a header but no rows.")
     return _Table(np.array(labels), np.array(values), np.array(lines), "line")
+
+
+def _columns(path: Path) -> dict[str, NDArray] | None:
+    """Return the columns of an npz or parquet file by name, None of a text file."""
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return _npz_columns(path)
+    return _parquet_columns(path) if suffix in _PARQUET else None
 
 
 def _npz_columns(path: Path) -> dict[str, NDArray]:
@@ -364,13 +318,13 @@ def _parquet_columns(path: Path) -> dict[str, NDArray]:
     return {str(name): frame[name].to_numpy() for name in frame.columns}
 
 
-def _expanded(names: list[str], columns: dict[str, NDArray]) -> list[str]:
-    """Return the names with that of a table (N, k) replaced by those of its columns."""
+def _expanded(names: list[str], columns: dict[str, NDArray], path: Path) -> list[str]:
+    """Return the names of columns, with that of a table (N, k) replaced by those of its columns."""
     found: list[str] = []
     for name in names:
         parts = [c for c in columns if re.fullmatch(rf"{re.escape(name)}\[\d+\]", c)]
         found += [name] if name in columns or not parts else parts
-    return found
+    return [_column(name, [*columns], path) for name in found]
 
 
 def _picked(
@@ -433,5 +387,5 @@ def _warn_if_millimetres(name: str, values: NDArray) -> None:
             f"The `{name}` columns span {np.ptp(values, axis=0).max():.4g} m around "
             f"{np.median(np.abs(values)):.4g} m; if the file has millimetres, give "
             f"{name}_unit='mm'.",
-            stacklevel=4,
+            stacklevel=3,
         )

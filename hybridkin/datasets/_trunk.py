@@ -15,9 +15,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 from joblib import Parallel, delayed
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
-from tqdm import tqdm
 
 from hybridkin.datasets._protocol import default_range, draw, paper_protocol
 from hybridkin.simulation import NotSettledError, TrunkPlant
@@ -34,29 +33,6 @@ MAX_REDRAWS = 20
 NOISE, REDRAW = 1, 2
 TODO, DONE, FAILED = 0, 1, 2
 
-DESCR = """\
-Simulated three-segment pneumatic trunk
----------------------------------------
-
-Chamber lengths and tip positions of `hybridkin.simulation.TrunkPlant`, a MuJoCo model in the
-manner of Festo's Bionic Handling Assistant, sampled by the protocol of Reinhart and Steil (2016).
-Everything here is simulated; nothing was measured on a robot.
-
-q : (n_samples, 9), measured chamber lengths [m], three per segment from base to tip
-x : (n_samples, 3), measured tip position in the motion-capture frame [m]
-q_target : (n_samples, 9), commanded chamber lengths [m]
-part : (n_samples,), 0, 1, 2 where that segment alone moves, 3 where all lengths are random
-row : (n_samples,), row of the sampling protocol
-failed : rows that did not settle, as (row, q_target, message)
-parameters : seed, noise, sampling and plant parameters
-
-The shipped set (`load_trunk`) has 3 x 500 + 500 rows, cable noise of 1 mm and motion-capture
-noise of 0.5 mm, and is what ``make_trunk(random_state=0)`` makes. Row i again:
-
-    plant = TrunkPlant(**data.parameters["plant"])
-    q, pose = plant.settle(data.q_target[i], random_state=[0, 1, data.row[i]])
-"""
-
 
 def make_trunk(
     q_target: ArrayLike | None = None,
@@ -67,12 +43,20 @@ def make_trunk(
     cable_noise: float = 1e-3,
     mocap_noise: float = 5e-4,
     n_jobs: int | None = None,
-    progress: bool | Callable[[int, int], object] = False,
+    progress: Callable[[int, int], object] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     return_X_y: bool = False,
     **plant_parameters: Any,
 ) -> Any:
     """Return simulated data of a pneumatic trunk, by default under the paper's protocol.
+
+    Chamber lengths and tip positions of `hybridkin.simulation.TrunkPlant`, a MuJoCo model in the
+    manner of Festo's Bionic Handling Assistant, sampled by the protocol of Reinhart and Steil
+    (2016). Everything here is simulated; nothing was measured on a robot. Row i again::
+
+        plant = TrunkPlant(**data.parameters["plant"])
+        seed = data.parameters["random_state"]
+        q, pose = plant.settle(data.q_target[i], random_state=[seed, 1, data.row[i]])
 
     The result depends on the seed and the parameters alone, not on `n_jobs` nor on interruptions.
     A row of the protocol that does not settle is drawn again, so that every part keeps its size;
@@ -93,8 +77,8 @@ def make_trunk(
         Standard deviation of each coordinate of the measured tip position [m].
     n_jobs : int or None, default=None
         Processes, as in joblib.
-    progress : bool or callable, default=False
-        True shows a bar; a callable is handed the rows done and the rows in all.
+    progress : callable, optional
+        Called with the rows done and the rows in all.
     checkpoint : path-like or None, default=None
         An .npz file kept up to date while rows are made. If it exists and was made with the same
         seed and parameters, only the missing rows are made.
@@ -106,9 +90,13 @@ def make_trunk(
     Returns
     -------
     data : :class:`~sklearn.utils.Bunch`
-        ``q`` (n_samples, 9) and ``x`` (n_samples, 3) [m], ``q_target``, ``part``, ``row``,
-        ``groups`` (None), ``failed``, ``parameters``, ``units``, ``source``, ``citation``,
-        ``DESCR``. ``part`` is None for a given `q_target`.
+        ``q`` (n_samples, 9), measured chamber lengths [m], three per segment from base to tip;
+        ``x`` (n_samples, 3), measured tip position in the motion-capture frame [m]; ``q_target``
+        (n_samples, 9), commanded chamber lengths [m]; ``part`` (n_samples,), 0, 1, 2 where that
+        segment alone moves, 3 where all lengths are random, None for a given `q_target`; ``row``
+        (n_samples,), row of the sampling protocol; ``groups`` (None); ``failed``, rows that did not
+        settle, as (row, q_target, message); ``parameters``, seed, noise, sampling and plant
+        parameters; ``units``, ``source``, ``citation``, ``DESCR``.
 
     Raises
     ------
@@ -132,26 +120,8 @@ def make_trunk(
     seed = _seed(random_state, checkpoint)
     plant = _plant_parameters(plant_parameters, cable_noise, mocap_noise)
     parameters = {"random_state": seed, "plant": plant, "mujoco": _mujoco_version()}
-    if q_target is None:
-        targets, part = paper_protocol(seed, n_segment=n_segment, n_random=n_random)
-        parameters["protocol"] = {
-            "n_segment": int(n_segment),
-            "n_random": int(n_random),
-            **default_range(),
-        }
-    else:
-        targets = np.array(q_target, dtype=float)
-        if targets.ndim != 2 or targets.shape[1] != 9:
-            raise ValueError(f"`q_target` must have shape (n_samples, 9), got {targets.shape}.")
-        low, high = TrunkPlant.admissible
-        bad = np.flatnonzero(~((targets >= low) & (targets <= high)).all(axis=1))
-        if len(bad):
-            raise ValueError(
-                f"`q_target` must be chamber lengths of {low} to {high} m, {len(bad)} rows are "
-                f"not, the first row {bad[0]}: {targets[bad[0]]}; clip them or convert to metres."
-            )
-        parameters["q_target"] = hashlib.sha256(targets.tobytes()).hexdigest()
-        part = np.full(len(targets), OWN, np.int8)
+    targets, part, drawn = _targets(q_target, seed, n_segment, n_random)
+    parameters |= drawn
     n = len(targets)
     state: dict[str, Any] = {
         "parameters": json.dumps(parameters, sort_keys=True),
@@ -167,12 +137,12 @@ def make_trunk(
     elif checkpoint is not None:
         _write(checkpoint, state)
     todo = np.flatnonzero(state["status"] == TODO)
-    report, close = _progress(progress, n)
-    report(n - len(todo), n)
     chunks = [todo[i : i + CHUNK] for i in range(0, len(todo), CHUNK)]
     results: Any = Parallel(n_jobs=n_jobs, return_as="generator")(
         delayed(_measure)(c, targets[c], part[c], seed, plant) for c in chunks
     )
+    report = progress or (lambda done, total: None)
+    report(n - len(todo), n)
     try:
         for rows, result in zip(chunks, results, strict=True):
             for key in ("q", "x", "q_target", "status"):
@@ -183,7 +153,6 @@ def make_trunk(
             report(int((state["status"] != TODO).sum()), n)
     finally:
         results.close()
-        close()
     if state["failed"]:
         row, _, message = state["failed"][0]
         fate = "drawn again" if q_target is None else "left out"
@@ -195,11 +164,33 @@ def make_trunk(
     return _bunch(state, return_X_y)
 
 
+def _targets(
+    q_target: ArrayLike | None, seed: int, n_segment: int, n_random: int
+) -> tuple[NDArray, NDArray, dict[str, Any]]:
+    """Return the commanded lengths (N, 9), the part of each row, and what they are made from."""
+    if q_target is None:
+        targets, part = paper_protocol(seed, n_segment=n_segment, n_random=n_random)
+        sizes = {"n_segment": int(n_segment), "n_random": int(n_random)}
+        return targets, part, {"protocol": sizes | default_range()}
+    targets = np.array(q_target, dtype=float)
+    if targets.ndim != 2 or targets.shape[1] != 9:
+        raise ValueError(f"`q_target` must have shape (n_samples, 9), got {targets.shape}.")
+    low, high = TrunkPlant.admissible
+    bad = np.flatnonzero(~((targets >= low) & (targets <= high)).all(axis=1))
+    if len(bad):
+        raise ValueError(
+            f"`q_target` must be chamber lengths of {low} to {high} m, {len(bad)} rows are "
+            f"not, the first row {bad[0]}: {targets[bad[0]]}; clip them or convert to metres."
+        )
+    digest = hashlib.sha256(targets.tobytes()).hexdigest()
+    return targets, np.full(len(targets), OWN, np.int8), {"q_target": digest}
+
+
 def load_trunk(*, return_X_y: bool = False) -> Any:
     """Return the shipped simulated data of a pneumatic trunk: 2000 rows of the paper's protocol.
 
-    Made by ``make_trunk(random_state=0)``: simulated, with 1 mm cable noise and 0.5 mm
-    motion-capture noise. Loading needs no MuJoCo.
+    Made by ``make_trunk(random_state=0)``: simulated, 3 x 500 + 500 rows with 1 mm cable noise and
+    0.5 mm motion-capture noise. Loading needs no MuJoCo.
 
     Parameters
     ----------
@@ -281,18 +272,6 @@ def _mujoco_version():
         return None
 
 
-def _progress(progress, total):
-    """Functions to report the rows done so far, and to close the report."""
-    if callable(progress):
-        return progress, lambda: None
-    bar = tqdm(total=total, disable=not progress, unit="row")
-
-    def report(done, _total):
-        bar.update(done - bar.n)
-
-    return report, bar.close
-
-
 def _write(path, state):
     """Write the file whole or not at all."""
     path = os.fspath(path)
@@ -348,5 +327,5 @@ def _bunch(state, return_X_y):
         units={"q": "m", "x": "m"},
         source="simulated by hybridkin.simulation.TrunkPlant",
         citation=PAPER,
-        DESCR=DESCR,
+        DESCR=inspect.getdoc(make_trunk),
     )

@@ -11,9 +11,10 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hybridkin._core.units import METRES
+
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
 
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _FAR = 20.0  # no tip is that far from where it is measured [m]
 
 
@@ -266,8 +267,8 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     Trajectory
         In metres and seconds, as timed in the file.
     """
-    if unit not in _UNITS:
-        raise ValueError(f"`unit` must be one of {tuple(_UNITS)}, got {unit!r}.")
+    if unit not in METRES:
+        raise ValueError(f"`unit` must be one of {tuple(METRES)}, got {unit!r}.")
     with open(path, encoding="utf-8-sig") as file:
         lines = [text.strip() for text in file]
     rows = [text.split(",") for text in lines if text and not text.startswith("#")]
@@ -284,7 +285,7 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     if dt is not None:
         _check_positive(dt, "dt")
     t = table[:, 0] if dt is None else dt * np.arange(len(table))
-    return Trajectory(t, _UNITS[unit] * table[:, -3:])
+    return Trajectory(t, METRES[unit] * table[:, -3:])
 
 
 def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.ndarray]:

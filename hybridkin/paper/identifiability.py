@@ -12,7 +12,7 @@ from hybridkin import datasets, robots
 from hybridkin.calibration.calibrate import calibrate
 from hybridkin.workflow.report import (
     GEOMETRY_HEADER,
-    TOLD,
+    IDENTIFIED,
     Report,
     distance,
     geometry_entries,
@@ -72,14 +72,14 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
         f"All of {', '.join(ASKED)} at once, from the {found['n_train']} training rows of one "
         f"split of the **simulated** data: {found['n_single']} rows of one segment moving alone "
         f"and {found['n_random']} fully random ones. Identified means that the rows narrow the "
-        f"prior at least {TOLD:.0f} times: {sum(e['told'] for e in asked['entries'])} of "
+        f"prior at least {IDENTIFIED:.0f} times: {sum(e['identified'] for e in asked['entries'])} of "
         f"{len(asked['entries'])} parameters. The others stay near the published geometry. The "
         "base is given by its rotation from the start and its position.",
     )
     report.table(GEOMETRY_HEADER, geometry_rows(asked["entries"]))
     report.text("What the samples do not identify, and which measurement would:")
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
-    n = sum(entry["told"] for entry in fewer["entries"])
+    n = sum(entry["identified"] for entry in fewer["entries"])
     report.text(f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:")
     report.table(GEOMETRY_HEADER, geometry_rows(fewer["entries"]))
     base = {entry["name"]: entry for entry in fewer["entries"]}

@@ -1,116 +1,118 @@
-"""Where a model may be steered: limits, commands it knows, a posture that keeps it there."""
+"""Where a model may be steered: limits, commands in its domain, a posture that keeps it there."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from hybridkin import robots
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.workflow.model import OpenedModel
+from hybridkin.workflow.model import LoadedModel
 
-_WALKERS, _PACES, _PACE = 256, 60, 0.12  # steps of a pace, as a share of the range
+_WALKERS, _STEPS, _STEP = 256, 60, 0.12  # length of a step, as a share of the range
 _EASE = 0.5  # domain distance from which the posture turns back; 1 is the edge of the domain
 
 
+@dataclass(frozen=True, eq=False)
+class PathLimits:
+    """The limits that a track keeps to.
+
+    Attributes
+    ----------
+    q_min, q_max : ndarray of shape (n,)
+        Least and largest value of every actuator [m]; with play of what the actuators do.
+    dq_max : ndarray of shape (n,) or None
+        Largest speed [m/s].
+    source : str
+        Where the first two come from.
+    """
+
+    q_min: NDArray
+    q_max: NDArray
+    dq_max: NDArray | None
+    source: str
+
+
 def path_limits(
-    opened: OpenedModel,
+    loaded: LoadedModel,
     q_min: ArrayLike | None = None,
     q_max: ArrayLike | None = None,
     dq_max: ArrayLike | None = None,
-) -> dict[str, Any]:
+) -> PathLimits:
     """Return the limits of the actuators: those given, else the description's within the fit's.
 
-    What the robot can do but the model has never seen is left out, unless it is asked for.
+    By default a track does not leave the range that the model was fitted on.
 
     Parameters
     ----------
-    opened : OpenedModel
+    loaded : LoadedModel
         The model, as from `open_model`.
     q_min, q_max, dq_max : float or array-like of shape (n,), optional
         Limits of the commands [m], and of their speed [m/s].
 
     Returns
     -------
-    dict
-        "q_min", "q_max" and "dq_max", ndarray of shape (n,) [m] and [m/s], the last None where
-        there is none; with play they hold for what the actuators do. "source": where the first two
-        come from.
+    PathLimits
+        With play the commands go half its width further.
 
     Raises
     ------
     ValueError
         If nobody knows the range of the actuators.
     """
+    half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
+    described = robots.Limits() if loaded.description is None else loaded.description.limits
+    trained = loaded.trained_range or robots.Limits()
     given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
-    own = None if opened.description is None else opened.description.limits
-    trained = opened.trained_range or (None, None)
-    room = 0.0 if opened.play is None else 0.5 * opened.play.width  # commands go so much further
-    found: dict[str, Any] = {}
-    sources = []
-    for name, learned, inwards, tighter in (
-        ("q_min", trained[0], room, np.maximum),
-        ("q_max", trained[1], -room, np.minimum),
-    ):
-        told = getattr(own, name, None)
-        if given[name] is not None:
-            found[name] = np.asarray(given[name], dtype=float) + inwards
-            sources.append("given")
-        elif told is not None and learned is not None:
-            found[name] = tighter(told + inwards, learned)
-            sources.append("robot description, within the range of the fit")
-        elif told is not None:
-            found[name] = told + inwards
-            sources.append("robot description")
-        elif learned is not None:
-            found[name] = learned
-            sources.append("range of the fit")
-        else:
-            raise ValueError(
-                "`q_min` and `q_max` must be given (--q-min, --q-max), or stand as [limits] in the "
-                "robot description: this model does not know the range of its actuators."
-            )
-    speed = getattr(own, "dq_max", None) if dq_max is None else dq_max
-    found["dq_max"] = np.inf if speed is None else speed
-    low, high, fast = (np.broadcast_to(v, opened.n_actuators).astype(float) for v in found.values())
+    asked = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
+    overrides = vars(robots.Limits(**asked).narrowed(half_play))
+    found = described.narrowed(half_play).intersect(trained)
+    found = replace(found, **{name: overrides[name] for name in asked})
+    if found.q_min is None or found.q_max is None:
+        raise ValueError(
+            "`q_min` and `q_max` must be given (--q-min, --q-max), or stand as [limits] in the "
+            "robot description: this model does not know the range of its actuators."
+        )
+    n = loaded.n_actuators
+    low, high = (np.broadcast_to(v, n).astype(float) for v in (found.q_min, found.q_max))
+    fast = None if found.dq_max is None else np.broadcast_to(found.dq_max, n).astype(float)
     if (low > high).any():
         raise ValueError(
             "`q_min` must not exceed `q_max`, with half the play and the range of the fit counted "
             f"in, got {low.tolist()} and {high.tolist()} m."
         )
-    source = " and ".join(dict.fromkeys(sources))
-    return {
-        "q_min": low,
-        "q_max": high,
-        "dq_max": None if speed is None else fast,
-        "source": source,
-    }
+    sources = {"robot description": described, "range of the fit": trained}
+    known = [words for words, limits in sources.items() if limits.q_min is not None]
+    asked_for = ["given"] if {"q_min", "q_max"} & {*asked} else []
+    if not {"q_min", "q_max"} <= {*asked}:
+        asked_for.append(", within the ".join(known))
+    return PathLimits(low, high, fast, " and ".join(asked_for))
 
 
-def preferred(opened: OpenedModel, limits: dict[str, Any]) -> NDArray:
-    """Return a configuration (n,) that the model knows, within the limits.
+def preferred(loaded: LoadedModel, limits: PathLimits) -> NDArray:
+    """Return a configuration (n,) in the domain of the model, within the limits.
 
-    It is the middle of the fit's range or, where the model is not at home there, no tendon pulled;
+    It is the middle of the fit's range or, where that lies outside the domain, no tendon pulled;
     without a fit the second, else the middle of the limits.
     """
-    low, high = opened.trained_range or (limits["q_min"], limits["q_max"])
-    places = [0.5 * (low + high) @ _seen(opened.chain, opened.n_actuators)]
-    if getattr(opened.chain, "lengths", None) is not None:
-        places.insert(0 if opened.trained_range is None else 1, np.zeros(opened.n_actuators))
-    places = [np.clip(place, limits["q_min"], limits["q_max"]) for place in places]
-    if not opened.is_hybrid:
-        return places[0]
+    trained, chain = loaded.trained_range, loaded.chain
+    low, high = (vars(trained or limits)[name] for name in ("q_min", "q_max"))
+    candidates = [0.5 * (low + high) @ _bending_projector(loaded)]
+    if isinstance(chain, ArcChain) and chain.lengths is not None:
+        candidates.insert(0 if trained is None else 1, np.zeros(loaded.n_actuators))
+    q = np.clip(candidates, limits.q_min, limits.q_max)
     with torch.no_grad():
-        weights = opened.module.error_weight(torch.from_numpy(np.stack(places)))
-    return places[int(weights.argmax())]
+        distance = loaded.module.domain_distance(torch.from_numpy(q)).numpy()
+    return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
 
 
-def known_commands(opened: OpenedModel, limits: dict[str, Any]) -> tuple[NDArray, NDArray]:
+def sample_domain(loaded: LoadedModel, limits: PathLimits) -> tuple[NDArray, NDArray]:
     """Return commands (K, n) from all over the domain, within the limits, and their tips (K, 3).
 
     The first is near the preferred one.
@@ -119,91 +121,67 @@ def known_commands(opened: OpenedModel, limits: dict[str, Any]) -> tuple[NDArray
     most of the box around the training rows lies outside it. On a plain tendon chain no tendon
     pulls against the others. Without a learned part they are drawn from the limits.
     """
-    low, high, rng = limits["q_min"], limits["q_max"], np.random.default_rng(0)
-    q = rng.uniform(low, high, (_WALKERS, opened.n_actuators))
-    module, rest = opened.module, preferred(opened, limits)
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"\d+ of \d+ rows of `\w+` pull the tendons")
-        if opened.is_hybrid:
+    low, high, rng = limits.q_min, limits.q_max, np.random.default_rng(0)
+    q = rng.uniform(low, high, (_WALKERS, loaded.n_actuators))
+    module, rest = loaded.module, preferred(loaded, limits)
+    with torch.no_grad():
+        if loaded.hybrid is not None:
             q = np.tile(rest, (_WALKERS, 1))
-            seen = _seen(opened.chain, opened.n_actuators)
-            for _ in range(_PACES):
-                pace = _PACE * (high - low) * rng.standard_normal(q.shape)
-                ahead = q + pace @ seen
+            bending = _bending_projector(loaded)
+            for _ in range(_STEPS):
+                step = _STEP * (high - low) * rng.standard_normal(q.shape)
+                ahead = q + step @ bending
                 inside = module.in_domain(torch.from_numpy(ahead)).numpy()
                 inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
                 q[inside] = ahead[inside]
-            q[0] = (
-                rest + 0.01 * (high - low) * rng.standard_normal(len(rest)) @ seen
-            )  # not straight
+            # Beside the preferred one, which may be exactly straight.
+            q[0] = rest + 0.01 * (high - low) * rng.standard_normal(len(rest)) @ bending
         tips = module(torch.from_numpy(q)).numpy()
-    known = np.isfinite(tips).all(axis=1)
-    return q[known], tips[known]
+    finite = np.isfinite(tips).all(axis=1)
+    return q[finite], tips[finite]
 
 
-def middle_tip(opened: OpenedModel, limits: dict[str, Any]) -> NDArray:
-    """Return a place in the midst of the workspace that the model knows.
+def _bending_projector(loaded: LoadedModel) -> NDArray:
+    """Return the projector (n, n) on what bends a plain tendon chain; of others the identity.
 
-    It is the tip of a command within its domain that is nearest to the mean of all such tips: some
-    robots reach only a surface.
-
-    Parameters
-    ----------
-    opened : OpenedModel
-        The model, as from `open_model`.
-    limits : dict
-        As from `path_limits`.
-
-    Returns
-    -------
-    ndarray of shape (3,)
-        The tip [m].
+    The bendings of such a chain are linear in q, and blind to what its tendons pull against each
+    other.
     """
-    _, tips = known_commands(opened, limits)
-    return tips[np.linalg.norm(tips - tips.mean(axis=0), axis=1).argmin()]
-
-
-def _seen(chain: Any, n: int) -> NDArray:
-    """Return the projector (n, n) on what bends a plain tendon chain; of others all is seen.
-
-    Its bendings are linear in q, and blind to what its tendons pull against each other.
-    """
+    chain = loaded.chain
     if not isinstance(chain, ConstantCurvatureChain) or chain.lengths is None:
-        return np.eye(n)
+        return np.eye(loaded.n_actuators)
     zero = torch.zeros(chain.n_actuators, dtype=torch.float64)
-    slopes: Any = torch.autograd.functional.jacobian(lambda row: chain.arcs(row)[1].ravel(), zero)
+    slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
     return (torch.linalg.pinv(slopes) @ slopes).numpy()
 
 
-def homeward(
-    opened: OpenedModel, limits: dict[str, Any], pull: float
+def preferred_posture(
+    loaded: LoadedModel, limits: PathLimits, pull: float
 ) -> Callable[[Tensor], Tensor] | NDArray:
-    """Return the posture for ``InverseKinematics(q_pref=...)``: towards what the model knows.
+    """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.
 
-    Half way to the edge of the domain it begins to turn back, down the domain distance of q, and it is
-    drawn to the `preferred` configuration, a share `pull` of the way; it is that configuration
+    Half way to the edge of the domain it begins to turn back, down the domain distance of q, and it
+    is drawn to the `preferred` configuration, a share `pull` of the way; it is that configuration
     where nothing guards the domain.
     """
-    rest = preferred(opened, limits)
-    if not opened.is_hybrid or opened.model.guard is None:
+    rest = preferred(loaded, limits)
+    if loaded.hybrid is None or loaded.hybrid.guard is None:
         return rest
-    home, squares = (
-        torch.from_numpy(rest),
-        torch.from_numpy((limits["q_max"] - limits["q_min"]) ** 2),
-    )
-    seen = torch.from_numpy(_seen(opened.chain, opened.n_actuators))
+    home, squares = torch.from_numpy(rest), torch.from_numpy((limits.q_max - limits.q_min) ** 2)
+    bending, module = torch.from_numpy(_bending_projector(loaded)), loaded.module
 
     def posture(q: Tensor) -> Tensor:
         rows = q.detach().reshape(-1, q.shape[-1])
         with torch.enable_grad():
             leaf = rows.clone().requires_grad_()
-            value: Any = opened.module.domain_distance(leaf)
+            value = module.domain_distance(leaf)
             (slope,) = torch.autograd.grad(value.sum(), leaf)
+        # Newton's step to the distance _EASE, in units of the range of every actuator.
         downhill = squares.to(slope) * slope
         steepness = (slope * downhill).sum(-1, keepdim=True)
         over = (value.detach() - _EASE).clamp(min=0.0)[:, None]
         step = over * downhill / steepness.clamp(min=torch.finfo(q.dtype).tiny)
-        step = step @ seen.to(step)
+        step = step @ bending.to(step)
         return (rows - step + pull * (home.to(rows) - rows)).reshape(q.shape)
 
     return posture

@@ -7,10 +7,11 @@ import os
 import platform
 import shutil
 import tempfile
+import textwrap
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,13 +21,32 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
-from hybridkin.calibration._parameters import parameter
 from hybridkin.calibration.calibrate import CalibrationResult
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
 
-_UNITS = {"bending_stiffness": (1e6, "mm²/rad²"), "axial_stiffness": (1.0, "-")}
+_WIDTH = 98
+_MILLIMETRES, _DEGREES = (1e3, "mm"), (180.0 / np.pi, "deg")
+_UNITS = {
+    "bending_stiffness": (1e6, "mm²/rad²"),
+    "axial_stiffness": (1.0, "-"),
+    **dict.fromkeys(("angles", "turns", "rest_bends"), _DEGREES),
+}
 
-TOLD = 10.0
-"""The data tell a parameter whose prior they narrow so many times."""
+_COLUMNS = {  # of tables of errors: heading, factor, format
+    "rows": ("rows", 1, ".0f"),
+    "mean": ("mean", 1e3, ".2f"),
+    "median": ("median", 1e3, ".2f"),
+    "std": ("std over rows", 1e3, ".2f"),
+    "p95": ("95 %", 1e3, ".2f"),
+    "max": ("max", 1e3, ".2f"),
+    "std_folds": ("std over folds", 1e3, ".2f"),
+    "share_in_domain": ("in domain [%]", 100, ".0f"),
+    "share_in_radius": ("in radius [%]", 100, ".0f"),
+}
+
+IDENTIFIED = 10.0
+"""The data identify a parameter whose prior they narrow at least so many times."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
@@ -47,38 +67,54 @@ def distance(a: NDArray, b: NDArray) -> NDArray:
     return np.linalg.norm(a - b, axis=-1)
 
 
-def geometry_entries(start: Any, result: CalibrationResult) -> list[dict[str, Any]]:
+def statistics(errors: NDArray) -> dict[str, Any]:
+    """Return mean, standard deviation, median, 95 % quantile and maximum of errors (N,)."""
+    spread = {"mean": errors.mean(), "std": errors.std(), "median": np.median(errors)}
+    return {**spread, "p95": np.percentile(errors, 95), "max": errors.max()}
+
+
+def millimetres(lengths: Sequence[float]) -> str:
+    """Return the largest of some lengths [m] in words."""
+    return f"{1e3 * max(lengths):.3g} mm"
+
+
+def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, Any]]:
     """Return what a calibration from `start` found, one entry for each free parameter.
 
     Returns
     -------
     list of dict
         "name"; "unit", "mm", "deg", "mm²/rad²" or "-"; "start", "value" and "std_error" in that
-        unit, of the base its turn from the start and its position; "narrowing" and "told".
+        unit, of the base its turn from the start and its position; "narrowing" and "identified".
     """
     entries = []
-    narrowing = iter(result.narrowing.tolist())
+    labels, narrowing = iter(result.names), iter(result.narrowing.tolist())
     for name, value in result.values.items():
-        part = parameter(start, name)
-        value, std = np.asarray(value), np.ravel(np.asarray(result.std_errors[name]))
+        before, value = _start_value(start, name), np.asarray(value)
+        units = value.size * [_UNITS.get(name, _MILLIMETRES)]
         if name == "base":
-            first = part.start.numpy()
-            turn = Rotation.from_matrix(value[:3, :3] @ first[:3, :3].T).as_rotvec()
-            before = np.concatenate([np.zeros(3), first[:3, 3]])
-            value = np.concatenate([turn, value[:3, 3]])
-        else:
-            before = part.value(part.start).numpy().ravel()
-        for label, kind, *numbers in zip(
-            part.labels, part.kind, before, value.ravel(), std, strict=True
-        ):
-            scale, unit = (180.0 / np.pi, "deg") if kind == "rad" else _UNITS.get(name, (1e3, "mm"))
-            entry = dict(
-                zip(("start", "value", "std_error"), scale * np.array(numbers), strict=True)
-            )
-            told = next(narrowing)
-            entries.append({"name": label, "unit": unit, **entry, "narrowing": told})
-            entries[-1]["told"] = told >= TOLD
+            turn = Rotation.from_matrix(value[:3, :3] @ before[:3, :3].T).as_rotvec()
+            before, value = np.append(np.zeros(3), before[:3, 3]), np.append(turn, value[:3, 3])
+            units = 3 * [_DEGREES] + 3 * [_MILLIMETRES]
+        columns = (before, value, np.asarray(result.std_errors[name]))
+        for (scale, unit), *numbers in zip(units, *map(np.ravel, columns), strict=True):
+            entry: dict[str, Any] = {"name": next(labels), "unit": unit}
+            entry["start"], entry["value"], entry["std_error"] = np.multiply(scale, numbers)
+            entry["narrowing"] = next(narrowing)
+            entry["identified"] = entry["narrowing"] >= IDENTIFIED
+            entries.append(entry)
     return entries
+
+
+def _start_value(start: Chain, name: str) -> NDArray:
+    """Return the value of a parameter of `calibrate` at the start."""
+    geometry = {key: value.detach().cpu().numpy() for key, value in start.geometry().items()}
+    if name == "turns" and isinstance(start, ArcChain):  # the angle of each ring's first actuator
+        counts = np.array(start.actuators_per_segment)
+        return geometry["angles"][np.cumsum(counts) - counts]
+    if name == "tool" and name not in geometry:
+        return geometry["offsets"][-1:]
+    return geometry[name]
 
 
 def geometry_rows(entries: Sequence[dict[str, Any]]) -> list[list[str]]:
@@ -88,13 +124,40 @@ def geometry_rows(entries: Sequence[dict[str, Any]]) -> list[list[str]]:
             f"{entry['name']} [{entry['unit']}]",
             *(f"{entry[key]:.2f}" for key in ("start", "value", "std_error")),
             f"{entry['narrowing']:.3g}",
-            "yes" if entry["told"] else "no",
+            "yes" if entry["identified"] else "no",
         ]
         for entry in entries
     ]
 
 
-GEOMETRY_HEADER = ("parameter", "start", "calibrated", "standard error", "prior narrowed", "told")
+GEOMETRY_HEADER = (
+    *("parameter", "start", "calibrated", "standard error", "prior narrowed", "identified"),
+)
+
+
+class _Table(NamedTuple):
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def markdown(self) -> str:
+        lines = [self.header, ["---"] * len(self.header), *self.rows]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+    def plain(self) -> str:
+        lines = [self.header, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        cells = (  # the first column to the left, the others to the right
+            [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in lines
+        )
+        return "\n".join("  " + "  ".join(line) for line in cells)
+
+
+class _Figure(NamedTuple):
+    name: str
+    caption: str
+
+    def markdown(self) -> str:
+        return f"![{self.caption}]({self.name}.png)\n\n*{self.caption}*"
 
 
 class Report:
@@ -107,23 +170,41 @@ class Report:
     """
 
     def __init__(self, title: str) -> None:
-        self.blocks = [f"# {title}"]
         self.record: dict[str, Any] = {"title": title, "versions": versions()}
+        self._blocks: list[str | _Table | _Figure] = [f"# {title}"]
         self._files: dict[str, Callable[[Path], Any]] = {}
 
     def text(self, *paragraphs: str) -> None:
         """Add paragraphs."""
-        self.blocks.extend(paragraphs)
+        self._blocks.extend(paragraphs)
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Add a table."""
-        lines = [header, ["---"] * len(header), *rows]
-        self.blocks.append("\n".join("| " + " | ".join(line) + " |" for line in lines))
+        self._blocks.append(_Table(header, rows))
+
+    def errors(self, record: dict[str, dict[str, Any]], columns: Sequence[str]) -> None:
+        """Add a table of tip errors [mm] by name, with some of their `statistics`."""
+        titles, factors, formats = zip(*(_COLUMNS[key] for key in columns), strict=True)
+        rows = []
+        for name, entry in record.items():
+            values = [factor * entry[key] for key, factor in zip(columns, factors, strict=True)]
+            rows.append([name, *map(format, values, formats)])
+        self.table(["tip error [mm]", *titles], rows)
 
     def figure(self, name: str, figure: Any, caption: str) -> None:
         """Add a figure that becomes `name`.png."""
-        self.blocks.append(f"![{caption}]({name}.png)\n\n*{caption}*")
+        self._blocks.append(_Figure(name, caption))
         self.file(f"{name}.png", lambda path: figure.savefig(path))
+
+    def markdown(self) -> str:
+        """Return the report as it is written."""
+        blocks = (b if isinstance(b, str) else b.markdown() for b in self._blocks)
+        return "\n\n".join(blocks) + "\n"
+
+    def plain(self) -> str:
+        """Return the text and the tables for a terminal."""
+        blocks = [block for block in self._blocks if not isinstance(block, _Figure)]
+        return "\n\n".join(_wrapped(b) if isinstance(b, str) else b.plain() for b in blocks)
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Add a file that `write` makes when handed its path."""
@@ -142,7 +223,7 @@ class Report:
                 write(staging / name)
             record = json.dumps(self.record, indent=2, default=_plain)
             (staging / "report.json").write_text(record + "\n", encoding="utf-8")
-            (staging / "report.md").write_text("\n\n".join(self.blocks) + "\n", encoding="utf-8")
+            (staging / "report.md").write_text(self.markdown(), encoding="utf-8")
             out.mkdir(exist_ok=True)
             names = [*self._files, "report.json", "report.md"]
             for name in names:
@@ -150,6 +231,17 @@ class Report:
         finally:
             shutil.rmtree(staging, ignore_errors=True)
         return [out / name for name in names]
+
+
+def _wrapped(text: str) -> str:
+    """Return lines of Markdown as text of the width of a terminal."""
+    lines: list[str] = []
+    for line in text.replace("**", "").splitlines():
+        indent = "  " if line.startswith("- ") else ""
+        lines += textwrap.wrap(
+            line.lstrip("# "), _WIDTH, subsequent_indent=indent, break_on_hyphens=False
+        )
+    return "\n".join(lines)
 
 
 def check_out(out: str | Path) -> None:

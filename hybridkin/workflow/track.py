@@ -5,68 +5,65 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hybridkin import datasets, plots, robots
-from hybridkin.ik.solver import IKStatus, InverseKinematics, Track
-from hybridkin.ik.trajectories import Trajectory, from_csv
-from hybridkin.workflow._domain import homeward, known_commands, path_limits
-from hybridkin.workflow.model import OpenedModel
-from hybridkin.workflow.report import Report, check_out
+from hybridkin._core.units import METRES
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.ik.results import IKStatus, Track
+from hybridkin.ik.solver import InverseKinematics
+from hybridkin.ik.trajectories import Trajectory
+from hybridkin.workflow._domain import PathLimits, path_limits, preferred_posture, sample_domain
+from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.report import Progress, Report, check_out, millimetres, quiet
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
-_STARTS = 16
+_GUESSES = 16
 _PULLS = (0.2, 0.0, 0.0, 0.2)  # to the preferred configuration, one attempt at the path each
 
 
 def track_path(
-    opened: OpenedModel,
+    loaded: LoadedModel,
     path: Trajectory,
     out: str | Path,
     *,
-    q_min: ArrayLike | None = None,
-    q_max: ArrayLike | None = None,
-    dq_max: ArrayLike | None = None,
+    limits: PathLimits | None = None,
     tol: float = 1e-4,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress = quiet,
 ) -> tuple[Report, list[Path]]:
     """Compute the commands that lead the tip along a path, and write them.
 
-    Written are ``track.csv``, with one row per point in the units, names and sign of the robot's
-    logs: time, commands, the model's tip, the target, the error and its status; a figure, and the
-    report. Points far apart are passed in several steps on a straight line; where points are
+    ``track.csv`` has one row per point in the units, names and sign of the robot's logs: time,
+    commands, the model's tip, the target, the error and its status. Figures and the report come
+    with it. Points far apart are passed in several steps on a straight line; where points are
     missed, other starts and postures are tried, and the track that reaches most within the domain
-    is kept. Of a model with play
-    the commands are those to send, which lead or trail what the actuators do by half its width, and
-    further columns ``effective_NAME`` hold the latter.
+    is kept. Of a model with play the commands are those to send, which lead or trail what the
+    actuators do by half its width, and further columns ``effective_NAME`` hold the latter.
 
     Parameters
     ----------
-    opened : OpenedModel
+    loaded : LoadedModel
         The model, as from `open_model`.
     path : Trajectory
         Points [m] and times [s].
     out : str or Path
         Folder to write into.
-    q_min, q_max, dq_max : array-like of shape (n,), optional
-        Limits [m], speeds [m/s]. Default: those of the robot's description within the range that
-        the model was fitted on, or that range, see `path_limits`. With play `dq_max` holds for what
-        the actuators do.
+    limits : PathLimits, optional
+        As from `path_limits`, which is also the default.
     tol : float, default=1e-4
         As for `InverseKinematics.track` [m].
     progress : callable, optional
-        Handed (what, done, total).
+        Called with (what, done, total).
 
     Returns
     -------
@@ -77,63 +74,70 @@ def track_path(
         What was written.
     """
     check_out(out)
-    log_format = opened.log_format()
-    limits = path_limits(opened, q_min, q_max, dq_max)
-    periods = np.diff(path.t)
-    commands, tips = known_commands(opened, limits)
-    way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
-    extent = np.linalg.norm(np.ptp(tips, axis=0))
-    fine, every = _in_steps(path, max(1, math.ceil(way / (_STEP * extent))))
-    dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
-    track: Any = None
-    for attempt, pull in enumerate(_PULLS):
-        ik = InverseKinematics(
-            opened.module,
-            q_min=limits["q_min"],
-            q_max=limits["q_max"],
-            dq_max=limits["dq_max"],
-            q_pref=homeward(opened, limits, pull),
-            beta=min(1.0, 1.0 / dt),
-            dt=dt,
-        )
-
-        def told(done: int, total: int, attempt: int = attempt) -> None:
-            if progress is not None:
-                progress(f"tracking, attempt {attempt + 1}", done + 1, total)
-
-        first = _starts(ik, path.x[0], commands, tips, 0.1 * tol)[attempt % 2]
-        found = _rows(ik.track(fine, q0=first, tol=tol, progress=told), slice(None, None, every))
-        if track is None or _score(found) > _score(track):
-            track = found
-        if _score(track) == (len(path), len(path)):
-            break
-    sent = track.q if opened.play is None else opened.play.command(track.q)[0]
-    inside = opened.module.in_domain(torch.from_numpy(track.q)) if opened.is_hybrid else None
+    log_format = loaded.log_format()
+    limits = path_limits(loaded) if limits is None else limits
+    track = _best_track(loaded, path, limits, tol, progress)
+    sent = track.q if loaded.play is None else loaded.play.command(track.q)[0]
+    effective = None if loaded.play is None else track.q
     names = [IKStatus(int(code)).name for code in track.status]
-    reached = np.isin(track.status, _REACHED)
-    report = Report(f"{opened.name}: a path of {len(path)} points")
+    speeds = np.abs(np.diff(track.q, axis=0) / np.diff(path.t)[:, None])
+    columns = {name: vars(log_format)[name] for name in ("q", "q_unit", "q_sign", "x", "x_unit")}
+    report = Report(f"{loaded.name}: a path of {len(path)} points")
     report.record.update(
-        model=str(opened.path),
+        model=str(loaded.path),
         n=len(path),
         duration_s=path.duration,
-        reached=int(reached.sum()),
+        reached=int(np.isin(track.status, _REACHED).sum()),
         errors={"mean": track.mean_error, "p95": track.p95_error, "max": track.max_error},
         tol=tol,
-        in_domain=None if inside is None else float(inside.double().mean()),
-        play=None if opened.play is None else np.ravel(opened.play.width).tolist(),
+        in_domain=None,
+        play=loaded.play_width,
         statuses={name: names.count(name) for name in dict.fromkeys(names)},
-        limits=limits,
-        largest_speed=np.abs(np.diff(track.q, axis=0) / periods[:, None]).max(initial=0.0),
-        columns={"q": log_format.q, "q_unit": log_format.q_unit, "q_sign": log_format.q_sign},
+        limits=dict(vars(limits)),
+        largest_speed=speeds.max(initial=0.0),
+        columns=columns,
     )
-    report.record["columns"] |= {"x": log_format.x, "x_unit": log_format.x_unit}
+    if loaded.hybrid is not None:
+        inside = loaded.module.in_domain(torch.from_numpy(track.q))
+        report.record["in_domain"] = float(inside.double().mean())
     _write_summary(report)
-    _add_figures(report, opened, track, sent)
-    effective = None if opened.play is None else track.q
+    _add_figures(report, loaded, track, sent)
     report.file(
         "track.csv", lambda file: _write_track(file, track, sent, effective, names, log_format)
     )
     return report, report.write(out)
+
+
+def _best_track(
+    loaded: LoadedModel, path: Trajectory, limits: PathLimits, tol: float, progress: Progress
+) -> Track:
+    """Return of several attempts the track that reaches most points within the domain."""
+    commands, tips = sample_domain(loaded, limits)
+    way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
+    extent = np.linalg.norm(np.ptp(tips, axis=0))
+    fine, every = _in_steps(path, max(1, math.ceil(way / (_STEP * extent))))
+    dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
+    tracks: list[Track] = []
+    for attempt, pull in enumerate(_PULLS):
+        ik = InverseKinematics(
+            loaded.module,
+            q_min=limits.q_min,
+            q_max=limits.q_max,
+            dq_max=limits.dq_max,
+            q_pref=preferred_posture(loaded, limits, pull),
+            beta=min(1.0, 1.0 / dt),
+            dt=dt,
+        )
+
+        def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
+            progress(what, done + 1, total)
+
+        first = _initial_guesses(ik, path.x[0], commands, tips, 0.1 * tol)[attempt % 2]
+        found: Any = ik.track(fine, q0=first, tol=tol, progress=report)
+        tracks.append(_thinned(found, every))
+        if _score(tracks[-1]) == (len(path), len(path)):
+            break
+    return max(tracks, key=_score)  # of equals the first
 
 
 def _in_steps(path: Trajectory, n: int) -> tuple[Trajectory, int]:
@@ -146,7 +150,7 @@ def _in_steps(path: Trajectory, n: int) -> tuple[Trajectory, int]:
     return Trajectory(t, np.stack(x, axis=1)), n
 
 
-def _starts(
+def _initial_guesses(
     ik: InverseKinematics, target: NDArray, commands: NDArray, tips: NDArray, tol: float
 ) -> list[NDArray]:
     """Return two configurations (n,) to start from, at the target.
@@ -155,15 +159,15 @@ def _starts(
     commands whose tips are nearest to the target, in the domain if possible, the one with the
     largest singular value sigma_min.
     """
-    near = np.argsort(np.linalg.norm(tips[1:] - target, axis=1))[:_STARTS] + 1
+    near = np.argsort(np.linalg.norm(tips[1:] - target, axis=1))[:_GUESSES] + 1
     near = np.concatenate([[0], near])
     targets = np.broadcast_to(target, (len(near), 3)).copy()
     found = ik.solve(targets, q0=commands[near], tol=tol, max_iter=200)
-    for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN):
+    for wanted in _REACHED:
         rows = np.flatnonzero(found.status[1:] == wanted) + 1
         if len(rows):
             return [found.q[0], found.q[rows[found.sigma_min[rows].argmax()]]]
-    free = ik.solve(target, tol=tol, max_iter=200, restarts=_STARTS, random_state=0)
+    free = ik.solve(target, tol=tol, max_iter=200, restarts=_GUESSES, random_state=0)
     return [found.q[0], free.q]
 
 
@@ -173,69 +177,26 @@ def _score(track: Track) -> tuple[int, int]:
     return int((statuses == IKStatus.CONVERGED).sum()), int(np.isin(statuses, _REACHED).sum())
 
 
-def _rows(track: Track, kept: slice) -> Track:
-    """Return some rows of a track."""
-    parts = {f.name: getattr(track, f.name) for f in fields(track)}
-    return replace(track, **{k: v[kept] for k, v in parts.items() if v is not None})
-
-
-def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> Trajectory:
-    """Return a path from a CSV file of t, x, y, z or x, y, z.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file; with three columns `dt` is needed.
-    unit : {"m", "cm", "mm"}, default="m"
-        Of the positions.
-    dt : float, optional
-        Time between points [s]; a file with times is read at this period, straight in between.
-
-    Returns
-    -------
-    Trajectory
-        Points [m] and times [s].
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it has no times and `dt` is not given, or is not a table of numbers.
-    """
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {file}.")
-    with open(file, encoding="utf-8-sig") as lines:
-        columns = max(
-            (len(line.split(",")) for line in lines if line.strip() and line[0] != "#"), default=0
-        )
-    if columns == 3:
-        if dt is None:
-            raise ValueError(f"{file} has no times: give the time between its points (--dt 0.02).")
-        return from_csv(file, dt=dt, unit=unit)
-    timed = from_csv(file, unit=unit)
-    if dt is None:
-        return timed
-    t = timed.t[0] + dt * np.arange(int(timed.duration / dt + 1e-9) + 1)
-    return Trajectory(t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1))
+def _thinned(track: Track, every: int) -> Track:
+    """Return every k-th row of a track."""
+    return replace(track, **{k: v[::every] for k, v in vars(track).items() if v is not None})
 
 
 def animate_track(
-    opened: OpenedModel,
+    loaded: LoadedModel,
     path: str | Path,
     out: str | Path,
     *,
     unit: str = "cm",
     speed: float = 1.0,
     n_frames: int = 150,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress = quiet,
 ) -> dict[str, Any]:
     """Write a film or an interactive page of a robot that runs through a file of commands.
 
     Parameters
     ----------
-    opened : OpenedModel
+    loaded : LoadedModel
         A model with a mechanical part.
     path : str or Path
         ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format.
@@ -248,40 +209,36 @@ def animate_track(
     n_frames : int, default=150
         Frames at most.
     progress : callable, optional
-        Handed (what, done, total).
+        Called with (what, done, total).
 
     Returns
     -------
     dict
         "frames", "duration_s", "fps", "path" and "bytes" of what was written.
     """
-    if not hasattr(opened.chain, "backbone"):
+    if loaded.chain is None:
         raise ValueError(
-            f"`model` {opened.path} has no body to draw; animate one with a chain as its "
+            f"`model` {loaded.path} has no body to draw; animate one with a chain as its "
             "mechanical part."
         )
     file = Path(path)
     if file.is_dir():
         file = file / "track.csv"
-    q, target, t = _read_track(file, opened.log_format())
+    q, target, t = _read_track(file, loaded.log_format())
     out = Path(out)
     if not out.absolute().parent.is_dir():
         raise FileNotFoundError(f"`out` must lie in a folder that exists, got {out}.")
-    q = opened.effective(q)
+    q = loaded.effective(q)
     with torch.no_grad():
-        tips = opened.module(torch.from_numpy(q)).numpy()
+        tips = loaded.module(torch.from_numpy(q)).numpy()
     film = plots.TrackAnimation.from_estimator(
-        opened.chain, q, target=target, t=t, x=tips, n_frames=n_frames
+        loaded.chain, q, target=target, t=t, x=tips, n_frames=n_frames
     )
     film.name = "tip (model)"
 
-    def told(done: int, total: int) -> None:
-        if progress is not None:
-            progress("drawing frames", done, total)
-
     staging = out.with_name(f".{out.stem}-unfinished{out.suffix}")
     try:
-        film.save(staging, unit=unit, speed=speed, progress=told)
+        film.save(staging, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
         os.replace(staging, out)
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
@@ -304,18 +261,14 @@ def _read_track(
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
-    time = next((name for name in (TIME, log_format.time) if name in header), None)
-    known = set(TARGET) <= set(header)
-    data = datasets.load_log(
-        file,
-        log_format.q,
-        TARGET if known else log_format.x,
-        time=time,
-        q_unit=log_format.q_unit,
-        x_unit=log_format.x_unit,
-        q_sign=log_format.q_sign,
-    )
-    return data.q, data.x if known else None, data.time
+    has_targets = set(TARGET) <= set(header)
+    columns = dict(vars(log_format), groups=None)
+    del columns["group_suffix"]
+    columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
+    if has_targets:
+        columns["x"] = TARGET
+    log = datasets.load_log(file, **columns)
+    return log.q, log.x if has_targets else None, log.time
 
 
 def _write_track(
@@ -327,34 +280,35 @@ def _write_track(
     log_format: robots.LogFormat,
 ) -> None:
     """Write commands, and what the actuators do where that is something else, point by point."""
-    unit, scale = log_format.q_sign / _METRES[log_format.q_unit], 1 / _METRES[log_format.x_unit]
+    unit, scale = log_format.q_sign / METRES[log_format.q_unit], 1 / METRES[log_format.x_unit]
     columns = np.column_stack([track.t, unit * sent, scale * track.x, scale * track.target])
     further = [] if effective is None else [f"effective_{name}" for name in log_format.q]
-    tail = np.empty((len(sent), 0)) if effective is None else unit * effective
+    tails = np.empty((len(sent), 0)) if effective is None else unit * effective
     with open(file, "w", encoding="utf-8", newline="") as lines:
         writer = csv.writer(lines, lineterminator="\n")
         head = [TIME, *log_format.q, *log_format.x, *TARGET, "error", "status", *further]
         writer.writerow(head)
-        rows = zip(columns, scale * track.error, statuses, tail, strict=True)
-        for row, error, status, does in rows:
-            cells = [f"{v + 0.0:.9g}" for v in row]
-            writer.writerow([*cells, f"{error:.6g}", status, *(f"{v + 0.0:.9g}" for v in does)])
+        rows = zip(columns, scale * track.error, statuses, tails, strict=True)
+        for row, error, status, tail in rows:
+            cells, more = ([f"{v + 0.0:.9g}" for v in part] for part in (row, tail))
+            writer.writerow([*cells, f"{error:.6g}", status, *more])
 
 
-def _add_figures(report: Report, opened: OpenedModel, track: Track, sent: NDArray) -> None:
+def _add_figures(report: Report, loaded: LoadedModel, track: Track, sent: NDArray) -> None:
     figure, axes = plots.new_figure(11.0, 4.2, 1, 3)
     display = plots.TrackingDisplay.from_tracks({"model": track})
-    i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])  # where most happens
+    i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])  # the plane of the largest moves
     display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
     display.plot_time(axes[1], unit="mm")
     display.plot_error(axes[2], unit="mm")
     axes[2].get_legend().remove()
     report.figure("track", figure, "Path, tip by the model, and its error.")
-    shares = getattr(opened.chain, "actuators_per_segment", (opened.n_actuators,))
+    chain = loaded.chain
+    shares = chain.actuators_per_segment if isinstance(chain, ArcChain) else (loaded.n_actuators,)
     n = len(shares)
     figure, axes = plots.new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
     shown = {"commands": replace(track, q=sent)}
-    if opened.play is not None:
+    if loaded.play is not None:
         shown["what the actuators do"] = track
     plots.ActuatorDisplay.from_tracks(shown, shares).plot(axes[:, 0], unit="mm")
     if len(shown) == 1:
@@ -364,7 +318,7 @@ def _add_figures(report: Report, opened: OpenedModel, track: Track, sent: NDArra
 
 def _write_summary(report: Report) -> None:
     record = report.record
-    errors = record["errors"]
+    columns, errors = record["columns"], record["errors"]
     report.text(
         f"{record['reached']} of {record['n']} points reached to within {1e3 * record['tol']:g} "
         f"mm, by the model. Error in mm: mean {1e3 * errors['mean']:.3g}, 95 % "
@@ -372,3 +326,13 @@ def _write_summary(report: Report) -> None:
         f"{record['limits']['source']}."
     )
     report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
+    if record["in_domain"] is not None:
+        report.text(f"{100 * record['in_domain']:.0f} % of the points lie in the model's domain.")
+    sign = ", shortening positive" if columns["q_sign"] < 0 else ""
+    units = f"q in {columns['q_unit']}{sign}; x, target and error in {columns['x_unit']}; t in s."
+    report.text(f"track.csv: {units}")
+    if record["play"] is not None:
+        report.text(
+            f"Backlash (play) {millimetres(record['play'])}: a command jumps by that where its "
+            "actuator turns back. q is what to send, effective_... what the actuators do."
+        )

@@ -11,11 +11,11 @@ from scipy.optimize import least_squares
 from hybridkin import ConstantCurvatureChain
 from hybridkin.chains.robots import bionic_handling_assistant
 from hybridkin.datasets import (
+    Log,
     _trunk,
     check_log,
     load_armlab,
     load_asl_trunk,
-    load_csv,
     load_ftdcr,
     load_log,
     load_trunk,
@@ -308,7 +308,7 @@ COLUMNS = {"q": ["a", "b", "c"], "x": ["X", "Y", "Z"]}
 
 def test_csv_reads_units_signs_groups_and_time(log):
     path = log(HEADER + "0.5,one,1,2,3,10,20,30\n1.5,two,4,5,6,40,50,60\n")
-    data = load_csv(
+    data = load_log(
         path,
         **COLUMNS,
         groups="run",
@@ -327,8 +327,8 @@ def test_csv_reads_units_signs_groups_and_time(log):
 
 def test_csv_angles_and_unitless(log):
     path = log(HEADER + "0,r,90,180,-90,1,2,3\n")
-    assert_allclose(load_csv(path, **COLUMNS, q_unit="deg").q, [[np.pi / 2, np.pi, -np.pi / 2]])
-    data = load_csv(path, **COLUMNS, q_unit="1")
+    assert_allclose(load_log(path, **COLUMNS, q_unit="deg").q, [[np.pi / 2, np.pi, -np.pi / 2]])
+    data = load_log(path, **COLUMNS, q_unit="1")
     assert_allclose(data.q, [[90, 180, -90]])
     assert data.units["q"] == "1"
 
@@ -336,23 +336,23 @@ def test_csv_angles_and_unitless(log):
 def test_csv_with_byte_order_mark_semicolons_blanks_and_empty_lines(log):
     text = "a; b;c;X;Y;Z\n1;2;3; 1;2;3\n\n4;5;6;1;2;3\n"
     path = log(text, encoding="utf-8-sig")
-    q, x = load_csv(path, **COLUMNS, q_unit="1", delimiter=";", return_X_y=True)
-    assert_allclose(q, [[1, 2, 3], [4, 5, 6]])
-    assert_allclose(x, [[1, 2, 3], [1, 2, 3]])
+    data = load_log(path, **COLUMNS, q_unit="1", delimiter=";")
+    assert_allclose(data.q, [[1, 2, 3], [4, 5, 6]])
+    assert_allclose(data.x, [[1, 2, 3], [1, 2, 3]])
 
 
 def test_csv_invalid_rows_are_counted_or_dropped(log):
     rows = "0,r,1,1,1,1,1,1\n0,r,nan,1,1,1,1,1\n0,r,1,1,1,1,,1\n0,r,1,1,1,inf,1,1\n0,r,1,1,1\n"
     path = log(HEADER + rows)
     with pytest.raises(ValueError, match=r"4 of 5 rows .* line 3, 4, 5, 6; .*drop_invalid=True"):
-        load_csv(path, **COLUMNS)
-    data = load_csv(path, **COLUMNS, groups="run", drop_invalid=True)
+        load_log(path, **COLUMNS)
+    data = load_log(path, **COLUMNS, groups="run", drop_invalid=True)
     assert data.q.shape == (1, 3)
     assert data.line.tolist() == [2]
     assert data.groups.tolist() == ["r"]
     path = log(HEADER + "0,r,nan,1,1,1,1,1\n")
     with pytest.raises(ValueError, match="no valid row left"):
-        load_csv(path, **COLUMNS, drop_invalid=True)
+        load_log(path, **COLUMNS, drop_invalid=True)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def test_csv_invalid_rows_are_counted_or_dropped(log):
         ("", {}, "is empty"),
         (HEADER, {"x": ["x", "Y", "Z"]}, r"no column 'x' .* did you mean 'X'\?"),
         (HEADER, {"groups": "runs"}, r"no column 'runs' .* did you mean 'run'\?"),
-        (HEADER.replace(",", ";"), {}, "check `delimiter`"),
+        (HEADER.replace(",", ";"), {"delimiter": ","}, "check `delimiter`"),
         ("a,a,b,c,X,Y,Z\n", {}, "Column 'a' occurs 2 times"),
         (HEADER, {"x": ["X", "Y"]}, "`x` must name 3 columns, got 2"),
         (HEADER, {"q": []}, "`q` must be column names"),
@@ -377,18 +377,18 @@ def test_csv_invalid_rows_are_counted_or_dropped(log):
 )
 def test_csv_errors(log, text, arguments, message):
     with pytest.raises(ValueError, match=message):
-        load_csv(log(text), **{**COLUMNS, **arguments})
+        load_log(log(text), **{**COLUMNS, **arguments})
 
 
 def test_csv_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match="there is none at"):
-        load_csv(tmp_path / "absent.csv", **COLUMNS)
+        load_log(tmp_path / "absent.csv", **COLUMNS)
 
 
 @pytest.mark.parametrize("row", ["0,r,1,1,1,100,200,300\n", "0,r,1,1,1,0,0,0\n0,r,1,1,1,9,0,0\n"])
 def test_csv_millimetres_in_a_metre_field_warn(log, row):
     with pytest.warns(UserWarning, match="x_unit='mm'"):
-        load_csv(log(HEADER + row), **COLUMNS, q_unit="mm")
+        load_log(log(HEADER + row), **COLUMNS, q_unit="mm")
 
 
 def test_logs_of_every_format_hold_the_same(tmp_path):
@@ -475,15 +475,15 @@ CHAIN = ConstantCurvatureChain([0.0055, 0.0055], lengths=[0.11, 0.09])
 
 
 def found(log, **options):
-    return {(f.kind, f.severity): f for f in check_log(log, **options).findings}
+    return {(f.kind, f.severity): f for f in check_log(Log(**log), **options).findings}
 
 
 def test_a_clean_log_passes():
-    report = check_log(tendon_log(), chain=CHAIN)
+    report = check_log(Log(**tendon_log()), chain=CHAIN)
     assert report.findings == ()
     assert report.ok
     assert "240 rows, 8 motions, 6 actuators, 24 s" in str(report)
-    assert "nothing to object to" in str(report)
+    assert "no errors and no warnings" in str(report)
 
 
 def test_frozen_tip():
@@ -533,7 +533,7 @@ def test_columns_that_never_change():
     log = tendon_log()
     log["q"][:, 2] = 0.001
     log["x"][:, 0] = 0.0
-    report = check_log(log)
+    report = check_log(Log(**log))
     messages = [f.message for f in report.warnings if f.kind == "constant"]
     assert [("never move: 'q[2]'" in messages[0]), ("never change: 'x[0]'" in messages[1])]
     log["x"][:] = 0.0
@@ -565,7 +565,7 @@ def test_times():
     log = tendon_log()
     log["time"][100:] += 5.0
     log["time"][[40, 41]] = log["time"][[41, 40]]
-    messages = [f.message for f in check_log(log).warnings]
+    messages = [f.message for f in check_log(Log(**log)).warnings]
     assert "do not increase at 1 rows (row 41)" in messages[0]
     assert "1 gaps in time within a motion, up to 5.1 s" in messages[1]
     assert "(row 100)" in messages[1]
@@ -594,7 +594,7 @@ def test_motions():
 def test_units_that_cannot_be(q, x, units, advice):
     log = tendon_log()
     log |= {"q": q * log["q"], "x": x * log["x"], "file_units": units}
-    report = check_log(log, chain=CHAIN)
+    report = check_log(Log(**log), chain=CHAIN)
     assert [f.kind for f in report.errors] == ["units"] * len(advice)
     for finding, wanted in zip(report.errors, advice, strict=True):
         assert wanted in finding.advice
@@ -604,20 +604,20 @@ def test_units_that_cannot_be(q, x, units, advice):
 def test_units_of_chambers(unit):
     data, scale = load_trunk(), {"mm": 1e3, "cm": 1e2}[unit]
     log = {"q": scale * data.q, "x": scale * data.x}
-    report = check_log(log, chain=bionic_handling_assistant())
+    report = check_log(Log(**log), chain=bionic_handling_assistant())
     for name, finding in zip("qx", report.errors, strict=True):
         assert f'{name}_unit = "{unit}"' in finding.advice
-    changes = check_log({"q": data.q - 0.25, "x": data.x}, chain=bionic_handling_assistant())
+    changes = check_log(Log(data.q - 0.25, data.x), chain=bionic_handling_assistant())
     assert "give `length`" in changes.errors[0].advice
 
 
 def test_a_wrong_sign_is_told():
     log = tendon_log()
     flipped = {**log, "q": -log["q"]}
-    finding = found(flipped, chain=CHAIN, base_is_free=False, q_sign=1)["sign", "warning"]
+    finding = found(flipped, chain=CHAIN, base_is_free=False)["sign", "warning"]
     assert "set q_sign = -1" in finding.advice
     # A half turn of a free base makes up for it where all tendons are taut.
-    assert check_log(flipped, chain=CHAIN).findings == ()
+    assert check_log(Log(**flipped), chain=CHAIN).findings == ()
     released = {**log, "q": np.abs(log["q"])}
     assert "only ever lengthened" in found(released, chain=CHAIN)["sign", "warning"].message
 
@@ -628,7 +628,7 @@ def test_clockwise_numbering_is_told(base_is_free):
     log = tendon_log(angles=turned)
     finding = found(log, chain=CHAIN, base_is_free=base_is_free)["numbering", "warning"]
     assert "clockwise = true" in finding.advice
-    assert check_log(tendon_log(), chain=CHAIN, base_is_free=base_is_free).ok
+    assert check_log(Log(**tendon_log()), chain=CHAIN, base_is_free=base_is_free).ok
 
 
 def test_a_model_that_explains_nothing_is_told():
@@ -640,13 +640,13 @@ def test_a_model_that_explains_nothing_is_told():
 
 def test_check_says_what_it_needs():
     with pytest.raises(ValueError, match=r"q of shape \(N, n\)"):
-        check_log({"q": np.ones((3, 3)), "x": np.ones((2, 3))})
+        Log(np.ones((3, 3)), np.ones((2, 3)))
     with pytest.raises(ValueError, match="must have 6 actuators"):
-        check_log({"q": np.ones((3, 3)), "x": np.ones((3, 3))}, chain=CHAIN)
+        check_log(Log(np.ones((3, 3)), np.ones((3, 3))), chain=CHAIN)
 
 
 def test_a_report_is_json(log):
-    data = load_csv(
+    data = load_log(
         log(HEADER + "0,r,1,2,3,1,2,3\n1,r,1,nan,3,1,2,3\n"), **COLUMNS, drop_invalid=True
     )
     record = json.loads(json.dumps(check_log(data).to_dict()))
@@ -683,7 +683,7 @@ def test_ftdcr(data_home):
     assert "MIT" in data.source
     pulls = load_ftdcr(data_home, subset="tendon_pull")
     assert_array_equal(pulls.q, data.q[: len(pulls.q)])
-    assert_array_equal(load_ftdcr(data_home, return_X_y=True)[1], data.x)
+    assert data.units == {"q": "m", "x": "m"}
     with pytest.raises(ValueError, match="`subset` must be one of"):
         load_ftdcr(data_home, subset="test")
 

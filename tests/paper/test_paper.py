@@ -32,7 +32,7 @@ def test_table1_orders_the_models_as_the_paper_does():
 def test_which_geometry_the_protocol_identifies():
     found = identifiability(datasets.load_trunk())
     assert (found["n_train"], found["n_single"], found["n_random"]) == (1900, 1500, 400)
-    identified = {entry["name"]: entry["told"] for entry in found["asked"]["entries"]}
+    identified = {entry["name"]: entry["identified"] for entry in found["asked"]["entries"]}
     assert all(identified[f"radii[{k}]"] for k in range(3))
     # A turn of all rings equals one of the base, a rest bend equals zeros of its sensors.
     assert not identified["base[rot z]"]
@@ -44,7 +44,7 @@ def test_which_geometry_the_protocol_identifies():
     assert len(sentences) == 10
     # Asked for once each, all are identified, and the tip error is the same.
     assert set(IDENTIFIABLE) < set(ASKED)
-    assert all(entry["told"] for entry in found["identifiable"]["entries"])
+    assert all(entry["identified"] for entry in found["identifiable"]["entries"])
     assert found["identifiable"]["unidentified"] == ()
     assert found["identifiable"]["test"] == pytest.approx(found["asked"]["test"], rel=0.01)
     assert found["identifiable"]["test"] < found["default"]["test"]

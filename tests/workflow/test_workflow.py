@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from hybridkin import (
 )
 from hybridkin.cli.main import main
 from hybridkin.saving.saved_model import model_header
-from hybridkin.workflow._domain import known_commands
+from hybridkin.workflow._domain import sample_domain
 from hybridkin.workflow.report import geometry_entries
 
 ROBOT = """
@@ -33,6 +34,16 @@ x = ["x", "y", "z"]
 q_unit = "mm"
 x_unit = "mm"
 """
+
+
+def fit(path, robot, out, groups=None, auto=False):
+    """Fit a log by two folds and one seed."""
+    description = robots.read_description(robot)
+    log_format = replace(description.log, groups=groups)
+    free = "base" in description.calibrate
+    log = workflow.read_log(path, log_format, chain=description.chain, base_is_free=free)
+    settings = workflow.FitSettings(n_folds=2, n_seeds=1, auto=auto)
+    return workflow.fit_log(log, description, out, settings, n_jobs=1)
 
 
 @pytest.fixture
@@ -70,19 +81,17 @@ def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
         assert max(run["largest_step"] for run in runs.values()) < 0.06  # at 25 points
     serial, nominal = closed["serial on calibrated"], closed["mechanical, nominal"]
     assert serial["feed-forward"]["mean"] < 0.5 * nominal["feed-forward"]["mean"]
-    told = record["identifiability"]
-    assert (
-        "What 1500 rows of one segment and 400 random rows of the simulated trunk tell" in printed
-    )
-    assert len(told["asked"]["entries"]) == 28
-    for entry in told["asked"]["entries"]:
-        assert re.search(
-            rf"{re.escape(entry['name'])} .* {'' if entry['told'] else 'not '}told\n", printed
-        )
+    found = record["identifiability"]
+    plain = re.sub(r"\s+", " ", printed)
+    assert "1500 rows of one segment moving alone and 400 fully random ones" in plain
+    assert len(found["asked"]["entries"]) == 28
+    for entry in found["asked"]["entries"]:
+        answer = "yes" if entry["identified"] else "no"
+        assert re.search(rf"{re.escape(entry['name'])} .* {answer}\n", printed)
         assert f"| {entry['name']} [{entry['unit']}] | " in report
-    for sentence in told["asked"]["unidentified"]:
+    for sentence in found["asked"]["unidentified"]:
         assert f"- {sentence}" in report
-        assert sentence in re.sub(r"\s+", " ", printed)
+        assert sentence in plain
     pictures = set(re.findall(r"\((\w+\.png)\)", report))
     assert len(pictures) == 6
     for name in pictures | {"report.json", "report.md"}:
@@ -106,16 +115,14 @@ def test_entries_of_a_calibration_have_units_a_user_reads(rng):
         entry = entries[name]
         assert entry["unit"] == unit
         assert [entry["start"], entry["value"]] == pytest.approx([before, value], abs=1e-6)
-        assert entry["told"]
+        assert entry["identified"]
         assert entry["narrowing"] > 10
 
 
-def test_fit_of_ring_turns_tells_that_they_are_turns_of_the_base(log, tmp_path):
+def test_turns_of_rings_are_not_identified_apart_from_the_base(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace('"base"]', '"turns", "base"]'))
-    report, _ = workflow.fit_log(
-        path, robot, tmp_path / "m", n_folds=2, n_seeds=1, auto=False, n_jobs=1
-    )
+    report, _ = fit(path, robot, tmp_path / "m")
     text = (tmp_path / "m" / "report.md").read_text()
     assert re.search(r"\| turns\[1\] \[deg\] \|.*\| no \|", text)
     (sentence,) = report.record["calibration"]["unidentified"]
@@ -127,7 +134,7 @@ def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace("0.11", "0.05"))
     with pytest.warns(UserWarning, match="left what is physical") as caught:
-        workflow.fit_log(path, robot, tmp_path / "m", n_folds=2, n_seeds=1, auto=False, n_jobs=1)
+        fit(path, robot, tmp_path / "m")
     assert len(caught) == 1
 
 
@@ -164,9 +171,7 @@ def test_fit_of_elastic_tendons(slack_log, tmp_path):
     path, data = slack_log
     robot = tmp_path / "elastic.toml"
     robot.write_text('model = "elastic-tendon"\n' + SLACK_ROBOT)
-    report, paths = workflow.fit_log(
-        path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, auto=False, n_jobs=1
-    )
+    report, paths = fit(path, robot, tmp_path / "m", groups="motion")
     held_out = report.record["held_out"]
     assert held_out["mechanical, calibrated"]["mean"] < 0.0005
     assert (
@@ -188,14 +193,12 @@ def test_fit_of_elastic_tendons(slack_log, tmp_path):
     assert errors.mean() < 0.0005
 
 
-def test_fit_of_the_plain_chain_tells_of_slack_once(slack_log, tmp_path):
+def test_fit_of_the_plain_chain_warns_of_slack_once(slack_log, tmp_path):
     path, _ = slack_log
     robot = tmp_path / "plain.toml"
     robot.write_text('calibrate = ["base"]\n' + SLACK_ROBOT)
     with pytest.warns(UserWarning, match="of 120 rows of `q` pull the tendons") as caught:
-        workflow.fit_log(
-            path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, auto=False, n_jobs=1
-        )
+        fit(path, robot, tmp_path / "m", groups="motion")
     assert len(caught) == 1
     text = (tmp_path / "m" / "report.md").read_text()
     assert text.count("pull the tendons") == 1
@@ -204,39 +207,27 @@ def test_fit_of_the_plain_chain_tells_of_slack_once(slack_log, tmp_path):
 
 def test_without_a_column_of_motions_the_log_is_cut_into_stretches(log, tmp_path):
     path, robot = log
-    report, _ = workflow.fit_log(
-        path, robot, tmp_path / "m", n_folds=2, n_seeds=1, auto=False, n_jobs=1
-    )
+    report, _ = fit(path, robot, tmp_path / "m")
     assert report.record["n_motions"] == 10
 
 
 def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home, tmp_path):
     robot = robots.read_description("examples/robots/ftdcr_v4.toml")
     data = datasets.load_ftdcr(data_home)
-    errors, _, _ = workflow.compare_by_group(
-        robot.chain,
-        data.q,
-        data.x,
-        data.groups,
-        parameters=robot.calibrate,
-        n_folds=3,
-        n_seeds=1,
-        auto=False,
-        n_jobs=-1,
-    )
+    log = datasets.Log(data.q, data.x, data.groups, data.time)
+    settings = workflow.FitSettings(n_folds=3, n_seeds=1, auto=False)
+    errors = workflow.compare_by_group(log, robot, settings).errors
     mean = {name: values.mean() for name, values in errors.items()}
     assert mean["hybrid, ELM"] <= mean["mechanical, calibrated"] < mean["mechanical, nominal"]
     assert mean["hybrid, ELM"] < mean["data-driven, ELM"]
 
 
-def test_auto_on_slack_tendons_tells_that_it_took_elastic_ones(slack_log, tmp_path):
+def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
     path, data = slack_log
     robot = tmp_path / "plain.toml"
     robot.write_text('calibrate = ["radii"]\n' + SLACK_ROBOT)
     with pytest.warns(UserWarning, match="pull the tendons"):
-        report, _ = workflow.fit_log(
-            path, robot, tmp_path / "m", groups="motion", n_folds=2, n_seeds=1, n_jobs=1
-        )
+        report, _ = fit(path, robot, tmp_path / "m", groups="motion", auto=True)
     assert report.record["saved"] == "hybrid, auto"
     chosen = report.record["auto"]
     assert chosen["taken"] == "ElasticTendonChain"
@@ -258,7 +249,7 @@ def test_auto_on_slack_tendons_tells_that_it_took_elastic_ones(slack_log, tmp_pa
     assert np.linalg.norm(predicted - data["x"], axis=1).mean() < 0.0005
 
 
-def test_play_lowers_the_errors_of_auto_on_motions_held_out():
+def test_play_lowers_the_errors_of_auto_on_held_out_motions():
     rng = np.random.default_rng(0)
     chain = ConstantCurvatureChain([0.005], lengths=[0.1])
     groups = np.repeat(np.arange(8), 20)
@@ -266,8 +257,10 @@ def test_play_lowers_the_errors_of_auto_on_motions_held_out():
     q = 0.0005 * np.stack([np.cos(groups - a) * swing.ravel() for a in (0, 2.0944, 4.1888)], axis=1)
     with torch.no_grad():
         x = chain(torch.from_numpy(PlayOperator(4e-4).apply_by_group(q, groups))).numpy()
-    options = {"parameters": ("radii",), "n_folds": 2, "n_seeds": 1, "n_jobs": 1}
-    errors, _, choices = workflow.compare_by_group(chain, q, x, groups, play=4e-4, **options)
+    robot = robots.RobotDescription("playful", chain, ("radii",), None)
+    settings = workflow.FitSettings(n_folds=2, n_seeds=1, play=4e-4)
+    log = datasets.Log(q, x, groups)
+    errors, _, choices = workflow.compare_by_group(log, robot, settings, n_jobs=1)
     assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
     assert all(choice["hybrid, auto"].endswith("play 0.4 mm") for choice in choices)
 
@@ -278,9 +271,66 @@ def test_an_actuator_that_never_moved_is_held_where_it_was():
     q[:, 4] = 0.25
     chain = robots.bionic_handling_assistant()
     model = HybridForwardModel(chain, "linear").fit(q, data.x[:200])
-    opened = workflow.OpenedModel("trunk", Path("trunk"), model, None, None)
-    limits = workflow.path_limits(opened)
-    assert limits["q_min"] == pytest.approx(q.min(axis=0))
-    assert limits["q_max"] == pytest.approx(q.max(axis=0))
-    assert limits["source"] == "range of the fit"
-    assert model.module_.in_domain(torch.from_numpy(known_commands(opened, limits)[0])).all()
+    loaded = workflow.LoadedModel("trunk", Path("trunk"), model)
+    limits = workflow.path_limits(loaded)
+    assert limits.q_min == pytest.approx(q.min(axis=0))
+    assert limits.q_max == pytest.approx(q.max(axis=0))
+    assert limits.source == "range of the fit"
+    assert model.module_.in_domain(torch.from_numpy(sample_domain(loaded, limits)[0])).all()
+
+
+def test_limits_intersect_where_both_are_known():
+    one = robots.Limits(q_min=np.array([-1.0, 0.0]), q_max=np.array([2.0, 3.0]))
+    other = robots.Limits(q_max=np.array([1.0, 4.0]), dq_max=np.array([0.5, 0.5]))
+    both = one.intersect(other)
+    assert both.q_min.tolist() == [-1.0, 0.0]
+    assert both.q_max.tolist() == [1.0, 3.0]
+    assert both.dq_max.tolist() == [0.5, 0.5]
+    narrow = both.narrowed(0.25)
+    assert narrow.q_min.tolist() == [-0.75, 0.25]
+    assert narrow.q_max.tolist() == [0.75, 2.75]
+    assert narrow.dq_max.tolist() == [0.5, 0.5]
+
+
+def test_given_limits_replace_those_of_the_description():
+    chain = ConstantCurvatureChain([0.005], lengths=[0.1])
+    limits = robots.Limits(np.full(3, -0.01), np.full(3, 0.01), np.full(3, 0.02))
+    robot = robots.RobotDescription("robot", chain, (), None, limits)
+    loaded = workflow.LoadedModel("robot", Path("robot.toml"), chain, robot)
+    found = workflow.path_limits(loaded, q_max=0.002)
+    assert found.q_min.tolist() == [-0.01] * 3
+    assert found.q_max.tolist() == [0.002] * 3
+    assert found.dq_max.tolist() == [0.02] * 3
+    assert found.source == "given and robot description"
+    with pytest.raises(ValueError, match="`q_min` must not exceed `q_max`"):
+        workflow.path_limits(loaded, q_min=0.02)
+    with pytest.raises(ValueError, match="--q-min"):
+        workflow.path_limits(workflow.LoadedModel("robot", Path("robot.toml"), chain))
+
+
+def test_a_report_prints_what_it_writes():
+    report = workflow.Report("A title")
+    report.text("## Part", "Some **bold** words.", "- " + "word " * 30)
+    report.table(["name", "a"], [["x", "1"], ["longer", "22"]])
+    assert "**bold**" in report.markdown()
+    assert "| longer | 22 |" in report.markdown()
+    printed = report.plain()
+    assert printed.startswith("A title\n\nPart\n\nSome bold words.\n\n- word")
+    assert printed.endswith("  name     a\n  x        1\n  longer  22")
+    assert max(map(len, printed.splitlines())) <= 98
+
+
+def test_a_log_that_does_not_pass_its_check_stops_the_fit(log, tmp_path):
+    path, robot = log
+    description = robots.read_description(robot)
+    measured = workflow.read_log(path, description.log)
+    x = measured.x.copy()
+    x[20:60] = x[20]
+    spoilt = datasets.Log(measured.q, x, np.repeat(np.arange(6), 30))
+    with pytest.raises(workflow.LogError, match="did not pass its check") as caught:
+        workflow.fit_log(spoilt, description, tmp_path / "m")
+    assert [f.kind for f in caught.value.report.errors] == ["frozen tip"]
+    settings = workflow.FitSettings(auto=False, play="auto")
+    with pytest.raises(ValueError, match="`play` requires `auto=True`"):
+        workflow.fit_log(measured, description, tmp_path / "m", settings)
+    assert not (tmp_path / "m").exists()

@@ -1,0 +1,186 @@
+"""What is known of a model: geometry, training, domain, errors, and what was chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.workflow._fit_report import auto_entry, auto_in_short
+from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.report import Report, millimetres
+
+
+def describe(loaded: LoadedModel) -> Report:
+    """Return a report on what is known of a model, in SI units and degrees.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The model, as from `open_model`.
+
+    Returns
+    -------
+    Report
+        Its ``record`` holds "kind", "n_actuators", "geometry" of the chain, "error_model",
+        "training", "domain", "radius", "play" (width [m]), "auto", "log_format", "limits",
+        "created" and "versions" of the program that wrote the file; None where nothing is known.
+    """
+    title = f"{loaded.name}: {type(loaded.model).__name__}, {loaded.n_actuators} actuators"
+    report = Report(title)
+    header, description, trained = loaded.header or {}, loaded.description, loaded.trained_range
+    report.record = {
+        "name": loaded.name,
+        "path": str(loaded.path),
+        "kind": type(loaded.model).__name__,
+        "n_actuators": loaded.n_actuators,
+        "geometry": None if loaded.chain is None else geometry(loaded.chain),
+        "error_model": None,
+        "play": loaded.play_width,
+        "auto": None,
+        "radius": None,
+        "domain": None if trained is None else _lists(trained, ("q_min", "q_max")),
+        "log_format": None,
+        "limits": None,
+        **{key: header.get(key) for key in ("training", "created", "versions")},
+    }
+    if description is not None:
+        if description.log is not None:
+            report.record["log_format"] = dict(vars(description.log))
+        report.record["limits"] = _lists(description.limits, ("q_min", "q_max", "dq_max"))
+    if loaded.hybrid is not None:
+        _add_hybrid(report.record, loaded.hybrid)
+    _write_geometry(report, report.record["geometry"])
+    _write_model(report)
+    _write_training(report, report.record["training"] or {})
+    return report
+
+
+def _add_hybrid(record: dict[str, Any], model: HybridForwardModel) -> None:
+    calibrated = [model.calibrate] if isinstance(model.calibrate, str) else list(model.calibrate)
+    kind = "none" if model.error_model_ is None else type(model.error_model_).__name__
+    error = {"kind": kind, "coupling": model.coupling}
+    if model.radius_ is not None:
+        record["radius"] = model.radius_._asdict()
+    if model.cv_results_ is not None:
+        record["auto"] = auto_entry(model)
+        error = {"kind": auto_in_short(record["auto"]), "coupling": None}
+    record["error_model"] = {**error, "guard": model.guard, "calibrated": calibrated}
+
+
+def geometry(chain: Chain) -> dict[str, Any]:
+    """Return the geometry of a chain.
+
+    Returns
+    -------
+    dict
+        "kind"; "base" position [m] and rotation vector [deg]; of chains of arcs "routing" and
+        "segments", each with radius, length and offset [m], angles and rest bend [deg] and, of
+        elastic tendons, stiffnesses.
+    """
+    pose = _numbers(chain.base)
+    turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec(degrees=True)
+    base = {"position": pose[:3, 3].tolist(), "rotation_vector_deg": turn.tolist()}
+    found: dict[str, Any] = {"kind": type(chain).__name__, "base": base}
+    if not isinstance(chain, ArcChain):
+        return found
+    parts = {name: _numbers(value) for name, value in chain.geometry().items()}
+    angles = np.split(parts["angles"], np.cumsum(chain.actuators_per_segment)[:-1])
+    segments = []
+    for k, radius in enumerate(parts["radii"].tolist()):
+        segments.append(
+            {
+                "radius": radius,
+                "length": float(parts["lengths"][k]) if "lengths" in parts else None,
+                "offset": float(parts["offsets"][k]),
+                "angles_deg": np.degrees(angles[k]).tolist(),
+                "rest_bend_deg": np.degrees(parts["rest_bends"].reshape(-1, 2)[k]).tolist(),
+            }
+        )
+        for name in ("bending_stiffness", "axial_stiffness"):
+            if name in parts:
+                segments[-1][name] = float(parts[name].ravel()[k])
+    return {**found, "routing": chain.routing, "segments": segments}
+
+
+def _lists(limits: Any, names: Iterable[str]) -> dict[str, list[float] | None]:
+    found = {name: vars(limits)[name] for name in names}
+    return {name: None if value is None else value.tolist() for name, value in found.items()}
+
+
+def _numbers(value: torch.Tensor) -> np.ndarray:
+    return value.detach().cpu().double().numpy()
+
+
+def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
+    if geometry is None:
+        report.text("No mechanical model.")
+        return
+    routing = f", routing {geometry['routing']}" if "routing" in geometry else ""
+    report.text(f"Mechanical model: {geometry['kind']}{routing}.")
+    rows = []
+    for k, entry in enumerate(geometry.get("segments", [])):
+        length = "extensible" if entry["length"] is None else f"{1e3 * entry['length']:.2f}"
+        cells = [f"{k + 1}", f"{1e3 * entry['radius']:.3f}", length, f"{1e3 * entry['offset']:.2f}"]
+        rows.append([*cells, ", ".join(f"{angle:.1f}" for angle in entry["angles_deg"])])
+    if rows:
+        header = ["segment", "radius [mm]", "length [mm]", "offset [mm]", "actuators at [deg]"]
+        report.table(header, rows)
+    turn = ", ".join(f"{v:.1f}" for v in geometry["base"]["rotation_vector_deg"])
+    report.text(
+        f"Base at ({_millimetres(geometry['base']['position'])}) mm, turned by ({turn}) deg."
+    )
+
+
+def _write_model(report: Report) -> None:
+    """Add error model, radius, play, domain, limits and the format of the logs."""
+    record = report.record
+    if record["error_model"] is not None:
+        kind, coupling, guard, _ = record["error_model"].values()
+        parts = [kind, coupling, f"guard {guard or 'none'}"]
+        report.text(f"Error model: {', '.join(part for part in parts if part)}.")
+    if record["radius"] is not None:
+        coverage, inside, outside = (record["radius"][k] for k in ("coverage", "inside", "outside"))
+        report.text(
+            f"Estimated error radius for {100 * coverage:.0f} % of the tips: {1e3 * inside:.3g} mm "
+            f"inside the domain, {1e3 * outside:.3g} mm outside."
+        )
+    if record["play"] is not None:
+        report.text(f"Backlash (play) of the actuators: {millimetres(record['play'])}.")
+    for what, limits in (("Fitted for", record["domain"]), ("Limits:", record["limits"])):
+        for name, value in (limits or {}).items():
+            if value is not None:
+                report.text(f"{what} {name} = {_millimetres(value)} mm.")
+    if record["log_format"] is not None:
+        q, x, q_unit, x_unit, q_sign, *_ = record["log_format"].values()
+        columns = f"q in {q_unit}, q_sign {q_sign} ({', '.join(q)}), x in {x_unit} ({', '.join(x)})"
+        report.text(f"Logs: {columns}.")
+
+
+def _write_training(report: Report, training: dict[str, Any]) -> None:
+    """Add what the file says of the fit; of one that was saved by hand it may be little."""
+    if "log" in training:
+        thinned = "" if training["n_whole"] == training["rows"] else f" of {training['n_whole']}"
+        report.text(
+            f"Fitted to {training['log']}: {training['rows']}{thinned} rows, "
+            f"{training['n_motions']} motions. Model: {training['saved']}, {training['chosen']}. "
+            "Errors on held-out motions:"
+        )
+        report.errors(training["held_out"], ("mean", "p95", "max"))
+    elif "rows" in training:
+        report.text(f"Fitted to {training['rows']} rows.")
+    if report.record["auto"] is not None:
+        report.text(" ".join(report.record["auto"]["words"]))
+    if report.record["versions"] is not None:
+        versions = ", ".join(f"{name} {value}" for name, value in report.record["versions"].items())
+        report.text(f"Saved on {report.record['created']} by {versions}.")
+
+
+def _millimetres(lengths: Iterable[float]) -> str:
+    return ", ".join(f"{1e3 * value:.4g}" for value in lengths)

@@ -1,0 +1,120 @@
+"""Paths for the tip: points of a file, or a named shape in the workspace of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hybridkin.ik import trajectories
+from hybridkin.ik.trajectories import Trajectory
+from hybridkin.workflow._domain import PathLimits, sample_domain
+from hybridkin.workflow.model import LoadedModel
+
+
+def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> Trajectory:
+    """Return a path from a CSV file of t, x, y, z or x, y, z.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; with three columns `dt` is needed.
+    unit : {"m", "cm", "mm"}, default="m"
+        Of the positions.
+    dt : float, optional
+        Time between points [s]; a file with times is read at this period, straight in between.
+
+    Returns
+    -------
+    Trajectory
+        Points [m] and times [s].
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it has no times and `dt` is not given, or is not a table of numbers.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {file}.")
+    with open(file, encoding="utf-8-sig") as lines:
+        rows = [line.split(",") for line in lines if line.strip() and line[0] != "#"]
+    if max(map(len, rows), default=0) == 3:
+        if dt is None:
+            raise ValueError(f"{file} has no times: give the time between its points (--dt 0.02).")
+        return trajectories.from_csv(file, dt=dt, unit=unit)
+    timed = trajectories.from_csv(file, unit=unit)
+    if dt is None:
+        return timed
+    t = timed.t[0] + dt * np.arange(int(timed.duration / dt + 1e-9) + 1)
+    return Trajectory(t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1))
+
+
+def shape_path(
+    loaded: LoadedModel,
+    limits: PathLimits,
+    shape: str,
+    size: Sequence[float],
+    *,
+    center: ArrayLike | None = None,
+    normal: ArrayLike | None = None,
+    turns: float = 3.0,
+    rise: float = 0.0,
+    duration: float = 10.0,
+    dt: float = 0.02,
+) -> Trajectory:
+    """Return the path of a named shape, in the workspace of a model.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The model, as from `open_model`.
+    limits : PathLimits
+        As from `path_limits`.
+    shape : {"figure-eight", "spiral", "line"}
+        What to draw.
+    size : sequence of float
+        Width and height of a figure eight, first and last radius of a spiral, x, y and z from end
+        to end of a line [m].
+    center : array-like of shape (3,), optional
+        Centre of the shape [m]. Default: a tip in the middle of the workspace.
+    normal : array-like of shape (3,), optional
+        Normal of its plane. Default: the z axis of the base.
+    turns : float, default=3.0
+        Turns of a spiral.
+    rise : float, default=0.0
+        Rise of a spiral along the normal [m].
+    duration, dt : float, default=10.0 and 0.02
+        Time for the shape, and between its points [s].
+
+    Returns
+    -------
+    Trajectory
+        Points [m] and times [s].
+
+    Raises
+    ------
+    ValueError
+        For another number of sizes than the shape has.
+    """
+    n_sizes = 3 if shape == "line" else 2
+    if len(size) != n_sizes:
+        raise ValueError(f"--size must be {n_sizes} numbers for a {shape}, got {len(size)}.")
+    if center is None:
+        # The tip nearest to the mean of all tips in the domain: some robots reach only a surface.
+        tips = sample_domain(loaded, limits)[1]
+        center = tips[np.linalg.norm(tips - tips.mean(axis=0), axis=1).argmin()]
+    if normal is None:
+        normal = (0.0, 0.0, 1.0) if loaded.chain is None else loaded.chain.base[:3, 2].tolist()
+    if shape == "figure-eight":
+        return trajectories.figure_eight(center, size, normal=normal, duration=duration, dt=dt)
+    if shape == "spiral":
+        return trajectories.spiral(
+            center, size, normal=normal, turns=turns, rise=rise, duration=duration, dt=dt
+        )
+    start, end = (np.asarray(center) + share * np.asarray(size) for share in (-0.5, 0.5))
+    return trajectories.line(start, end, duration=duration, dt=dt)
