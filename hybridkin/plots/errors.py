@@ -68,7 +68,7 @@ class ErrorHistogramDisplay(_ErrorDisplay):
     Parameters
     ----------
     errors : mapping of str to array-like of shape (N,)
-        Tip distances of each model [m]; NaN is left out.
+        Tip distances of each model [m]; NaN is ignored.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class ErrorBoxDisplay(_ErrorDisplay):
     Parameters
     ----------
     errors : mapping of str to array-like of shape (N,)
-        Tip distances of each model [m]; NaN is left out.
+        Tip distances of each model [m]; NaN is ignored.
 
     Attributes
     ----------
