@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+from sklearn.base import BaseEstimator
 from torch import nn
 
 from hybridkin._core.model import PoseModel
@@ -14,9 +16,6 @@ from hybridkin.hybrid._fit import NamedFeatures
 from hybridkin.hybrid._guards import GUARDS
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
-
-if TYPE_CHECKING:
-    from hybridkin.hybrid.estimator import HybridForwardModel
 
 __all__ = ["COUPLINGS", "FEATURES", "GUARDS", "check_settings", "resolved_error_model"]
 
@@ -35,8 +34,9 @@ def resolved_error_model(error_model: Any, seed: int | np.random.RandomState | N
     return NamedFeatures(error_model) if error_model in FEATURES else error_model
 
 
-def check_settings(model: HybridForwardModel) -> None:
+def check_settings(estimator: BaseEstimator) -> None:
     """Raise where the settings of a HybridForwardModel are not allowed."""
+    model = SimpleNamespace(**estimator.get_params(deep=False))
     error_model, mechanical = model.error_model, model.mechanical_model
     names = ("auto", "drop", *_REGRESSORS, *FEATURES)
     chosen = ("coupling", model.coupling, COUPLINGS), ("guard", model.guard, GUARDS)
@@ -91,7 +91,7 @@ def check_settings(model: HybridForwardModel) -> None:
         )
 
 
-def _check_pose_settings(model: HybridForwardModel) -> None:
+def _check_pose_settings(model: SimpleNamespace) -> None:
     if not isinstance(model.mechanical_model, PoseModel):
         raise TypeError(
             "`mechanical_model` must be a PoseModel, with pose_and_jacobian(q), for output='pose', "
