@@ -315,7 +315,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x, weight = self._evaluated(lambda m, q: (m(q), m.error_weight(q)), X, groups)
         return x, self.radius_.at(weight.astype(np.float64)).astype(x.dtype)
 
-    def predict_mechanical(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
+    def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
         return self._evaluated(lambda m, q: (m.mechanical_part(q),), X, groups)[0]
 
