@@ -140,11 +140,7 @@ def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
         sample_weight=rows.weights,
     )
     return replace(
-        spec,
-        mechanical=result.chain,
-        calibrate=(),
-        calibration=result,
-        messages=tuple(messages),
+        spec, mechanical=result.chain, calibrate=(), calibration=result, messages=tuple(messages)
     )
 
 
@@ -199,7 +195,8 @@ def _fit_regressor(model: Any, rows: Rows, error: NDArray) -> Any:
         given["sample_weight"] = rows.weights
     if rows.groups is not None and has_fit_parameter(model, "groups"):
         given["groups"] = rows.groups
-    return clone(model).fit(rows.X, error, **given)
+    regressor: Any = clone(model)
+    return regressor.fit(rows.X, error, **given)
 
 
 def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, counted: Tensor) -> ReadoutFit:

@@ -92,9 +92,9 @@ class Guard(PortableModule):
 
     def _kept(self, relative: Tensor) -> tuple[Tensor, Tensor]:
         """Return the length kept of a relative length of at least 1, and its derivative."""
-        room = self.MOST - 1.0
-        bent = torch.tanh((relative - 1.0) / room)
-        return 1.0 + room * bent, 1.0 - bent * bent
+        margin = self.MOST - 1.0
+        bent = torch.tanh((relative - 1.0) / margin)
+        return 1.0 + margin * bent, 1.0 - bent * bent
 
 
 class LeverageGuard(Guard):

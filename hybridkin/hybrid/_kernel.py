@@ -50,7 +50,8 @@ def tuned_kernel(
     totals: dict[tuple[int, int], float] = {}
 
     def ridge(at: tuple[int, int]) -> KernelRidge:
-        return KernelRidge(kernel="rbf", gamma=_GAMMAS[at[0]] / spread, alpha=_ALPHAS[at[1]])
+        gamma = _GAMMAS[at[0]] / spread
+        return KernelRidge(kernel="rbf", gamma=gamma).set_params(alpha=_ALPHAS[at[1]])
 
     def held_out(at: tuple[int, int]) -> float:
         if at not in totals:

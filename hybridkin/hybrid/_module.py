@@ -48,33 +48,10 @@ class Fading(NamedTuple):
     slope: Tensor  # dg/dq, (k, 1, n)
 
 
-class Correction(PortableModule):
-    """A learned correction c(q) and its guard.
+class TipCorrection(PortableModule):
+    """A learned correction at the tip, c(q) = eps(q).
 
-    Parameters
-    ----------
-    guard : Guard or None
-        Where c is trusted: s(q) is c faded by the guard's weight g(q), and shortened where it is
-        too long. None: s = c.
-    """
-
-    def __init__(self, guard: Guard | None) -> None:
-        super().__init__()
-        self.guard = guard
-
-    def value(self, q: Tensor, inside: Inside | None) -> Tensor:
-        """Return c(q) at rows q (N, n), shape (N, m) [m]."""
-        raise NotImplementedError
-
-    def guarded_and_jacobian(
-        self, q: Tensor, inside: Inside | None
-    ) -> tuple[Tensor, Tensor, Fading | None]:
-        """Return s, inside the robot f + s, (N, m), its derivative (N, m, n), and what fades."""
-        raise NotImplementedError
-
-
-class TipCorrection(Correction):
-    """A correction at the tip, c(q) = eps(q).
+    s(q) is c(q), faded by the weight g(q) of the guard, and shortened where it is too long.
 
     Parameters
     ----------
@@ -87,8 +64,9 @@ class TipCorrection(Correction):
     layout = Layout("tip_correction", {}, parts=("module", "guard"))
 
     def __init__(self, module: ForwardModel, guard: Guard | None = None) -> None:
-        super().__init__(guard)
+        super().__init__()
         self.module = module
+        self.guard = guard
 
     def value(self, q: Tensor, inside: Inside | None) -> Tensor:
         """Return eps(q) at rows q (N, n), shape (N, m) [m]."""
@@ -117,8 +95,8 @@ class TipCorrection(Correction):
         return *guard.shortened_with_jacobian(x, J), fading
 
 
-class InnerCorrection(Correction):
-    """A correction inside the robot, c(q) = F(z(q) + W phi(q)) - f(q); serial coupling.
+class InnerCorrection(PortableModule):
+    """A learned correction inside the robot, c(q) = F(z(q) + W phi(q)) - f(q); serial coupling.
 
     z and F are `coordinates` and `from_coordinates` of the mechanical model, so f(q) = F(z(q)).
 
@@ -137,9 +115,10 @@ class InnerCorrection(Correction):
     def __init__(
         self, mechanical: ForwardModel, readout: Readout, guard: Guard | None = None
     ) -> None:
-        super().__init__(guard)
+        super().__init__()
         self.mechanical = mechanical
         self.readout = readout
+        self.guard = guard
 
     def value(self, q: Tensor, inside: Inside | None) -> Tensor:
         """Return F(z + W phi) - f at rows q (N, n), shape (N, m) [m]."""
@@ -167,6 +146,9 @@ class InnerCorrection(Correction):
         own, J_own = _weighed(x[rows] - f, J[rows] - J_f, fading.weight, fading.slope)
         own, J_own = guard.shortened_with_jacobian(own, J_own)
         return x.index_copy(0, rows, f + own), J.index_copy(0, rows, J_f + J_own), fading
+
+
+Correction = TipCorrection | InnerCorrection
 
 
 class HybridModule(ForwardModel):

@@ -57,7 +57,7 @@ class PoseHybridModule(HybridModule, PoseModel):
         return T, J
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
-        return (self._poser(q) + self._learned(q, None)[:, :3],)
+        return (self._pose_model(q) + self._learned(q, None)[:, :3],)
 
     def _nothing(self, q: Tensor) -> Tensor:
         return q.new_zeros(len(q), 6)
@@ -66,19 +66,19 @@ class PoseHybridModule(HybridModule, PoseModel):
         return self._added((self._nothing(q), q.new_zeros(len(q), 6, q.shape[1])), q, None)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        x, J = self._poser.forward_and_jacobian(q)
+        x, J = self._pose_model.forward_and_jacobian(q)
         error, slope = self._learned_and_jacobian(q)
         return x + error[:, :3], J + slope[:, :3]
 
     def _pose(self, q: Tensor) -> tuple[Tensor]:
         error = self._learned(q, None)
-        turn = rotation(error[:, 3:] / reach_of(self._poser))[0]
-        return (_moved(self._poser.pose(q), error[:, :3], turn),)
+        turn = rotation(error[:, 3:] / reach_of(self._pose_model))[0]
+        return (_moved(self._pose_model.pose(q), error[:, :3], turn),)
 
     def _pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        T, J = self._poser.pose_and_jacobian(q)
+        T, J = self._pose_model.pose_and_jacobian(q)
         error, slope = self._learned_and_jacobian(q)
-        reach = reach_of(self._poser)
+        reach = reach_of(self._pose_model)
         turn, left = rotation(error[:, 3:] / reach)
         # exp(phi) R_mech has the angular velocity J_l(phi) dphi/dq + exp(phi) omega_mech.
         angular = left @ (slope[:, 3:] / reach) + turn @ J[:, 3:]
@@ -86,7 +86,7 @@ class PoseHybridModule(HybridModule, PoseModel):
         return _moved(T, error[:, :3], turn), J
 
     @property
-    def _poser(self) -> PoseModel:
+    def _pose_model(self) -> PoseModel:
         return cast(PoseModel, self.mechanical)
 
 
@@ -101,12 +101,12 @@ class PoseRows(PoseHybridModule):
 
     def mechanical_part(self, q: Tensor) -> Tensor:
         """Return positions and rotation vectors of the mechanical model, shape (..., 6)."""
-        return _rows(self._poser.pose(q))
+        return _rows(self._pose_model.pose(q))
 
     def error_part(self, q: Tensor) -> Tensor:
         """Return the way [m] and the rotation vector [rad] from there to the hybrid's pose."""
         error = super().error_part(q)
-        return torch.cat([error[..., :3], error[..., 3:] / reach_of(self._poser)], dim=-1)
+        return torch.cat([error[..., :3], error[..., 3:] / reach_of(self._pose_model)], dim=-1)
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         return (_rows(self._pose(q)[0]),)

@@ -69,17 +69,6 @@ class ReadoutFit(NamedTuple):
         )
 
 
-class _Found(NamedTuple):
-    """A fit in the variables of its problem."""
-
-    problem: _Problem
-    weights: Tensor
-    alphas: Pair
-    residual: Tensor  # (N, m) [m], leave-out
-    scores: dict[Pair, float]
-    gradient: float
-
-
 class _AtTip(ForwardModel):
     """A model whose inner coordinates are its tip: a correction of them is one at the tip."""
 
@@ -159,25 +148,19 @@ def fit_readout(
             found = _fitted(problem.in_noise(noise_ratio), members, alphas)
         else:
             found = _chosen(problem, members)
-            noise_ratio = problem.likeliest_ratio(found.residual)
+            noise_ratio = problem.likeliest_ratio(torch.from_numpy(found.residual))
             if noise_ratio < inf:
                 other = _chosen(problem.in_noise(noise_ratio), members, found.alphas)
                 if problem.mean_distance(other.residual) < problem.mean_distance(found.residual):
                     found = other
-        residual = x.new_full(x.shape, nan)
-        residual[kept] = found.residual
-        readout = found.problem.readout(found.weights)
-    return ReadoutFit(
-        readout,
-        found.alphas,
-        residual.cpu().numpy(),
-        found.scores,
-        found.gradient,
-        found.problem.noise_ratio,
-    )
+    residual = np.full(x.shape, nan)
+    residual[kept.cpu().numpy()] = found.residual
+    return found._replace(residual=residual)
 
 
-def _chosen(problem: _Problem, members: list[Tensor] | None, start: Pair | None = None) -> _Found:
+def _chosen(
+    problem: _Problem, members: list[Tensor] | None, start: Pair | None = None
+) -> ReadoutFit:
     """Return the fit with the penalties of least leave-out error."""
     weights, alphas, scores = problem.nothing, start, {}
     for _ in range(2):
@@ -188,7 +171,8 @@ def _chosen(problem: _Problem, members: list[Tensor] | None, start: Pair | None 
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
     assert alphas is not None
     found = _fitted(problem, members, alphas, weights)._replace(scores=scores)
-    if problem.mean_square(found.residual) > problem.mean_square(problem.rest):
+    without = problem.mean_distance(problem.rest.numpy(force=True), 2)
+    if problem.mean_distance(found.residual, 2) > without:
         # The linearised problem predicted an improvement that the exact one does not show.
         return _fitted(problem, members, (inf, inf))._replace(scores=scores)
     return found
@@ -196,12 +180,14 @@ def _chosen(problem: _Problem, members: list[Tensor] | None, start: Pair | None 
 
 def _fitted(
     problem: _Problem, members: list[Tensor] | None, alphas: Pair, start: Tensor | None = None
-) -> _Found:
+) -> ReadoutFit:
     """Return the fit with given penalties, from weights to start at."""
     penalty = problem.penalty(alphas)
     weights, gradient = problem.minimum(problem.nothing if start is None else start, penalty)
     left_out = problem.linearised(weights).left_out(penalty, members)
-    return _Found(problem, weights, alphas, problem.in_metres(left_out), {}, gradient)
+    residual = problem.in_metres(left_out).numpy(force=True)
+    readout, ratio = problem.readout(weights), problem.noise_ratio
+    return ReadoutFit(readout, alphas, residual, {}, gradient, ratio)
 
 
 class _Problem:
@@ -266,13 +252,10 @@ class _Problem:
             residual = torch.linalg.solve(self.whitening, residual)
         return residual / self.root
 
-    def mean_distance(self, residual: Tensor) -> float:
-        """Return the mean of the distances (N, m) [m] of the rows as often as they count."""
-        return float((self.root[:, 0].square() @ residual.norm(dim=1)) / self.root.square().sum())
-
-    def mean_square(self, residual: Tensor) -> float:
-        """Return the same of their squares [m^2]."""
-        return float((self.root * residual).square().sum() / self.root.square().sum())
+    def mean_distance(self, residual: NDArray, power: int = 1) -> float:
+        """Return the weighed mean length of residuals (N, m) [m], or of its `power`."""
+        weights = self.root[:, 0].square().numpy(force=True)
+        return float(np.average(np.linalg.norm(residual, axis=1) ** power, weights=weights))
 
     def penalty(self, alphas: Pair) -> Tensor:
         """Return the penalty of every feature (K,)."""

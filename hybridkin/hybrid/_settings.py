@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+from sklearn.base import BaseEstimator
 from torch import nn
 
 from hybridkin._core.model import PoseModel
+from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._fit import NamedFeatures
 from hybridkin.hybrid._guards import GUARDS
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
-
-if TYPE_CHECKING:
-    from hybridkin.hybrid.estimator import HybridForwardModel
 
 __all__ = ["COUPLINGS", "FEATURES", "GUARDS", "check_settings", "resolved_error_model"]
 
 COUPLINGS = ("parallel", "serial")
 FEATURES = ("linear", "quadratic", "pose")
 """Error models by the name of their features."""
+_OUTPUTS = ("position", "pose")
 _REGRESSORS = ("elm", "kernel")
 _HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)  # whose features can act inside the robot
 
@@ -33,12 +34,15 @@ def resolved_error_model(error_model: Any, seed: int | np.random.RandomState | N
     return NamedFeatures(error_model) if error_model in FEATURES else error_model
 
 
-def check_settings(model: HybridForwardModel) -> None:
+def check_settings(estimator: BaseEstimator) -> None:
     """Raise where the settings of a HybridForwardModel are not allowed."""
+    model = SimpleNamespace(**estimator.get_params(deep=False))
     error_model, mechanical = model.error_model, model.mechanical_model
     names = ("auto", "drop", *_REGRESSORS, *FEATURES)
-    if model.coupling not in COUPLINGS:
-        raise ValueError(f"`coupling` must be one of {[*COUPLINGS]}, got {model.coupling!r}.")
+    chosen = ("coupling", model.coupling, COUPLINGS), ("guard", model.guard, GUARDS)
+    for name, value, allowed in (*chosen, ("output", model.output, _OUTPUTS)):
+        if value not in allowed:
+            raise ValueError(f"`{name}` must be one of {allowed}, got {value!r}.")
     if model.coverage is not None and not 0.0 < model.coverage < 1.0:
         raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}.")
     wanted = model.calibrate
@@ -51,12 +55,8 @@ def check_settings(model: HybridForwardModel) -> None:
         raise ValueError(
             f"`play` must be a width, one per actuator, 'auto' or None, got {model.play!r}."
         )
-    if model.output not in ("position", "pose"):
-        raise ValueError(f"`output` must be 'position' or 'pose', got {model.output!r}.")
     if model.output == "pose":
         _check_pose_settings(model)
-    if model.guard not in GUARDS:
-        raise ValueError(f"`guard` must be one of {GUARDS}, got {model.guard!r}.")
     if isinstance(error_model, str) and error_model not in names:
         raise ValueError(
             f"`error_model` must be an estimator, None or one of {[*names]}, got {error_model!r}."
@@ -84,9 +84,14 @@ def check_settings(model: HybridForwardModel) -> None:
             "`mechanical_model` must be a torch module q -> x or None, got "
             f"{type(mechanical).__name__}; wrap a function in an nn.Module."
         )
+    elif not isinstance(mechanical, Chain) and wanted != "default" and [*wanted]:
+        raise TypeError(
+            f"`mechanical_model` must be a chain, with a geometry, to `calibrate` {wanted!r}, got "
+            f"{type(mechanical).__name__}."
+        )
 
 
-def _check_pose_settings(model: HybridForwardModel) -> None:
+def _check_pose_settings(model: SimpleNamespace) -> None:
     if not isinstance(model.mechanical_model, PoseModel):
         raise TypeError(
             "`mechanical_model` must be a PoseModel, with pose_and_jacobian(q), for output='pose', "

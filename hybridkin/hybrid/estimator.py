@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -34,6 +34,8 @@ from hybridkin.hybrid._settings import (
 from hybridkin.learning.elm import ELMRegressor
 
 __all__ = ["COUPLINGS", "FEATURES", "GUARDS", "HybridForwardModel"]
+
+_DTYPES = (np.float64, np.float32)
 
 
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -269,9 +271,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
             if not 0.0 < value <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
-        X, y = validate_data(
-            self, X, y=y, multi_output=True, dtype=[np.float64, np.float32], reset=False
-        )
+        X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES, reset=False)
         if self.play_ is not None:
             X, self._play_state = self.play_.apply(X, self._play_state)
         q, y = torch.from_numpy(X.astype(np.float64)), np.asarray(y, dtype=np.float64)
@@ -315,7 +315,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x, weight = self._evaluated(lambda m, q: (m(q), m.error_weight(q)), X, groups)
         return x, self.radius_.at(weight.astype(np.float64)).astype(x.dtype)
 
-    def predict_mechanical(self, X: Any, groups: ArrayLike | None = None) -> NDArray:
+    def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
         return self._evaluated(lambda m, q: (m.mechanical_part(q),), X, groups)[0]
 
@@ -345,18 +345,20 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         return self._evaluated(lambda m, q: (m.error_weight(q),), X, groups, warn=False)[0]
 
-    def _checked_rows(
-        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None, groups: ArrayLike | None
-    ) -> Rows:
+    def _checked_rows(self, X: Any, y: Any, weights: ArrayLike | None, groups: Any) -> Rows:
         """Return the measured rows, checked."""
-        X, y = validate_data(self, X, y=y, multi_output=True, dtype=[np.float64, np.float32])
+        X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES)
         X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
-        groups = None if groups is None else _checked_groups(groups, len(X))
-        if sample_weight is not None:
-            sample_weight = _check_sample_weight(
-                sample_weight, X, dtype=np.float64, ensure_non_negative=True
-            )
-        return Rows(X, np.asarray(y, dtype=np.float64), sample_weight, groups)
+        if groups is not None:
+            groups = np.asarray(groups)
+            if groups.shape != (len(X),):
+                raise ValueError(
+                    f"`groups` must have shape ({len(X)},), one entry for each row of `X`, got "
+                    f"{groups.shape}."
+                )
+        if weights is not None:
+            weights = _check_sample_weight(weights, X, dtype=np.float64, ensure_non_negative=True)
+        return Rows(X, np.asarray(y, dtype=np.float64), cast("NDArray | None", weights), groups)
 
     def _spec(self, rows: Rows) -> Spec:
         """Return what the settings ask for, with a copy of the mechanical model."""
@@ -382,13 +384,13 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _evaluated(
         self,
         function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]],
-        X: ArrayLike,
+        X: Any,
         groups: ArrayLike | None,
         warn: bool = True,
     ) -> list[NDArray]:
         """Return what a function of the module gives for the rows of X, in the dtype of X."""
         check_is_fitted(self)
-        X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
+        X = validate_data(self, X, dtype=_DTYPES, reset=False)
         q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
         if warn and isinstance(self.mechanical_model_, Chain):
             self.mechanical_model_.warn_contradictory(q, "X", stacklevel=4)
@@ -407,12 +409,3 @@ def _messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
     if rows.y.ndim == 2:
         found.append(span_message("y", torch.from_numpy(rows.y[:, :3]), float(chain.reach)))
     return tuple(message for message in found if message is not None)
-
-
-def _checked_groups(groups: ArrayLike, n: int) -> NDArray:
-    groups = np.asarray(groups)
-    if groups.shape != (n,):
-        raise ValueError(
-            f"`groups` must have shape ({n},), one entry for each row of `X`, got {groups.shape}."
-        )
-    return groups

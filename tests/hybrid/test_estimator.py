@@ -245,6 +245,8 @@ def test_bad_data(log):
     q, x, _ = log
     with pytest.raises(TypeError, match="must be a torch module"):
         HybridForwardModel(lambda q: q).fit(q, x)
+    with pytest.raises(TypeError, match=r"must be a chain.*SmallSum"):
+        HybridForwardModel(SmallSum(), calibrate=("radii",)).fit(q, x[:, 0])
     with pytest.raises(ValueError, match=r"`X` must have shape \(..., 9\)"):
         HybridForwardModel(bha()).fit(q[:, :6], x)
     with pytest.raises(ValueError, match="`y` must have 3 columns"):

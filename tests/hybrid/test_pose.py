@@ -549,7 +549,7 @@ class TipOnly(torch.nn.Module):
 @pytest.mark.parametrize(
     ("options", "kind", "match"),
     [
-        ({"output": "frame"}, ValueError, "'position' or 'pose'"),
+        ({"output": "frame"}, ValueError, "`output` must be one of .*'position', 'pose'.*'frame'"),
         ({"mechanical_model": TipOnly()}, TypeError, "PoseModel.*TipOnly"),
         ({"mechanical_model": None}, TypeError, "PoseModel.*NoneType"),
         ({"coupling": "serial"}, ValueError, "'parallel'.*ELMRegressorCV"),

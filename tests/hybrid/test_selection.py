@@ -129,15 +129,15 @@ def test_other_mechanical_models_and_single_outputs():
 def test_fits_in_threads_are_independent():
     """The filters for warnings belong to the process: no fit may touch them."""
     rng, groups = np.random.default_rng(0), np.arange(40) // 8
-    chain = ConstantCurvatureChain([0.012], lengths=[0.1])
+    chain = ConstantCurvatureChain([0.04])
     logs = []
     for _ in range(2):
-        q = rng.uniform(-0.005, 0.005, (40, 3))
-        x = chain(torch.from_numpy(q + 20.0 * q[:, ::-1] ** 2)).numpy()
+        q = rng.uniform(0.18, 0.22, (40, 3))
+        x = chain(torch.from_numpy(q + 9.0 * (q[:, ::-1] - 0.2) ** 2)).numpy()
         logs.append((q, x + 1e-3 * rng.standard_normal(x.shape)))
 
     def predicted(k):
-        start = ConstantCurvatureChain([0.01], lengths=[0.1])
+        start = ConstantCurvatureChain([0.05])
         model = HybridForwardModel(start, "auto", calibrate=("radii",), random_state=0)
         model.fit(*logs[k % 2], groups=groups)
         return model.module_(torch.from_numpy(logs[0][0])).numpy()
