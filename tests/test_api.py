@@ -20,7 +20,12 @@ FLOORS = [
     {"chains", "learning", "ik"},
     {"_core", "datasets", "plots", "simulation"},
 ]
-BESIDE = {"datasets": {"simulation"}, "plots": {"_core", "chains"}, "simulation": set(), "_core": set()}
+BESIDE = {
+    "datasets": {"simulation"},
+    "plots": {"_core", "chains"},
+    "simulation": set(),
+    "_core": set(),
+}
 
 
 def folder_of(path):

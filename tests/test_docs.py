@@ -13,7 +13,16 @@ import hybridkin
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
-MODULES = ("datasets", "paper", "plots", "robots", "simulation", "tasks", "trajectories", "workflow")
+MODULES = (
+    "datasets",
+    "paper",
+    "plots",
+    "robots",
+    "simulation",
+    "tasks",
+    "trajectories",
+    "workflow",
+)
 # In the unit of the robot's actuators, whatever that is, or of data that need no robot.
 OF_THE_ACTUATORS = {"q", "q0", "q_min", "q_max", "q_pref", "dq", "X", "y", "std"}
 WITHOUT_UNIT = {
