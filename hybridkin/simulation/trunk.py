@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -371,9 +370,9 @@ class TrunkPlant:
         return data.ten_length.copy(), T_base_tip
 
 
-def _check_number(name, value):
+def _check_number(name: str, value: Any) -> None:
     low = -np.inf if name == "tilt" else 0.0
-    enough = isinstance(value, Real) and np.isfinite(value) and value >= low
+    enough = isinstance(value, (int, float, np.number)) and np.isfinite(value) and value >= low
     if not enough or (value == 0 and name not in _MAY_BE_ZERO):
         sign = ">=" if name in _MAY_BE_ZERO else ">"
         raise ValueError(f"`{name}` must be a finite number {sign} {low:g}, got {value!r}.")
