@@ -206,6 +206,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             `predict` and the Jacobians), where numbers look like millimetres, and the warnings of
             `calibrate`.
         """
+        for message in self.fit_with_messages(X, y, sample_weight, groups):
+            warnings.warn(message, stacklevel=2)
+        return self
+
+    def fit_with_messages(
+        self,
+        X: Any,
+        y: Any,
+        sample_weight: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> list[str]:
+        """Fit as `fit` does and return the messages of its warnings; none is issued."""
         check_settings(self)
         rows = self._checked_rows(X, y, sample_weight, groups)
         spec = self._spec(rows)
@@ -229,9 +241,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.radius_: Radius | None = None
         if self.coverage is not None:
             self.radius_ = conformal_radius(asked, rows, self.coverage)
-        for message in (*said, *_messages(fitted, rows)):
-            warnings.warn(message, stacklevel=2)
-        return self
+        return [*said, *_messages(fitted, rows)]
 
     def partial_fit(
         self,
