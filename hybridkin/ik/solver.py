@@ -37,7 +37,7 @@ class InverseKinematics:
     model : ForwardModel, fitted estimator, nn.Module, callable, (callable, callable) or Task
         Maps q ``(..., n)`` to tips ``(..., 3)`` [m], row by row, torch to torch; a pair is such a
         function and its Jacobian, see `as_forward_model`. Its `in_domain` decides between CONVERGED
-        and OUT_OF_DOMAIN. Poses, several points, priorities and NumPy functions are tasks, see
+        and OUT_OF_DOMAIN. Poses, several points and NumPy functions are tasks, see
         `hybridkin.tasks`; then x has the shape of their targets.
     q_min, q_max : float or array-like of shape (n,), optional
         Limits of q, in the unit of q.
@@ -81,9 +81,7 @@ class InverseKinematics:
     damped task is solved in the box without posture first, and the posture then only chooses
     among the steps that move the tip the same way (to 1e-8 of the step; where v is also out of
     reach, up to 1e-3 was seen). A start outside the limits walks back at
-    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q. Of two prioritised
-    tasks the first is exact where no limit is met; otherwise the second may cost it 1e-7 of the
-    step where it can be reached, and up to 1e-3 where it is out of reach too.
+    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q.
 
     References
     ----------

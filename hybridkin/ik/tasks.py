@@ -1,4 +1,4 @@
-"""What inverse kinematics steers: positions, poses, several points, one task before another."""
+"""What inverse kinematics steers: positions, poses, several points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
 
-__all__ = ["PointsTask", "PoseTask", "PositionTask", "PrioritizedTask", "StackedTask", "Task"]
+__all__ = ["PointsTask", "PoseTask", "PositionTask", "StackedTask", "Task"]
 
 Tolerance: TypeAlias = float | tuple[float, ...]
 
@@ -33,8 +33,6 @@ class Task:
         Rows of the error that belong together, as the position and the rotation of a pose.
     units : tuple of float
         What one unit of every part counts in metres.
-    first : int or None
-        Number of leading rows that come before the others; None: all count alike.
     models : tuple of ForwardModel
         The models that are evaluated.
     """
@@ -42,7 +40,6 @@ class Task:
     shape: tuple[int, ...]
     parts: tuple[int, ...]
     units: tuple[float, ...]
-    first: int | None = None
     models: tuple[ForwardModel, ...]
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -304,32 +301,6 @@ class StackedTask(Task):
         """Raise where the part of a task is not valid."""
         for task, part in zip(self.tasks, self.split(x_target), strict=True):
             task.check(part, name)
-
-
-class PrioritizedTask(StackedTask):
-    """Two tasks, the second one in the null space of the first, which it never disturbs.
-
-    Parameters
-    ----------
-    first, second : Task, nn.Module or callable
-        The tasks; a model stands for its `PositionTask`.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from hybridkin import InverseKinematics, robots
-    >>> from hybridkin.ik.tasks import PrioritizedTask
-    >>> chain = robots.bionic_handling_assistant()
-    >>> task = PrioritizedTask(chain, chain.with_tip(2.0))
-    >>> tip, elbow = torch.tensor([[0.1, 0.0, 0.75], [5.0, 0.0, 0.5]], dtype=torch.float64)
-    >>> solution = InverseKinematics(task, q_min=0.1, q_max=0.4).solve(task.join(tip, elbow))
-    >>> [bool((a - b).norm() < 1e-4) for a, b in zip(task.split(solution.x), (tip, elbow))]
-    [True, False]
-    """
-
-    def __init__(self, first: object, second: object) -> None:
-        super().__init__(first, second)
-        self.first = sum(self.tasks[0].parts)
 
 
 @runtime_checkable
