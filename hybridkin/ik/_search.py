@@ -139,10 +139,8 @@ class Search:
 
     def _rank(self, found: Found) -> Tensor:
         """Return 0 for rows that are done, 1 for those outside the domain, 2 for the others."""
-        rank = torch.where(found.reached, 0, 2)
-        if not len(rank):
-            return rank
-        return torch.where(found.reached & ~self.settings.task.in_domain(found.q), 1, rank)
+        inside = self.settings.task.in_domain(found.q)
+        return torch.where(found.reached, torch.where(inside, 0, 1), 2)
 
     def _point(self, q: Tensor, target: Tensor) -> Point:
         x, J = self.settings.evaluate(q)

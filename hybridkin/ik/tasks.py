@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -84,7 +85,7 @@ class Task:
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies within the domains of all models, shape (N,)."""
-        return self.domain_distance(q) <= 1.0
+        return self.domain_distance(q) <= 1.0 if len(q) > 0 else q.new_ones(0, dtype=torch.bool)
 
 
 class PositionTask(Task):
@@ -144,7 +145,7 @@ class PositionTask(Task):
         PositionTask
             Without derivatives of solutions (`differentiable`).
         """
-        return cls(_NumpyModel(function, jacobian), size)
+        return cls([partial(_through_numpy, f) for f in (function, jacobian)], size)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (N, size) and J (N, size, n), in closed form where the model has one."""
@@ -269,9 +270,8 @@ class StackedTask(Task):
         if len(x) != len(self.tasks):
             raise ValueError(f"`x` must be {len(self.tasks)} targets, one per task, got {len(x)}.")
         tensors = [a if isinstance(a, Tensor) else torch.as_tensor(np.asarray(a)) for a in x]
-        parts = [
-            a.flatten(a.ndim - len(task.shape)) for a, task in zip(tensors, self.tasks, strict=True)
-        ]
+        pairs = zip(tensors, self.tasks, strict=True)
+        parts = [a.flatten(a.ndim - len(task.shape)) for a, task in pairs]
         lead = torch.broadcast_shapes(*(a.shape[:-1] for a in parts))
         joined = torch.cat([a.expand(*lead, -1) for a in parts], dim=-1)
         return joined if any(isinstance(a, Tensor) for a in x) else joined.numpy()
@@ -340,25 +340,11 @@ def as_task(model: object) -> Task:
     return model if isinstance(model, Task) else PositionTask(model)
 
 
-class _NumpyModel(ForwardModel):
-    """A NumPy function and its Jacobian, without a graph."""
-
-    def __init__(
-        self, function: Callable[[NDArray], ArrayLike], jacobian: Callable[[NDArray], ArrayLike]
-    ) -> None:
-        super().__init__()
-        self._function, self._jacobian = function, jacobian
-
-    def forward(self, q: Tensor) -> Tensor:
-        return self._computed(self._function, q)
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self(q), self._computed(self._jacobian, q)
-
-    def _computed(self, function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:
-        if q.requires_grad and torch.is_grad_enabled():
-            raise ValueError(
-                "`model` must be twice differentiable by torch for derivatives of the solution, "
-                "got functions for NumPy."
-            )
-        return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)
+def _through_numpy(function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:
+    """Return what a NumPy function gives, without a graph."""
+    if q.requires_grad and torch.is_grad_enabled():
+        raise ValueError(
+            "`model` must be twice differentiable by torch for derivatives of the solution, got "
+            "functions for NumPy."
+        )
+    return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)
