@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from torch import Tensor
 
-__all__ = ["Layout", "Restore", "Stored", "estimator_of", "feature_names", "params_of", "plain"]
-
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
-_REQUIRED = object()
 
 
 class Layout(NamedTuple):
@@ -86,18 +83,15 @@ class Stored:
         **settings
             Values that JSON can express; arrays become lists, tuples too.
         """
-        tensors = {name: value for name, value in (arrays or {}).items() if value is not None}
-        return cls(
-            kind,
-            plain(settings),
-            {
-                name: np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-                for name, value in tensors.items()
-            },
-            {name: part for name, part in (parts or {}).items() if part is not None},
-        )
+        given = {
+            name: np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+            for name, value in (arrays or {}).items()
+            if value is not None
+        }
+        made_of = {name: part for name, part in (parts or {}).items() if part is not None}
+        return cls(kind, plain(settings), given, made_of)
 
-    def value(self, key: str, kinds: Any, default: Any = _REQUIRED) -> Any:
+    def value(self, key: str, kinds: Any) -> Any:
         """Return a setting of one of these types.
 
         Parameters
@@ -106,17 +100,13 @@ class Stored:
             Its name.
         kinds : type or tuple of types and None
             The types allowed. An int counts as a float; a bool is neither.
-        default : optional
-            Returned where the setting is missing. Without a default it must be there.
         """
-        if key not in self.settings and default is not _REQUIRED:
-            return default
         if key not in self.settings:
             raise ValueError(f"`{key}` of {self.kind!r} is missing")
         value, kinds = self.settings[key], kinds if isinstance(kinds, tuple) else (kinds,)
         if type(value) is int and float in kinds and int not in kinds:
             value = float(value)
-        if type(value) not in [type(None) if kind is None else kind for kind in kinds]:
+        if (None if value is None else type(value)) not in kinds:
             names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
             raise ValueError(f"`{key}` of {self.kind!r} must be {names}, got {value!r:.60}")
         return value
@@ -125,9 +115,8 @@ class Stored:
         """Return a setting that is a list of one type."""
         values = self.value(key, list)
         if not all(type(value) is kind for value in values):
-            raise ValueError(
-                f"`{key}` of {self.kind!r} must be a list of {kind.__name__}, got {values!r:.60}"
-            )
+            need = f"must be a list of {kind.__name__}, got {values!r:.60}"
+            raise ValueError(f"`{key}` of {self.kind!r} {need}")
         return values
 
     def array(
@@ -149,7 +138,9 @@ class Stored:
         array = self.arrays[name]
         if array.dtype not in (np.float32, np.float64):
             raise ValueError(f"{name!r} must be float32 or float64, got {array.dtype}")
-        if shape is not None and not _fits(array.shape, shape):
+        sizes = array.shape if shape is None else shape
+        fits = len(sizes) == array.ndim
+        if not fits or any(n not in (None, m) for n, m in zip(sizes, array.shape, strict=True)):
             wanted = str(shape).replace("None", "any")
             raise ValueError(f"{name!r} must have shape {wanted}, got {array.shape}")
         if finite and not np.isfinite(array).all():
@@ -165,8 +156,7 @@ class Stored:
             For every array one letter per axis; the same letter stands for the same length:
             ``tensors(coef="mn", bias="m")``.
         """
-        lengths: dict[str, int] = {}
-        found = {}
+        lengths, found = {}, {}
         for name, letters in shapes.items():
             array = self.array(name, tuple(lengths.get(letter) for letter in letters))
             lengths |= dict(zip(letters, array.shape, strict=True))
@@ -201,10 +191,9 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
     A random state that is not a number becomes None, and so does the device.
     """
     params = plain(estimator.get_params(deep=False))
-    params |= {"device": None} if "device" in params else {}
-    if not isinstance(params.get("random_state"), int):
-        params |= {"random_state": None} if "random_state" in params else {}
-    return params
+    seeded = isinstance(params.get("random_state"), int)
+    dropped = {"device"} if seeded else {"device", "random_state"}
+    return params | dict.fromkeys(dropped & params.keys())
 
 
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
@@ -224,8 +213,3 @@ def feature_names(stored: Stored, n: int) -> NDArray | None:
     if names and len(names) != n:
         raise ValueError(f"`feature_names_in` must be {n} names, got {len(names)}")
     return np.array(names, dtype=object) if names else None
-
-
-def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    pairs = zip(shape, wanted, strict=False)
-    return len(shape) == len(wanted) and all(n is None or m == n for m, n in pairs)
