@@ -28,7 +28,7 @@ from hybridkin.chains._slack import (
     responses_of,
     rough_of,
 )
-from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]
@@ -116,9 +116,9 @@ class ElasticTendonChain(ArcChain):
     tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
     """
 
-    layout = Layout("elastic_tendons", {}, {"routing": str})
     _counts = "n_tendons"
     _entries = (*_SHAPING, "lengths", "offsets", "base")
+    layout = Layout("elastic_tendons", dict.fromkeys(_entries, ""), STRUCTURE)
     _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
 
     lengths: Tensor

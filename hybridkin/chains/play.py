@@ -28,6 +28,9 @@ class PlayState(NamedTuple):
     effective: Any
 
 
+_Step = Callable[[Tensor, PlayState, Tensor], PlayState]  # row, state before, half the width
+
+
 class PlayOperator:
     """Play between commanded and effective tendon length changes.
 
@@ -160,12 +163,7 @@ class PlayOperator:
         return f"PlayOperator(width={self.width.tolist()})"
 
     def _run(
-        self,
-        given: Any,
-        state: PlayState | None,
-        name: str,
-        step: Callable[[Tensor, PlayState, Tensor], PlayState],
-        wanted: int,
+        self, given: Any, state: PlayState | None, name: str, step: _Step, wanted: int
     ) -> tuple[Any, PlayState]:
         """Return the entry `wanted` of the state after every row given, and the last state."""
         rows = given if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -84,7 +84,8 @@ class RigidChain(Chain):
 
     _entries = ("base", "tool")
     _structure = ("n_actuators", "kinds", "names")
-    layout = Layout("rigid", {})
+    _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "base")
+    layout = Layout("rigid", dict.fromkeys(_arrays, ""), {"kinds": list, "names": list})
 
     origins: Tensor
     axes: Tensor
@@ -159,9 +160,7 @@ class RigidChain(Chain):
         end_link: str,
         *,
         root_link: str | None = None,
-        tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform | None = None,
-        dtype: torch.dtype = torch.float64,
+        **options: Any,
     ) -> RigidChain:
         """Return the arm from one link of a URDF to another.
 
@@ -173,8 +172,8 @@ class RigidChain(Chain):
             The link whose frame carries the tool.
         root_link : str, optional
             The link that is the base. Default: the root of the tree that `end_link` is in.
-        tool, base, dtype
-            As for `RigidChain`.
+        **options
+            `tool`, `base` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -190,8 +189,7 @@ class RigidChain(Chain):
             For text that is no URDF, links that are not there or not connected, a path without
             moving joint, and joints that are floating, planar or mimic another one.
         """
-        path = urdf_path(text_or_path, end_link, root_link)
-        return cls(**moving_joints(path), tool=tool, base=base, dtype=dtype)
+        return cls(**moving_joints(urdf_path(text_or_path, end_link, root_link)), **options)
 
     @classmethod
     def from_mjcf(
@@ -200,9 +198,7 @@ class RigidChain(Chain):
         end_link: str,
         *,
         root_link: str | None = None,
-        tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform | None = None,
-        dtype: torch.dtype = torch.float64,
+        **options: Any,
     ) -> RigidChain:
         """Return the arm from one body of a MuJoCo model to another body or site.
 
@@ -214,8 +210,8 @@ class RigidChain(Chain):
             The body, or else the site, whose frame carries the tool.
         root_link : str, optional
             The body that is the base. Default: the world.
-        tool, base, dtype
-            As for `RigidChain`.
+        **options
+            `tool`, `base` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -232,26 +228,18 @@ class RigidChain(Chain):
             For text that is no MJCF, bodies that are not there or not connected, a path without
             moving joint, and free or ball joints.
         """
-        path = mjcf_path(text_or_path, end_link, root_link)
-        return cls(**moving_joints(path), tool=tool, base=base, dtype=dtype)
+        return cls(**moving_joints(mjcf_path(text_or_path, end_link, root_link)), **options)
 
     @classmethod
-    def from_chain(
-        cls,
-        chain: KinematicsChain,
-        *,
-        tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform | None = None,
-        dtype: torch.dtype = torch.float64,
-    ) -> RigidChain:
+    def from_chain(cls, chain: KinematicsChain, **options: Any) -> RigidChain:
         """Return the arm of a pytorch_kinematics chain without branches.
 
         Parameters
         ----------
         chain : pytorch_kinematics SerialChain
             Starts at the base and ends at the end link. It is not changed.
-        tool, base, dtype
-            As for `RigidChain`.
+        **options
+            `tool`, `base` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -264,7 +252,7 @@ class RigidChain(Chain):
         ValueError
             For chains that branch or have no moving joint.
         """
-        return cls(**moving_joints(chain_path(chain)), tool=tool, base=base, dtype=dtype)
+        return cls(**moving_joints(chain_path(chain)), **options)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -429,17 +417,12 @@ class RigidChain(Chain):
         """Return the tool in the last joint's moving frame, homogeneous, shape (4,)."""
         return self.tip.to(q) @ nn.functional.pad(self.tool.to(q), (0, 1), value=1.0)
 
-    def stored(self) -> Stored:
-        """Return how the arm describes itself: its joints, their limits, tool and base."""
-        arrays = {"origins": self.origins, "axes": self.axes, "tip": self.tip, "tool": self.tool}
-        arrays |= {"q_min": self.q_min, "q_max": self.q_max, "base": self.base}
-        return Stored.of(self.layout.kind, arrays, kinds=self.kinds, names=self.names)
-
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
         """Return the arm of a description."""
-        geometry = {name: stored.array(name) for name in ("origins", "axes", "tip", "tool", "base")}
-        limits = {name: stored.array(name, finite=False) for name in ("q_min", "q_max")}
-        kinds, names = (stored.list_of(str, key) for key in ("kinds", "names"))
-        dtype = torch.from_numpy(geometry["base"]).dtype
-        return cls(**geometry, **limits, kinds=kinds, names=names, dtype=dtype)
+        settings = {key: stored.list_of(str, key) for key in cls.layout.settings}
+        arrays = {
+            name: stored.array(name, finite=name not in ("q_min", "q_max"))
+            for name in cls.layout.arrays
+        }
+        return cls(**arrays, **settings, dtype=torch.from_numpy(arrays["base"]).dtype)
