@@ -18,7 +18,7 @@ from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
-from hybridkin.chains._checks import actuator_counts, filled, flat_angles, pose, vector
+from hybridkin.chains._checks import actuator_counts, filled, flat_angles, lengths_of, pose
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class ArcChain(Chain):
         """
         if routing not in _ROUTINGS:
             raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
-        radii = vector(radii, "radii", dtype, positive=True)
+        radii = lengths_of(radii, "radii", dtype)
         S = radii.numel()
         name, n_actuators, least = counts
         self.actuators_per_segment = actuator_counts(n_actuators, S, name, least)
@@ -91,7 +91,7 @@ class ArcChain(Chain):
             "base": pose(base, "base", dtype),
         }
         if lengths is not None:
-            geometry["lengths"] = vector(lengths, "lengths", dtype, size=S, positive=True)
+            geometry["lengths"] = lengths_of(lengths, "lengths", dtype, S)
             warn_millimetres("lengths", geometry["lengths"], 10.0)
         return geometry
 

@@ -14,16 +14,9 @@ from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
+from hybridkin.chains import _joint_motions
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints, urdf_path
 from hybridkin.chains._checks import pose, rigid_pose, shaped
-from hybridkin.chains._joint_motions import (
-    carried_tip,
-    column_carriers,
-    frames,
-    joint_motions,
-    last_frame_and_joints,
-    shares,
-)
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -137,7 +130,7 @@ class RigidChain(Chain):
                 f"`q_min` must not exceed `q_max`, got {low.tolist()} and {high.tolist()}."
             )
         slides = torch.tensor([kind == "prismatic" for kind in self.kinds], device=axes.device)
-        motions = joint_motions(origins, axes, slides)
+        motions = _joint_motions.joint_motions(origins, axes, slides)
         geometry = {
             "origins": origins,
             "axes": axes,
@@ -147,7 +140,7 @@ class RigidChain(Chain):
             "tool": shaped(tool, "tool", (3,)),
             "base": pose(base, "base", dtype),
             "motions": motions,
-            "carriers": column_carriers(motions, origins, axes),
+            "carriers": _joint_motions.column_carriers(motions, origins, axes),
         }
         geometry = {name: value.to(axes.device, dtype) for name, value in geometry.items()}
         self._set_geometry({**geometry, "slides": slides})
@@ -377,14 +370,14 @@ class RigidChain(Chain):
         """Return u_1 and u_2 of every joint, in rows of shape (N, n)."""
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         slides = self.slides if "prismatic" in self.kinds else None
-        return shares(q.reshape(-1, self.n_actuators), slides)
+        return _joint_motions.shares(q.reshape(-1, self.n_actuators), slides)
 
     def _frames(self, q: Tensor) -> Tensor:
         """Return every joint's moving frame in the base frame, shape (..., n, 4, 4)."""
-        return frames(*self._shares(q), self.motions.to(q)).reshape(*q.shape, 4, 4)
+        return _joint_motions.frames(*self._shares(q), self.motions.to(q)).reshape(*q.shape, 4, 4)
 
     def _tip(self, q: Tensor) -> tuple[Tensor]:
-        p = carried_tip(*self._shares(q), self.motions.to(q), self._end(q))
+        p = _joint_motions.carried_tip(*self._shares(q), self.motions.to(q), self._end(q))
         return ((self.base.to(q)[:3] @ p).T.reshape(*q.shape[:-1], 3),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -400,7 +393,7 @@ class RigidChain(Chain):
         axes and the origin.
         """
         buffers = (part.to(q) for part in (self.motions, self.axes, self.carriers))
-        frame, axes, points = last_frame_and_joints(*self._shares(q), *buffers)
+        frame, axes, points = _joint_motions.last_frame_and_joints(*self._shares(q), *buffers)
         tip = (self._end(q) @ frame.flatten(1)).unflatten(0, (3, -1))
         columns = torch.linalg.cross(axes, tip - points, dim=1)
         if "prismatic" in self.kinds:

@@ -286,7 +286,7 @@ def _chain(content: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendon
     segments: list[dict[str, Any]] = []
     for i, table in enumerate(tables):
         segments += _segments(table, f"[[segment]] {i + 1}")
-    given = {key: [segment[key] for segment in segments] for key in segments[0]}
+    given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
     elastic = model == "elastic-tendon"
     for key in ("length", *_STIFFNESS):
         missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
