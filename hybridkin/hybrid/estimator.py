@@ -402,8 +402,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         X = validate_data(self, X, dtype=_DTYPES, reset=False)
         q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
-        if warn and isinstance(self.mechanical_model_, Chain):
-            self.mechanical_model_.warn_contradictory(q, "X", stacklevel=4)
+        chain = self.mechanical_model_
+        message = chain.contradiction(q, "X") if warn and isinstance(chain, Chain) else None
+        if message is not None:
+            warnings.warn(message, stacklevel=3)
         with torch.no_grad():
             arrays = [part.numpy() for part in function(self.module_.rows(), q)]
         arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
