@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from torch import Tensor
 
-__all__ = ["Layout", "Restore", "Stored", "estimator_of", "feature_names", "params_of", "plain"]
-
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 _REQUIRED = object()
 
@@ -218,12 +216,13 @@ def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
     return cls(**known)
 
 
-def feature_names(stored: Stored, n: int) -> NDArray | None:
-    """Return the names of n columns as scikit-learn keeps them; None where there are none."""
-    names = stored.list_of(str, "feature_names_in")
+def restore_columns(estimator: Any, stored: Stored, n: int) -> None:
+    """Set the number of columns, and their names if there are any, as scikit-learn keeps them."""
+    estimator.n_features_in_, names = n, stored.list_of(str, "feature_names_in")
     if names and len(names) != n:
         raise ValueError(f"`feature_names_in` must be {n} names, got {len(names)}")
-    return np.array(names, dtype=object) if names else None
+    if names:
+        estimator.feature_names_in_ = np.array(names, dtype=object)
 
 
 def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
