@@ -285,11 +285,6 @@ def jacobian(model: Any, q: Tensor) -> Tensor:
     return as_forward_model(model).jacobian(q)
 
 
-def forward_and_jacobian(model: Any, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Return x and dx/dq, in closed form where the model has one."""
-    return as_forward_model(model).forward_and_jacobian(q)
-
-
 def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[Tensor, Tensor]:
     """Return x and dx/dq by one backward pass per output coordinate."""
     keep_graph = q.requires_grad and torch.is_grad_enabled()

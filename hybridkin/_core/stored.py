@@ -15,7 +15,6 @@ from sklearn.base import BaseEstimator
 from torch import Tensor
 
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
-_REQUIRED = object()
 
 
 class Layout(NamedTuple):
@@ -95,7 +94,7 @@ class Stored:
             {name: part for name, part in (parts or {}).items() if part is not None},
         )
 
-    def value(self, key: str, kinds: Any, default: Any = _REQUIRED) -> Any:
+    def value(self, key: str, kinds: Any) -> Any:
         """Return a setting of one of these types.
 
         Parameters
@@ -104,11 +103,7 @@ class Stored:
             Its name.
         kinds : type or tuple of types and None
             The types allowed. An int counts as a float; a bool is neither.
-        default : optional
-            Returned where the setting is missing. Without a default it must be there.
         """
-        if key not in self.settings and default is not _REQUIRED:
-            return default
         if key not in self.settings:
             raise ValueError(f"`{key}` of {self.kind!r} is missing")
         value, kinds = self.settings[key], kinds if isinstance(kinds, tuple) else (kinds,)
@@ -147,9 +142,13 @@ class Stored:
         array = self.arrays[name]
         if array.dtype not in (np.float32, np.float64):
             raise ValueError(f"{name!r} must be float32 or float64, got {array.dtype}")
-        if shape is not None and not _fits(array.shape, shape):
-            wanted = str(shape).replace("None", "any")
-            raise ValueError(f"{name!r} must have shape {wanted}, got {array.shape}")
+        wanted = array.shape if shape is None else shape
+        matching = len(wanted) == array.ndim
+        if not matching or any(
+            n not in (None, m) for m, n in zip(array.shape, wanted, strict=True)
+        ):
+            allowed = str(shape).replace("None", "any")
+            raise ValueError(f"{name!r} must have shape {allowed}, got {array.shape}")
         if finite and not np.isfinite(array).all():
             raise ValueError(f"{name!r} must be finite")
         return array
@@ -199,10 +198,8 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
     A random state that is not a number becomes None, and so does the device.
     """
     params = plain(estimator.get_params(deep=False))
-    params |= {"device": None} if "device" in params else {}
-    if not isinstance(params.get("random_state"), int):
-        params |= {"random_state": None} if "random_state" in params else {}
-    return params
+    lost = {name for name in ("device", "random_state") if not isinstance(params.get(name), int)}
+    return {name: None if name in lost else value for name, value in params.items()}
 
 
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
@@ -223,8 +220,3 @@ def restore_columns(estimator: Any, stored: Stored, n: int) -> None:
         raise ValueError(f"`feature_names_in` must be {n} names, got {len(names)}")
     if names:
         estimator.feature_names_in_ = np.array(names, dtype=object)
-
-
-def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    pairs = zip(shape, wanted, strict=False)
-    return len(shape) == len(wanted) and all(n is None or m == n for m, n in pairs)

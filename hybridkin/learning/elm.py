@@ -12,15 +12,8 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
-from hybridkin.learning._ridge import Statistics, fit_readout, merge
-from hybridkin.learning.hidden_layer import (
-    BLOCK_ELEMENTS,
-    DTYPES,
-    check_rows,
-    device_named,
-    draw_layer,
-    gather,
-)
+from hybridkin.learning._ridge import BLOCK_ELEMENTS, Statistics, fit_readout, gather, merge
+from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer
 from hybridkin.learning.network import ACTIVATIONS, ELM, LAYER, READOUT
 
 

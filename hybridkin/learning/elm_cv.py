@@ -13,8 +13,9 @@ from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.stored import plain
 from hybridkin.learning._left_out import LeftOut
+from hybridkin.learning._ridge import gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
-from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer, gather
+from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
 
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)  # times the largest eigenvalue of the features' Gram matrix
 _ZOOM = (0.5, 1.0, 2.0, 4.0)  # weight scales tried with new input scales, times the best so far

@@ -5,11 +5,9 @@ import torch
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, validate_data
 
-from hybridkin.learning._ridge import Statistics, accumulate
 from hybridkin.learning.network import ELM, LAYER, READOUT
 
 DTYPES = (np.float64, np.float32)
-BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
 
 
 def _scaling(X, sample_weight, input_scaling):
@@ -66,23 +64,6 @@ def draw_layer(params, X, sample_weight):
     shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
     arrays = (*layer, *map(np.zeros, shapes))
     return ELM(params.activation, **dict(zip(LAYER + READOUT, arrays, strict=True)))
-
-
-def gather(stats, elm, X, y, sample_weight, block_size):
-    """Return the statistics `stats` (None: of no rows) with the rows of `X` and `y` added."""
-    n_features = len(elm.output_weights)
-    n_columns = n_features + y.shape[1]
-    if stats is None:
-        stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
-    block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
-    with torch.no_grad():
-        stats = accumulate(stats, elm, X, y, sample_weight, block_size)
-    if not np.isfinite(stats.scatter[:, :n_features]).all():
-        raise ValueError(
-            "`X` and `y` must give finite sums of products of features and targets in float64, "
-            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
-        )
-    return stats
 
 
 def device_named(name):

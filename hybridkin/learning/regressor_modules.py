@@ -44,15 +44,15 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     while len(steps) > 1 and (found := _affine(steps[0])) is not None:
         center, scale = center + scale * found[0], scale * found[1]
         steps = steps[1:]
-    readout, polynomial = steps[-1], len(steps) == 2 and isinstance(steps[0], PolynomialFeatures)
-    if len(steps) == 1 and isinstance(readout, _LINEAR):
-        coef = np.atleast_2d(np.asarray(readout.coef_)) / scale
-        return AffineModule(coef, readout.intercept_ - coef @ center)
-    if polynomial and isinstance(readout, _LINEAR):
-        coef, powers = np.atleast_2d(readout.coef_), steps[0].powers_
-        powers = np.vstack([np.zeros_like(powers[:1]), powers])  # the intercept is a monomial
-        constant = np.broadcast_to(readout.intercept_, len(coef))
-        return PolynomialModule(powers, np.vstack([constant, coef.T]), center, scale)
+    readout = steps[-1]
+    if isinstance(readout, _LINEAR):
+        coef = np.atleast_2d(np.asarray(readout.coef_))
+        if len(steps) == 1:
+            return AffineModule(coef / scale, readout.intercept_ - coef / scale @ center)
+        if len(steps) == 2 and isinstance(steps[0], PolynomialFeatures):
+            powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))  # the intercept is a monomial
+            constant = np.broadcast_to(readout.intercept_, len(coef))
+            return PolynomialModule(powers, np.vstack([constant, coef.T]), center, scale)
     if len(steps) == 1 and (expansion := _expansion(readout)) is not None:
         rows, weights, widths, bias = expansion
         return KernelModule(rows / widths, weights, bias, center, scale * widths)
@@ -79,11 +79,9 @@ class AffineModule(ForwardModel):
 
     def __init__(self, coef: ArrayLike, bias: ArrayLike) -> None:
         super().__init__()
-        matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64).contiguous()
-        intercept = torch.tensor(np.asarray(bias), dtype=torch.float64)
-        self.register_buffer("coef", matrix)
-        self.register_buffer("bias", intercept.expand(len(matrix)).clone())
+        matrix = np.atleast_2d(coef)
         self.n_outputs, self.n_actuators = matrix.shape
+        _register(self, coef=matrix, bias=np.broadcast_to(bias, self.n_outputs))
 
     def forward(self, q: Tensor) -> Tensor:
         """Return coef q + bias, shape (..., m)."""
@@ -194,6 +192,7 @@ class KernelModule(ForwardModel):
         super().__init__()
         at, heights = np.asarray(rows), np.asarray(weights)
         (n_rows, self.n_actuators), self.n_outputs = at.shape, heights.shape[1]
+        self._block = max(1, _KERNEL_BLOCK // n_rows)
         tangent = (heights[:, :, None] * at[:, None, :]).reshape(n_rows, -1)
         bias = np.broadcast_to(bias, self.n_outputs)
         _register(self, rows=at, weights=heights, bias=bias, center=center, scale=scale)
@@ -201,25 +200,19 @@ class KernelModule(ForwardModel):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""
-        return in_blocks(self._forward, q, self._block)[0]
+        weights, bias = self.weights.to(q), self.bias.to(q)
+        return in_blocks(lambda q: (self._kernel(q)[1] @ weights + bias,), q, self._block)[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return both for the price of one kernel matrix."""
         x, J = in_blocks(self._forward_and_jacobian, q, self._block)
         return x, J
 
-    @property
-    def _block(self) -> int:
-        return max(1, _KERNEL_BLOCK // len(self.rows))
-
     def _kernel(self, q: Tensor) -> tuple[Tensor, Tensor]:
         u, rows = (q - self.center.to(q)) / self.scale.to(q), self.rows.to(q)
         squares = u.square().sum(-1, keepdim=True) + rows.square().sum(-1)
         distances = (squares - 2.0 * (u @ rows.mT)).clamp(min=0.0)
         return u, torch.exp(-0.5 * distances)
-
-    def _forward(self, q: Tensor) -> tuple[Tensor]:
-        return (self._kernel(q)[1] @ self.weights.to(q) + self.bias.to(q),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         u, kernel = self._kernel(q)

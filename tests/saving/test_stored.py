@@ -100,7 +100,6 @@ def test_entries_are_checked_when_they_are_read():
     arrays = {"a": np.zeros((2, 3)), "b": np.zeros(3), "n": np.full(2, np.nan)}
     stored = Stored.of("thing", {**arrays, "i": np.arange(3)}, count=3, flag=True, names=["x", 1])
     assert stored.value("count", float) == 3.0
-    assert stored.value("missing", str, "default") == "default"
     assert {*stored.tensors(a="kn", b="n")} == {"a", "b"}
     assert np.isnan(stored.array("n", (None,), finite=False)).all()
     wrong = [
