@@ -53,6 +53,10 @@ class PortableModule(nn.Module):
             **{name: None if part is None else restore(part) for name, part in parts.items()},
         )
 
+    if TYPE_CHECKING:  # attributes that no statement assigns are buffers
+
+        def __getattr__(self, name: str) -> Tensor: ...
+
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
         state["_buffers"] = {

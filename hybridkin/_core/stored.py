@@ -191,9 +191,8 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
     A random state that is not a number becomes None, and so does the device.
     """
     params = plain(estimator.get_params(deep=False))
-    seeded = isinstance(params.get("random_state"), int)
-    dropped = {"device"} if seeded else {"device", "random_state"}
-    return params | dict.fromkeys(dropped & params.keys())
+    lost = {name for name in ("device", "random_state") if not isinstance(params.get(name), int)}
+    return {name: None if name in lost else value for name, value in params.items()}
 
 
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
@@ -207,9 +206,10 @@ def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
     return cls(**known)
 
 
-def feature_names(stored: Stored, n: int) -> NDArray | None:
-    """Return the names of n columns as scikit-learn keeps them; None where there are none."""
-    names = stored.list_of(str, "feature_names_in")
+def restore_columns(estimator: Any, stored: Stored, n: int) -> None:
+    """Set the number of columns, and their names if there are any, as scikit-learn keeps them."""
+    estimator.n_features_in_, names = n, stored.list_of(str, "feature_names_in")
     if names and len(names) != n:
         raise ValueError(f"`feature_names_in` must be {n} names, got {len(names)}")
-    return np.array(names, dtype=object) if names else None
+    if names:
+        estimator.feature_names_in_ = np.array(names, dtype=object)

@@ -11,7 +11,7 @@ from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.model import PortableModule, as_forward_model
-from hybridkin._core.stored import Restore, Stored, estimator_of, feature_names, params_of, plain
+from hybridkin._core.stored import Restore, Stored, estimator_of, params_of, plain, restore_columns
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.chains.play import PlayOperator
@@ -28,8 +28,6 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import AffineModule, KernelModule, PolynomialModule
-
-__all__ = ["hybrid_of", "restorer", "stored_hybrid", "training_of"]
 
 # Every module that a description may hold, by its kind.
 _MODULES: dict[str, type[PortableModule]] = {
@@ -106,9 +104,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.module_ = restore(stored.part("module"))
     model.mechanical_model_ = model.module_.mechanical
     model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
-    model.n_features_in_, names = n, feature_names(stored, n)
-    if names is not None:
-        model.feature_names_in_ = names
+    restore_columns(model, stored, n)
     model._single_output = stored.value("single_output", bool)
     center = torch.tensor(stored.array("drift_center", (n,)))
     with torch.no_grad():  # arrays that do not fit together fail here, not in use
@@ -119,8 +115,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.calibration_, model.play_, model.radius_ = None, None, None
     model._play_state = None
     if "play_width" in stored.arrays:
-        width = stored.array("play_width")
-        model.play_ = PlayOperator(stored.array("play_width", (n,) if width.ndim else ()))
+        one = stored.array("play_width").ndim == 0
+        model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))
     if "radius" in stored.arrays:
         inside, outside, coverage, n_rows = map(float, stored.array("radius", (4,)))
         model.radius_ = Radius(inside, outside, coverage, int(n_rows))
@@ -145,10 +141,9 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
         known["rows"] = len(vars(error)["X_fit_"])
     elif model.radius_ is not None:
         known["rows"] = model.radius_.n_rows
-    if model.calibration_ is not None:
-        found = model.calibration_
+    if (found := model.calibration_) is not None:
         known["calibration"] = {"rmse": found.rmse, "held_out_rmse": found.cv_rmse}
-        known["calibration"] |= {"converged": found.converged}
+        known["calibration"]["converged"] = found.converged
     if model.cv_results_ is not None:
         known["cv_results"] = model.cv_results_
     return plain(known)

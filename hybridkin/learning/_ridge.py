@@ -11,6 +11,8 @@ from sklearn.utils import gen_batches
 
 from hybridkin.learning.network import READOUT
 
+BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
+
 
 class Statistics(NamedTuple):
     """Total weight, mean, and scatter about the mean, of the rows [features, targets]."""
@@ -20,13 +22,18 @@ class Statistics(NamedTuple):
     scatter: np.ndarray
 
 
-def accumulate(stats, elm, X, y, sample_weight, block_size):
-    """Return `stats` with the rows of `X`, `y` added, block by block.
+@torch.no_grad()
+def gather(stats, elm, X, y, sample_weight, block_size):
+    """Return the statistics `stats` (None: of no rows) with the rows of `X` and `y` added.
 
     A block is centred about its own mean. The step from the old mean to the block's enters as one
     more row, so that all of it is one symmetric product per block, and exact.
     """
     n_features, device = len(elm.output_weights), elm.input_center.device
+    n_columns = n_features + y.shape[1]
+    if stats is None:
+        stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
+    block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
     n, mean = stats.n, torch.tensor(stats.mean, device=device)
     scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is kept up
     buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
@@ -36,14 +43,11 @@ def accumulate(stats, elm, X, y, sample_weight, block_size):
         block = z[:-1]
         elm._write_features(q, block[:, :n_features])
         block[:, n_features:] = torch.tensor(y[rows], device=device)
-        if sample_weight is None:
-            n_block, mean_block = float(len(block)), block.mean(0)
-            block -= mean_block
-        else:
-            w = torch.tensor(sample_weight[rows], device=device)
-            n_block = w.sum().item()
-            mean_block = w @ block / n_block
-            block -= mean_block
+        w = None if sample_weight is None else torch.tensor(sample_weight[rows], device=device)
+        n_block = float(len(block)) if w is None else w.sum().item()
+        mean_block = block.mean(0) if w is None else w @ block / n_block
+        block -= mean_block
+        if w is not None:
             block *= w.sqrt()[:, None]
         step = mean_block - mean
         torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
@@ -55,6 +59,11 @@ def accumulate(stats, elm, X, y, sample_weight, block_size):
         else:
             scatter.addmm_(z.T, z)
     lower = np.tril(scatter.cpu().numpy())
+    if not np.isfinite(lower[:, :n_features]).all():
+        raise ValueError(
+            "`X` and `y` must give finite sums of products of features and targets in float64, "
+            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
+        )
     return Statistics(n, mean.cpu().numpy(), lower + np.tril(lower, -1).T)
 
 

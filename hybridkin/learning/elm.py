@@ -11,23 +11,108 @@ from sklearn.utils import gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from hybridkin._core.stored import Stored, estimator_of, feature_names, params_of
-from hybridkin.learning._ridge import Statistics, fit_readout, merge
-from hybridkin.learning.hidden_layer import (
-    BLOCK_ELEMENTS,
-    DTYPES,
-    check_rows,
-    device_named,
-    draw_layer,
-    gather,
-    without_readout,
-)
+from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
+from hybridkin.learning._ridge import BLOCK_ELEMENTS, Statistics, fit_readout, gather, merge
+from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer
 from hybridkin.learning.network import ACTIVATIONS, ELM, LAYER, READOUT
 
-__all__ = ["ELMRegressor"]
+
+class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """What a fitted network tells about new inputs."""
+
+    module_: ELM
+    noise_variance_: np.ndarray
+    block_size: int | None
+    _y_ndim: int
+
+    def predict(self, X, return_std=False):
+        """Return the prediction at `X`, in the dtype of `X`.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+        return_std : bool, default=False
+            Whether to return the standard deviation of a new measurement as well.
+
+        Returns
+        -------
+        y : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Predictions, one-dimensional if the targets were.
+        std : ndarray of the shape of y
+            Only if `return_std`: ``sqrt(noise_variance_ * (1 + leverage(X)))``, the posterior
+            predictive of the Bayesian ridge with prior ``N(0, noise_variance_ / alpha)``.
+        """
+        if not return_std:
+            return self._map(X, lambda elm, q: (elm(q),))[0]
+        y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)))
+        noise = self.noise_variance_ if y.ndim == 2 else self.noise_variance_[0]
+        std = np.sqrt(np.multiply.outer(1 + leverage, noise))
+        return y, std.astype(y.dtype)
+
+    def jacobian(self, X):
+        """Return the derivative of the prediction by the inputs, in closed form.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        J : ndarray of shape (n_samples, n_inputs) or (n_samples, n_outputs, n_inputs)
+            Jacobians [unit of y per unit of X]; gradients if the targets were one-dimensional.
+        """
+        return self._map(X, lambda elm, q: (elm.jacobian(q),))[0]
+
+    def predict_and_jacobian(self, X):
+        """Return ``predict(X), jacobian(X)`` for the price of one hidden layer.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        y, J : ndarray of their shapes
+            As from `predict` and `jacobian`.
+        """
+        return self._map(X, lambda elm, q: elm.forward_and_jacobian(q))
+
+    def leverage(self, X):
+        """Return ``phi' (G + alpha 1)^-1 phi``, at most 1 on the training rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_inputs)
+            Inputs.
+
+        Returns
+        -------
+        leverage : ndarray of shape (n_samples,)
+            Influence that a row of weight 1 would have had on its own prediction [-]. With an
+            intercept the features are centred, and 1 / n is added.
+        """
+        return self._map(X, lambda elm, q: (elm.leverage(q),))[0]
+
+    def _map(self, X, function):
+        """Return the arrays that `function(module, q)` gives, computed block by block."""
+        check_is_fitted(self, "module_")
+        X = np.asarray(validate_data(self, X, reset=False, dtype=DTYPES, order="C"))
+        elm, outputs = self.module_, ()
+        width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
+        with torch.no_grad():
+            for rows in gen_batches(len(X), self.block_size or max(1, BLOCK_ELEMENTS // width)):
+                q = torch.tensor(X[rows], dtype=torch.float64, device=elm.input_center.device)
+                parts = function(elm, q)
+                outputs = outputs or [np.empty((len(X), *p.shape[1:]), X.dtype) for p in parts]
+                for array, part in zip(outputs, parts, strict=True):
+                    array[rows] = part.cpu().numpy()
+        return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
 
 
-class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class ELMRegressor(FittedNetwork):
     """Extreme learning machine: a fixed random hidden layer, a readout by ridge regression.
 
     ``f(x) = W_out sigma(W u + b)`` with `u` the inputs mapped to [-1, 1], W and b drawn once, and
@@ -105,12 +190,6 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     >>> elm.jacobian(q).shape
     (500, 2, 3)
     """
-
-    n_features_in_: int
-    feature_names_in_: np.ndarray
-    input_center_: np.ndarray
-    input_scale_: np.ndarray
-    output_weights_: np.ndarray
 
     _parameter_constraints = {  # noqa: RUF012
         "n_hidden": [Interval(Integral, 1, None, closed="left")],
@@ -212,120 +291,43 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise TypeError(f"`other` must be a fitted ELMRegressor, got {type(other).__name__}.")
         check_is_fitted(self, "module_")
         check_is_fitted(other, "module_")
-        for name in (*(f"{name}_" for name in LAYER), "_activation", "feature_names_in_"):
-            if not np.array_equal(getattr(self, name, ()), getattr(other, name, ())):
+        ours, theirs = ({**vars(m), "activation": m.module_.activation} for m in (self, other))
+        for name in (*(f"{name}_" for name in LAYER), "activation", "feature_names_in_"):
+            if not np.array_equal(ours.get(name, ()), theirs.get(name, ())):
                 raise ValueError(
                     f"`other` must have this model's hidden layer, input scaling and columns, but "
-                    f"its {name.strip('_')} differs; give both models the same int as "
+                    f"its {name.rstrip('_')} differs; give both models the same int as "
                     f"`random_state`, the same parameters, and bounds as `input_scaling`."
                 )
-        if self.output_weights_.shape != other.output_weights_.shape:
+        shape, given = (m.module_.output_weights.shape for m in (self, other))
+        if shape != given:
             raise ValueError(
-                f"`other` must have output_weights_ of shape {self.output_weights_.shape}, got "
-                f"{other.output_weights_.shape}; fit both models with the same `direct_link` and "
-                f"the same columns of `y`."
+                f"`other` must have output_weights_ of shape {tuple(shape)}, got {tuple(given)}; "
+                f"fit both models with the same `direct_link` and the same columns of `y`."
             )
-        stats = merge(self._stats, other._stats)
-        return self._solve(stats, len(self.output_weights_), device_named(self.device))
-
-    def predict(self, X, return_std=False):
-        """Return the prediction at `X`, in the dtype of `X`.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_inputs)
-            Inputs.
-        return_std : bool, default=False
-            Whether to return the standard deviation of a new measurement as well.
-
-        Returns
-        -------
-        y : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-            Predictions, one-dimensional if the targets were.
-        std : ndarray of the shape of y
-            Only if `return_std`: ``sqrt(noise_variance_ * (1 + leverage(X)))``, the posterior
-            predictive of the Bayesian ridge with prior ``N(0, noise_variance_ / alpha)``.
-        """
-        if not return_std:
-            return self._map(X, lambda elm, q: (elm(q),))[0]
-        y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)))
-        noise = self.noise_variance_ if y.ndim == 2 else self.noise_variance_[0]
-        std = np.sqrt(np.multiply.outer(1 + leverage, noise))
-        return y, std.astype(y.dtype)
-
-    def jacobian(self, X):
-        """Return the derivative of the prediction by the inputs, in closed form.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_inputs)
-            Inputs.
-
-        Returns
-        -------
-        J : ndarray of shape (n_samples, n_inputs) or (n_samples, n_outputs, n_inputs)
-            Jacobians [unit of y per unit of X]; gradients if the targets were one-dimensional.
-        """
-        return self._map(X, lambda elm, q: (elm.jacobian(q),))[0]
-
-    def predict_and_jacobian(self, X):
-        """Return ``predict(X), jacobian(X)`` for the price of one hidden layer.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_inputs)
-            Inputs.
-
-        Returns
-        -------
-        y, J : ndarray of their shapes
-            As from `predict` and `jacobian`.
-        """
-        return self._map(X, lambda elm, q: elm.forward_and_jacobian(q))
-
-    def leverage(self, X):
-        """Return ``phi' (G + alpha 1)^-1 phi``, at most 1 on the training rows.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_inputs)
-            Inputs.
-
-        Returns
-        -------
-        leverage : ndarray of shape (n_samples,)
-            Influence that a row of weight 1 would have had on its own prediction [-]. With an
-            intercept the features are centred, and 1 / n is added.
-        """
-        return self._map(X, lambda elm, q: (elm.leverage(q),))[0]
+        return self._solve(merge(self._stats, other._stats), self.module_)
 
     def _learn(self, X, y, sample_weight, first, decay=1.0):
-        X, y, sample_weight, kept = check_rows(self, X, y, sample_weight, reset=first)
-        if kept is not None:
-            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]  # pyright: ignore
-        device = device_named(self.device)
+        X, y, sample_weight, _ = check_rows(self, X, y, sample_weight, reset=first)
         y_ndim, y = y.ndim, y.reshape(len(y), -1)
         if first:
-            elm, stats = draw_layer(self, X, sample_weight).to(device), None
+            elm, stats = draw_layer(self, X, sample_weight), None
         else:
-            elm = without_readout(
-                self._arrays(LAYER), self._activation, len(self.output_weights_)
-            ).to(device)
-            n_outputs = self.output_weights_.shape[1]
-            if y.shape[1] != n_outputs:
+            elm, (n, mean, scatter) = self.module_, self._stats
+            if y.shape[1] != elm.n_outputs:
                 raise ValueError(
-                    f"`y` must have {n_outputs} columns as in earlier calls, got {y.shape[1]}; "
-                    f"call `fit` to start afresh."
+                    f"`y` must have {elm.n_outputs} columns as in earlier calls, got "
+                    f"{y.shape[1]}; call `fit` to start afresh."
                 )
-            n, mean, scatter = self._stats
             stats, y_ndim = Statistics(decay * n, mean, decay * scatter), self._y_ndim
+        elm = elm.to(device_named(self.device))
         stats = gather(stats, elm, X, y, sample_weight, self.block_size)
-        self._activation, self._y_ndim = elm.activation, y_ndim
-        for name in LAYER:
-            setattr(self, f"{name}_", elm.get_buffer(name).numpy(force=True))
-        return self._solve(stats, len(elm.output_weights), device)
+        self._y_ndim = y_ndim
+        return self._solve(stats, elm)
 
-    def _solve(self, stats, n_features, device):
+    def _solve(self, stats, elm):
+        """Fit the readout to statistics of the features of `elm`."""
+        n_features = len(elm.output_weights)
         n_outputs = len(stats.mean) - n_features
         if np.ndim(self.alpha):
             alpha = np.asarray(self.alpha, dtype=np.float64)
@@ -344,45 +346,16 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 linalg.LinAlgWarning,
                 stacklevel=2,
             )
-        self._stats, self.n_samples_seen_ = stats, stats.n
-        for name, array in readout.items():
-            setattr(self, f"{name}_", array)
-        self._build(device)
+        layer = {name: elm.get_buffer(name).cpu() for name in LAYER}
+        module = ELM(elm.activation, **layer, **readout)
+        return self._hold(module.to(device_named(self.device)), stats)
+
+    def _hold(self, module, stats):
+        """Take over a fitted network, its arrays as learned names too."""
+        self.module_, self._stats, self.n_samples_seen_ = module, stats, stats.n
+        for name in LAYER + READOUT:
+            setattr(self, f"{name}_", module.get_buffer(name).numpy(force=True))
         return self
-
-    def _build(self, device):
-        self.module_ = ELM(self._arrays(LAYER + READOUT), self._activation).to(device)
-
-    def _arrays(self, names):
-        return {name: vars(self)[f"{name}_"] for name in names}
-
-    def _map(self, X, function):
-        """Return the arrays that `function(module, q)` gives, computed block by block."""
-        check_is_fitted(self, "module_")
-        X = np.asarray(validate_data(self, X, reset=False, dtype=DTYPES, order="C"))
-        elm, outputs = self.module_, ()
-        width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
-        with torch.no_grad():
-            for rows in gen_batches(len(X), self.block_size or max(1, BLOCK_ELEMENTS // width)):
-                q = torch.tensor(X[rows], dtype=torch.float64, device=elm.input_center.device)
-                parts = function(elm, q)
-                outputs = outputs or [np.empty((len(X), *p.shape[1:]), X.dtype) for p in parts]
-                for array, part in zip(outputs, parts, strict=True):
-                    array[rows] = part.cpu().numpy()
-        return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
-
-    def __getstate__(self):
-        # Arrays only: the same bytes whatever the device, and readable where it is missing.
-        return {name: value for name, value in super().__getstate__().items() if name != "module_"}
-
-    def __setstate__(self, state):
-        super().__setstate__(state)
-        if "_stats" in state:
-            try:
-                device = device_named(self.device)
-            except RuntimeError:
-                device = torch.device("cpu")
-            self._build(device)
 
     def stored(self):
         """Return how the fitted network describes itself, with what `partial_fit` goes on from."""
@@ -405,21 +378,10 @@ class ELMRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         elm = estimator_of(cls, stored.value("params", dict))
         elm._validate_params()
         network = restore(stored.part("network"))
-        n_outputs, n_both = network.n_outputs, sum(network.output_weights.shape)
+        n_both = sum(network.output_weights.shape)
         mean, scatter = stored.array("mean", (n_both,)), stored.array("scatter", (n_both, n_both))
-        seen = stored.value("n_samples_seen", float)
-        state = {f"{name}_": value.numpy() for name, value in network.state_dict().items()}
-        state |= {
-            "noise_variance_": stored.array("noise_variance", (n_outputs,), finite=False),
-            "solver_": stored.value("solver", str),
-            "n_samples_seen_": seen,
-            "n_features_in_": network.n_actuators,
-            "_activation": network.activation,
-            "_y_ndim": stored.value("y_ndim", int),
-            "_stats": Statistics(seen, mean, scatter),
-        }
-        names = feature_names(stored, network.n_actuators)
-        state |= {} if names is None else {"feature_names_in_": names}
-        elm.__setstate__({**elm.get_params(), **state})
-        elm.module_ = network
-        return elm
+        shape = (network.n_outputs,)
+        elm.noise_variance_ = stored.array("noise_variance", shape, finite=False)
+        elm.solver_, elm._y_ndim = stored.value("solver", str), stored.value("y_ndim", int)
+        restore_columns(elm, stored, network.n_actuators)
+        return elm._hold(network, Statistics(stored.value("n_samples_seen", float), mean, scatter))

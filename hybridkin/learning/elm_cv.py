@@ -5,30 +5,27 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
+from sklearn.base import _fit_context
 from sklearn.model_selection import GroupKFold, LeaveOneGroupOut, check_cv
 from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.stored import plain
 from hybridkin.learning._left_out import LeftOut
-from hybridkin.learning.elm import ELMRegressor
-from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer, gather
-
-__all__ = ["ELMRegressorCV"]
+from hybridkin.learning._ridge import gather
+from hybridkin.learning.elm import ELMRegressor, FittedNetwork
+from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
 
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)  # times the largest eigenvalue of the features' Gram matrix
 _ZOOM = (0.5, 1.0, 2.0, 4.0)  # weight scales tried with new input scales, times the best so far
 _WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
 _LEAST_RELEVANCE = 0.01
 _ROWS_OF_JACOBIANS = 10_000
-_SHARED = (
-    *("activation", "input_scaling", "fit_intercept", "direct_link", "block_size", "device"),
-)
+_SHARED = ["activation", "input_scaling", "fit_intercept", "direct_link", "block_size", "device"]
 
 
-class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class ELMRegressorCV(FittedNetwork):
     """Extreme learning machine that chooses penalty, weight scale, size and input scales itself.
 
     Every choice is made by the mean squared error on held-out rows, each row alone or by groups.
@@ -166,21 +163,18 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             The fitted estimator.
         """
         X, y, sample_weight, kept = check_rows(self, X, y, sample_weight)
-        n_rows, y_shape = len(y), y.shape
-        if kept is not None:
-            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]  # pyright: ignore
         if len(y) < 2:
             raise ValueError(
                 f"`X` must have at least 2 rows of positive weight, so that one can be held out, "
                 f"got n_samples={len(y)}; ELMRegressor needs no choice."
             )
-        splits = _splits(self.cv, y_shape, groups, kept)
-        task = _Task(X, y, y.reshape(len(y), -1), sample_weight, splits, self)
+        weights = np.ones(len(X)) if sample_weight is None else sample_weight
+        splits = _splits(self.cv, groups, kept)
+        task = _Task(X, y.reshape(len(y), -1), sample_weight, weights, splits, self.alphas)
         seed = self.random_state
         if not isinstance(seed, Integral):
             seed = int(check_random_state(seed).randint(2**31))
-        settings = self.get_params()
-        shared = {name: settings[name] for name in _SHARED} | {"random_state": seed}
+        shared = {name: vars(self)[name] for name in _SHARED} | {"random_state": seed}
         sizes = _positive(self.n_hidden, "n_hidden", integer=True)
         scales = _positive(self.weight_scales, "weight_scales")
         untouched, tried = np.ones(X.shape[1]), []
@@ -206,66 +200,37 @@ class ELMRegressorCV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             best = tried[-1]
         self.alpha_ = best.params["alpha"]
         self.best_params_, self.best_score_ = best.params, -best.score
-        self.best_estimator_ = ELMRegressor(**best.params).fit(X, y, sample_weight)
-        errors = _left_out_errors(best, task)
-        if kept is not None:
-            among = errors
-            errors = np.full((n_rows, errors.shape[1]), np.nan)
-            errors[kept] = among
-        self.left_out_errors_ = errors.reshape(y_shape)
-        self.cv_results_ = {
-            "n_hidden": np.array([candidate.params["n_hidden"] for candidate in tried]),
-            "weight_scale": np.array([candidate.params["weight_scale"] for candidate in tried]),
-            "relevance": np.array([candidate.relevance for candidate in tried]),
-            "alphas": np.array([candidate.alphas for candidate in tried]),
-            "mean_squared_error": np.array([candidate.mse for candidate in tried]),
-        }
+        chosen = ELMRegressor(**best.params).fit(X, y, sample_weight)
+        self.best_estimator_, self.module_ = chosen, chosen.module_
+        self.noise_variance_, self._y_ndim = chosen.noise_variance_, y.ndim
+        self.left_out_errors_ = np.full((len(kept), *y.shape[1:]), np.nan)
+        self.left_out_errors_[kept] = _left_out_errors(best, task).reshape(y.shape)
+        names = ("n_hidden", "weight_scale", "relevance", "alphas", "mean_squared_error")
+        rows = (
+            (c.params["n_hidden"], c.params["weight_scale"], c.relevance, c.alphas, c.mse)
+            for c in tried
+        )
+        columns = map(np.array, zip(*rows, strict=True))
+        self.cv_results_ = dict(zip(names, columns, strict=True))
         return self
-
-    @property
-    def module_(self):
-        """The fitted network as a torch module."""
-        return self._best().module_
-
-    def predict(self, X, return_std=False):
-        """Return the prediction at `X`, as `ELMRegressor.predict` does."""
-        return self._best().predict(self._checked(X), return_std)
-
-    def jacobian(self, X):
-        """Return the derivative by the inputs, as `ELMRegressor.jacobian` does."""
-        return self._best().jacobian(self._checked(X))
-
-    def predict_and_jacobian(self, X):
-        """Return both, as `ELMRegressor.predict_and_jacobian` does."""
-        return self._best().predict_and_jacobian(self._checked(X))
-
-    def leverage(self, X):
-        """Return the leverage, as `ELMRegressor.leverage` does."""
-        return self._best().leverage(self._checked(X))
 
     def stored(self):
         """Return the description of the chosen ELMRegressor."""
-        chosen = self._best().stored()
+        check_is_fitted(self, "module_")
+        chosen = self.best_estimator_.stored()
         chosen.settings["feature_names_in"] = plain(vars(self).get("feature_names_in_", []))
         return chosen
-
-    def _best(self):
-        check_is_fitted(self, "best_estimator_")
-        return self.best_estimator_
-
-    def _checked(self, X):
-        return validate_data(self, X, reset=False, dtype=DTYPES)
 
 
 class _Task(NamedTuple):
     """Rows of positive weight, and which of them are held out together (None: each alone)."""
 
     X: np.ndarray
-    y: np.ndarray
-    targets: np.ndarray  # y with two dimensions
+    targets: np.ndarray  # with two dimensions
     sample_weight: np.ndarray | None
+    weights: np.ndarray  # the same, or ones
     splits: list | None
-    settings: ELMRegressorCV
+    alphas: Any
 
 
 class _Candidate(NamedTuple):
@@ -280,21 +245,19 @@ class _Candidate(NamedTuple):
 
 
 def _candidate(params, relevance, task):
-    X, _, targets, sample_weight, splits, settings = task
+    X, targets, sample_weight, weights, splits, alphas = task
     asked = ELMRegressor(**params)
     elm = draw_layer(asked, X, sample_weight).to(device_named(asked.device))
     stats = gather(None, elm, X, targets, sample_weight, asked.block_size)
     left_out = LeftOut(elm, stats, X, targets, sample_weight, asked.fit_intercept)
-    alphas = settings.alphas
     if isinstance(alphas, str):
         alphas = _AUTO_ALPHAS * (left_out.eigenvalues[-1] or 1.0)
     else:
         alphas = _positive(alphas, "alphas")
     total, weight = np.zeros((len(alphas), targets.shape[1])), 0.0
     for rows, errors in _errors(left_out, len(X), splits, alphas):
-        w = np.ones(len(rows)) if sample_weight is None else sample_weight[rows]
-        total += np.einsum("r, lrm -> lm", w, errors * errors)
-        weight += w.sum()
+        total += np.einsum("r, lrm -> lm", weights[rows], errors * errors)
+        weight += weights[rows].sum()
     mse = np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
     params = {**params, "alpha": float(alphas[mse.argmin()])}
     return _Candidate(params, relevance, alphas, mse, float(mse.min()), left_out)
@@ -326,55 +289,49 @@ def _relevance(best, task):
     It is measured in the units in which the inputs were scaled at first.
     """
     model = ELMRegressor(**best.params).fit(task.X, task.targets, task.sample_weight)
-    scale = model.input_scale_ * best.relevance
+    center, scale = (
+        model.module_.get_buffer(name).numpy(force=True) for name in ("input_center", "input_scale")
+    )
+    scale = scale * best.relevance
     total, squares, weight = 0.0, 0.0, 0.0
     for batch in gen_batches(len(task.X), _ROWS_OF_JACOBIANS):
         J = model.jacobian(task.X[batch]) * scale
-        w = np.ones(len(J)) if task.sample_weight is None else task.sample_weight[batch]
+        w = task.weights[batch]
         total = total + np.tensordot(w, J, 1)
         squares, weight = squares + np.tensordot(w, J * J, 1), weight + w.sum()
     spread = np.sqrt(np.maximum(squares / weight - (total / weight) ** 2, 0.0).sum(axis=0))
     relevance = np.maximum(spread / (spread.max() or 1.0), _LEAST_RELEVANCE)
-    center, half = model.input_center_, scale / relevance
+    half = scale / relevance
     return relevance, np.array([center - half, center + half])
 
 
-def _splits(cv, y_shape, groups, kept):
+def _splits(cv, groups, kept):
     """Return (rows out, rows asked) of every split, counted among the rows kept."""
     if groups is None and cv is None:
         return None
     if groups is not None:
         groups = np.asarray(groups)
-        if groups.shape != y_shape[:1]:
+        if groups.shape != kept.shape:
             raise ValueError(
-                f"`groups` must have shape ({y_shape[0]},), one entry for each row of `X`, got "
+                f"`groups` must have shape {kept.shape}, one entry for each row of `X`, got "
                 f"{groups.shape}."
-            )
-        if len(np.unique(groups)) < 2:
-            raise ValueError(
-                "`groups` must name at least 2 groups, to hold one out, got 1; without `groups` "
-                "single rows are held out."
             )
         if cv is None:
             cv = LeaveOneGroupOut()
         elif isinstance(cv, Integral):
             cv = GroupKFold(int(cv))
-    rows = np.zeros(y_shape[0])
-    splits = []
+    splits, rows = [], np.zeros(len(kept))
     splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
     for train, test in splitter.split(rows, rows, groups):
-        used, asked = rows.astype(bool), rows.astype(bool)
-        used[train], asked[test] = True, True
-        if (used & asked).any():
+        out, asked = np.ones(len(kept), dtype=bool), np.zeros(len(kept), dtype=bool)
+        out[train], asked[test] = False, True
+        if (asked & ~out).any():
             raise ValueError(
                 "`cv` must not test on rows that it trains on, but a split of its own does; use a "
                 "splitter of sklearn.model_selection."
             )
-        if kept is not None:
-            used, asked = used[kept], asked[kept]
-        if asked.any():
-            splits.append((np.flatnonzero(~used), np.flatnonzero(asked)))
-    return splits
+        splits.append((np.flatnonzero(out[kept]), np.flatnonzero(asked[kept])))
+    return [split for split in splits if len(split[1])]
 
 
 def _positive(values, name, integer=False):

@@ -5,11 +5,9 @@ import torch
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, validate_data
 
-from hybridkin.learning._ridge import Statistics, accumulate
 from hybridkin.learning.network import ELM, LAYER, READOUT
 
 DTYPES = (np.float64, np.float32)
-BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
 
 
 def _scaling(X, sample_weight, input_scaling):
@@ -42,17 +40,18 @@ def _scaling(X, sample_weight, input_scaling):
 
 
 def check_rows(estimator, X, y, sample_weight, reset=True):
-    """Return `X`, float64 `y`, the weights, and the rows of positive weight; None for all."""
+    """Return the rows of positive weight, float64 `y`, with their weights; and which they are."""
     checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
     X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
-    kept = None
+    y, kept = y.astype(np.float64, copy=False), np.ones(len(X), dtype=bool)
     if sample_weight is not None:
         sample_weight = _check_sample_weight(
             sample_weight, X, dtype=np.float64, ensure_non_negative=True
         )
-        if not sample_weight.all():
-            kept = np.flatnonzero(sample_weight)
-    return X, y.astype(np.float64, copy=False), sample_weight, kept
+        kept = sample_weight > 0
+        if not kept.all():
+            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]
+    return X, y, sample_weight, kept
 
 
 def draw_layer(params, X, sample_weight):
@@ -62,31 +61,9 @@ def draw_layer(params, X, sample_weight):
     b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
     layer = (W, b, *_scaling(X, sample_weight, params.input_scaling))
     n_features = params.n_hidden + params.direct_link * X.shape[1]
-    return without_readout(dict(zip(LAYER, layer, strict=True)), params.activation, n_features)
-
-
-def without_readout(layer, activation, n_features):
-    """Return a hidden layer as a network without outputs: only its features count."""
     shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
-    blank = {name: np.zeros(shape) for name, shape in zip(READOUT, shapes, strict=True)}
-    return ELM({**layer, **blank}, activation)
-
-
-def gather(stats, elm, X, y, sample_weight, block_size):
-    """Return the statistics `stats` (None: of no rows) with the rows of `X` and `y` added."""
-    n_features = len(elm.output_weights)
-    n_columns = n_features + y.shape[1]
-    if stats is None:
-        stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
-    block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
-    with torch.no_grad():
-        stats = accumulate(stats, elm, X, y, sample_weight, block_size)
-    if not np.isfinite(stats.scatter[:, :n_features]).all():
-        raise ValueError(
-            "`X` and `y` must give finite sums of products of features and targets in float64, "
-            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
-        )
-    return stats
+    arrays = (*layer, *map(np.zeros, shapes))
+    return ELM(params.activation, **dict(zip(LAYER + READOUT, arrays, strict=True)))
 
 
 def device_named(name):

@@ -1,5 +1,6 @@
 """A random hidden layer and its readout as a torch module, with closed-form derivatives."""
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -47,8 +48,10 @@ class ELM(LeverageModule):
 
     Parameters
     ----------
-    arrays : mapping of str to array
-        What the state dict holds, so ``ELM(elm.state_dict(), elm.activation)`` is a copy:
+    activation : {"logistic", "tanh", "sin"}, default="logistic"
+        The function sigma.
+    **arrays
+        What the state dict holds, so ``ELM(elm.activation, **elm.state_dict())`` is a copy:
 
         - input_weights (n_hidden, n_inputs), input_bias (n_hidden,): the hidden layer W, b;
         - input_center, input_scale (n_inputs,): affine map of the inputs [unit of q];
@@ -56,8 +59,6 @@ class ELM(LeverageModule):
           eps], where `n_features` is `n_hidden`, plus `n_inputs` with a direct link;
         - leverage_center (n_features,), leverage_factor (n_features, n_features), leverage_offset
           (): ``leverage = |(phi - leverage_center) @ leverage_factor|^2 + leverage_offset``.
-    activation : {"logistic", "tanh", "sin"}, default="logistic"
-        The function sigma.
     """
 
     layout = Layout(
@@ -67,36 +68,24 @@ class ELM(LeverageModule):
         | {"leverage_center": "f", "leverage_factor": "ff"},
         {"activation": str},
     )
-    input_weights: torch.Tensor
-    input_bias: torch.Tensor
-    input_center: torch.Tensor
-    input_scale: torch.Tensor
-    output_weights: torch.Tensor
-    intercept: torch.Tensor
-    leverage_center: torch.Tensor
-    leverage_factor: torch.Tensor
-    leverage_offset: torch.Tensor
-    tangent: torch.Tensor
 
-    def __init__(self, arrays, activation="logistic"):
+    def __init__(self, activation="logistic", **arrays):
         super().__init__()
         self.activation = activation
         for name in LAYER + READOUT:
-            value = arrays[name]
-            if isinstance(value, torch.Tensor):
-                value = value.detach().clone()
-            else:  # copied at once, or a read-only array would warn
-                value = torch.tensor(value, dtype=torch.float64)
-            self.register_buffer(name, value)
-        self.n_actuators, self.n_outputs = len(self.input_center), len(self.intercept)
-        self.register_buffer("tangent", None, persistent=False)
-        _refresh_tangent(self)
-        self.register_load_state_dict_post_hook(_refresh_tangent)
+            self.register_buffer(name, torch.tensor(np.asarray(arrays[name])))
+        n_hidden, self.n_actuators = self.input_weights.shape
+        n_features, self.n_outputs = self.output_weights.shape
+        if n_features not in (n_hidden, n_hidden + self.n_actuators):
+            raise ValueError(f"{n_hidden} hidden neurons cannot have {n_features} features")
+        # J = T @ sigma' with T = w_out (x) w_in
+        w_in, w_out = self.input_weights / self.input_scale, self.output_weights[:n_hidden]
+        self.register_buffer("tangent", (w_out.T[:, None] * w_in.T).flatten(0, 1))
 
     def extra_repr(self):
         """Return the layer sizes and the activation, for printing."""
-        (n_hidden, n_inputs), n_outputs = self.input_weights.shape, len(self.intercept)
-        return f"{n_inputs} -> {n_hidden} {self.activation} -> {n_outputs}"
+        n_hidden = len(self.input_weights)
+        return f"{self.n_actuators} -> {n_hidden} {self.activation} -> {self.n_outputs}"
 
     def _hidden(self, q, out=None):
         n_inputs = len(self.input_center)
@@ -157,7 +146,7 @@ class ELM(LeverageModule):
         return in_blocks(rows, q, max(1, _BLOCK // len(self.input_weights)))
 
     def forward_jacobian_and_below(self, q, limit):
-        """Return ``forward(q)``, ``jacobian(q)`` and where the leverage is surely below `limit`.
+        """Return value, Jacobian and where the leverage is surely below `limit`, as the base does.
 
         The features serve all three.
         """
@@ -195,19 +184,3 @@ class ELM(LeverageModule):
         rounding = 8 * len(center) ** 0.5 * torch.finfo(torch.float32).eps * factor.norm()
         bound = half.norm(dim=-1) + rounding * (single.norm(dim=-1) + center.norm())
         return bound < (limit - self.leverage_offset).clamp(min=0.0).sqrt()
-
-    @classmethod
-    def from_stored(cls, stored, restore):
-        """Return the network of a description."""
-        arrays = stored.tensors(**cls.layout.arrays)
-        (n_hidden, n), n_features = arrays["input_weights"].shape, len(arrays["output_weights"])
-        if n_features not in (n_hidden, n_hidden + n):
-            raise ValueError(f"{n_hidden} hidden neurons cannot have {n_features} features")
-        return cls(arrays, stored.value("activation", str))
-
-
-def _refresh_tangent(elm, incompatible_keys=None):
-    # J = T @ sigma' with T = w_out (x) w_in
-    w_in = elm.input_weights / elm.input_scale
-    w_out = elm.output_weights[: len(w_in)]
-    elm.tangent = (w_out.T[:, None] * w_in.T).flatten(0, 1)

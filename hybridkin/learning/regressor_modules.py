@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process import kernels as gp
 from sklearn.kernel_ridge import KernelRidge
@@ -18,9 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, as_forward_model
-from hybridkin._core.stored import Layout, Restore, Stored
-
-__all__ = ["AffineModule", "KernelModule", "PolynomialModule", "RegressorModule", "error_module"]
+from hybridkin._core.stored import Layout
 
 _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
 _MOST_POWER = 100
@@ -39,26 +37,25 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     q : Tensor of shape (N, n)
         The rows that it was fitted on.
     """
-    module = getattr(regressor, "module_", None)
-    if isinstance(module, nn.Module):
-        return as_forward_model(module)
-    steps = (
-        [step for _, step in regressor.steps] if isinstance(regressor, Pipeline) else [regressor]
-    )
+    if isinstance(getattr(regressor, "module_", None), nn.Module):
+        return as_forward_model(regressor)
+    steps = [*regressor.named_steps.values()] if isinstance(regressor, Pipeline) else [regressor]
     center, scale = np.zeros(q.shape[1]), np.ones(q.shape[1])
     while len(steps) > 1 and (found := _affine(steps[0])) is not None:
         center, scale = center + scale * found[0], scale * found[1]
         steps = steps[1:]
-    readout, polynomial = steps[-1], len(steps) == 2 and isinstance(steps[0], PolynomialFeatures)
-    if len(steps) == 1 and isinstance(readout, _LINEAR):
-        coef = np.atleast_2d(np.asarray(readout.coef_)) / scale
-        return AffineModule(coef, readout.intercept_ - coef @ center)
-    if polynomial and isinstance(readout, _LINEAR):
-        coef, intercept = np.asarray(readout.coef_), readout.intercept_
-        return PolynomialModule(steps[0].powers_, coef, intercept, center, scale)
+    readout = steps[-1]
+    if isinstance(readout, _LINEAR):
+        coef = np.atleast_2d(np.asarray(readout.coef_))
+        if len(steps) == 1:
+            return AffineModule(coef / scale, readout.intercept_ - coef / scale @ center)
+        if len(steps) == 2 and isinstance(steps[0], PolynomialFeatures):
+            powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))  # the intercept is a monomial
+            constant = np.broadcast_to(readout.intercept_, len(coef))
+            return PolynomialModule(powers, np.vstack([constant, coef.T]), center, scale)
     if len(steps) == 1 and (expansion := _expansion(readout)) is not None:
         rows, weights, widths, bias = expansion
-        return KernelModule(rows, weights, bias, center, scale, widths)
+        return KernelModule(rows / widths, weights, bias, center, scale * widths)
     return RegressorModule(regressor, q)
 
 
@@ -79,16 +76,12 @@ class AffineModule(ForwardModel):
     """
 
     layout = Layout("affine", {"coef": "mn", "bias": "m"})
-    coef: Tensor
-    bias: Tensor
 
     def __init__(self, coef: ArrayLike, bias: ArrayLike) -> None:
         super().__init__()
-        matrix = torch.tensor(np.atleast_2d(coef), dtype=torch.float64).contiguous()
-        intercept = torch.tensor(np.asarray(bias), dtype=torch.float64)
-        self.register_buffer("coef", matrix)
-        self.register_buffer("bias", intercept.expand(len(matrix)).clone())
+        matrix = np.atleast_2d(coef)
         self.n_outputs, self.n_actuators = matrix.shape
+        _register(self, coef=matrix, bias=np.broadcast_to(bias, self.n_outputs))
 
     def forward(self, q: Tensor) -> Tensor:
         """Return coef q + bias, shape (..., m)."""
@@ -100,7 +93,7 @@ class AffineModule(ForwardModel):
 
 
 class PolynomialModule(ForwardModel):
-    """A polynomial ``coef @ phi(u) + intercept`` of ``u = (q - center) / scale``.
+    """A polynomial ``phi(u) @ readout`` of ``u = (q - center) / scale``.
 
     The derivative of a monomial is another one: the Jacobian is a second readout of the same
     features.
@@ -109,47 +102,38 @@ class PolynomialModule(ForwardModel):
     ----------
     powers : array-like of int of shape (P, n)
         Exponents of the monomials.
-    coef : array-like of shape (m, P) or (P,)
-        Their coefficients.
-    intercept : array-like of shape (m,) or float
-        Added to the sum.
+    readout : array-like of shape (P, m)
+        Their coefficients; those of a monomial that stands there twice are added.
     center, scale : array-like of shape (n,)
         Map of the inputs [unit of q].
     """
 
-    layout = Layout("polynomial", {})
-    powers: Tensor
-    readout: Tensor
-    slope: Tensor
-    center: Tensor
-    scale: Tensor
+    layout = Layout("polynomial", {"powers": "pn", "readout": "pm", "center": "n", "scale": "n"})
 
     def __init__(
-        self,
-        powers: ArrayLike,
-        coef: ArrayLike,
-        intercept: ArrayLike,
-        center: ArrayLike,
-        scale: ArrayLike,
+        self, powers: ArrayLike, readout: ArrayLike, center: ArrayLike, scale: ArrayLike
     ) -> None:
         super().__init__()
-        monomials = [tuple(map(int, row)) for row in np.asarray(powers)]
-        coef, n = np.atleast_2d(coef), np.asarray(powers).shape[1]
-        where: dict[tuple[int, ...], int] = {}
-        for monomial in [(0,) * n, *monomials, *_lowered(monomials)]:
-            where.setdefault(monomial, len(where))
-        readout, slope = np.zeros((len(where), len(coef))), np.zeros((len(where), len(coef), n))
-        readout[0] = intercept
-        for k, monomial in enumerate(monomials):
-            readout[where[monomial]] += coef[:, k]
-            for j, power in enumerate(monomial):
-                if power:
-                    slope[where[_lower(monomial, j)], :, j] += power * coef[:, k]
-        slope /= np.asarray(scale)
-        slope = slope.reshape(len(where), -1)
-        _register(self, readout=readout, slope=slope, center=center, scale=scale)
-        self.register_buffer("powers", torch.tensor(list(where)))
-        self.n_actuators, self.n_outputs = n, len(coef)
+        exponents, coef = np.asarray(powers), np.asarray(readout)
+        if not np.isin(exponents, range(_MOST_POWER)).all():
+            raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
+        monomials = [tuple(map(int, row)) for row in exponents]
+        derivatives = [
+            (k, j, (*row[:j], power - 1, *row[j + 1 :]))
+            for k, row in enumerate(monomials)
+            for j, power in enumerate(row)
+            if power
+        ]
+        distinct = dict.fromkeys([*monomials, *(lower for _, _, lower in derivatives)])
+        where = {monomial: i for i, monomial in enumerate(distinct)}
+        self.n_actuators, self.n_outputs = exponents.shape[1], coef.shape[1]
+        values = np.zeros((len(where), self.n_outputs))
+        slope = np.zeros((*values.shape, self.n_actuators))
+        np.add.at(values, [where[row] for row in monomials], coef)
+        for k, j, lower in derivatives:
+            slope[where[lower], :, j] += monomials[k][j] * coef[k]
+        slope = (slope / np.asarray(scale)).reshape(len(where), -1)
+        _register(self, powers=list(where), readout=values, center=center, scale=scale, slope=slope)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the polynomial, shape (..., m)."""
@@ -168,32 +152,18 @@ class PolynomialModule(ForwardModel):
     def _monomials(self, q: Tensor) -> Tensor:
         u = (q - self.center.to(q)) / self.scale.to(q)
         phi = torch.ones_like(u[..., :1]).expand(*u.shape[:-1], len(self.powers))
+        powers = self.powers.long()
         of_each = [torch.ones_like(u)]
-        for _ in range(int(self.powers.max())):
+        for _ in range(int(powers.max())):
             of_each.append(of_each[-1] * u)
         table = torch.stack(of_each, dim=-1)
         for j in range(u.shape[-1]):
-            phi = phi * table[..., j, :].index_select(-1, self.powers[:, j])
+            phi = phi * table[..., j, :].index_select(-1, powers[:, j])
         return phi
-
-    def stored(self) -> Stored:
-        """Return how the module describes itself; its monomials include their derivatives."""
-        arrays = {"powers": self.powers.double(), "readout": self.readout}
-        arrays |= {"center": self.center, "scale": self.scale}
-        return Stored.of(self.layout.kind, arrays)
-
-    @classmethod
-    def from_stored(cls, stored: Stored, restore: Restore) -> PolynomialModule:
-        """Return the module of a description."""
-        arrays = stored.tensors(powers="pn", readout="pm", center="n", scale="n")
-        if not np.isin(arrays["powers"], range(_MOST_POWER)).all():
-            raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
-        coef = arrays["readout"].T
-        return cls(arrays["powers"], coef, 0.0, arrays["center"], arrays["scale"])
 
 
 class KernelModule(ForwardModel):
-    """A sum of Gaussians ``weights' exp(-|(u - u_i) / widths|^2 / 2) + bias`` at training rows.
+    """A sum of Gaussians ``weights' exp(-|u - u_i|^2 / 2) + bias`` at training rows.
 
     Parameters
     ----------
@@ -204,20 +174,12 @@ class KernelModule(ForwardModel):
     bias : array-like of shape (m,) or float
         Added to the sum.
     center, scale : array-like of shape (n,)
-        ``u = (q - center) / scale`` [unit of q].
-    widths : array-like of shape (n,) or float, default=1.0
-        Widths of the Gaussians along each u.
+        ``u = (q - center) / scale`` [unit of q]; the Gaussians have width 1 along each u.
     """
 
     layout = Layout(
         "kernel", {"rows": "kn", "weights": "km", "bias": "m", "center": "n", "scale": "n"}
     )
-    rows: Tensor
-    weights: Tensor
-    tangent: Tensor
-    bias: Tensor
-    center: Tensor
-    scale: Tensor
 
     def __init__(
         self,
@@ -226,37 +188,31 @@ class KernelModule(ForwardModel):
         bias: ArrayLike,
         center: ArrayLike,
         scale: ArrayLike,
-        widths: ArrayLike = 1.0,
     ) -> None:
         super().__init__()
-        at, heights = np.asarray(rows) / np.asarray(widths), np.asarray(weights)
-        tangent = heights[:, :, None] * at[:, None, :]
-        bias, scale = np.broadcast_to(bias, heights.shape[1]), np.asarray(scale) * widths
-        _register(self, rows=at, weights=heights, tangent=tangent.reshape(len(at), -1))
-        _register(self, bias=bias, center=center, scale=scale)
-        self.n_actuators, self.n_outputs = at.shape[1], heights.shape[1]
+        at, heights = np.asarray(rows), np.asarray(weights)
+        (n_rows, self.n_actuators), self.n_outputs = at.shape, heights.shape[1]
+        self._block = max(1, _KERNEL_BLOCK // n_rows)
+        tangent = (heights[:, :, None] * at[:, None, :]).reshape(n_rows, -1)
+        bias = np.broadcast_to(bias, self.n_outputs)
+        _register(self, rows=at, weights=heights, bias=bias, center=center, scale=scale)
+        _register(self, tangent=tangent)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""
-        return in_blocks(self._forward, q, self._block)[0]
+        weights, bias = self.weights.to(q), self.bias.to(q)
+        return in_blocks(lambda q: (self._kernel(q)[1] @ weights + bias,), q, self._block)[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return both for the price of one kernel matrix."""
         x, J = in_blocks(self._forward_and_jacobian, q, self._block)
         return x, J
 
-    @property
-    def _block(self) -> int:
-        return max(1, _KERNEL_BLOCK // len(self.rows))
-
     def _kernel(self, q: Tensor) -> tuple[Tensor, Tensor]:
         u, rows = (q - self.center.to(q)) / self.scale.to(q), self.rows.to(q)
         squares = u.square().sum(-1, keepdim=True) + rows.square().sum(-1)
         distances = (squares - 2.0 * (u @ rows.mT)).clamp(min=0.0)
         return u, torch.exp(-0.5 * distances)
-
-    def _forward(self, q: Tensor) -> tuple[Tensor]:
-        return (self._kernel(q)[1] @ self.weights.to(q) + self.bias.to(q),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         u, kernel = self._kernel(q)
@@ -279,7 +235,7 @@ class RegressorModule(ForwardModel):
         self.regressor = regressor
         width = (q.amax(0) - q.amin(0)).numpy()
         self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(width > 0, width, 1.0)
-        self.n_actuators, self.n_outputs = q.shape[1], self._predict(q[:1].numpy()).shape[1]
+        self.n_actuators, self.n_outputs = q.shape[1], self.evaluate(q[:1]).shape[1]
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the regressor's prediction, shape (..., m)."""
@@ -291,23 +247,15 @@ class RegressorModule(ForwardModel):
 
     def differences(self, q: Tensor) -> Tensor:
         """Return dx/dq outside any graph, shape (..., m, n)."""
-        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
-        columns = []
-        for j, step in enumerate(self._step):
-            move = np.zeros(rows.shape[1])
-            move[j] = step
-            columns.append((self._predict(rows + move) - self._predict(rows - move)) / (2 * step))
-        J = torch.from_numpy(np.stack(columns, axis=-1)).to(q)
-        return J.reshape(*q.shape[:-1], *J.shape[1:])
+        at, steps = q.detach().cpu().double(), torch.from_numpy(np.diag(self._step))
+        changes = [self.evaluate(at + step) - self.evaluate(at - step) for step in steps]
+        return (torch.stack(changes, dim=-1) / (2 * steps.diag())).to(q)
 
     def evaluate(self, q: Tensor) -> Tensor:
         """Return the prediction outside any graph, shape (..., m)."""
         rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
-        x = torch.from_numpy(self._predict(rows)).to(q)
-        return x.reshape(*q.shape[:-1], x.shape[-1])
-
-    def _predict(self, rows: NDArray) -> NDArray:
-        return np.asarray(self.regressor.predict(rows), dtype=np.float64).reshape(len(rows), -1)
+        x = np.asarray(self.regressor.predict(rows), dtype=np.float64)
+        return torch.from_numpy(x).to(q).reshape(*q.shape[:-1], -1)
 
 
 class _Differenced(torch.autograd.Function):
@@ -354,21 +302,11 @@ def _gaussian(kernel: gp.Kernel) -> tuple[float, Any] | None:
     """Return height and widths of a kernel, if between different rows it is a Gaussian."""
     if type(kernel) is gp.RBF:  # a Matern kernel is one to isinstance
         return 1.0, kernel.length_scale
-    if isinstance(kernel, gp.Sum):
-        for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):
-            if isinstance(other, gp.WhiteKernel):
-                return _gaussian(one)
-    if isinstance(kernel, gp.Product):
+    if isinstance(kernel, gp.KernelOperator):
         for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):
             found = _gaussian(one)
-            if isinstance(other, gp.ConstantKernel) and found is not None:
+            if found and isinstance(kernel, gp.Sum) and isinstance(other, gp.WhiteKernel):
+                return found
+            if found and isinstance(kernel, gp.Product) and isinstance(other, gp.ConstantKernel):
                 return other.constant_value * found[0], found[1]
     return None
-
-
-def _lower(monomial: tuple[int, ...], j: int) -> tuple[int, ...]:
-    return (*monomial[:j], monomial[j] - 1, *monomial[j + 1 :])
-
-
-def _lowered(monomials: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-    return [_lower(row, j) for row in monomials for j, power in enumerate(row) if power]

@@ -4,7 +4,6 @@ The header is a JSON object with
 
 - ``format``: "hybridkin-model";
 - ``version``: raised when earlier readers could no longer read the file;
-- ``requires``: names of features that a reader must know;
 - ``kind``, ``settings``, ``arrays``, ``parts``: the description of the model, see `Stored`.
   ``arrays`` gives the name of every array in the file, so that equal arrays are written once;
 - everything else by name. A reader ignores entries that it does not know.
@@ -19,8 +18,6 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +28,11 @@ from safetensors.numpy import save_file
 
 from hybridkin._core.stored import Stored
 
-__all__ = ["VERSION", "packed", "read", "read_header", "unpacked", "write"]
-
 FORMAT = "hybridkin-model"
 VERSION = 3
-KNOWN: frozenset[str] = frozenset()
-"""What a file of this version may require."""
-
 _HEADER, _CHECKSUM = "hybridkin", "sha256"
+_UNREADABLE = (SafetensorError, AttributeError, LookupError, OSError, RecursionError, TypeError)
+_UNREADABLE += (ValueError,)
 
 Header = dict[str, Any]
 Arrays = dict[str, NDArray]
@@ -109,25 +103,6 @@ def write(path: Path, header: Header, arrays: Arrays) -> None:
 
 def read(path: Path) -> tuple[Header, Arrays]:
     """Return header and arrays of a file that is whole and of the version read here."""
-    with _opened(path) as (file, metadata):
-        header = _header(path, metadata)
-        arrays = {name: file.get_tensor(name) for name in file.keys()}
-    if metadata.get(_CHECKSUM) != _checksum(metadata[_HEADER], arrays):
-        raise ValueError(
-            f"{path} is damaged: its content does not match its checksum; copy it again, or save "
-            "the model again."
-        )
-    return header, arrays
-
-
-def read_header(path: Path) -> Header:
-    """Return the header of a file alone; its arrays are neither read nor checked."""
-    with _opened(path) as (_, metadata):
-        return _header(path, metadata)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
     if path.is_dir():
         found = sorted(file.name for file in path.glob("*.safetensors"))
         hint = f"; it contains {found[0]}." if found else " without a saved model."
@@ -136,37 +111,32 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
         raise FileNotFoundError(f"`path` must name a saved model, got {path}: no such file.")
     try:
         with safe_open(path, framework="numpy") as file:
-            yield file, file.metadata() or {}
-    except (SafetensorError, AttributeError, TypeError, OSError) as error:
-        raise ValueError(f"{path} is not a model saved by hybridkin ({error}).") from error
-
-
-def _header(path: Path, metadata: dict[str, str]) -> Header:
-    try:
-        header = json.loads(metadata[_HEADER], parse_constant=_refused)
-    except (KeyError, ValueError, RecursionError) as error:
+            metadata = file.metadata() or {}
+            header = json.loads(metadata[_HEADER], parse_constant=_refused)
+            arrays = {name: file.get_tensor(name) for name in file.keys()}
+    except _UNREADABLE as error:
         raise ValueError(f"{path} is not a model saved by hybridkin ({error!r}).") from error
+    _check_version(path, header)
+    if metadata.get(_CHECKSUM) != _checksum(metadata[_HEADER], arrays):
+        raise ValueError(
+            f"{path} is damaged: its content does not match its checksum; copy it again, or save "
+            "the model again."
+        )
+    return header, arrays
+
+
+def _check_version(path: Path, header: Any) -> None:
     known = isinstance(header, dict) and header.get("format") == FORMAT
     if not known or type(header.get("version")) is not int or header["version"] < 1:
         raise ValueError(f"{path} is not a model saved by hybridkin: its header is another one.")
-    versions = header.get("versions")
-    writer = versions.get("hybridkin") if isinstance(versions, dict) else None
-    way_out = "install the hybridkin that wrote it"
-    way_out += f", {writer[:40]}" if isinstance(writer, str) else ""
     if header["version"] != VERSION:
+        versions = header.get("versions")
+        writer = versions.get("hybridkin") if isinstance(versions, dict) else None
+        named = f", {writer[:40]}" if isinstance(writer, str) else ""
         raise ValueError(
             f"{path} has format version {header['version']}, this hybridkin reads version "
-            f"{VERSION}; {way_out}, or save the model again."
+            f"{VERSION}; install the hybridkin that wrote it{named}, or save the model again."
         )
-    required = header.get("requires", [])
-    if not isinstance(required, list) or not all(isinstance(name, str) for name in required):
-        raise ValueError(f"{path} is damaged: `requires` must be a list of names.")
-    unknown = sorted({*required} - KNOWN)
-    if unknown:
-        raise ValueError(
-            f"{path} requires what this hybridkin does not know, {', '.join(unknown)}; {way_out}."
-        )
-    return header
 
 
 def _refused(constant: str) -> None:

@@ -23,14 +23,10 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.hidden_layer import device_named
-from hybridkin.saving._file import packed, read, read_header, unpacked, write
+from hybridkin.saving._file import packed, read, unpacked, write
 
-__all__ = ["load_model", "model_header", "save_model"]
-
-_DAMAGE = (
-    *(ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError),
-    *(AssertionError, TypeError, ValueError),
-)
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError)
+_DAMAGE += (AssertionError, TypeError, ValueError)
 Model = ForwardModel | ELMRegressor | ELMRegressorCV | HybridForwardModel
 
 
@@ -59,9 +55,8 @@ def save_model(
 
     Notes
     -----
-    A reader ignores entries of the header that it does not know, unless the file ``requires`` them.
-    Then, and for another format version, `load_model` refuses the file and names the hybridkin that
-    wrote it.
+    A reader ignores entries of the header that it does not know. For another format version,
+    `load_model` refuses the file and names the hybridkin that wrote it.
 
     Examples
     --------
@@ -72,7 +67,7 @@ def save_model(
     >>> load_model(path)
     ConstantCurvatureChain(extensible, 3 segments, 9 actuators, routing 'segment')
     """
-    header: dict[str, Any] = {"requires": [], **_origin()}
+    header = _origin()
     known: dict[str, Any] = {}
     if isinstance(model, HybridForwardModel):
         stored, known = stored_hybrid(model), training_of(model)
@@ -125,15 +120,14 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
     try:
         stored = unpacked(header, arrays)
         if stored.kind == "hybrid":
-            hybrid = hybrid_of(stored, header.get("training"))
-            hybrid.module_ = hybrid.module_.to(at)
-            return hybrid
-        if stored.kind == "elm_regressor":
-            elm = ELMRegressor.from_stored(stored, restorer())
-            elm.device = None if device is None else str(at)
-            elm.module_ = elm.module_.to(at)
-            return elm
-        return restorer()(stored).to(at)
+            model = hybrid_of(stored, header.get("training"))
+        elif stored.kind == "elm_regressor":
+            model = ELMRegressor.from_stored(stored, restorer())
+            model.device = None if device is None else str(at)
+        else:
+            return restorer()(stored).to(at)
+        model.module_.to(at)
+        return model
     except _DAMAGE as error:
         raise ValueError(f"{path} is damaged: {error or repr(error)}.") from error
 
@@ -160,7 +154,7 @@ def model_header(path: str | Path) -> dict[str, Any]:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not such a model, or has another format version.
+        If the file is not such a model, is damaged, or has another format version.
 
     Examples
     --------
@@ -172,7 +166,7 @@ def model_header(path: str | Path) -> dict[str, Any]:
     >>> model_header(path)["units"]
     {'q': 'm', 'x': 'm'}
     """
-    return read_header(Path(path))
+    return read(Path(path))[0]
 
 
 def _origin() -> dict[str, Any]:
