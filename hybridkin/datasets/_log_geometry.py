@@ -111,13 +111,11 @@ def _not_lengths(q: NDArray) -> LogFinding:
             "if the log holds changes of length, add the length at rest to each, or, for a robot "
             "with tendons on a backbone of fixed length, give `length` in every [[segment]]."
         )
-    return LogFinding(
-        "geometry",
-        "error",
-        f"the robot is described with chambers, whose q are positive actuator lengths, but q "
-        f"goes down to {1e3 * q.min():.4g} mm.",
-        advice,
+    message = (
+        "the robot is described with chambers, whose q are positive actuator lengths, but q goes "
+        f"down to {1e3 * q.min():.4g} mm."
     )
+    return LogFinding("geometry", "error", message, advice)
 
 
 def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterator[LogFinding]:
@@ -133,8 +131,13 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
     spread = np.sqrt(((log.x[rows] - log.x[rows].mean(axis=0)) ** 2).sum(axis=1).mean())
     if spread == 0 or len(rows) < 10:
         return
-    missed = _missed_by_way(q[rows], log.x[rows], robot, base_is_free)
-    missed = {name: rms / spread for name, rms in missed.items()}
+    ways = {"as declared": q[rows], "numbering": robot.renumbered(q[rows])}
+    if not robot.extensible:
+        ways |= {"sign": -q[rows], "sign and numbering": -ways["numbering"]}
+    missed = {
+        name: _missed(robot.tips(way), log.x[rows], base_is_free) / spread
+        for name, way in ways.items()
+    }
     as_declared, best = missed["as declared"], min(missed, key=lambda name: missed[name])
     # The simplest of those that are about as good.
     best = next(name for name in missed if missed[name] < 1.1 * missed[best])
@@ -148,33 +151,23 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
             message = f"{compared}with the sign of q{other} flipped."
             yield LogFinding("sign", "warning", message, sign_advice)
         if "numbering" in best:
-            yield LogFinding(
-                "numbering",
-                "warning",
-                f"{compared}with the actuators numbered the other way round.",
+            message = f"{compared}with the actuators numbered the other way round."
+            advice = (
                 "set clockwise = true in every [[segment]] (or negate angles_deg); check that the "
-                "axes of the tip are right-handed.",
+                "axes of the tip are right-handed."
             )
+            yield LogFinding("numbering", "warning", message, advice)
     elif 1 - as_declared**2 < 0.3:
-        of_q, more = (
-            ("", " and the lengths.") if base_is_free else (" of q", ", the lengths and [base].")
-        )
-        yield LogFinding(
-            "geometry",
-            "warning",
+        of_q, more = ("", "") if base_is_free else (" of q", " and [base]")
+        message = (
             f"the nominal model explains only {_share(as_declared)} of the tip's motion, whatever "
-            f"the sign and the numbering{of_q}.",
-            "check the order of the columns of q (segment by segment from the base), the angles, "
-            f"the routing{more}",
+            f"the sign and the numbering{of_q}."
         )
-
-
-def _missed_by_way(q: NDArray, x: NDArray, robot: _Robot, base_is_free: bool) -> dict[str, float]:
-    """Return the rms distance of the nominal tips for each sign and numbering of q [m]."""
-    ways = {"as declared": q, "numbering": robot.renumbered(q)}
-    if not robot.extensible:
-        ways |= {"sign": -q, "sign and numbering": -ways["numbering"]}
-    return {name: _missed(robot.tips(some), x, base_is_free) for name, some in ways.items()}
+        advice = (
+            "check the order of the columns of q (segment by segment from the base), the angles, "
+            f"the routing, the lengths{more}."
+        )
+        yield LogFinding("geometry", "warning", message, advice)
 
 
 def _missed(predicted: NDArray, x: NDArray, base_is_free: bool) -> float:

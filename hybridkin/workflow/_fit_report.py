@@ -124,27 +124,21 @@ def _in_words(entry: dict[str, Any]) -> list[str]:
         )
     candidates = entry["candidates"]
     least, alone = min((e, name) for name, e in candidates.items() if name != "blend")
-    without = f"{1e3 * candidates['mechanical']:.2f} mm without any."
+    best, without = f"{1e3 * least:.2f} mm", f"{1e3 * candidates['mechanical']:.2f} mm without any."
+    text = f"Auto took the error model {alone}: {best} on held-out motions, {without}"
     if len(entry["weights"]) > 1:
-        sentences.append(
+        text = (
             "The blend of auto is the weighted mean of several hybrids: "
-            f"{1e3 * candidates['blend']:.2f} mm on held-out motions, {1e3 * least:.2f} mm with "
-            f"the best of them alone ({alone}), {without}"
+            f"{1e3 * candidates['blend']:.2f} mm on held-out motions, {best} with the best of them "
+            f"alone ({alone}), {without}"
         )
-    else:
-        sentences.append(
-            f"Auto took the error model {alone}: {1e3 * least:.2f} mm on held-out motions, "
-            f"{without}"
-        )
+    sentences.append(text)
     if entry["play"] is not None:
-        sentences.append(
-            f"Backlash (play) of the actuators: {millimetres(entry['play'])}. Predictions follow "
-            "the order of the rows, motion by motion."
-        )
+        width = millimetres(entry["play"])
+        order = "Predictions follow the order of the rows, motion by motion."
+        sentences.append(f"Backlash (play) of the actuators: {width}. {order}")
     elif entry["play_asked"]:
-        sentences.append(
-            "Auto looked for backlash (play) of the actuators; it did not lower the errors."
-        )
+        sentences.append("Auto looked for backlash (play); it did not lower the errors.")
     return sentences
 
 

@@ -141,8 +141,9 @@ def read_log(
                 f"{len({*motions})}; keep some."
             )
         log = replace(log, groups=np.array(motions)).rows(kept)
-    checks = {"chain": chain, "base_is_free": base_is_free, "drop_invalid": drop_invalid}
-    report = datasets.check_log(log, **checks)
+    report = datasets.check_log(
+        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
+    )
     measured = _with_motions(log, report, tuple(exclude))
     if drop_frozen:
         frozen = [f.rows for f in report.findings if f.kind == "frozen tip"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -110,7 +111,7 @@ def shape_path(
         center = tips[np.linalg.norm(tips - tips.mean(axis=0), axis=1).argmin()]
     if normal is None:
         normal = (0.0, 0.0, 1.0) if loaded.chain is None else loaded.chain.base[:3, 2].tolist()
-    timing = {"duration": duration, "dt": dt}
+    timing: Any = {"duration": duration, "dt": dt}
     if shape == "figure-eight":
         return trajectories.figure_eight(center, size, normal=normal, **timing)
     if shape == "spiral":
