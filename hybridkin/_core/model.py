@@ -283,9 +283,12 @@ def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[T
     with torch.enable_grad():
         leaf = q if keep_graph else q.detach().requires_grad_(True)
         x = function(leaf)
-        given = {"create_graph": keep_graph, "retain_graph": True, "materialize_grads": True}
-        columns = x.unbind(-1)
-        rows = [torch.autograd.grad(a.sum(), leaf, **given)[0] for a in columns]
+        how: dict[str, Any] = {
+            "create_graph": keep_graph,
+            "retain_graph": True,
+            "materialize_grads": True,
+        }
+        rows = [torch.autograd.grad(a.sum(), leaf, **how)[0] for a in x.unbind(-1)]
     J = torch.stack(rows, dim=-2)
     return (x, J) if keep_graph else (x.detach(), J.detach())
 

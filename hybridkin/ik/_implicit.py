@@ -69,8 +69,10 @@ def _newton(
         scaled = held * unit
         mu = damped_solve(row_gram(scaled), apply_rows(scaled, unit * posture.detach()))
         pull = posture - apply_columns(J, mu)
-        given = {"retain_graph": True, "materialize_grads": True}
-        rows = [torch.autograd.grad(a.sum(), leaf, **given)[0] for a in pull.unbind(-1)]
+        rows = [
+            torch.autograd.grad(a.sum(), leaf, retain_graph=True, materialize_grads=True)[0]
+            for a in pull.unbind(-1)
+        ]
         H = torch.stack(rows, dim=-2)
     both = free[:, :, None] & free[:, None, :]
     H = torch.where(both, H.detach(), torch.diag_embed((~free).to(q)))

@@ -22,16 +22,9 @@ Array: TypeAlias = "ArrayLike | Tensor | Transform3d"  # what comes in, NumPy or
 Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 
-def bound(
-    value: Array | None,
-    name: str,
-    default: float = math.nan,
-    *,
-    finite: bool = False,
-    positive: bool = False,
-) -> Tensor:
+def bound(value: Array, name: str, *, finite: bool = False, positive: bool = False) -> Tensor:
     """Return a limit, a posture or weights as a float64 tensor of shape () or (n,)."""
-    a = as_tensor(default if value is None else value, name).cpu().double()
+    a = as_tensor(value, name).cpu().double()
     good = a.ndim < 2 and a.numel() > 0 and not torch.isnan(a).any()
     require(good, f"`{name}` must be a number or of shape (n,), without NaN, got {a.tolist()}.")
     good = torch.isfinite(a).all() or not finite

@@ -117,9 +117,9 @@ class InverseKinematics:
         self.model = model
         self.settings = StepSettings(
             as_task(model),
-            bound(q_min, "q_min", -math.inf),
-            bound(q_max, "q_max", math.inf),
-            bound(dq_max, "dq_max", math.inf, positive=True),
+            bound(-math.inf if q_min is None else q_min, "q_min"),
+            bound(math.inf if q_max is None else q_max, "q_max"),
+            bound(math.inf if dq_max is None else dq_max, "dq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
             float(beta),
             None if gain is None else float(gain),
@@ -239,7 +239,8 @@ class InverseKinematics:
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q, target = rows_of(q, lead), rows_of(target, lead, axes)
-        starts = self._restarts(q, restarts, random_state, q0 is not None)
+        rng = np.random.default_rng(random_state)
+        starts = self._restarts(q, restarts, rng, q0 is not None)
         found = Search(settings, tolerance, max_iter).solve(q, target, q0 is None, starts)
         q = found.q
         if differentiable:
@@ -360,11 +361,7 @@ class InverseKinematics:
         return Tracker(self.settings, q0, self.settings.tolerance(tol), memory)
 
     def _restarts(
-        self,
-        q: Tensor,
-        restarts: int,
-        random_state: int | np.random.Generator | None,
-        from_preferred: bool,
+        self, q: Tensor, restarts: int, rng: np.random.Generator, from_preferred: bool
     ) -> list[Tensor]:
         """Return further starts (n,): the preferred configuration, then draws in the limits."""
         n, settings = q.shape[-1], self.settings
@@ -375,7 +372,7 @@ class InverseKinematics:
         low, span = settings.q_min.expand(n), (settings.q_max - settings.q_min).expand(n)
         if not torch.isfinite(span).all():
             raise ValueError("`restarts` draws starts in the limits: give finite `q_min`, `q_max`.")
-        shares = np.random.default_rng(random_state).random((restarts - len(points), n))
+        shares = rng.random((restarts - len(points), n))
         return points + list((low + span * torch.as_tensor(shares)).to(q))
 
     def _times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:

@@ -16,7 +16,7 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
 
-__all__ = ["PointsTask", "PoseTask", "PositionTask", "StackedTask", "Task"]
+__all__ = ["PointsTask", "PoseTask", "PositionTask", "Task"]
 
 Tolerance: TypeAlias = float | tuple[float, ...]
 
@@ -223,86 +223,6 @@ class PoseTask(Task):
             )
 
 
-class StackedTask(Task):
-    """Several tasks at once, their errors traded by weights: least squares of all rows.
-
-    A target is one vector: `join` makes it from the targets of the tasks.
-
-    Parameters
-    ----------
-    *tasks : Task, nn.Module or callable
-        The tasks; a model stands for its `PositionTask`.
-    weights : sequence of float, optional
-        Factor on every task's error. Default: 1 each.
-
-    Examples
-    --------
-    The tip at one point, the end of the second segment near another:
-
-    >>> import torch
-    >>> from hybridkin import InverseKinematics, robots
-    >>> from hybridkin.ik.tasks import StackedTask
-    >>> chain = robots.bionic_handling_assistant()
-    >>> task = StackedTask(chain, chain.with_tip(2.0), weights=[1.0, 0.1])
-    >>> tip, elbow = torch.tensor([[0.1, 0.0, 0.75], [0.0, 0.0, 0.5]], dtype=torch.float64)
-    >>> ik = InverseKinematics(task, q_min=0.1, q_max=0.4)
-    >>> ik.solve(task.join(tip, elbow)).converged
-    tensor(True)
-    """
-
-    def __init__(self, *tasks: object, weights: Sequence[float] | None = None) -> None:
-        self.tasks = tuple(as_task(task) for task in tasks)
-        self.weights = [1.0] * len(tasks) if weights is None else [float(w) for w in weights]
-        n, good = len(tasks), all(0.0 < w < math.inf for w in self.weights)
-        if n == 0 or len(self.weights) != n or not good:
-            raise ValueError(
-                f"`weights` must be positive, one per task, of one task or more; got {n} tasks and "
-                f"weights {self.weights}."
-            )
-        self.models = tuple(model for task in self.tasks for model in task.models)
-        self.shape = (sum(math.prod(task.shape) for task in self.tasks),)
-        self.parts = tuple(rows for task in self.tasks for rows in task.parts)
-        pairs = zip(self.weights, self.tasks, strict=True)
-        self.units = tuple(weight * unit for weight, task in pairs for unit in task.units)
-
-    def join(self, *x: ArrayLike | Tensor) -> Tensor | NDArray:
-        """Return one target (..., k) from the targets ``(..., *shape)`` of all tasks."""
-        if len(x) != len(self.tasks):
-            raise ValueError(f"`x` must be {len(self.tasks)} targets, one per task, got {len(x)}.")
-        tensors = [a if isinstance(a, Tensor) else torch.as_tensor(np.asarray(a)) for a in x]
-        pairs = zip(tensors, self.tasks, strict=True)
-        parts = [a.flatten(a.ndim - len(task.shape)) for a, task in pairs]
-        lead = torch.broadcast_shapes(*(a.shape[:-1] for a in parts))
-        joined = torch.cat([a.expand(*lead, -1) for a in parts], dim=-1)
-        return joined if any(isinstance(a, Tensor) for a in x) else joined.numpy()
-
-    def split(self, x: Tensor) -> tuple[Tensor, ...]:
-        """Return the targets, or the x, of every task from one (..., k), torch or NumPy."""
-        lead = x.shape[: x.ndim - len(self.shape)]
-        ends = np.cumsum([math.prod(task.shape) for task in self.tasks]).tolist()
-        x = x.reshape(*lead, ends[-1])
-        parts = zip(self.tasks, [0, *ends[:-1]], ends, strict=True)
-        return tuple(x[..., a:b].reshape(*lead, *task.shape) for task, a, b in parts)
-
-    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return all x (N, *shape), side by side, and the weighted J (N, m, n)."""
-        parts = [task.evaluate(q) for task in self.tasks]
-        rows = [w * J for w, (_, J) in zip(self.weights, parts, strict=True)]
-        x = torch.cat([x.flatten(1) for x, _ in parts], dim=1)
-        return x.reshape(len(q), *self.shape), torch.cat(rows, dim=-2)
-
-    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return the weighted errors (N, m), one task after another."""
-        pairs = zip(self.split(x), self.split(x_target), strict=True)
-        errors = [task.difference(a, b) for task, (a, b) in zip(self.tasks, pairs, strict=True)]
-        return torch.cat([w * e for w, e in zip(self.weights, errors, strict=True)], dim=-1)
-
-    def check(self, x_target: Tensor, name: str) -> None:
-        """Raise where the part of a task is not valid."""
-        for task, part in zip(self.tasks, self.split(x_target), strict=True):
-            task.check(part, name)
-
-
 @runtime_checkable
 class _WithPoints(Protocol):
     """A chain that can be cut at a point of its backbone."""
@@ -310,7 +230,7 @@ class _WithPoints(Protocol):
     def with_tip(self, at: float) -> ForwardModel: ...
 
 
-class PointsTask(StackedTask):
+class PointsTask(Task):
     """Bring several points along the backbone to points: 3 P rows, targets (P, 3).
 
     Parameters
@@ -320,7 +240,20 @@ class PointsTask(StackedTask):
     at : sequence of float
         Where on the backbone, in segments from the base.
     weights : sequence of float, optional
-        Factor on every point's error. Default: 1 each.
+        Factor on every point's error, which trades them where not all can be reached. Default: 1
+        each.
+
+    Examples
+    --------
+    The end of the second segment near one point, the tip at another:
+
+    >>> import torch
+    >>> from hybridkin import InverseKinematics, robots
+    >>> from hybridkin.ik.tasks import PointsTask
+    >>> task = PointsTask(robots.bionic_handling_assistant(), [2.0, 3.0], weights=[0.1, 1.0])
+    >>> targets = torch.tensor([[0.0, 0.0, 0.5], [0.1, 0.0, 0.75]], dtype=torch.float64)
+    >>> InverseKinematics(task, q_min=0.1, q_max=0.4).solve(targets).converged
+    tensor(True)
     """
 
     def __init__(
@@ -328,11 +261,24 @@ class PointsTask(StackedTask):
     ) -> None:
         if not isinstance(chain, _WithPoints):
             raise TypeError(
-                f"`chain` must have with_tip(at), got {type(chain).__name__}; stack the models of "
-                "the points with StackedTask."
+                f"`chain` must have with_tip(at), as chains of arcs, got {type(chain).__name__}."
             )
-        super().__init__(*(chain.with_tip(float(a)) for a in at), weights=weights)
-        self.shape = (len(self.tasks), 3)
+        self.models, n = tuple(chain.with_tip(float(a)) for a in at), len(at)
+        self.units = (1.0,) * n if weights is None else tuple(float(w) for w in weights)
+        if n == 0 or len(self.units) != n or not all(0.0 < w < math.inf for w in self.units):
+            need = "positive, one for every point of `at`"
+            raise ValueError(f"`weights` must be {need}, got {self.units} for {n} points.")
+        self.shape, self.parts = (n, 3), (3,) * n
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the points (N, P, 3) and the weighted J (N, 3 P, n)."""
+        x, J = zip(*(model.forward_and_jacobian(q) for model in self.models), strict=True)
+        weighted = [w * rows for w, rows in zip(self.units, J, strict=True)]
+        return torch.stack(x, dim=1).to(q), torch.cat(weighted, dim=-2).to(q)
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return the weighted errors (N, 3 P), one point after another."""
+        return (x.new_tensor(self.units)[:, None] * (x_target - x)).flatten(-2)
 
 
 def as_task(model: object) -> Task:

@@ -38,6 +38,8 @@ class Tracker:
         Actuators that the last step held at a limit of position or speed.
     sigma_min : float
         Smallest singular value of the Jacobian there, NaN where an input was not finite.
+    damping : float
+        Damping lambda of the last step, in the unit of `sigma_min`.
     backend : str
         What computes: "torch".
 
@@ -181,6 +183,7 @@ class Tracker:
         self._before, self._x, self._e, self._last = self._q, x, e, step
         self.x, self.saturated = self._given_back(x), self._given_back(step.saturated)
         self.error, self.sigma_min = float(e.norm(dim=-1)), float(step.sigma_min)
+        self.damping = float(step.damping)
 
     def _given_back(self, row: Tensor) -> NDArray | Tensor:
         return as_array(row[0]).copy() if self._as_numpy else row[0].clone()

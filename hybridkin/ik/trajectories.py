@@ -70,8 +70,7 @@ class Trajectory:
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
-        low, high = self.x.min(axis=0), self.x.max(axis=0)
-        span = " x ".join(f"{side:.3g}" for side in high - low)
+        span = " x ".join(f"{side:.3g}" for side in np.ptp(self.x, axis=0))
         return f"Trajectory({len(self)} points, {self.duration:.4g} s, {span} m)"
 
 
@@ -271,8 +270,7 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     if unit not in METRES:
         raise ValueError(f"`unit` must be one of {tuple(METRES)}, got {unit!r}.")
     with open(path, encoding="utf-8-sig") as file:
-        lines = [text.strip() for text in file]
-    rows = [text.split(",") for text in lines if text and not text.startswith("#")]
+        rows = [text.split(",") for text in map(str.strip, file) if text and text[0] != "#"]
     columns, need = (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
     named = bool(rows) and not _is_number(rows[0][0])
     try:
