@@ -92,10 +92,9 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
     robust = loss != "linear"
     sigma = max(rows.noise(residual(theta), robust), floor)
     converged, tol = False, 1e-5 if roughly else 1e-12
-    options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol) | {
-        "jac": whitened_jacobian
-    }
-    options |= {"bounds": (problem.low, problem.high), "loss": loss, "max_nfev": 100}
+    options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol)
+    options |= {"jac": whitened_jacobian, "bounds": (problem.low, problem.high)}
+    options |= {"loss": loss, "max_nfev": 100}
     for _ in range(2 if roughly else _MAX_ROUNDS):
         solution = least_squares(whitened, theta, args=(sigma,), **options)
         theta, converged = solution.x, solution.status > 0
