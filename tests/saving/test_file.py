@@ -195,7 +195,7 @@ def _entries(header: Any, at: tuple[Any, ...] = ()) -> list[Any]:
 def _damaged_entries(header):
     """Yield ways to entries of a header, each with a hostile value that it takes.
 
-    Entries of one kind are read by the same lines of code: the names of arrays, the items of a list,
+    The same lines of code read the entries of a kind: the names of arrays, the items of a list,
     one setting of several parts. The first of a kind takes all values, the others one each in turn.
     """
     hostile: list[Any] = [None, True, -1, 1e300, "../../x", [], {}, [[[]]]]
