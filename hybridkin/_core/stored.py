@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from torch import Tensor
 
+from hybridkin._core.arrays import as_array
+
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
 
@@ -83,13 +85,9 @@ class Stored:
         **settings
             Values that JSON can express; arrays become lists, tuples too.
         """
-        given = {
-            name: np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-            for name, value in (arrays or {}).items()
-            if value is not None
-        }
-        made_of = {name: part for name, part in (parts or {}).items() if part is not None}
-        return cls(kind, plain(settings), given, made_of)
+        numbers = {name: as_array(a) for name, a in (arrays or {}).items() if a is not None}
+        models = {name: part for name, part in (parts or {}).items() if part is not None}
+        return cls(kind, plain(settings), numbers, models)
 
     def value(self, key: str, kinds: Any) -> Any:
         """Return a setting of one of these types.

@@ -27,8 +27,8 @@ class LeftOut:
         Of all rows.
     X, y : ndarray of shape (n_samples, n_inputs) and (n_samples, n_outputs)
         All rows.
-    sample_weight : ndarray of shape (n_samples,) or None
-        Positive weights, or ones.
+    weights : ndarray of shape (n_samples,)
+        Positive weights of the rows.
     fit_intercept : bool
         Whether the readout has an intercept; it is fitted anew without the held-out rows.
 
@@ -39,12 +39,12 @@ class LeftOut:
     .. [2] Cook, R. D., & Weisberg, S. (1982). Residuals and influence in regression, section 3.7.
     """
 
-    def __init__(self, elm, stats, X, y, sample_weight, fit_intercept):
+    def __init__(self, elm, stats, X, y, weights, fit_intercept):
         n_features = len(elm.output_weights)
         self._elm, self._X, self._intercept = elm, X, fit_intercept
         mean, G, C, _ = moments(stats, n_features, fit_intercept)
         self._n, self._center = stats.n, mean[:n_features]
-        self._root = np.ones(len(X)) if sample_weight is None else np.sqrt(sample_weight)
+        self._root = np.sqrt(weights)
         self._y = (y - mean[n_features:]) * self._root[:, None]
         self._wide = len(X) <= n_features
         if self._wide:
@@ -94,11 +94,9 @@ class LeftOut:
             return self._refitted(out, asked, alphas)
         Z, D = self._z(out), self._d(alphas)
         residuals, among = self._residuals(Z, D, out), np.searchsorted(out, asked)
-        fixed = np.zeros((len(out), len(out)))
-        if not self._wide:
-            fixed += np.eye(len(out))
-            if self._intercept:
-                fixed -= np.outer(self._root[out], self._root[out]) / self._n
+        fixed = np.eye(len(out)) * (not self._wide)
+        if self._intercept and not self._wide:
+            fixed -= np.outer(self._root[out], self._root[out]) / self._n
         errors = (
             linalg.solve(fixed + (Z * d) @ Z.T, r, assume_a="sym")[among]
             for d, r in zip(D, residuals, strict=True)

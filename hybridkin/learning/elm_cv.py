@@ -206,12 +206,8 @@ class ELMRegressorCV(FittedNetwork):
         self.left_out_errors_ = np.full((len(kept), *y.shape[1:]), np.nan)
         self.left_out_errors_[kept] = _left_out_errors(best, task).reshape(y.shape)
         names = ("n_hidden", "weight_scale", "relevance", "alphas", "mean_squared_error")
-        rows = (
-            (c.params["n_hidden"], c.params["weight_scale"], c.relevance, c.alphas, c.mse)
-            for c in tried
-        )
-        columns = map(np.array, zip(*rows, strict=True))
-        self.cv_results_ = dict(zip(names, columns, strict=True))
+        rows = [{**candidate.params, **candidate._asdict()} for candidate in tried]
+        self.cv_results_ = {name: np.array([row[name] for row in rows]) for name in names}
         return self
 
     def stored(self):
@@ -239,7 +235,7 @@ class _Candidate(NamedTuple):
     params: dict
     relevance: np.ndarray
     alphas: np.ndarray
-    mse: np.ndarray  # (n_alphas,)
+    mean_squared_error: np.ndarray  # (n_alphas,)
     score: float
     left_out: LeftOut
 
@@ -249,11 +245,9 @@ def _candidate(params, relevance, task):
     asked = ELMRegressor(**params)
     elm = draw_layer(asked, X, sample_weight).to(device_named(asked.device))
     stats = gather(None, elm, X, targets, sample_weight, asked.block_size)
-    left_out = LeftOut(elm, stats, X, targets, sample_weight, asked.fit_intercept)
-    if isinstance(alphas, str):
-        alphas = _AUTO_ALPHAS * (left_out.eigenvalues[-1] or 1.0)
-    else:
-        alphas = _positive(alphas, "alphas")
+    left_out = LeftOut(elm, stats, X, targets, weights, asked.fit_intercept)
+    largest = left_out.eigenvalues[-1] or 1.0
+    alphas = _AUTO_ALPHAS * largest if isinstance(alphas, str) else _positive(alphas, "alphas")
     total, weight = np.zeros((len(alphas), targets.shape[1])), 0.0
     for rows, errors in _errors(left_out, len(X), splits, alphas):
         total += np.einsum("r, lrm -> lm", weights[rows], errors * errors)

@@ -1,4 +1,4 @@
-"""Rows as an ELM takes them, its random hidden layer, and the sums over its features."""
+"""Rows as an ELM takes them, and its random hidden layer."""
 
 import numpy as np
 import torch

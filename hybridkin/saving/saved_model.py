@@ -67,7 +67,11 @@ def save_model(
     >>> load_model(path)
     ConstantCurvatureChain(extensible, 3 segments, 9 actuators, routing 'segment')
     """
-    header = _origin()
+    versions = {"hybridkin": __version__, "python": platform.python_version()}
+    versions |= {"torch": str(torch.__version__), "numpy": np.__version__}
+    versions["scikit-learn"] = sklearn.__version__
+    created = datetime.now(timezone.utc).date().isoformat()
+    header: dict[str, Any] = {"versions": versions, "created": created}
     known: dict[str, Any] = {}
     if isinstance(model, HybridForwardModel):
         stored, known = stored_hybrid(model), training_of(model)
@@ -167,17 +171,6 @@ def model_header(path: str | Path) -> dict[str, Any]:
     {'q': 'm', 'x': 'm'}
     """
     return read(Path(path))[0]
-
-
-def _origin() -> dict[str, Any]:
-    versions = {
-        "hybridkin": __version__,
-        "python": platform.python_version(),
-        "torch": str(torch.__version__),
-        "numpy": np.__version__,
-        "scikit-learn": sklearn.__version__,
-    }
-    return {"versions": versions, "created": datetime.now(timezone.utc).date().isoformat()}
 
 
 def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
