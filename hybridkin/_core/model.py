@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd import grad
 
 from hybridkin._core.stored import Layout, Restore, Stored
 
@@ -279,12 +280,10 @@ def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[T
     with torch.enable_grad():
         leaf = q if keep else q.detach().requires_grad_(True)
         x = function(leaf)
-        how: dict[str, Any] = {
-            "create_graph": keep,
-            "retain_graph": True,
-            "materialize_grads": True,
-        }
-        rows = [torch.autograd.grad(a.sum(), leaf, **how)[0] for a in x.unbind(-1)]
+        rows = [
+            grad(a.sum(), leaf, create_graph=keep, retain_graph=True, materialize_grads=True)[0]
+            for a in x.unbind(-1)
+        ]
     J = torch.stack(rows, dim=-2)
     return (x, J) if keep else (x.detach(), J.detach())
 
