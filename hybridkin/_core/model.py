@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd import grad
 
 from hybridkin._core.stored import Layout, Restore, Stored
 
@@ -279,18 +280,16 @@ def jacobian(model: Any, q: Tensor) -> Tensor:
 
 def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[Tensor, Tensor]:
     """Return x and dx/dq by one backward pass per output coordinate."""
-    keep_graph = q.requires_grad and torch.is_grad_enabled()
+    keep = q.requires_grad and torch.is_grad_enabled()
     with torch.enable_grad():
-        leaf = q if keep_graph else q.detach().requires_grad_(True)
+        leaf = q if keep else q.detach().requires_grad_(True)
         x = function(leaf)
-        how: dict[str, Any] = {
-            "create_graph": keep_graph,
-            "retain_graph": True,
-            "materialize_grads": True,
-        }
-        rows = [torch.autograd.grad(a.sum(), leaf, **how)[0] for a in x.unbind(-1)]
+        rows = [
+            grad(a.sum(), leaf, create_graph=keep, retain_graph=True, materialize_grads=True)[0]
+            for a in x.unbind(-1)
+        ]
     J = torch.stack(rows, dim=-2)
-    return (x, J) if keep_graph else (x.detach(), J.detach())
+    return (x, J) if keep else (x.detach(), J.detach())
 
 
 def _checked(x: Any) -> Tensor:
