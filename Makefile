@@ -2,16 +2,21 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= results
+# Processes of the tests: one for each core, at most four.
+TESTS := -q -n auto --maxprocesses 4 --dist worksteal
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test bench check docs clean dist oldest
+.PHONY: paper test quick bench check docs clean dist oldest
 
 paper: $(VENV)/.installed
 	$(BIN)/python -m hybridkin paper --out $(OUT)
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest $(TESTS)
+
+quick: $(VENV)/.installed
+	$(BIN)/python -m pytest $(TESTS) -m "not slow"
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet

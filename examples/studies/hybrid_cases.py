@@ -6,7 +6,6 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,10 +174,6 @@ def _without_noise(
     name: str, folder: Any, n_jobs: int | None, **rows: Any
 ) -> tuple[NDArray, NDArray]:
     """Return rows of a plant without noise, so that it can be added or not."""
-    checkpoint = None
-    if folder is not None:
-        asked = f"{rows['n_random']}" if "n_random" in rows else f"inner, {len(rows['q_target'])}"
-        checkpoint = Path(folder) / f"{name}, {asked} rows.npz"
     return datasets.make_trunk(
         **rows,
         n_segment=0,
@@ -186,7 +181,7 @@ def _without_noise(
         cable_noise=0.0,
         mocap_noise=0.0,
         n_jobs=n_jobs,
-        checkpoint=checkpoint,
+        checkpoint=folder,
         return_X_y=True,
         **PLANTS[name],
     )

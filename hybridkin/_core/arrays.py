@@ -49,25 +49,14 @@ def is_numpy(value: object) -> bool:
     return not isinstance(value, (Tensor, Transform))
 
 
-def bound(value: Numbers | None, name: str, default: float) -> Tensor:
-    """Return a limit or posture as a float64 tensor of shape () or (n,)."""
-    bound = as_tensor(default if value is None else value, name).cpu().double()
-    if bound.ndim > 1 or bound.numel() == 0 or torch.isnan(bound).any():
-        raise ValueError(
-            f"`{name}` must be a number or of shape (n,), without NaN, got {bound.tolist()}."
-        )
-    return bound
-
-
 def leading(pairs: Sequence[tuple[Tensor, int]]) -> tuple[int, ...]:
     """Return the common batch shape of tensors, each with its number of trailing axes."""
     shapes = [tuple(a.shape[: a.ndim - trailing]) for a, trailing in pairs]
     try:
         return tuple(torch.broadcast_shapes(*shapes))
     except RuntimeError as error:
-        raise ValueError(
-            f"configurations and targets must agree in their batch shapes, got {shapes}."
-        ) from error
+        need = "configurations and targets must agree in their batch shapes"
+        raise ValueError(f"{need}, got {shapes}.") from error
 
 
 def rows_of(a: Tensor, lead: tuple[int, ...], trailing: int = 1) -> Tensor:

@@ -20,20 +20,16 @@ def in_blocks(
         return function(q)  # which raises
     blocks = q.reshape(-1, q.shape[-1]).split(size)
     first = function(blocks[0])
-    if len(blocks) == 1:
-        whole = [part.flatten(1).contiguous() for part in first]
-    elif any(part.requires_grad for part in first):  # a graph would grow by every write
+    if len(blocks) == 1 or any(part.requires_grad for part in first):  # writes grow a graph
         parts = zip(first, *(function(rows) for rows in blocks[1:]), strict=True)
-        whole = [torch.cat(part) for part in parts]
+        whole = [torch.cat([a.flatten(1) for a in part]) for part in parts]
     else:
         whole = [part.new_empty(q.shape[:-1].numel(), part.shape[1:].numel()) for part in first]
         for k, rows in enumerate(blocks):
             for result, part in zip(whole, function(rows) if k else first, strict=True):
                 result[k * size : k * size + len(part)].copy_(part.flatten(1))
-    shapes = (part.shape[1:] for part in first)
-    return tuple(
-        result.reshape(*q.shape[:-1], *shape) for result, shape in zip(whole, shapes, strict=True)
-    )
+    pairs = zip(whole, first, strict=True)
+    return tuple(result.reshape(*q.shape[:-1], *part.shape[1:]) for result, part in pairs)
 
 
 def check_vectors(value: Tensor, size: int, name: str, why: str) -> Tensor:

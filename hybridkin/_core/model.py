@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.stored import Layout, Restore, Stored
@@ -13,8 +14,6 @@ from hybridkin._core.stored import Layout, Restore, Stored
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
     from typing_extensions import Self
-
-__all__ = ["ForwardModel", "FunctionModel", "PortableModule", "PoseModel", "as_forward_model"]
 
 
 class PortableModule(nn.Module):
@@ -67,13 +66,10 @@ class PortableModule(nn.Module):
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        buffers: dict[str, Tensor | None] = {}
-        for name, stored in state["_buffers"].items():
-            buffers[name] = None
-            if stored is not None:
-                array, device = stored
-                at_home = device == "cpu" or torch.cuda.is_available()
-                buffers[name] = torch.tensor(array, device=device if at_home else "cpu")
+        def opened(array: NDArray, device: str) -> Tensor:
+            return torch.tensor(array, device=device if torch.cuda.is_available() else "cpu")
+
+        buffers = {k: None if a is None else opened(*a) for k, a in state["_buffers"].items()}
         super().__setstate__({**state, "_buffers": buffers})
 
 
@@ -176,17 +172,13 @@ class FunctionModel(ForwardModel):
     """
 
     def __init__(
-        self,
-        function: Callable[..., Any],
-        jacobian: Callable[..., Any] | None = None,
+        self, function: Callable[..., Any], jacobian: Callable[..., Any] | None = None
     ) -> None:
         super().__init__()
         self.function = function
         names = ("jacobian", "forward_and_jacobian", "in_domain", "n_actuators")
-        own, pair, domain, n = (getattr(function, name, None) for name in names)
-        self.own_jacobian = own if jacobian is None else jacobian
-        self.own_pair = pair if jacobian is None else None
-        self.own_domain = domain
+        own, pair, self.own_domain, n = (getattr(function, name, None) for name in names)
+        self.own_jacobian, self.own_pair = (own, pair) if jacobian is None else (jacobian, None)
         self.n_actuators = int(n or 0)
 
     def forward(self, q: Tensor) -> Tensor:
@@ -291,22 +283,11 @@ def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[T
     with torch.enable_grad():
         leaf = q if keep_graph else q.detach().requires_grad_(True)
         x = function(leaf)
-        rows = [
-            torch.autograd.grad(
-                x[..., i].sum(), leaf, create_graph=keep_graph, retain_graph=True, allow_unused=True
-            )[0]
-            for i in range(x.shape[-1])
-        ]
-    rows = [torch.zeros_like(leaf) if row is None else row for row in rows]
+        given = {"create_graph": keep_graph, "retain_graph": True, "materialize_grads": True}
+        columns = x.unbind(-1)
+        rows = [torch.autograd.grad(a.sum(), leaf, **given)[0] for a in columns]
     J = torch.stack(rows, dim=-2)
     return (x, J) if keep_graph else (x.detach(), J.detach())
-
-
-def device_of(model: nn.Module) -> torch.device:
-    """Return the device of a module's tensors; the CPU where it has none."""
-    for tensor in (*model.parameters(), *model.buffers()):
-        return tensor.device
-    return torch.device("cpu")
 
 
 def _checked(x: Any) -> Tensor:

@@ -22,9 +22,9 @@ def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
     See Barfoot, State Estimation for Robotics (2017), section 7.1.
     """
     K = cross_matrix(phi)
-    square, eye = K @ K, torch.eye(3).to(phi)
+    eye = torch.eye(3).to(phi)
     _, f, g, c3, _ = (part[..., None, None] for part in stumpff(phi.square().sum(-1)))
-    return eye + f * K + g * square, eye + g * K + c3 * square
+    return eye + f * K + g * K @ K, eye + g * K + c3 * K @ K
 
 
 def rotation_vector(R: Tensor) -> Tensor:

@@ -104,7 +104,7 @@ class Stored:
         value, kinds = self.settings[key], kinds if isinstance(kinds, tuple) else (kinds,)
         if type(value) is int and float in kinds and int not in kinds:
             value = float(value)
-        if type(value) not in [type(None) if kind is None else kind for kind in kinds]:
+        if (None if value is None else type(value)) not in kinds:
             names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
             raise ValueError(f"`{key}` of {self.kind!r} must be {names}, got {value!r:.60}")
         return value
@@ -113,9 +113,8 @@ class Stored:
         """Return a setting that is a list of one type."""
         values = self.value(key, list)
         if not all(type(value) is kind for value in values):
-            raise ValueError(
-                f"`{key}` of {self.kind!r} must be a list of {kind.__name__}, got {values!r:.60}"
-            )
+            need = f"must be a list of {kind.__name__}, got {values!r:.60}"
+            raise ValueError(f"`{key}` of {self.kind!r} {need}")
         return values
 
     def array(
@@ -137,13 +136,11 @@ class Stored:
         array = self.arrays[name]
         if array.dtype not in (np.float32, np.float64):
             raise ValueError(f"{name!r} must be float32 or float64, got {array.dtype}")
-        wanted = array.shape if shape is None else shape
-        matching = len(wanted) == array.ndim
-        if not matching or any(
-            n not in (None, m) for m, n in zip(array.shape, wanted, strict=True)
-        ):
-            allowed = str(shape).replace("None", "any")
-            raise ValueError(f"{name!r} must have shape {allowed}, got {array.shape}")
+        sizes = array.shape if shape is None else shape
+        fits = len(sizes) == array.ndim
+        if not fits or any(n not in (None, m) for n, m in zip(sizes, array.shape, strict=True)):
+            wanted = str(shape).replace("None", "any")
+            raise ValueError(f"{name!r} must have shape {wanted}, got {array.shape}")
         if finite and not np.isfinite(array).all():
             raise ValueError(f"{name!r} must be finite")
         return array
@@ -157,8 +154,7 @@ class Stored:
             For every array one letter per axis; the same letter stands for the same length:
             ``tensors(coef="mn", bias="m")``.
         """
-        lengths: dict[str, int] = {}
-        found = {}
+        lengths, found = {}, {}
         for name, letters in shapes.items():
             array = self.array(name, tuple(lengths.get(letter) for letter in letters))
             lengths |= dict(zip(letters, array.shape, strict=True))

@@ -27,21 +27,10 @@ def span_message(name: str, tips: Tensor, reach: float) -> str | None:
     )
 
 
-def warn_span(name: str, tips: Tensor, reach: float) -> None:
-    """Warn where tips (N, 3) of a log lie further apart than a robot of that size can reach."""
-    message = span_message(name, tips, reach)
-    if message is not None:
-        warnings.warn(message, stacklevel=4)
-
-
 def millimetres_message(name: str, value: Tensor, limit: float) -> str | None:
     """Return a warning where values are too large to be metres."""
-    if not value.numel() or float(value.max()) <= limit:
-        return None
-    return (
-        f"`{name}` reaches {float(value.max()):.4g}, which looks like millimetres; hybridkin "
-        "works in metres."
-    )
+    what = ", which looks like millimetres; hybridkin works in metres."
+    return _too_large(name, value, limit, what)
 
 
 def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
@@ -53,9 +42,10 @@ def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
 
 def degrees_message(name: str, turns: Tensor) -> str | None:
     """Return a warning where joint angles are too large to be radians."""
-    if not turns.numel() or float(turns.max()) <= _TURNS:
-        return None
-    return (
-        f"`{name}` reaches {float(turns.max()):.4g} on a revolute joint, which looks like "
-        "degrees; hybridkin works in radians."
-    )
+    what = " on a revolute joint, which looks like degrees; hybridkin works in radians."
+    return _too_large(name, turns, _TURNS, what)
+
+
+def _too_large(name: str, value: Tensor, limit: float, what: str) -> str | None:
+    largest = float(value.max()) if value.numel() else 0.0
+    return None if largest <= limit else f"`{name}` reaches {largest:.4g}{what}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -82,30 +82,22 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
         with torch.no_grad():
             return rows.jacobian(problem, torch.as_tensor(theta).to(rows.q)).numpy()
 
+    def whitened(theta: NDArray, sigma: float) -> NDArray:
+        return np.concatenate([residual(theta) / sigma, theta / problem.prior_std])
+
+    def whitened_jacobian(theta: NDArray, sigma: float) -> NDArray:
+        return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
+
     floor = 1e-12 * float(problem.chain.reach)
     robust = loss != "linear"
     sigma = max(rows.noise(residual(theta), robust), floor)
-    converged = False
-    tol = 1e-5 if roughly else 1e-12
+    converged, tol = False, 1e-5 if roughly else 1e-12
+    options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol) | {
+        "jac": whitened_jacobian
+    }
+    options |= {"bounds": (problem.low, problem.high), "loss": loss, "max_nfev": 100}
     for _ in range(2 if roughly else _MAX_ROUNDS):
-
-        def whitened(theta: NDArray, sigma: float = sigma) -> NDArray:
-            return np.concatenate([residual(theta) / sigma, theta / problem.prior_std])
-
-        def whitened_jacobian(theta: NDArray, sigma: float = sigma) -> NDArray:
-            return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
-
-        solution = least_squares(
-            whitened,
-            theta,
-            jac=whitened_jacobian,  # pyright: ignore[reportArgumentType]
-            bounds=(problem.low, problem.high),
-            loss=loss,
-            ftol=tol,
-            xtol=tol,
-            gtol=tol,
-            max_nfev=100,
-        )
+        solution = least_squares(whitened, theta, args=(sigma,), **options)
         theta, converged = solution.x, solution.status > 0
         previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:

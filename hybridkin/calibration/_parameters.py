@@ -72,7 +72,7 @@ class Parameter:
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         """Return the standard errors of `value` from those of the free directions."""
-        raise NotImplementedError
+        return std * self.units
 
     def flags(self, identified: NDArray) -> NDArray:
         """Return for each entry of `value` whether the directions that move it are identified."""
@@ -109,14 +109,19 @@ class Scaled(Parameter):
 class Shifted(Parameter):
     """Numbers moved along constant directions, each entry by at most one of them.
 
-    Bounds count from `origin`; `physical` are the default ones. Where this name means only some
-    entries, `shown` has their indices.
+    Bounds count from `origin`; `physical` are the default ones. The user's value has the entries
+    with the indices `shown`, in `shape`.
     """
 
     directions: NDArray  # (numel, size)
-    origin: NDArray
-    physical: tuple[float, float] = (-np.inf, np.inf)
-    shown: NDArray | None = None
+    physical: tuple[float, float]
+    shown: NDArray
+    shape: tuple[int, ...]
+
+    @property
+    def origin(self) -> NDArray:
+        """What the bounds count from, shape (size,)."""
+        return self.start.numpy().ravel()[self.shown]
 
     def moved(self, part: Tensor) -> Tensor:
         directions = torch.as_tensor(self.directions).to(part)
@@ -132,20 +137,14 @@ class Shifted(Parameter):
         return (low - self.origin) / self.units, (high - self.origin) / self.units
 
     def value(self, entry: Tensor) -> Tensor:
-        if self.shown is None:
-            return entry
-        value = entry.flatten()[torch.as_tensor(self.shown)]
-        return value[0] if self.name == "tool" else value
+        return entry.flatten()[torch.as_tensor(self.shown)].reshape(self.shape)
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
-        return self._of_entries(np.abs(self.directions) @ std).reshape(value.shape)
+        return (np.abs(self.directions) @ std)[self.shown].reshape(self.shape)
 
     def flags(self, identified: NDArray) -> NDArray:
         flags = ~((self.directions != 0) & ~identified).any(axis=1)
-        return self._of_entries(flags).reshape(tuple(self.value(self.start).shape))
-
-    def _of_entries(self, all_entries: NDArray) -> NDArray:
-        return all_entries if self.shown is None else all_entries[self.shown]
+        return flags[self.shown].reshape(self.shape)
 
 
 class Posed(Parameter):
@@ -171,9 +170,6 @@ class Posed(Parameter):
             )
         return np.full(6, -np.inf), np.full(6, np.inf)
 
-    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
-        return std * self.units
-
 
 def parameter_names(chain: Chain) -> list[str]:
     """Return the names that `calibrate` takes for a chain."""
@@ -184,40 +180,34 @@ def parameter_names(chain: Chain) -> list[str]:
 def parameter(chain: Chain, name: str) -> Parameter:
     """Return the free directions of one name, at the chain's present geometry."""
     geometry = {key: value.detach().cpu() for key, value in chain.geometry().items()}
-    reach = float(chain.reach)
-    if name == "tool" and name not in geometry:
-        offsets = geometry["offsets"]
-        last = np.eye(len(offsets))[:, -1:] * reach
-        origin = offsets[-1:].numpy()
-        units, low = np.array([reach]), (_SHORTEST * reach, np.inf)
-        shown = np.array([len(offsets) - 1])
-        return Shifted(name, "offsets", offsets, ("tool",), units, ("m",), last, origin, low, shown)
-    if name == "turns" and isinstance(chain, ArcChain):
-        start, counts = geometry["angles"], np.array(chain.actuators_per_segment)
-        rings = np.repeat(np.eye(len(counts)), counts, axis=0)
-        first = np.cumsum(counts) - counts
-        labels, kind = _labels(name, (len(counts),)), ("rad",) * len(counts)
-        origin, ones = start.numpy()[first], np.ones(len(counts))
-        return Shifted(name, "angles", start, labels, ones, kind, rings, origin, shown=first)
-    start = geometry[name]
+    entry = name if name in geometry else ALIASES[name]
+    start, reach = geometry[entry], float(chain.reach)
+    shape, size = tuple(start.shape), start.numel()
     if name == "base":
         labels = tuple(f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z"))
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
-    labels, size = _labels(name, tuple(start.shape)), start.numel()
     if name in SCALED:
-        return Scaled(name, name, start, labels, np.ones(size), ("-",) * size)
+        return Scaled(name, name, start, _labels(name, shape), np.ones(size), ("-",) * size)
     unit, kind, physical = reach, "m", (-np.inf, np.inf)
-    if name == "rest_bends":
+    if entry == "rest_bends":
         unit, kind, physical = 1.0, "rad", (-math.pi, math.pi)
-    elif name == "angles":
+    elif entry == "angles":
         unit, kind = 1.0, "rad"
-    elif name == "offsets":
+    elif entry == "offsets":
         physical = (_SHORTEST * reach, np.inf)
-    elif name.endswith("_zeros"):
+    elif entry.endswith("_zeros"):
         unit = float(geometry["radii"].mean())
-    units, origin, kinds = np.full(size, unit), start.numpy().ravel(), (kind,) * size
-    return Shifted(name, name, start, labels, units, kinds, np.diag(units), origin, physical)
+    directions, shown = unit * np.eye(size), np.arange(size)
+    if name == "turns" and isinstance(chain, ArcChain):  # each segment's actuators together
+        counts = np.array(chain.actuators_per_segment)
+        directions = np.repeat(np.eye(len(counts)), counts, axis=0)
+        shown, shape = np.cumsum(counts) - counts, (len(counts),)
+    elif name != entry:  # "tool", the last of the offsets
+        directions, shown, shape = directions[:, -1:], shown[-1:], ()
+    labels, size = _labels(name, shape), len(shown)
+    units, kinds = np.full(size, unit), (kind,) * size
+    return Shifted(name, entry, start, labels, units, kinds, directions, physical, shown, shape)
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:

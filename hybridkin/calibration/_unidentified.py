@@ -15,6 +15,7 @@ _SMALL = 0.05  # of a step, or of the tips' move: not mentioned
 _SLIGHT = 0.01  # of the largest move of the tips by one parameter alone
 _ALIKE = 0.02
 _STILL = 1e-6  # [mm]
+_NO_EFFECT = "does not move the tips"
 _INSIDE = 0.05  # of a unit vector: within a span
 _STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%")}
 
@@ -37,9 +38,7 @@ def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
         tips = float(np.linalg.norm(columns @ move))
         alone = np.abs(move) * np.linalg.norm(columns, axis=0)
         counts = alone > max(_SMALL * tips, _SLIGHT * alone.max(), _STILL)
-        effect = (
-            "does not move the tips" if tips < _STILL else f"moves the tips by {tips:.2g} mm rms"
-        )
+        effect = f"moves the tips by {tips:.2g} mm rms" if tips >= _STILL else _NO_EFFECT
         terms = _terms(problem, move * to_steps, lead)
         shown = [term for term in terms if abs(term[1]) > _SMALL][:_N_TERMS]
         hidden = sum(counts[term[2]] for term in terms if term not in shown)
@@ -92,7 +91,8 @@ def _few_terms(directions: NDArray) -> NDArray:
         return a / np.linalg.norm(a)
 
     columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
-    candidates = sorted((shortest(held) for held in columns), key=lambda a: _spread(a @ directions))
+    candidates = [shortest(held) for held in columns]
+    candidates.sort(key=lambda a: np.abs(a @ directions).sum() / np.abs(a @ directions).max())
     chosen: list[NDArray] = []
     while len(chosen) < K:
         taken = np.array(chosen).reshape(-1, K)
@@ -100,7 +100,3 @@ def _few_terms(directions: NDArray) -> NDArray:
         free = [a for a in candidates if np.linalg.norm(rest @ a) > _INSIDE]
         chosen.append(free[0] if free else shortest(rest[0]))
     return np.array(chosen) @ directions
-
-
-def _spread(move: NDArray) -> float:
-    return float(np.abs(move).sum() / np.abs(move).max())

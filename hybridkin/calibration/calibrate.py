@@ -24,7 +24,6 @@ from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
 
-_LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 _WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
 # Identified below this share of the prior: k parameters that share one unidentified direction
 # narrow to 1 / sqrt(k) by the prior alone.
@@ -211,8 +210,6 @@ def fit_geometry(
             f"another Chain, got {type(chain).__name__}."
         )
     names = _check_parameters(chain, parameters, bounds, prior)
-    if loss not in _LOSSES:
-        raise ValueError(f"`loss` must be one of {_LOSSES}, got {loss!r}.")
     torch_given = isinstance(q, Tensor)
     q, x, messages = _check_data(chain, q, x)
     if groups is not None:
@@ -333,15 +330,20 @@ def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> C
     )
 
 
-def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
+def motion_folds(groups: NDArray) -> list[tuple[NDArray, NDArray]]:
+    """Return the training and the held-out rows of at most 5 folds of whole motions."""
     folds = min(5, len(np.unique(groups)))
     if folds < 2:
         raise ValueError(
-            "`groups` must name at least 2 motions to hold one out, got 1; leave `groups` out "
-            "where the log is one motion."
+            "`groups` must name at least 2 motions to hold one out, got 1; record more motions, or "
+            "calibrate without `groups`."
         )
+    return list(GroupKFold(folds).split(groups, groups=groups))
+
+
+def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     squares = 0.0
-    for train, test in GroupKFold(folds).split(rows.q, groups=groups):
+    for train, test in motion_folds(groups):
         fit = solve(best.problem, Rows(*(part[train] for part in rows)), best.theta, loss)
         held_out = Rows(*(part[test] for part in rows))
         squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weight.sum())
@@ -405,8 +407,8 @@ def _check_weights(sample_weight: Numbers | None, q: Tensor) -> Tensor:
     if sample_weight is None:
         return q.new_ones(len(q))
     weights = as_tensor(sample_weight, "sample_weight").to(q)
-    valid = weights.shape == (len(q),) and bool((torch.isfinite(weights) & (weights >= 0)).all())
-    if not valid or not (weights > 0).any():
+    valid = torch.isfinite(weights) & (weights >= 0)
+    if weights.shape != (len(q),) or not valid.all() or not weights.any():
         raise ValueError(
             f"`sample_weight` must hold {len(q)} non-negative numbers, not all zero, got shape "
             f"{tuple(weights.shape)}."

@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.model_selection import GroupKFold
 
 from hybridkin._core.arrays import Numbers, as_array
-from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
+from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry, motion_folds
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 
 __all__ = ["PlayFit", "fit_play"]
-
-_FOLDS = 5
 
 
 @dataclass(frozen=True)
@@ -120,13 +117,10 @@ def fit_play(
     """
     tried = np.unique(np.concatenate([[0.0], np.asarray(widths, dtype=float).ravel()]))
     groups = np.asarray(groups)
-    folds = min(_FOLDS, len(np.unique(groups)))
-    if folds < 2:
-        raise ValueError("`groups` must name at least 2 motions to hold one out, got 1.")
+    splits = motion_folds(groups)
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q, x = as_array(q), as_array(x)
     effective = [PlayOperator(width).apply_by_group(q, groups) for width in tried]
-    splits = list(GroupKFold(folds).split(groups, groups=groups))
 
     def mean_square(y: NDArray, train: NDArray, test: NDArray) -> float:
         """Return the mean squared tip distance on the held-out motions."""
@@ -140,7 +134,7 @@ def fit_play(
     cv_rmse = np.sqrt(np.average(mean_squares, axis=1, weights=sizes))
     best = int(np.argmin(cv_rmse))
     gains = np.sqrt(mean_squares[0]) - np.sqrt(mean_squares[best])
-    gain, std_error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(folds))
+    gain, std_error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(splits)))
     kept = best > 0 and gain > std_error
     chosen = best if kept else 0
     result = calibrate(chain, effective[chosen], x, names, **calibrate_options)

@@ -67,9 +67,7 @@ def _turned(v: Sequence[Tensor], b: Bending, arc: Stumpff) -> Vector:
 
 def tip(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     """Return the tip (3, N) in the base frame, carried from the last segment to the first."""
-    x, y = bending.unbind()
-    arc = stumpff(torch.addcmul(x * x, y, y))
-    return torch.stack(_all_carried(length, (x, y), arc, offsets)[0][0].point)
+    return torch.stack(_all_carried(length, bending, offsets)[0][0].point)
 
 
 def tip_and_columns(
@@ -85,9 +83,7 @@ def tip_and_columns(
     Columns are the lengths of all segments, then the x-, then the y-bendings. With `angular`,
     3 S columns of angular velocity follow, with `rigid`, S columns for the offsets.
     """
-    x, y = bending.unbind()
-    arc = stumpff(torch.addcmul(x * x, y, y))
-    carried, segments = _all_carried(length, (x, y), arc, offsets)
+    carried, segments, (x, y), arc = _all_carried(length, bending, offsets)
     tx, ty, tz = (torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
     rest = torch.stack([at.rest for at in carried])
     across = torch.stack([at.across for at in carried])
@@ -107,10 +103,15 @@ def tip_and_columns(
 
 
 def _all_carried(
-    length: Tensor, bending: Bending, arc: Stumpff, offsets: Tensor
-) -> tuple[list[_Carried], list[tuple[Bending, Stumpff]]]:
-    """Return the tip in the start frame of every segment, and each segment's bending and arc."""
-    bends = [*zip(*(part.unbind() for part in bending), strict=True)]
+    length: Tensor, bending: Tensor, offsets: Tensor
+) -> tuple[list[_Carried], list[tuple[Bending, Stumpff]], Bending, Stumpff]:
+    """Return the tip in the start frame of every segment, and the segments' bendings and arcs.
+
+    These for each segment by itself, then of all segments.
+    """
+    x, y = bending.unbind()
+    arc = stumpff(torch.addcmul(x * x, y, y))
+    bends = [*zip(x.unbind(), y.unbind(), strict=True)]
     arcs = [Stumpff(*each) for each in zip(*(part.unbind() for part in arc), strict=True)]
     segments = [*zip(bends, arcs, strict=True)]
     zero = torch.zeros_like(length[0])
@@ -119,7 +120,7 @@ def _all_carried(
     for of_length, (b, of_arc), offset in reversed(parts):
         carried.append(_carried(point, of_length, b, of_arc, offset))
         point = carried[-1].point
-    return carried[::-1], segments
+    return carried[::-1], segments, (x, y), arc
 
 
 def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:

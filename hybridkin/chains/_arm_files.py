@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
@@ -42,15 +42,16 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
     if not moving:
         raise ValueError("the path from the root to `end_link` must have a moving joint.")
     # Limits that are missing or empty (lower = upper) are infinite.
-    given = [(-math.inf, math.inf) if joint.limits is None else joint.limits for joint in moving]
-    limits = [(low, high) if low < high else (-math.inf, math.inf) for low, high in given]
+    given = [(0.0, 0.0) if joint.limits is None else joint.limits for joint in moving]
+    limits = np.array(given, dtype=float)
+    limits[limits[:, 0] >= limits[:, 1]] = -math.inf, math.inf
     return {
         "origins": np.stack([joint.origin for joint in moving]),
         "axes": [joint.axis for joint in moving],
         "kinds": [joint.kind for joint in moving],
         "names": [joint.name or f"joint_{k + 1}" for k, joint in enumerate(moving)],
-        "q_min": [float(low) for low, _ in limits],
-        "q_max": [float(high) for _, high in limits],
+        "q_min": limits[:, 0],
+        "q_max": limits[:, 1],
         "tip": pending,
     }
 
@@ -112,8 +113,8 @@ def _urdf_joint(joint: Any) -> Joint:
         )
     origin = np.eye(4)
     if joint.origin is not None:
-        origin[:3, :3] = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()
-        origin[:3, 3] = joint.origin.xyz or [0, 0, 0]
+        turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0])
+        origin = _matrix(turn, joint.origin.xyz or [0, 0, 0])
     kind = "revolute" if joint.type == "continuous" else joint.type
     axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # the URDF default
     limits = None
@@ -168,21 +169,22 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
                 "and slides are supported on the way to `end_link`; choose a `root_link` after it."
             )
         axis, anchor, zero = model.jnt_axis[j], model.jnt_pos[j], model.qpos0[model.jnt_qposadr[j]]
-        origin, back = np.eye(4), np.eye(4)
-        origin[:3, 3], back[:3, 3] = anchor, -anchor
-        if _MJCF_KINDS[kind] == "revolute":
-            origin[:3, :3] = Rotation.from_rotvec(-zero * axis).as_matrix()
-        else:
-            origin[:3, 3] -= zero * axis
         limits = model.jnt_range[j] if model.jnt_limited[j] else None
-        steps += [Joint(origin, _MJCF_KINDS[kind], axis, name, limits), Joint(back)]
+        back, none = -zero * axis, np.zeros(3)  # from MuJoCo's reference to q = 0
+        turn, slide = (back, none) if _MJCF_KINDS[kind] == "revolute" else (none, back)
+        origin = _matrix(Rotation.from_rotvec(turn), anchor + slide)
+        steps.append(Joint(origin, _MJCF_KINDS[kind], axis, name, limits))
+        steps.append(Joint(_matrix(Rotation.identity(), -anchor)))
     return steps
 
 
 def _mjcf_pose(position: NDArray, quaternion: NDArray) -> NDArray:
+    return _matrix(Rotation.from_quat(np.roll(quaternion, -1)), position)  # w comes first
+
+
+def _matrix(turn: Rotation, position: ArrayLike) -> NDArray:
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # w comes first
-    matrix[:3, 3] = position
+    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), position
     return matrix
 
 

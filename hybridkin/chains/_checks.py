@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,22 +15,12 @@ from hybridkin._core.arrays import Numbers, Transform
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
-def vector(
-    value: Numbers,
-    name: str,
-    dtype: torch.dtype,
-    *,
-    size: int | None = None,
-    positive: bool = False,
-) -> Tensor:
-    """Return one number per segment as a tensor (S,), checked."""
-    vector = numeric(value, name, dtype)
-    if vector.ndim != 1 or vector.numel() == 0 or (size is not None and vector.numel() != size):
-        need = "(S,), one value per segment" if size is None else f"({size},), one per segment"
-        raise ValueError(f"`{name}` must have shape {need}, got {tuple(vector.shape)}.")
-    if positive and not (vector > 0).all():
-        raise ValueError(f"`{name}` must be positive [m], got {vector.tolist()}.")
-    return vector
+def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
+    """Return one positive length per segment, shape (S,)."""
+    lengths = shaped(value, name, (size,), dtype)
+    if not len(lengths) or not (lengths > 0).all():
+        raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
+    return lengths
 
 
 def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
@@ -63,12 +53,17 @@ def numeric(
 
 
 def shaped(
-    value: Numbers, name: str, shape: tuple[int | None, ...], *, finite: bool = True
+    value: Numbers,
+    name: str,
+    shape: tuple[int | None, ...],
+    dtype: torch.dtype = torch.float64,
+    *,
+    finite: bool = True,
 ) -> Tensor:
-    """Return an array as a float64 tensor of the given shape; None is any length."""
-    tensor = numeric(value, name, finite=finite)
-    fits = tensor.ndim == len(shape)
-    if not fits or any(b not in (None, a) for a, b in zip(tensor.shape, shape, strict=True)):
+    """Return an array as a tensor of the given shape; None is any length."""
+    tensor = numeric(value, name, dtype, finite=finite)
+    pairs = zip(tensor.shape, shape, strict=False)
+    if tensor.ndim != len(shape) or any(need not in (None, size) for size, need in pairs):
         need = ", ".join("n" if size is None else str(size) for size in shape)
         need = f"({need},)" if len(shape) == 1 else f"({need})"
         raise ValueError(f"`{name}` must have shape {need}, got {tuple(tensor.shape)}.")
@@ -143,16 +138,3 @@ def rigid_pose(value: Numbers, name: str) -> Tensor:
     matrix[:3, :3] = u @ vh
     matrix[3] = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
     return matrix
-
-
-def check_replacements(values: Mapping[str, Tensor], current: Mapping[str, Tensor]) -> None:
-    """Raise where values are not part of the geometry, or have another shape."""
-    for name, value in values.items():
-        if name not in current:
-            raise ValueError(
-                f"`{name}` is not part of this chain's geometry; it has {sorted(current)}."
-            )
-        if value.shape != current[name].shape:
-            raise ValueError(
-                f"`{name}` must have shape {tuple(current[name].shape)}, got {tuple(value.shape)}."
-            )

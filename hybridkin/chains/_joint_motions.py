@@ -7,6 +7,8 @@ Batches come last in the results, vectors are (3, N); all are in the base frame.
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor, nn
 
@@ -59,10 +61,7 @@ def frames(u1: Tensor, u2: Tensor, motions: Tensor) -> Tensor:
     u1, u2 = (part[..., None, None] for part in (u1, u2))
     still, by_u1, by_u2 = motions.unbind(1)
     steps = torch.addcmul(torch.addcmul(still, u1, by_u1), u2, by_u2).unbind(1)
-    found = [steps[0]]
-    for step in steps[1:]:
-        found.append(found[-1] @ step)
-    return torch.stack(found, dim=1)
+    return torch.stack([*itertools.accumulate(steps, torch.matmul)], dim=1)
 
 
 def last_frame_and_joints(

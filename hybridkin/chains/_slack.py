@@ -175,11 +175,7 @@ class FindTaut(torch.autograd.Function):
             rows = tensors[0].movedim(dims[0], 0)
             codes = FindTaut.apply(find, rows.flatten(0, 1), *tensors[1:])
             return codes.unflatten(0, rows.shape[:2]), 0
-        each = [
-            [
-                part if dim is None else part.select(dim, k)
-                for part, dim in zip(tensors, dims, strict=True)
-            ]
-            for k in range(info.batch_size)
-        ]
-        return torch.stack([FindTaut.apply(find, *parts) for parts in each]), 0
+        n, pairs = info.batch_size, zip(tensors, dims, strict=True)
+        each = [[a] * n if dim is None else a.unbind(dim) for a, dim in pairs]
+        found = [FindTaut.apply(find, *parts) for parts in zip(*each, strict=True)]
+        return torch.stack(found), 0

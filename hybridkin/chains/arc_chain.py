@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -17,13 +18,14 @@ from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
-from hybridkin.chains._checks import actuator_counts, filled, flat_angles, pose, vector
+from hybridkin.chains._checks import actuator_counts, filled, flat_angles, lengths_of, pose
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 _ROUTINGS = ("segment", "base")
+STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "routing": str}
 
 
 class Frames(NamedTuple):
@@ -74,7 +76,7 @@ class ArcChain(Chain):
         """
         if routing not in _ROUTINGS:
             raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
-        radii = vector(radii, "radii", dtype, positive=True)
+        radii = lengths_of(radii, "radii", dtype)
         S = radii.numel()
         name, n_actuators, least = counts
         self.actuators_per_segment = actuator_counts(n_actuators, S, name, least)
@@ -89,7 +91,7 @@ class ArcChain(Chain):
             "base": pose(base, "base", dtype),
         }
         if lengths is not None:
-            geometry["lengths"] = vector(lengths, "lengths", dtype, size=S, positive=True)
+            geometry["lengths"] = lengths_of(lengths, "lengths", dtype, S)
             warn_millimetres("lengths", geometry["lengths"], 10.0)
         return geometry
 
@@ -380,12 +382,9 @@ class ArcChain(Chain):
 
     def _poses(self, length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
         steps = arc_transforms(length, bending, offsets.to(length))
-        pose = self.base.to(length).expand(*length.shape[:-1], 4, 4)
-        poses = [pose]
-        for step in steps.unbind(-3):
-            pose = pose @ step
-            poses.append(pose)
-        return torch.stack(poses, dim=-3)
+        base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
+        poses = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
+        return torch.stack([*poses], dim=-3)
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         return (self._tip_of(self._to_tip(self._arcs(q)), q),)
@@ -419,25 +418,15 @@ class ArcChain(Chain):
         J = torch.matmul(slope.T, columns)  # (3, n, N)
         return J.permute(2, 0, 1).reshape(*q.shape[:-1], 3, self.n_actuators)
 
-    def stored(self) -> Stored:
-        """Return how the chain describes itself: its geometry and how it is routed."""
-        names = ("actuators_per_segment", "tip_at", *self.layout.settings)
-        settings = {name: vars(self)[name] for name in names}
-        return Stored.of(self.layout.kind, self.geometry(), **settings)
-
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
         """Return the chain of a description."""
         counts = stored.list_of(int, "actuators_per_segment")
-        entries: dict[str, Any] = {
-            name: stored.array(name)
-            for name in cls._entries
-            if name != "lengths" or name in stored.arrays
-        }
+        names = [name for name in cls._entries if name != "lengths" or name in stored.arrays]
+        entries: dict[str, Any] = {name: stored.array(name) for name in names}
         if sum(counts) != len(entries["angles"]):
             raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
         entries["angles"] = np.split(entries["angles"], np.cumsum(counts)[:-1])
-        entries |= {name: stored.value(name, kind) for name, kind in cls.layout.settings.items()}
-        dtype = torch.from_numpy(entries["base"]).dtype
-        chain = cls(**entries, **{cls._counts: counts}, dtype=dtype)
+        entries |= {"routing": stored.value("routing", str), cls._counts: counts}
+        chain = cls(**entries, dtype=torch.from_numpy(entries["base"]).dtype)
         return chain.with_tip(stored.value("tip_at", float))

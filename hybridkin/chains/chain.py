@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
@@ -11,7 +10,6 @@ from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors
 from hybridkin._core.model import PoseModel
-from hybridkin.chains._checks import check_replacements
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -63,7 +61,15 @@ class Chain(PoseModel):
         Chain
             A new chain of the same kind; this one is not changed.
         """
-        check_replacements(geometry, self.geometry())
+        current = self.geometry()
+        for name, value in geometry.items():
+            if name not in current:
+                raise ValueError(
+                    f"`{name}` is not part of this chain's geometry; it has {sorted(current)}."
+                )
+            shape = tuple(current[name].shape)
+            if value.shape != shape:
+                raise ValueError(f"`{name}` must have shape {shape}, got {tuple(value.shape)}.")
         chain = type(self).__new__(type(self))
         nn.Module.__init__(chain)
         chain.__dict__.update({name: self.__dict__[name] for name in self._structure})
@@ -145,9 +151,3 @@ class Chain(PoseModel):
         None for a robot whose actuators cannot contradict each other.
         """
         return None
-
-    def warn_contradictory(self, q: Tensor, name: str = "q", stacklevel: int = 3) -> None:
-        """Warn where `contradiction` has a warning."""
-        message = self.contradiction(q, name)
-        if message is not None:
-            warnings.warn(message, stacklevel=stacklevel)

@@ -12,7 +12,7 @@ from hybridkin._core.stored import Layout
 from hybridkin._core.units import millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled
-from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
 
 __all__ = ["ConstantCurvatureChain"]
 
@@ -71,9 +71,9 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
-    layout = Layout("constant_curvature", {}, {"routing": str})
     _counts = "n_actuators"
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
+    layout = Layout("constant_curvature", dict.fromkeys(_entries, ""), STRUCTURE)
 
     lengths: Tensor | None
     actuator_zeros: Tensor

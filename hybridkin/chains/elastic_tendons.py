@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -12,30 +12,15 @@ from torch import Tensor, nn
 from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.stored import Layout
 from hybridkin._core.units import millimetres_message
+from hybridkin.chains import _slack
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled
-from hybridkin.chains._slack import (
-    MOST,
-    Balance,
-    Elasticity,
-    FindTaut,
-    Responses,
-    applied,
-    as_mask,
-    extended,
-    find_by_solving,
-    find_in_table,
-    responses_of,
-    rough_of,
-)
-from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]
 
-_SHAPING = (
-    *("radii", "angles", "bending_stiffness", "axial_stiffness", "rest_bends", "tendon_zeros"),
-)
+_SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros".split()
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are stored
 _Rough = tuple[Tensor, Tensor]
 
@@ -116,9 +101,9 @@ class ElasticTendonChain(ArcChain):
     tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
     """
 
-    layout = Layout("elastic_tendons", {}, {"routing": str})
     _counts = "n_tendons"
     _entries = (*_SHAPING, "lengths", "offsets", "base")
+    layout = Layout("elastic_tendons", dict.fromkeys(_entries, ""), STRUCTURE)
     _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
 
     lengths: Tensor
@@ -149,8 +134,10 @@ class ElasticTendonChain(ArcChain):
         geometry = self._checked(
             radii, lengths, counts, angles, routing, offsets, rest_bends, base, dtype
         )
-        if self.n_actuators > MOST:
-            raise ValueError(f"`n_tendons` must be at most {MOST} in all, got {self.n_actuators}.")
+        if self.n_actuators > _slack.MOST:
+            raise ValueError(
+                f"`n_tendons` must be at most {_slack.MOST} in all, got {self.n_actuators}."
+            )
         bending = 0.01 * geometry["radii"] ** 2 if bending_stiffness is None else bending_stiffness
         axial = 10.0 if axial_stiffness is None else axial_stiffness
         for name, value in (("bending_stiffness", bending), ("axial_stiffness", axial)):
@@ -158,7 +145,7 @@ class ElasticTendonChain(ArcChain):
             if not (geometry[name] > 0).all():
                 raise ValueError(f"`{name}` must be positive, got {geometry[name].tolist()}.")
         zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
-        self._table: tuple[list[Tensor], object, Responses, _Rough] | None = None
+        self._table: tuple[list[Tensor], object, _slack.Responses, _Rough] | None = None
         self._set_geometry({**geometry, "tendon_zeros": zeros})
 
     @classmethod
@@ -189,16 +176,10 @@ class ElasticTendonChain(ArcChain):
                 "`chain` must have `lengths`: the actuators of extensible segments are no tendons."
             )
         geometry, counts = chain.geometry(), chain.actuators_per_segment
-        zeros = geometry.pop("actuator_zeros")
-        given = {
-            **geometry,
-            "n_tendons": counts,
-            "angles": [part.tolist() for part in geometry["angles"].split(counts)],
-            "tendon_zeros": zeros,
-            "routing": chain.routing,
-            "dtype": chain.radii.dtype,
-        }
-        return cls(**(given | options)).with_tip(chain.tip_at)
+        geometry["tendon_zeros"] = geometry.pop("actuator_zeros")
+        angles = [part.tolist() for part in geometry["angles"].split(counts)]
+        given = {"n_tendons": counts, "routing": chain.routing, "dtype": chain.radii.dtype}
+        return cls(**{**geometry, "angles": angles, **given, **options}).with_tip(chain.tip_at)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -248,11 +229,11 @@ class ElasticTendonChain(ArcChain):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_table": None}
 
-    def _elasticity(self) -> Elasticity:
+    def _elasticity(self) -> _slack.Elasticity:
         counts = self.actuators_per_segment
         at = levers(self.radii, self.angles, counts)
         one = torch.ones_like(self.radii)
-        return Elasticity(
+        return _slack.Elasticity(
             reading_matrix(at, counts, self.routing, True),
             torch.cat([one, 1.0 / self.radii, 1.0 / self.radii]),
             torch.cat([self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]),
@@ -260,7 +241,7 @@ class ElasticTendonChain(ArcChain):
             self.tendon_zeros,
         )
 
-    def _all_responses(self, rows: Tensor) -> tuple[Responses, _Rough]:
+    def _all_responses(self, rows: Tensor) -> tuple[_slack.Responses, _Rough]:
         """Return the responses of all sets of taut tendons, stored while the geometry stays."""
         geometry = self.geometry()
         shaping = [geometry[name] for name in _SHAPING]
@@ -272,46 +253,50 @@ class ElasticTendonChain(ArcChain):
             if key == kept_key and all(a is b for a, b in zip(kept, shaping, strict=True)):
                 return responses, rough
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
-        guard = contextlib.nullcontext()
-        if torch.is_inference_mode_enabled():  # or derivatives could not use what is kept
-            guard = torch.inference_mode(False)
+        # Outside inference mode, or derivatives could not use what is stored.
+        guard = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
         with guard:
-            elasticity = Elasticity(*(part.double() for part in self._elasticity()))
-            responses = responses_of(as_mask(codes, self.n_actuators), *elasticity)
-            responses = Responses(*(part.to(rows) for part in responses))
-            rough = rough_of(responses.stretch.detach())
+            elasticity = _slack.Elasticity(*(part.double() for part in self._elasticity()))
+            responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), *elasticity)
+            responses = _slack.Responses(*(part.to(rows) for part in responses))
+            rough = _slack.rough_of(responses.stretch.detach())
         if not passing:
             self._table = (shaping, key, responses, rough)
         return responses, rough
 
-    def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, Responses]:
+    def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, _slack.Responses]:
         """Return the sets of taut tendons (N,) as bits, and where among responses they stand."""
         if self.n_actuators <= _TABLE:
             table, rough = self._all_responses(rows)
             stretch = table.stretch.detach()
-            codes = FindTaut.apply(find_in_table, rows.detach(), stretch, *rough)
+            codes = _slack.FindTaut.apply(_slack.find_in_table, rows.detach(), stretch, *rough)
             return codes, codes, table
         elasticity = [part.to(rows) for part in self._elasticity()]
-        codes = FindTaut.apply(
-            find_by_solving, rows.detach(), *(part.detach() for part in elasticity)
+        codes = _slack.FindTaut.apply(
+            _slack.find_by_solving, rows.detach(), *(part.detach() for part in elasticity)
         )
         each = torch.arange(len(rows), device=rows.device)
-        return codes, each, responses_of(as_mask(codes, self.n_actuators), *elasticity)
+        return (
+            codes,
+            each,
+            _slack.responses_of(_slack.as_mask(codes, self.n_actuators), *elasticity),
+        )
 
-    def _balance(self, rows: Tensor) -> Balance:
+    def _balance(self, rows: Tensor) -> _slack.Balance:
         codes, at, responses = self._find(rows)
         shape, stretch = (
-            applied(maps.index_select(0, at), extended(rows)) for maps in responses[:2]
+            _slack.applied(maps.index_select(0, at), _slack.extended(rows))
+            for maps in responses[:2]
         )
-        taut = as_mask(codes, self.n_actuators)
+        taut = _slack.as_mask(codes, self.n_actuators)
         compliance = responses.compliance.index_select(0, at)
-        return Balance(shape, stretch.relu() * taut, taut, compliance)
+        return _slack.Balance(shape, stretch.relu() * taut, taut, compliance)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         straight = nn.functional.pad(self.lengths.to(rows), (0, 2 * self.n_segments))
         _, at, responses = self._find(rows)
         maps = responses.shape.index_select(0, at)
-        arcs = (applied(maps, extended(rows)) + straight).T.contiguous()
+        arcs = (_slack.applied(maps, _slack.extended(rows)) + straight).T.contiguous()
         return arcs, maps[..., :-1].permute(1, 2, 0)
 
     def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +26,9 @@ class PlayState(NamedTuple):
 
     command: Any
     effective: Any
+
+
+_Step = Callable[[Tensor, PlayState, Tensor], PlayState]  # row, state before, half the width
 
 
 class PlayOperator:
@@ -88,12 +91,13 @@ class PlayOperator:
         ValueError
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
-        rows, half, before = self._checked(q, state, "q")
-        y, (sent, effective) = [], before
-        for sent in rows:
-            effective = torch.minimum(torch.maximum(effective, sent - half), sent + half)
-            y.append(effective)
-        return _like(q, y, rows, PlayState(sent, effective))
+
+        def follow(row: Tensor, at: PlayState, half: Tensor) -> PlayState:
+            return PlayState(
+                row, torch.minimum(torch.maximum(at.effective, row - half), row + half)
+            )
+
+        return self._run(q, state, "q", follow, 1)
 
     def command(self, y: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
         """Return the commands by which the effective changes become y: the inverse of `apply`.
@@ -119,13 +123,12 @@ class PlayOperator:
         ValueError
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
-        rows, half, before = self._checked(y, state, "y")
-        q, (sent, effective) = [], before
-        for row in rows:
-            sent = torch.where(row == effective, sent, row + half * torch.sign(row - effective))
-            effective = row
-            q.append(sent)
-        return _like(y, q, rows, PlayState(sent, effective))
+
+        def lead(row: Tensor, at: PlayState, half: Tensor) -> PlayState:
+            ahead = row + half * torch.sign(row - at.effective)
+            return PlayState(torch.where(row == at.effective, at.command, ahead), row)
+
+        return self._run(y, state, "y", lead, 0)
 
     def apply_by_group(self, q: Any, groups: ArrayLike) -> Any:
         """Return the effective changes of a log of several motions, each started afresh.
@@ -159,33 +162,31 @@ class PlayOperator:
     def __repr__(self) -> str:
         return f"PlayOperator(width={self.width.tolist()})"
 
-    def _checked(
-        self, rows: Any, state: PlayState | None, name: str
-    ) -> tuple[Tensor, Tensor, PlayState]:
-        """Return the rows, half the width and the state before them as tensors."""
-        rows = rows if isinstance(rows, Tensor) else torch.as_tensor(np.asarray(rows))
+    def _run(
+        self, given: Any, state: PlayState | None, name: str, step: _Step, wanted: int
+    ) -> tuple[Any, PlayState]:
+        """Return the entry `wanted` of the state after every row given, and the last state."""
+        rows = given if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given))
         rows = rows if rows.is_floating_point() else rows.to(torch.float64)
         if rows.ndim != 2 or self.width.shape not in ((), rows.shape[1:]):
             needed = self.width.size if self.width.ndim else "n"
             raise ValueError(f"`{name}` must have shape (T, {needed}), got {tuple(rows.shape)}.")
         if not torch.isfinite(rows).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
-        if state is None:
-            if not len(rows):
-                raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
-            state = PlayState(rows[0], rows[0])
-        before = PlayState(*(torch.as_tensor(part).to(rows) for part in state))
-        if any(part.shape != rows.shape[1:] for part in before):
-            shapes = [tuple(part.shape) for part in before]
+        if state is None and not len(rows):
+            raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
+        start = (rows[0], rows[0]) if state is None else state
+        at = PlayState(*(torch.as_tensor(part).to(rows) for part in start))
+        shapes = [tuple(part.shape) for part in at]
+        if shapes != [tuple(rows.shape[1:])] * 2:
             raise ValueError(
-                f"`state` must hold vectors of shape {(rows.shape[1],)}, got {shapes}."
+                f"`state` must hold vectors of shape ({rows.shape[1]},), got {shapes}."
             )
-        return rows, torch.as_tensor(self.width / 2).to(rows), before
-
-
-def _like(given: Any, rows: Sequence[Tensor], like: Tensor, state: PlayState) -> tuple[Any, Any]:
-    """Return rows and state as tensors or arrays, whichever was given."""
-    out = torch.stack(tuple(rows)) if rows else torch.zeros_like(like)
-    if isinstance(given, Tensor):
-        return out, state
-    return out.numpy(), PlayState(*(part.numpy() for part in state))
+        found, half = [], torch.as_tensor(self.width / 2).to(rows)
+        for row in rows:
+            at = step(row, at, half)
+            found.append(at[wanted])
+        out = torch.stack(found) if found else rows.clone()
+        if isinstance(given, Tensor):
+            return out, at
+        return out.numpy(), PlayState(*(part.numpy() for part in at))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,16 +14,9 @@ from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
+from hybridkin.chains import _joint_motions
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints, urdf_path
 from hybridkin.chains._checks import pose, rigid_pose, shaped
-from hybridkin.chains._joint_motions import (
-    carried_tip,
-    column_carriers,
-    frames,
-    joint_motions,
-    last_frame_and_joints,
-    shares,
-)
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -84,7 +77,8 @@ class RigidChain(Chain):
 
     _entries = ("base", "tool")
     _structure = ("n_actuators", "kinds", "names")
-    layout = Layout("rigid", {})
+    _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "base")
+    layout = Layout("rigid", dict.fromkeys(_arrays, ""), {"kinds": list, "names": list})
 
     origins: Tensor
     axes: Tensor
@@ -136,7 +130,7 @@ class RigidChain(Chain):
                 f"`q_min` must not exceed `q_max`, got {low.tolist()} and {high.tolist()}."
             )
         slides = torch.tensor([kind == "prismatic" for kind in self.kinds], device=axes.device)
-        motions = joint_motions(origins, axes, slides)
+        motions = _joint_motions.joint_motions(origins, axes, slides)
         geometry = {
             "origins": origins,
             "axes": axes,
@@ -146,7 +140,7 @@ class RigidChain(Chain):
             "tool": shaped(tool, "tool", (3,)),
             "base": pose(base, "base", dtype),
             "motions": motions,
-            "carriers": column_carriers(motions, origins, axes),
+            "carriers": _joint_motions.column_carriers(motions, origins, axes),
         }
         geometry = {name: value.to(axes.device, dtype) for name, value in geometry.items()}
         self._set_geometry({**geometry, "slides": slides})
@@ -159,9 +153,7 @@ class RigidChain(Chain):
         end_link: str,
         *,
         root_link: str | None = None,
-        tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform | None = None,
-        dtype: torch.dtype = torch.float64,
+        **options: Any,
     ) -> RigidChain:
         """Return the arm from one link of a URDF to another.
 
@@ -173,8 +165,8 @@ class RigidChain(Chain):
             The link whose frame carries the tool.
         root_link : str, optional
             The link that is the base. Default: the root of the tree that `end_link` is in.
-        tool, base, dtype
-            As for `RigidChain`.
+        **options
+            `tool`, `base` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -190,8 +182,7 @@ class RigidChain(Chain):
             For text that is no URDF, links that are not there or not connected, a path without
             moving joint, and joints that are floating, planar or mimic another one.
         """
-        path = urdf_path(text_or_path, end_link, root_link)
-        return cls(**moving_joints(path), tool=tool, base=base, dtype=dtype)
+        return cls(**moving_joints(urdf_path(text_or_path, end_link, root_link)), **options)
 
     @classmethod
     def from_mjcf(
@@ -200,9 +191,7 @@ class RigidChain(Chain):
         end_link: str,
         *,
         root_link: str | None = None,
-        tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform | None = None,
-        dtype: torch.dtype = torch.float64,
+        **options: Any,
     ) -> RigidChain:
         """Return the arm from one body of a MuJoCo model to another body or site.
 
@@ -214,8 +203,8 @@ class RigidChain(Chain):
             The body, or else the site, whose frame carries the tool.
         root_link : str, optional
             The body that is the base. Default: the world.
-        tool, base, dtype
-            As for `RigidChain`.
+        **options
+            `tool`, `base` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -232,26 +221,18 @@ class RigidChain(Chain):
             For text that is no MJCF, bodies that are not there or not connected, a path without
             moving joint, and free or ball joints.
         """
-        path = mjcf_path(text_or_path, end_link, root_link)
-        return cls(**moving_joints(path), tool=tool, base=base, dtype=dtype)
+        return cls(**moving_joints(mjcf_path(text_or_path, end_link, root_link)), **options)
 
     @classmethod
-    def from_chain(
-        cls,
-        chain: KinematicsChain,
-        *,
-        tool: Numbers = (0.0, 0.0, 0.0),
-        base: Numbers | Transform | None = None,
-        dtype: torch.dtype = torch.float64,
-    ) -> RigidChain:
+    def from_chain(cls, chain: KinematicsChain, **options: Any) -> RigidChain:
         """Return the arm of a pytorch_kinematics chain without branches.
 
         Parameters
         ----------
         chain : pytorch_kinematics SerialChain
             Starts at the base and ends at the end link. It is not changed.
-        tool, base, dtype
-            As for `RigidChain`.
+        **options
+            `tool`, `base` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -264,7 +245,7 @@ class RigidChain(Chain):
         ValueError
             For chains that branch or have no moving joint.
         """
-        return cls(**moving_joints(chain_path(chain)), tool=tool, base=base, dtype=dtype)
+        return cls(**moving_joints(chain_path(chain)), **options)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -389,14 +370,14 @@ class RigidChain(Chain):
         """Return u_1 and u_2 of every joint, in rows of shape (N, n)."""
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         slides = self.slides if "prismatic" in self.kinds else None
-        return shares(q.reshape(-1, self.n_actuators), slides)
+        return _joint_motions.shares(q.reshape(-1, self.n_actuators), slides)
 
     def _frames(self, q: Tensor) -> Tensor:
         """Return every joint's moving frame in the base frame, shape (..., n, 4, 4)."""
-        return frames(*self._shares(q), self.motions.to(q)).reshape(*q.shape, 4, 4)
+        return _joint_motions.frames(*self._shares(q), self.motions.to(q)).reshape(*q.shape, 4, 4)
 
     def _tip(self, q: Tensor) -> tuple[Tensor]:
-        p = carried_tip(*self._shares(q), self.motions.to(q), self._end(q))
+        p = _joint_motions.carried_tip(*self._shares(q), self.motions.to(q), self._end(q))
         return ((self.base.to(q)[:3] @ p).T.reshape(*q.shape[:-1], 3),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -412,7 +393,7 @@ class RigidChain(Chain):
         axes and the origin.
         """
         buffers = (part.to(q) for part in (self.motions, self.axes, self.carriers))
-        frame, axes, points = last_frame_and_joints(*self._shares(q), *buffers)
+        frame, axes, points = _joint_motions.last_frame_and_joints(*self._shares(q), *buffers)
         tip = (self._end(q) @ frame.flatten(1)).unflatten(0, (3, -1))
         columns = torch.linalg.cross(axes, tip - points, dim=1)
         if "prismatic" in self.kinds:
@@ -429,17 +410,12 @@ class RigidChain(Chain):
         """Return the tool in the last joint's moving frame, homogeneous, shape (4,)."""
         return self.tip.to(q) @ nn.functional.pad(self.tool.to(q), (0, 1), value=1.0)
 
-    def stored(self) -> Stored:
-        """Return how the arm describes itself: its joints, their limits, tool and base."""
-        arrays = {"origins": self.origins, "axes": self.axes, "tip": self.tip, "tool": self.tool}
-        arrays |= {"q_min": self.q_min, "q_max": self.q_max, "base": self.base}
-        return Stored.of(self.layout.kind, arrays, kinds=self.kinds, names=self.names)
-
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
         """Return the arm of a description."""
-        geometry = {name: stored.array(name) for name in ("origins", "axes", "tip", "tool", "base")}
-        limits = {name: stored.array(name, finite=False) for name in ("q_min", "q_max")}
-        kinds, names = (stored.list_of(str, key) for key in ("kinds", "names"))
-        dtype = torch.from_numpy(geometry["base"]).dtype
-        return cls(**geometry, **limits, kinds=kinds, names=names, dtype=dtype)
+        settings = {key: stored.list_of(str, key) for key in cls.layout.settings}
+        arrays = {
+            name: stored.array(name, finite=name not in ("q_min", "q_max"))
+            for name in cls.layout.arrays
+        }
+        return cls(**arrays, **settings, dtype=torch.from_numpy(arrays["base"]).dtype)

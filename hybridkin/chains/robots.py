@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import math
 import sys
 from collections.abc import Mapping
@@ -35,7 +36,7 @@ __all__ = [
 BHA_LENGTH_LIMITS = (0.10, 0.40)
 """Shortest and longest chamber of the Bionic Handling Assistant [m]."""
 
-_MODELS = ("constant-curvature", "elastic-tendon")
+_MODELS = {"constant-curvature": ConstantCurvatureChain, "elastic-tendon": ElasticTendonChain}
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
 
 
@@ -115,11 +116,12 @@ class Limits:
 
     def intersect(self, other: Limits) -> Limits:
         """Return the limits that keep to both; what one does not know the other decides."""
-        return Limits(
-            _tighter(np.maximum, self.q_min, other.q_min),
-            _tighter(np.minimum, self.q_max, other.q_max),
-            _tighter(np.minimum, self.dq_max, other.dq_max),
-        )
+        found = {}
+        for name, mine in vars(self).items():
+            given = [limit for limit in (mine, vars(other)[name]) if limit is not None]
+            tighter = np.maximum if name == "q_min" else np.minimum
+            found[name] = functools.reduce(tighter, given) if given else None
+        return Limits(**found)
 
     def narrowed(self, by: float | np.ndarray) -> Limits:
         """Return the limits with the range of every actuator smaller by `by` at both ends [m]."""
@@ -127,14 +129,6 @@ class Limits:
         return Limits(
             None if low is None else low + by, None if high is None else high - by, self.dq_max
         )
-
-
-def _tighter(
-    choose: np.ufunc, one: np.ndarray | None, other: np.ndarray | None
-) -> np.ndarray | None:
-    if one is None or other is None:
-        return one if other is None else other
-    return choose(one, other)
 
 
 @dataclass(frozen=True)
@@ -273,24 +267,7 @@ def read_description(path: str | Path) -> RobotDescription:
 def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
     top = {"name", "model", "routing", "calibrate", "segment", "base", "log", "limits"}
     _known(content, top, "the file")
-    model = content.get("model", _MODELS[0])
-    if model not in _MODELS:
-        raise ValueError(f"`model` must be one of {_MODELS}, got {model!r}.")
-    segments = []
-    tables = content.get("segment", [])
-    if not isinstance(tables, list) or not tables:
-        raise ValueError("`segment` is missing; describe each segment in a [[segment]] table.")
-    for i, table in enumerate(tables):
-        segments += _segments(table, f"[[segment]] {i + 1}")
-    build = _elastic_chain if model == "elastic-tendon" else _plain_chain
-    chain = build(
-        {key: [segment[key] for segment in segments] for key in segments[0]},
-        angles=[segment["angles"] for segment in segments],
-        offsets=[segment["offset"] for segment in segments],
-        rest_bends=[segment["rest_bend"] for segment in segments],
-        base=_base(content.get("base", {})),
-        **({"routing": content["routing"]} if "routing" in content else {}),
-    )
+    chain = _chain(content)
     calibrate = content.get("calibrate", chain.default_parameters)
     if not isinstance(calibrate, (list, tuple)):
         raise ValueError(f"`calibrate` must be a list of names, got {calibrate!r}.")
@@ -299,48 +276,43 @@ def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
     return RobotDescription(str(content.get("name", stem)), chain, tuple(calibrate), log, limits)
 
 
-def _plain_chain(segments: Mapping[str, list[Any]], **options: Any) -> ConstantCurvatureChain:
-    for name in _STIFFNESS:
-        if any(value is not None for value in segments[name]):
+def _chain(content: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendonChain:
+    model = content.get("model", "constant-curvature")
+    if model not in _MODELS:
+        raise ValueError(f"`model` must be one of {(*_MODELS,)}, got {model!r}.")
+    tables = content.get("segment", [])
+    if not isinstance(tables, list) or not tables:
+        raise ValueError("`segment` is missing; describe each segment in a [[segment]] table.")
+    segments: list[dict[str, Any]] = []
+    for i, table in enumerate(tables):
+        segments += _segments(table, f"[[segment]] {i + 1}")
+    given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
+    elastic = model == "elastic-tendon"
+    for key in ("length", *_STIFFNESS):
+        missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
+        if elastic and key == "length" and missing:
             raise ValueError(
-                f"`{name}` in [[segment]] is not known to model 'constant-curvature'; leave it "
-                'out, or set model = "elastic-tendon".'
-            )
-    lengths = _all_or_none(segments, "length", "every [[segment]] (tendons) or in none (chambers)")
-    return ConstantCurvatureChain(
-        segments["radius"],
-        n_actuators=[len(angles) for angles in segments["angles"]],
-        lengths=lengths,
-        actuator_zeros=segments["zeros"],
-        **options,
-    )
-
-
-def _elastic_chain(segments: Mapping[str, list[Any]], **options: Any) -> ElasticTendonChain:
-    for i, length in enumerate(segments["length"]):
-        if length is None:
-            raise ValueError(
-                f"`length` is missing for segment {i + 1}; model 'elastic-tendon' needs the "
+                f"`length` is missing for segment {missing[0]}; model 'elastic-tendon' needs the "
                 "backbone length [m] in every [[segment]]."
             )
-    stiffness = {
-        name: _all_or_none(segments, name, "every [[segment]] or in none") for name in _STIFFNESS
-    }
-    return ElasticTendonChain(
-        segments["radius"],
-        segments["length"],
-        n_tendons=[len(angles) for angles in segments["angles"]],
-        tendon_zeros=segments["zeros"],
-        **stiffness,
-        **options,
-    )
-
-
-def _all_or_none(segments: Mapping[str, list[Any]], key: str, where: str) -> list[Any] | None:
-    given = [value is not None for value in segments[key]]
-    if any(given) and not all(given):
-        raise ValueError(f"`{key}` must stand in {where}.")
-    return segments[key] if any(given) else None
+        if not elastic and key != "length" and len(missing) < len(segments):
+            raise ValueError(
+                f"`{key}` in [[segment]] is not known to model 'constant-curvature'; leave it "
+                'out, or set model = "elastic-tendon".'
+            )
+        if 0 < len(missing) < len(segments):
+            kinds = " (tendons) or in none (chambers)" if key == "length" else " or in none"
+            raise ValueError(f"`{key}` must stand in every [[segment]]{kinds}.")
+        given[key] = None if missing else given[key]
+    build, lengths, zeros = _MODELS[model], given.pop("length"), given.pop("zeros")
+    counts = [len(angles) for angles in given["angles"]]
+    if elastic:
+        given |= {"n_tendons": counts, "tendon_zeros": zeros}
+    else:
+        given = {key: value for key, value in given.items() if key not in _STIFFNESS}
+        given |= {"n_actuators": counts, "actuator_zeros": zeros}
+    given |= {"routing": content["routing"]} if "routing" in content else {}
+    return build(lengths=lengths, base=_base(content.get("base", {})), **given)
 
 
 def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
@@ -358,10 +330,10 @@ def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
         angles = math.radians(_number(table, "angle_deg", where, 0.0)) + step * np.arange(n)
     segment = {
-        "radius": _number(table, "radius", where),
-        "offset": _number(table, "offset", where, 0.0),
+        "radii": _number(table, "radius", where),
+        "offsets": _number(table, "offset", where, 0.0),
         "angles": angles,
-        "rest_bend": np.radians(_numbers(table, "rest_bend_deg", where, 2)),
+        "rest_bends": np.radians(_numbers(table, "rest_bend_deg", where, 2)),
         "zeros": _numbers(table, "zeros", where, len(angles)),
     }
     for key in ("length", *_STIFFNESS):
@@ -379,34 +351,26 @@ def _base(table: Mapping[str, Any]) -> np.ndarray:
 
 
 def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
-    keys = {"q", "x", "q_unit", "x_unit", "q_sign", "group_suffix", "groups", "time"}
-    _known(table, keys, "[log]")
-    columns = {}
+    _known(table, set(LogFormat.__dataclass_fields__), "[log]")
+    given = dict(table)
     for key, size in (("q", n_actuators), ("x", 3)):
         value = table.get(key, [])
         if not isinstance(value, list) or len(value) != size:
             raise ValueError(f"`{key}` in [log] must name {size} columns, got {value!r}.")
-        columns[key] = tuple(str(name) for name in value)
-    for key in ("q_unit", "x_unit"):
-        if table.get(key, "m") not in METRES:
-            raise ValueError(f"`{key}` in [log] must be one of {[*METRES]}, got {table[key]!r}.")
-    if table.get("q_sign", 1) not in (1, -1):
-        raise ValueError(f"`q_sign` in [log] must be 1 or -1, got {table['q_sign']!r}.")
+        given[key] = tuple(str(name) for name in value)
+    for key, allowed in (("q_unit", [*METRES]), ("x_unit", [*METRES]), ("q_sign", [1, -1])):
+        if key in table and table[key] not in allowed:
+            raise ValueError(f"`{key}` in [log] must be one of {allowed}, got {table[key]!r}.")
     for key in ("group_suffix", "groups", "time"):
         if not isinstance(table.get(key, ""), str):
             raise ValueError(f"`{key}` in [log] must be text, got {table[key]!r}.")
-    options = ("q_unit", "x_unit", "q_sign", "group_suffix", "groups", "time")
-    extra = {key: table[key] for key in options if key in table}
-    return LogFormat(**columns, **extra)
+    return LogFormat(**given)
 
 
 def _limits(table: Mapping[str, Any], n_actuators: int) -> Limits:
-    _known(table, {"q_min", "q_max", "dq_max"}, "[limits]")
-    found = {}
-    for key, value in table.items():
-        values = [value] * n_actuators if type(value) in (int, float) else value
-        found[key] = _numbers({key: values}, key, "[limits]", n_actuators)
-    limits = Limits(**found)
+    _known(table, set(Limits.__dataclass_fields__), "[limits]")
+    each = {key: v if isinstance(v, list) else [v] * n_actuators for key, v in table.items()}
+    limits = Limits(**{key: _numbers(each, key, "[limits]", n_actuators) for key in each})
     low, high = limits.q_min, limits.q_max
     if low is not None and high is not None and (low > high).any():
         raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")

@@ -311,15 +311,15 @@ def _play(text: str) -> float | str:
     return value
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be positive, got {text}")
-    return value
+def _between(low: float, high: float) -> Callable[[str], float]:
+    """Return a type of options: a number between two others."""
+
+    def number(text: str) -> float:
+        if not low < float(text) < high:
+            raise argparse.ArgumentTypeError(f"must lie between {low:g} and {high:g}, got {text}")
+        return float(text)
+
+    return number
 
 
-def _share(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < 1.0:
-        raise argparse.ArgumentTypeError(f"must lie between 0 and 1, got {text}")
-    return value
+_positive, _share = _between(0.0, float("inf")), _between(0.0, 1.0)

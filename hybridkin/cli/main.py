@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
-import math
+import contextlib
 import re
 import sys
 import warnings
@@ -41,26 +40,22 @@ class _Outcome(NamedTuple):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, see `hybridkin --help`."""
     arguments = parser().parse_args(argv)
-    bars = _Bars()
     try:
-        with warnings.catch_warnings():
+        with contextlib.closing(_Bars()) as bars, warnings.catch_warnings():
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = bars.warn
             outcome = _RUN[arguments.command](arguments, bars)
     except KeyboardInterrupt:
-        bars.close()
         print("hybridkin: interrupted; nothing was written", file=sys.stderr)
         return 130
     except Exception as error:
-        bars.close()
         if not _is_of_input(error):
             raise
         print(f"hybridkin: error: {error}", file=sys.stderr)
         return 2
-    bars.close()
     if arguments.json:
         written = {"written": [str(path) for path in outcome.paths]} if outcome.paths else {}
-        print(json.dumps(_plain({**outcome.record, **written}), indent=2, allow_nan=False))
+        print(hybridkin.workflow.report.json_text({**outcome.record, **written}))
         return outcome.code
     print(outcome.text)
     if outcome.paths:
@@ -200,10 +195,8 @@ def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         n_frames=arguments.frames,
         progress=bars,
     )
-    text = (
-        f"{record['frames']} frames, {record['fps']:.3g} a second, {record['bytes'] / 1e6:.2f} MB"
-    )
-    return _Outcome(record, text, [arguments.out])
+    speed, size = f"{record['fps']:.3g} a second", f"{record['bytes'] / 1e6:.2f} MB"
+    return _Outcome(record, f"{record['frames']} frames, {speed}, {size}", [arguments.out])
 
 
 def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
@@ -231,7 +224,7 @@ _RUN = {
 def _read(arguments: argparse.Namespace, log_format: LogFormat, **check: Any) -> MeasuredLog:
     """Return the log of the arguments, read and checked."""
     names = ("exclude", "drop_invalid", "drop_frozen", "delimiter")
-    options = {name: getattr(arguments, name) for name in names}
+    options = {name: vars(arguments)[name] for name in names}
     return hybridkin.workflow.read_log(arguments.log, log_format, **options, **check)
 
 
@@ -246,7 +239,7 @@ def _read_for(
 def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: Path) -> LogFormat:
     """Return how the log is written: what is known, with what the options say instead."""
     names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time")
-    given = {name: getattr(arguments, name) for name in names}
+    given = {name: vars(arguments)[name] for name in names}
     given = {name: value for name, value in given.items() if value is not None}
     if known is not None:
         return replace(known, **given)
@@ -260,27 +253,13 @@ def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: 
 
 def _limits(arguments: argparse.Namespace, log_format: LogFormat) -> dict[str, Any]:
     """Return the limits [m] as the model counts them, from options in the log's unit and sign."""
-    given = {name: getattr(arguments, name) for name in ("q_min", "q_max", "dq_max")}
-    signs = {"q_min": log_format.q_sign, "q_max": log_format.q_sign, "dq_max": 1}
-    scale, found = METRES[log_format.q_unit], {}
-    for name, value in given.items():
+    metre, sign, found = METRES[log_format.q_unit], log_format.q_sign, {}
+    for name in ("q_min", "q_max", "dq_max"):
+        value = vars(arguments)[name]
         if value is not None:
-            numbers = [signs[name] * scale * v for v in value]
+            numbers = [(1 if name == "dq_max" else sign) * metre * v for v in value]
             found[name] = numbers if len(numbers) > 1 else numbers[0]
-    if log_format.q_sign < 0:  # the least of one sign is the largest of the other
+    if sign < 0:  # the least of one sign is the largest of the other
         other = {"q_min": "q_max", "q_max": "q_min", "dq_max": "dq_max"}
         found = {other[name]: value for name, value in found.items()}
     return found
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON can say it; what is not finite becomes null."""
-    if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value

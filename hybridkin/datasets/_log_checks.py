@@ -206,26 +206,21 @@ def _frozen_rows(q: NDArray, still: NDArray) -> NDArray:
     return np.concatenate(found)
 
 
+_CONSTANT = {"q": "actuators that never move", "x": "tip columns that never change"}
+_CONSTANT_ADVICE = {
+    "q": "nothing can be learned about them: record motions of each, or keep them at rest in use.",
+    "x": "check the names of the columns; motion in one plane is fitted in that plane only.",
+}
+
+
 def _constant(rows: _Rows) -> Iterator[LogFinding]:
-    for which, what, advice in (
-        (
-            "q",
-            "actuators that never move",
-            "nothing can be learned about them: record motions of each, and keep them at rest when "
-            "the model is used.",
-        ),
-        (
-            "x",
-            "tip columns that never change",
-            "check the names of the columns; a robot that moves in one plane is fitted in that "
-            "plane only.",
-        ),
-    ):
+    for which, what in _CONSTANT.items():
         columns = rows.columns(which)
         flat = [repr(name) for name, column in columns if np.ptp(column) == 0]
         if flat:
             severity = "error" if len(flat) == len(columns) else "warning"
-            yield rows.finding("constant", severity, f"{what}: {', '.join(flat)}.", advice)
+            message = f"{what}: {', '.join(flat)}."
+            yield rows.finding("constant", severity, message, _CONSTANT_ADVICE[which])
 
 
 def _duplicates(rows: _Rows) -> Iterator[LogFinding]:
@@ -238,13 +233,10 @@ def _duplicates(rows: _Rows) -> Iterator[LogFinding]:
     if len(copies):
         n = 0 if groups is None else int((groups[copies] != groups[original[copies]]).sum())
         across = f", {n} of them in another motion" if n else ""
-        yield rows.finding(
-            "duplicates",
-            "warning",
-            f"{len(copies)} rows are exact copies of earlier ones{across} ({rows.named(copies)}).",
-            "delete them: copies in training and test part make errors look smaller than they are.",
-            copies,
-        )
+        message = f"{len(copies)} rows are exact copies of earlier ones{across}"
+        advice = "delete them: copies in training and test part make errors look too small."
+        message = f"{message} ({rows.named(copies)})."
+        yield rows.finding("duplicates", "warning", message, advice, copies)
     keep = np.setdiff1d(np.arange(len(q)), copies)
     q, x = q[keep], x[keep]
     _, inverse, counts = np.unique(q, axis=0, return_inverse=True, return_counts=True)
@@ -294,26 +286,19 @@ def _times(rows: _Rows) -> Iterator[LogFinding]:
     step, same = np.diff(rows.log.time), rows.same_motion()
     late = np.flatnonzero(step <= 0) + 1
     if len(late):
-        yield rows.finding(
-            "time",
-            "warning",
-            f"times do not increase at {len(late)} rows ({rows.named(late)}).",
-            "sort the rows by time within each motion; play and lag are judged by the order.",
-            late,
-        )
+        message = f"times do not increase at {len(late)} rows ({rows.named(late)})."
+        advice = "sort the rows by time within each motion; play and lag are judged by the order."
+        yield rows.finding("time", "warning", message, advice, late)
     inside = step[same & (step > 0)]
     usual = float(np.median(inside)) if len(inside) >= 10 else np.inf
     gaps = np.flatnonzero(same & (step > _GAP * usual)) + 1
     if len(gaps):
-        yield rows.finding(
-            "time",
-            "warning",
+        message = (
             f"{len(gaps)} gaps in time within a motion, up to {step[gaps - 1].max():.4g} s "
-            f"where {usual:.4g} s is usual ({rows.named(gaps)}).",
-            "rows were lost there or the robot waited; give the parts before and after names of "
-            "their own if the robot was touched in between.",
-            gaps,
+            f"where {usual:.4g} s is usual ({rows.named(gaps)})."
         )
+        advice = "rows were lost or the robot waited; if it was touched, name the parts apart."
+        yield rows.finding("time", "warning", message, advice, gaps)
 
 
 def _motions(rows: _Rows) -> Iterator[LogFinding]:
@@ -322,29 +307,20 @@ def _motions(rows: _Rows) -> Iterator[LogFinding]:
         advice = "record some hundreds, spread over the whole workspace."
         yield rows.finding("rows", "warning", f"{n_rows} rows are few.", advice)
     if groups is None:
-        yield rows.finding(
-            "motions",
-            "warning",
-            "no column names the motion of a row; errors on held-out motions are then estimated "
-            "from stretches of the log.",
-            "give `groups` (--groups COLUMN, or groups = in [log]).",
-        )
+        message = "no column names the motion of a row: stretches of the log are held out instead."
+        advice = "give `groups` (--groups COLUMN, or groups = in [log])."
+        yield rows.finding("motions", "warning", message, advice)
         return
     n = len(np.unique(groups))
     if n > 0.5 * n_rows and n > _FEW_MOTIONS:
-        yield rows.finding(
-            "motions",
-            "warning",
-            f"{n} motions in {n_rows} rows: nearly every row is a motion of its own, which makes a "
-            "random split.",
+        message = f"{n} motions in {n_rows} rows: nearly every row is its own, a random split."
+        advice = (
             "name the same motion in all rows of one sweep; for poses taken one by one at random "
-            "this is right.",
+            "this is right."
         )
+        yield rows.finding("motions", "warning", message, advice)
     elif n < _FEW_MOTIONS:
-        yield rows.finding(
-            "motions",
-            "warning",
-            f"{n} motion{'s are' if n > 1 else ' is'} few: errors on held-out motions are "
-            "uncertain.",
-            "record more motions, or cut long ones into parts that differ.",
-        )
+        few = f"{n} motion{'s are' if n > 1 else ' is'} few"
+        message = f"{few}: errors on held-out motions are uncertain."
+        advice = "record more motions, or cut long ones into parts that differ."
+        yield rows.finding("motions", "warning", message, advice)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SEVERITIES = ("error", "warning", "note")
-_WIDTH = 96
+_WIDTH, _ARROW = 96, " " * 11 + "-> "
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +87,10 @@ class LogReport:
 
     def accepting(self, kind: str) -> LogReport:
         """Return the report with findings of a kind, whose rows were left out, as notes."""
+        note = {"severity": "note", "advice": "find out why."}
         others = [f for f in self.findings if f.kind != kind]
         notes = [
-            replace(
-                f,
-                severity="note",
-                message=f"{f.message} They were left out.",
-                advice="find out why.",
-            )
+            replace(f, message=f"{f.message} They were left out.", **note)
             for f in self.findings
             if f.kind == kind
         ]
@@ -134,8 +130,7 @@ class LogReport:
         ]
         for finding in self.findings:
             head = f"  {finding.severity.upper():8s} {finding.kind}: "
-            lines.append(_filled(head, finding.message))
-            lines.append(_filled(" " * 11 + "-> ", finding.advice))
+            lines += [_filled(head, finding.message), _filled(_ARROW, finding.advice)]
         lines.append(f"  {self.summary()}")
         return "\n".join(lines)
 

@@ -19,11 +19,8 @@ from typing_extensions import Self
 
 from hybridkin._core.units import METRES
 
-__all__ = ["Log", "load_log"]
-
 LENGTHS = {**METRES, "um": 1e-6, "in": 0.0254}
-ANGLES = {"rad": 1.0, "deg": np.pi / 180}
-UNITLESS = {"1": 1.0}
+UNITS = {**LENGTHS, "rad": 1.0, "deg": np.pi / 180, "1": 1.0}
 
 _PARQUET = (".parquet", ".pq")
 _DELIMITERS = (",", ";", "\t")
@@ -162,132 +159,167 @@ def load_log(
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
-    q, x, columns = _names("q", q), _names("x", x), _columns(path)
-    if columns is not None:
-        q, x = _expanded(q, columns, path), _expanded(x, columns, path)
+    table = _read(path, delimiter)
+    q, x = table.names("q", q), table.names("x", x)
     if len(x) != 3:
         raise ValueError(f"`x` must name 3 columns, got {len(x)}: {x}.")
-    q_scale = _scale("q_unit", q_unit, {**LENGTHS, **ANGLES, **UNITLESS})
-    x_scale = _scale("x_unit", x_unit, LENGTHS)
-    sign = _signs(q_sign, len(q))
-    wanted = [*q, *x, *([] if time is None else [time])]
-    if columns is None:
-        labels, values, places, kind = _read_text(path, wanted, groups, delimiter)
-    else:
-        labels, values, places, kind = _picked(path, wanted, groups, columns)
-    invalid = ~np.isfinite(values).all(axis=1)
-    if invalid.any() and not drop_invalid:
-        first = ", ".join(map(str, places[invalid][:5]))
+    sign = _checked_sign(len(q), q_unit, x_unit, q_sign)
+    values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
+    places = np.arange(len(values)) if table.lines is None else table.lines
+    valid = np.isfinite(values).all(axis=1)
+    if not valid.all() and not drop_invalid:
+        kind = "row" if table.lines is None else "line"
+        first = ", ".join(map(str, places[~valid][:5]))
         raise ValueError(
-            f"{invalid.sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
+            f"{(~valid).sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
             f"infinite value, the first in {kind} {first}; correct them or leave them out by "
             "drop_invalid=True."
         )
-    if invalid.all():
+    if not valid.any():
         raise ValueError(
             f"{str(path)!r} has no valid row left: all have a missing, NaN or infinite value."
         )
-    valid, n = values[~invalid], len(q)
-    if q_unit == "m":
-        _warn_if_millimetres("q", valid[:, :n])
-    if x_unit == "m":
-        _warn_if_millimetres("x", valid[:, n : n + 3])
+    values, n = values[valid], len(q)
+    columns = {"q": values[:, :n], "x": values[:, n : n + 3]}
+    for name, unit in (("q", q_unit), ("x", x_unit)):
+        span, middle = np.ptp(columns[name], axis=0).max(), np.median(np.abs(columns[name]))
+        if unit == "m" and (middle > 10 or span > 5):
+            warnings.warn(
+                f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
+                f"millimetres, give {name}_unit='mm'.",
+                stacklevel=2,
+            )
     return Log(
-        valid[:, :n] * q_scale * sign,
-        valid[:, n : n + 3] * x_scale,
-        groups=None if groups is None else labels[~invalid],
-        time=None if time is None else valid[:, -1],
-        line=places[~invalid],
-        invalid_lines=places[invalid],
+        columns["q"] * UNITS[q_unit] * sign,
+        columns["x"] * LENGTHS[x_unit],
+        groups=None if labels is None else labels[valid],
+        time=None if time is None else values[:, -1],
+        line=places[valid],
+        invalid_lines=places[~valid],
         q_names=q,
         x_names=x,
         q_sign=q_sign,
-        units={"q": "m" if q_unit in LENGTHS else "rad" if q_unit in ANGLES else "1", "x": "m"},
+        units={"q": "m" if q_unit in LENGTHS else "1" if q_unit == "1" else "rad", "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )
 
 
 class _Table(NamedTuple):
-    """Columns as read: labels (N,), values (N, k) with NaN for gaps, and where each row stands."""
+    """The columns of a file as they stand in it; of text also the line of every row."""
 
-    labels: NDArray
-    values: NDArray
-    places: NDArray
-    kind: str  # of place: "line" or "row"
+    path: Path
+    header: list[str]
+    columns: Sequence[NDArray | Sequence[str]]
+    lines: NDArray | None = None
+
+    def names(self, argument: str, asked: Sequence[str]) -> list[str]:
+        """Return the names of columns, with that of an array (N, k) replaced by its columns'."""
+        asked = [asked] if isinstance(asked, str) else list(asked)
+        if not asked or not all(isinstance(name, str) for name in asked):
+            raise ValueError(f"`{argument}` must be column names, got {asked!r}.")
+        if len(set(asked)) < len(asked):
+            raise ValueError(f"`{argument}` names a column twice: {asked}.")
+        found: list[str] = []
+        for name in asked:
+            parts = [c for c in self.header if re.fullmatch(rf"{re.escape(name)}\[\d+\]", c)]
+            found += [name] if name in self.header or not parts else parts
+        for name in found:
+            self.column(name)
+        return found
+
+    def column(self, name: str) -> NDArray | Sequence[str]:
+        """Return the column of that name."""
+        count, path = self.header.count(name), str(self.path)
+        if count > 1:
+            raise ValueError(f"Column {name!r} occurs {count} times in {path!r}; rename it.")
+        if count:
+            return self.columns[self.header.index(name)]
+        close = [other for other in self.header if other.lower() == name.lower()]
+        close = close or difflib.get_close_matches(name, self.header, n=3, cutoff=0.4)
+        hint = f"did you mean {', '.join(map(repr, close))}?" if close else ""
+        if len(self.header) == 1:
+            hint = "it has one column only, check `delimiter`."
+        raise ValueError(
+            f"There is no column {name!r} in {path!r}; {hint} Its columns: {self.header}."
+        )
+
+    def numbers(self, name: str) -> NDArray:
+        """Return the column of that name as numbers, NaN for empty cells."""
+        column = self.column(name)
+        if self.lines is not None:
+            cells = zip(column, self.lines, strict=True)
+            return np.array([_number(str(cell), name, line, self.path) for cell, line in cells])
+        try:
+            return np.asarray(column).astype(float)
+        except (TypeError, ValueError) as error:
+            kind = np.asarray(column).dtype
+            raise ValueError(
+                f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
+            ) from error
+
+    def rows(self, names: list[str], groups: str | None) -> tuple[NDArray, NDArray | None]:
+        """Return columns of numbers (N, k), and the group of every row."""
+        found, labels = {name: self.numbers(name) for name in names}, None
+        sizes = {name: len(column) for name, column in found.items()}
+        if groups is not None:
+            labels = np.array([str(value).strip() for value in self.column(groups)])
+            sizes[groups] = len(labels)
+        if len({*sizes.values()}) > 1:
+            raise ValueError(
+                f"The columns of {str(self.path)!r} must be equally long, got {sizes}."
+            )
+        if not all(sizes.values()):
+            header = "no" if self.lines is None else "a header but no"
+            raise ValueError(f"{str(self.path)!r} has {header} rows.")
+        return np.column_stack([*found.values()]), labels
 
 
-def _names(argument: str, names: Sequence[str]) -> list[str]:
-    names = [names] if isinstance(names, str) else list(names)
-    if not names or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"`{argument}` must be column names, got {names!r}.")
-    if len(set(names)) < len(names):
-        raise ValueError(f"`{argument}` names a column twice: {names}.")
-    return names
-
-
-def _scale(argument: str, unit: str, known: dict[str, float]) -> float:
-    if unit not in known:
-        raise ValueError(f"`{argument}` must be one of {list(known)}, got {unit!r}.")
-    return known[unit]
-
-
-def _signs(q_sign: ArrayLike, n: int) -> NDArray:
+def _checked_sign(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
+    """Return the sign of the n columns of q, once units and sign are known to be such."""
+    for name, unit, known in (("q_unit", q_unit, UNITS), ("x_unit", x_unit, LENGTHS)):
+        if unit not in known:
+            raise ValueError(f"`{name}` must be one of {list(known)}, got {unit!r}.")
     sign = np.asarray(q_sign, dtype=float)
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
         raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
     return sign
 
 
-def _delimiter(path: Path) -> str:
-    with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
-        header = file.readline()
-    return max(_DELIMITERS, key=header.count)
+def _read(path: Path, delimiter: str | None) -> _Table:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return _read_npz(path)
+    return _read_parquet(path) if suffix in _PARQUET else _read_text(path, delimiter)
 
 
-def _read_text(path: Path, wanted: list[str], groups: str | None, delimiter: str | None) -> _Table:
-    labels, values, lines = [], [], []
-    delimiter = delimiter or _delimiter(path)
+def _read_text(path: Path, delimiter: str | None) -> _Table:
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
+            delimiter = delimiter or max(_DELIMITERS, key=file.readline().count)
+            file.seek(0)
             reader = csv.reader(file, delimiter=delimiter)
             header = [name.strip() for name in next(reader, [])]
-            if not header:
-                raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
-            columns = [header.index(_column(name, header, path)) for name in wanted]
-            group_column = None if groups is None else header.index(_column(groups, header, path))
-            for cells in reader:
-                if not any(cell.strip() for cell in cells):
-                    continue
-                line = reader.line_num
-                if len(cells) > len(header):
-                    raise ValueError(
-                        f"Line {line} of {str(path)!r} has {len(cells)} cells, the header "
-                        f"{len(header)}; check `delimiter` (now {delimiter!r})."
-                    )
-                cells += [""] * (len(header) - len(cells))
-                values.append([_number(cells[c], header[c], line, path) for c in columns])
-                labels.append("" if group_column is None else cells[group_column].strip())
-                lines.append(line)
+            rows = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(
             f"{str(path)!r} is not a text file in UTF-8 ({error}); save the log as CSV, npz or "
             "parquet."
         ) from error
-    if not values:
-        raise ValueError(f"{str(path)!r} has a header but no rows.")
-    return _Table(np.array(labels), np.array(values), np.array(lines), "line")
+    if not header:
+        raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
+    n = len(header)
+    for line, row in rows:
+        if len(row) > n:
+            raise ValueError(
+                f"Line {line} of {str(path)!r} has {len(row)} cells, the header {n}; check "
+                f"`delimiter` (now {delimiter!r})."
+            )
+    cells = [*zip(*(row + [""] * (n - len(row)) for _, row in rows), strict=True)] or [()] * n
+    return _Table(path, header, cells, np.array([line for line, _ in rows], dtype=int))
 
 
-def _columns(path: Path) -> dict[str, NDArray] | None:
-    """Return the columns of an npz or parquet file by name, None of a text file."""
-    suffix = path.suffix.lower()
-    if suffix == ".npz":
-        return _npz_columns(path)
-    return _parquet_columns(path) if suffix in _PARQUET else None
-
-
-def _npz_columns(path: Path) -> dict[str, NDArray]:
+def _read_npz(path: Path) -> _Table:
     """Return the arrays (N,) of a file, columns of arrays (N, k) as ``name[i]``."""
     columns: dict[str, NDArray] = {}
     try:
@@ -300,10 +332,10 @@ def _npz_columns(path: Path) -> dict[str, NDArray]:
             columns[name] = array
         elif array.ndim == 2:
             columns |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
-    return columns
+    return _Table(path, [*columns], [*columns.values()])
 
 
-def _parquet_columns(path: Path) -> dict[str, NDArray]:
+def _read_parquet(path: Path) -> _Table:
     try:
         import pandas as pd
 
@@ -315,56 +347,7 @@ def _parquet_columns(path: Path) -> dict[str, NDArray]:
         ) from error
     except (ValueError, OSError) as error:
         raise ValueError(f"{str(path)!r} is not a parquet file: {error}.") from error
-    return {str(name): frame[name].to_numpy() for name in frame.columns}
-
-
-def _expanded(names: list[str], columns: dict[str, NDArray], path: Path) -> list[str]:
-    """Return the names of columns, with that of a table (N, k) replaced by those of its columns."""
-    found: list[str] = []
-    for name in names:
-        parts = [c for c in columns if re.fullmatch(rf"{re.escape(name)}\[\d+\]", c)]
-        found += [name] if name in columns or not parts else parts
-    return [_column(name, [*columns], path) for name in found]
-
-
-def _picked(
-    path: Path, wanted: list[str], groups: str | None, columns: dict[str, NDArray]
-) -> _Table:
-    asked = [*wanted, *([] if groups is None else [groups])]
-    picked = {name: columns[_column(name, [*columns], path)] for name in asked}
-    sizes = {name: len(array) for name, array in picked.items()}
-    if len(set(sizes.values())) > 1:
-        raise ValueError(f"The columns of {str(path)!r} must be equally long, got {sizes}.")
-    n = next(iter(sizes.values()))
-    if n == 0:
-        raise ValueError(f"{str(path)!r} has no rows.")
-    values = np.empty((n, len(wanted)))
-    for k, name in enumerate(wanted):
-        try:
-            values[:, k] = picked[name].astype(float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"Column {name!r} of {str(path)!r} must hold numbers, got {picked[name].dtype}."
-            ) from error
-    labels = np.full(n, "") if groups is None else np.array([*map(str, picked[groups])])
-    return _Table(labels, values, np.arange(n), "row")
-
-
-def _column(name: str, header: list[str], path: Path) -> str:
-    """Return the name, once it is known to be that of one column."""
-    found = header.count(name)
-    if found == 1:
-        return name
-    if found:
-        raise ValueError(f"Column {name!r} occurs {found} times in {str(path)!r}; rename it.")
-    close = difflib.get_close_matches(name, header, n=3, cutoff=0.4)
-    lower = [other for other in header if other.lower() == name.lower()]
-    suggestion = f"did you mean {', '.join(map(repr, lower or close))}?" if lower or close else ""
-    if len(header) == 1:
-        suggestion = "it has one column only, check `delimiter`."
-    raise ValueError(
-        f"There is no column {name!r} in {str(path)!r}; {suggestion} Its columns: {header}."
-    )
+    return _Table(path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns])
 
 
 def _number(cell: str, name: str, line: int, path: Path) -> float:
@@ -379,13 +362,3 @@ def _number(cell: str, name: str, line: int, path: Path) -> float:
             "correct the cell (an empty one counts as missing, see `drop_invalid`; decimals take "
             "a point)."
         ) from None
-
-
-def _warn_if_millimetres(name: str, values: NDArray) -> None:
-    if np.median(np.abs(values)) > 10 or np.ptp(values, axis=0).max() > 5:
-        warnings.warn(
-            f"The `{name}` columns span {np.ptp(values, axis=0).max():.4g} m around "
-            f"{np.median(np.abs(values)):.4g} m; if the file has millimetres, give "
-            f"{name}_unit='mm'.",
-            stacklevel=3,
-        )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+RANGE = {"low": 0.19, "high": 0.31, "hold": 0.20, "jitter": 0.005}
+"""Working range, held length and half the spread about it [m]."""
 
 
 def paper_protocol(
@@ -14,15 +16,12 @@ def paper_protocol(
     *,
     n_segment: int = 500,
     n_random: int = 500,
-    low: float = 0.19,
-    high: float = 0.31,
-    hold: float = 0.20,
-    jitter: float = 0.005,
 ) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
     """Return the commanded lengths of the paper's sampling protocol and the part of each row.
 
-    First each segment in turn moves alone, its three lengths uniform in the working range while
-    the other segments stay short; then all nine lengths are uniform in the range.
+    First each segment in turn moves alone, its three lengths uniform from 0.19 to 0.31 m while the
+    other segments are held at 0.20 m, give or take 5 mm; then all nine lengths are uniform in that
+    range.
 
     Parameters
     ----------
@@ -32,12 +31,6 @@ def paper_protocol(
         Rows per segment that moves alone.
     n_random : int, default=500
         Rows in which all lengths are random.
-    low, high : float, default=0.19 and 0.31
-        Working range of the lengths [m].
-    hold : float, default=0.20
-        Length at which the segments at rest are held [m].
-    jitter : float, default=0.005
-        Held lengths are uniform within ``hold`` -+ ``jitter`` [m].
 
     Returns
     -------
@@ -57,37 +50,20 @@ def paper_protocol(
     >>> q_target.shape, (part == 3).sum().item()
     ((2000, 9), 500)
     """
-    if not (np.isfinite([low, high, hold, jitter]).all() and low < high and jitter >= 0):
-        raise ValueError(
-            f"`low` < `high` and `jitter` >= 0 are needed, got low={low}, high={high}, "
-            f"jitter={jitter}."
-        )
     for name, value in (("n_segment", n_segment), ("n_random", n_random)):
         if not (isinstance(value, (int, np.integer)) and value >= 0):
             raise ValueError(f"`{name}` must be an integer >= 0, got {value!r}.")
     rng = np.random.default_rng(random_state)
     part = np.repeat(np.arange(4, dtype=np.int8), [n_segment] * 3 + [n_random])
-    return draw(rng, part, low, high, hold, jitter), part
+    return draw(rng, part), part
 
 
-def draw(
-    rng: np.random.Generator,
-    part: NDArray[np.int8],
-    low: float,
-    high: float,
-    hold: float,
-    jitter: float,
-) -> NDArray[np.float64]:
+def draw(rng: np.random.Generator, part: NDArray[np.int8]) -> NDArray[np.float64]:
     """Return commanded lengths (n_samples, 9) for rows of the given parts; see paper_protocol."""
+    low, high, hold, jitter = RANGE.values()
     moving = (part[:, None] == 3) | (part[:, None] == np.arange(9) // 3)
     unit = rng.random((len(part), 9))
     return np.where(moving, low + (high - low) * unit, hold + jitter * (2 * unit - 1))
-
-
-def default_range() -> dict[str, float]:
-    """Return the range of lengths that `paper_protocol` has by default."""
-    arguments = inspect.signature(paper_protocol).parameters
-    return {name: arguments[name].default for name in ("low", "high", "hold", "jitter")}
 
 
 def paper_split(

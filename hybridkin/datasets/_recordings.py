@@ -11,8 +11,6 @@ from sklearn.utils import Bunch
 
 from hybridkin.datasets._logs import load_log
 
-__all__ = ["load_armlab", "load_asl_trunk", "load_ftdcr"]
-
 DATA_HOME = "HYBRIDKIN_DATA"
 
 FTDCR_SERVOS = tuple(f"servo_{i}_mm" for i in (4, 3, 9, 5, 2, 8, 6, 1, 7))

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import json
 import os
 import warnings
-from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from importlib.resources import as_file, files
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Memory, Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
 
-from hybridkin.datasets._protocol import default_range, draw, paper_protocol
+from hybridkin.datasets._protocol import RANGE, draw, paper_protocol
 from hybridkin.simulation import NotSettledError, TrunkPlant
 
 PAPER = (
@@ -27,11 +24,10 @@ PAPER = (
 )
 OWN = -1  # part of a row whose command was given
 PARTS = ("segment 0", "segment 1", "segment 2", "all segments")
-CHUNK = 25  # rows a process does at a time, and at most loses when it is interrupted
+CHUNK = 25  # rows a process does at a time, and loses when it is interrupted
 MAX_REDRAWS = 20
 # Random streams apart from the protocol's own: measurement noise (row), redraws (row, attempt).
 NOISE, REDRAW = 1, 2
-TODO, DONE, FAILED = 0, 1, 2
 
 
 def make_trunk(
@@ -43,7 +39,6 @@ def make_trunk(
     cable_noise: float = 1e-3,
     mocap_noise: float = 5e-4,
     n_jobs: int | None = None,
-    progress: Callable[[int, int], object] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     return_X_y: bool = False,
     **plant_parameters: Any,
@@ -77,11 +72,9 @@ def make_trunk(
         Standard deviation of each coordinate of the measured tip position [m].
     n_jobs : int or None, default=None
         Processes, as in joblib.
-    progress : callable, optional
-        Called with the rows done and the rows in all.
     checkpoint : path-like or None, default=None
-        An .npz file kept up to date while rows are made. If it exists and was made with the same
-        seed and parameters, only the missing rows are made.
+        Folder that keeps rows as they are made (a `joblib.Memory`). Rows that it has from the same
+        seed and parameters are not made again, after an interruption for example.
     return_X_y : bool, default=False
         If True, return ``(q, x)`` only.
     **plant_parameters
@@ -101,7 +94,7 @@ def make_trunk(
     Raises
     ------
     ValueError
-        If `q_target` or a parameter is invalid, or the checkpoint is of another run.
+        If `q_target` or a parameter is invalid.
     ImportError
         If MuJoCo is not installed.
 
@@ -117,51 +110,32 @@ def make_trunk(
     >>> data.q.shape, data.x.shape, data.part.tolist()
     ((5, 9), (5, 3), [0, 1, 2, 3, 3])
     """
-    seed = _seed(random_state, checkpoint)
-    plant = _plant_parameters(plant_parameters, cable_noise, mocap_noise)
-    parameters = {"random_state": seed, "plant": plant, "mujoco": _mujoco_version()}
-    targets, part, drawn = _targets(q_target, seed, n_segment, n_random)
-    parameters |= drawn
-    n = len(targets)
-    state: dict[str, Any] = {
-        "parameters": json.dumps(parameters, sort_keys=True),
-        "q": np.full((n, 9), np.nan),
-        "x": np.full((n, 3), np.nan),
-        "q_target": targets,
-        "part": part,
-        "status": np.full(n, TODO, np.int8),
-        "failed": [],
-    }
-    if checkpoint is not None and os.path.exists(checkpoint):
-        state = _resume(checkpoint, state)
-    elif checkpoint is not None:
-        _write(checkpoint, state)
-    todo = np.flatnonzero(state["status"] == TODO)
-    chunks = [todo[i : i + CHUNK] for i in range(0, len(todo), CHUNK)]
-    results: Any = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(_measure)(c, targets[c], part[c], seed, plant) for c in chunks
-    )
-    report = progress or (lambda done, total: None)
-    report(n - len(todo), n)
-    try:
-        for rows, result in zip(chunks, results, strict=True):
-            for key in ("q", "x", "q_target", "status"):
-                state[key][rows] = result[key]
-            state["failed"] += result["failed"]
-            if checkpoint is not None:
-                _write(checkpoint, state)
-            report(int((state["status"] != TODO).sum()), n)
-    finally:
-        results.close()
-    if state["failed"]:
-        row, _, message = state["failed"][0]
+    if random_state is None:
+        random_state = int(np.random.default_rng().integers(2**31))
+    if not isinstance(random_state, (int, np.integer)) or random_state < 0:
+        raise ValueError(f"`random_state` must be an integer >= 0 or None, got {random_state!r}.")
+    noise = {"cable_noise": cable_noise, "mocap_noise": mocap_noise}
+    plant = _plant_parameters({**plant_parameters, **noise})
+    made = {"random_state": int(random_state), "plant": plant, "mujoco": version("mujoco")}
+    targets, part, drawn = _targets(q_target, made["random_state"], n_segment, n_random)
+    measure = Memory(checkpoint, verbose=0).cache(_measure)
+    chunks = np.array_split(np.arange(len(targets)), max(1, -(-len(targets) // CHUNK)))
+    jobs = (delayed(measure)(rows, targets[rows], part[rows], made) for rows in chunks)
+    q, x, targets, failed = zip(*Parallel(n_jobs=n_jobs)(jobs), strict=True)  # type: ignore
+    q, x, targets = map(np.concatenate, (q, x, targets))
+    failed = [one for chunk in failed for one in chunk]
+    if failed:
+        row, _, message = failed[0]
         fate = "drawn again" if q_target is None else "left out"
         warnings.warn(
-            f"{len(state['failed'])} configurations did not settle and were {fate}; the first, in "
-            f"row {row}: {message}",
+            f"{len(failed)} configurations did not settle and were {fate}; the first, in row "
+            f"{row}: {message}",
             stacklevel=2,
         )
-    return _bunch(state, return_X_y)
+    kept = np.flatnonzero(np.isfinite(q).all(axis=1))
+    columns = {"q": q, "x": x, "q_target": targets, "part": part, "row": np.arange(len(q))}
+    columns = {name: column[kept] for name, column in columns.items()}
+    return _bunch(columns, made | drawn, failed, return_X_y)
 
 
 def _targets(
@@ -171,7 +145,7 @@ def _targets(
     if q_target is None:
         targets, part = paper_protocol(seed, n_segment=n_segment, n_random=n_random)
         sizes = {"n_segment": int(n_segment), "n_random": int(n_random)}
-        return targets, part, {"protocol": sizes | default_range()}
+        return targets, part, {"protocol": sizes | RANGE}
     targets = np.array(q_target, dtype=float)
     if targets.ndim != 2 or targets.shape[1] != 9:
         raise ValueError(f"`q_target` must have shape (n_samples, 9), got {targets.shape}.")
@@ -182,8 +156,7 @@ def _targets(
             f"`q_target` must be chamber lengths of {low} to {high} m, {len(bad)} rows are "
             f"not, the first row {bad[0]}: {targets[bad[0]]}; clip them or convert to metres."
         )
-    digest = hashlib.sha256(targets.tobytes()).hexdigest()
-    return targets, np.full(len(targets), OWN, np.int8), {"q_target": digest}
+    return targets, np.full(len(targets), OWN, np.int8), {}
 
 
 def load_trunk(*, return_X_y: bool = False) -> Any:
@@ -209,26 +182,32 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
     >>> data.q.shape, data.x.shape
     ((2000, 9), (2000, 3))
     """
-    with as_file(files("hybridkin.datasets") / "data" / "trunk.npz") as path:
-        return _bunch(_read(path), return_X_y)
+    with as_file(files("hybridkin.datasets") / "data" / "trunk.npz") as path, np.load(path) as file:
+        columns = {name: file[name] for name in ("q", "x", "q_target", "part")}
+        parameters = json.loads(str(file["parameters"]))
+    return _bunch({**columns, "row": np.arange(len(columns["q"]))}, parameters, [], return_X_y)
 
 
-def _measure(rows, targets, part, seed, plant_parameters):
+def _measure(rows, targets, part, made):
     """Settle a chunk of rows; the noise of a row is seeded by (seed, row) whoever makes it."""
-    plant, failed, targets = TrunkPlant(**plant_parameters), [], targets.copy()
+    seed, plant, failed, targets = (
+        made["random_state"],
+        TrunkPlant(**made["plant"]),
+        [],
+        targets + 0,
+    )
     q, x = np.full((len(rows), 9), np.nan), np.full((len(rows), 3), np.nan)
-    status = np.full(len(rows), FAILED, np.int8)
     for i, row in enumerate(rows.tolist()):
         for attempt in range(1 if part[i] == OWN else 1 + MAX_REDRAWS):
             if attempt:
                 rng = np.random.default_rng([seed, REDRAW, row, attempt])
-                targets[i] = draw(rng, part[i : i + 1], **default_range())[0]
+                targets[i] = draw(rng, part[i : i + 1])[0]
             try:
                 q[i], pose = plant.settle(targets[i], random_state=[seed, NOISE, row])
             except NotSettledError as error:
-                failed.append([row, targets[i].tolist(), str(error)])
+                failed.append((row, targets[i].copy(), str(error)))
                 continue
-            x[i], status[i] = pose[:3, 3], DONE
+            x[i] = pose[:3, 3]
             break
         else:
             if part[i] != OWN:
@@ -236,94 +215,27 @@ def _measure(rows, targets, part, seed, plant_parameters):
                     f"Row {row}: none of {1 + MAX_REDRAWS} draws of part {PARTS[part[i]]!r} "
                     f"settled; the last: {failed[-1][2]}"
                 )
-    return {"q": q, "x": x, "q_target": targets, "status": status, "failed": failed}
+    return q, x, targets, failed
 
 
-def _seed(random_state, checkpoint):
-    if random_state is None:
-        if checkpoint is not None and os.path.exists(checkpoint):
-            raise ValueError(
-                "`random_state` must be an integer to resume from `checkpoint`, got None."
-            )
-        return int(np.random.default_rng().integers(2**31))
-    if not isinstance(random_state, (int, np.integer)) or random_state < 0:
-        raise ValueError(f"`random_state` must be an integer >= 0 or None, got {random_state!r}.")
-    return int(random_state)
-
-
-def _plant_parameters(given, cable_noise, mocap_noise):
-    """All arguments of the plant, as plain numbers and lists."""
-    defaults = {k: v.default for k, v in inspect.signature(TrunkPlant).parameters.items()}
-    del defaults["random_state"]  # every row has its own seed
-    unknown = sorted(set(given) - set(defaults))
-    if unknown:
-        raise ValueError(
-            f"`plant_parameters` must be among {sorted(defaults)}, got {', '.join(unknown)}."
-        )
-    merged = {**defaults, **given, "cable_noise": cable_noise, "mocap_noise": mocap_noise}
+def _plant_parameters(given):
+    """Return all arguments of the plant, as plain numbers and lists."""
+    merged = {k: v.default for k, v in inspect.signature(TrunkPlant).parameters.items()} | given
+    del merged["random_state"]  # every row has its own seed
     TrunkPlant(**merged)  # complains here, not in a process
     return {name: np.asarray(value).tolist() for name, value in merged.items()}
 
 
-def _mujoco_version():
-    try:
-        return version("mujoco")
-    except PackageNotFoundError:
-        return None
-
-
-def _write(path, state):
-    """Write the file whole or not at all."""
-    path = os.fspath(path)
-    part = f"{path}.part"
-    with open(part, "wb") as file:
-        np.savez_compressed(file, **{**state, "failed": json.dumps(state["failed"])})
-    os.replace(part, path)
-
-
-def _read(path):
-    with open(path, "rb") as stream, np.load(stream) as file:
-        state = {key: file[key] for key in file.files}
-    state["parameters"] = str(state["parameters"])
-    state["failed"] = json.loads(str(state["failed"]))
-    return state
-
-
-def _resume(path, fresh):
-    try:
-        state = _read(path)
-        old, new = json.loads(state["parameters"]), json.loads(fresh["parameters"])
-    except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-        raise ValueError(
-            f"`checkpoint` must be a file written by make_trunk, got {os.fspath(path)!r} "
-            f"({error}); delete it or name another."
-        ) from error
-    differ = [key for key in sorted(set(old) | set(new)) if old.get(key) != new.get(key)]
-    if "plant" in differ:
-        differ.remove("plant")
-        differ += [key for key in new["plant"] if old["plant"].get(key) != new["plant"][key]]
-    if differ:
-        raise ValueError(
-            f"`checkpoint` {os.fspath(path)!r} was made with another {', '.join(differ)}; "
-            "ask for the same run, delete the file or name another."
-        )
-    return state
-
-
-def _bunch(state, return_X_y):
-    rows = np.flatnonzero(state["status"] == DONE)
-    q, x, part = state["q"][rows], state["x"][rows], state["part"][rows]
+def _bunch(columns, parameters, failed, return_X_y):
+    """Return rows and where they come from; `columns` are q, x, q_target, part and row."""
     if return_X_y:
-        return q, x
+        return columns["q"], columns["x"]
+    own = (columns["part"] == OWN).any()
     return Bunch(
-        q=q,
-        x=x,
+        **{**columns, "part": None if own else columns["part"]},
         groups=None,
-        q_target=state["q_target"][rows],
-        part=None if (part == OWN).any() else part,
-        row=rows,
-        failed=[(row, np.array(target), message) for row, target, message in state["failed"]],
-        parameters=json.loads(state["parameters"]),
+        failed=failed,
+        parameters=parameters,
         units={"q": "m", "x": "m"},
         source="simulated by hybridkin.simulation.TrunkPlant",
         citation=PAPER,

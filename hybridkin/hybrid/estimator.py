@@ -206,6 +206,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             `predict` and the Jacobians), where numbers look like millimetres, and the warnings of
             `calibrate`.
         """
+        for message in self.fit_with_messages(X, y, sample_weight, groups):
+            warnings.warn(message, stacklevel=2)
+        return self
+
+    def fit_with_messages(
+        self,
+        X: Any,
+        y: Any,
+        sample_weight: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> list[str]:
+        """Fit as `fit` does and return the messages of its warnings; none is issued."""
         check_settings(self)
         rows = self._checked_rows(X, y, sample_weight, groups)
         spec = self._spec(rows)
@@ -229,9 +241,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.radius_: Radius | None = None
         if self.coverage is not None:
             self.radius_ = conformal_radius(asked, rows, self.coverage)
-        for message in (*said, *_messages(fitted, rows)):
-            warnings.warn(message, stacklevel=2)
-        return self
+        return [*said, *_messages(fitted, rows)]
 
     def partial_fit(
         self,
@@ -392,8 +402,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         X = validate_data(self, X, dtype=_DTYPES, reset=False)
         q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
-        if warn and isinstance(self.mechanical_model_, Chain):
-            self.mechanical_model_.warn_contradictory(q, "X", stacklevel=4)
+        chain = self.mechanical_model_
+        message = chain.contradiction(q, "X") if warn and isinstance(chain, Chain) else None
+        if message is not None:
+            warnings.warn(message, stacklevel=3)
         with torch.no_grad():
             arrays = [part.numpy() for part in function(self.module_.rows(), q)]
         arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]

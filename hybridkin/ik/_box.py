@@ -11,7 +11,7 @@ from torch import Tensor
 from hybridkin.ik._gram import apply_columns, apply_rows, solve_rows
 
 _PROXIMAL_ROUNDS = 2
-_FIRST_OF_TWO = 1e-3  # damping of the first task's rows where a second one follows
+_MAX_NEWTON = 60  # steps; a handful is usual
 
 
 class BoxProblem(NamedTuple):
@@ -46,7 +46,7 @@ class BoxProblem(NamedTuple):
 
 
 def box_limited_step(
-    problem: BoxProblem, damping_sq: Tensor, mu: Tensor | None = None, *, max_iter: int = 60
+    problem: BoxProblem, damping_sq: Tensor, mu: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return the exact minimiser of |dq - z|^2 + |J dq - v|^2 / lambda^2 in the box.
 
@@ -59,13 +59,11 @@ def box_limited_step(
     ----------
     problem : BoxProblem
         Jacobians, wanted and preferred steps, bounds.
-    damping_sq : Tensor of shape (N,) or (N, m)
-        lambda^2 > 0 of all or of every row, in the unit of J J^T; not much below 1e-6 of its
-        largest eigenvalue in float64.
+    damping_sq : Tensor of shape (N,)
+        lambda^2 > 0, in the unit of J J^T; not much below 1e-6 of its largest eigenvalue in
+        float64.
     mu : Tensor of shape (N, m), optional
         Start of the iteration. Default: zero.
-    max_iter : int, default=60
-        Cap on Newton steps; a handful is usual.
 
     Returns
     -------
@@ -80,14 +78,13 @@ def box_limited_step(
     (1993), for semismooth Newton methods.
     """
     mu = torch.zeros_like(problem.v) if mu is None else mu
-    damping_sq = _of_every_row(damping_sq, problem.v)
     best, live = mu.clone(), problem
     rows = torch.arange(len(mu), device=mu.device)
     noise = 4.0 * torch.finfo(mu.dtype).eps
     settled = torch.zeros(len(mu), dtype=torch.bool, device=mu.device)
-    for _ in range(max_iter):
+    for _ in range(_MAX_NEWTON):
         y, dq = live.at(mu)
-        pull = damping_sq * mu
+        pull = damping_sq[:, None] * mu
         residual = apply_rows(live.J, dq) + pull - live.v
         scale = apply_rows(live.J.abs(), dq.abs()) + pull.abs() + live.v.abs()
         best[rows] = mu
@@ -110,7 +107,7 @@ def box_limited_step(
         same = ((full > lower) == (y > lower)) & ((full < upper) == (y < upper))
         settled = (same | (lower == upper)).all(-1)
         start = (newton * residual).sum(-1)
-        curvature = (damping_sq * newton.square()).sum(-1)
+        curvature = damping_sq * newton.square().sum(-1)
         end = start + curvature + (slope * _moved(y, full, lower, upper)).sum(-1)
         length = torch.ones_like(end)
         far = ((end > 0.0) & ~settled).nonzero()[:, 0]
@@ -122,23 +119,20 @@ def box_limited_step(
     return problem.at(best)[1], best
 
 
-def strict_box_step(problem: BoxProblem, damping_sq: Tensor, first: int | None = None) -> Tensor:
+def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
     """Return the box-limited step whose task part does not depend on the preferred step z.
 
     Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
     would trade v against z; therefore the damped task is solved in the box for z = 0 first, and
-    z chooses among the steps that move the tip as that one does. Two tasks go the same way: the
-    second one chooses among the steps that the first one leaves, z among what is left then.
+    z chooses among the steps that move the tip as that one does.
 
     Parameters
     ----------
     problem : BoxProblem
         Jacobians, wanted and preferred steps, bounds.
-    damping_sq : Tensor of shape (N,) or (N, m)
+    damping_sq : Tensor of shape (N,)
         lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with
         that much, and its task error is taken out by proximal rounds on the multipliers.
-    first : int, optional
-        Number of leading rows that come before the others. Default: all rows are one task.
 
     Returns
     -------
@@ -150,28 +144,15 @@ def strict_box_step(problem: BoxProblem, damping_sq: Tensor, first: int | None =
     # Without any Jacobian the floor only has to be positive.
     relative = max(1e-6, math.sqrt(torch.finfo(J.dtype).eps))
     floor = torch.where(size_sq > 0.0, relative * size_sq, torch.ones_like(size_sq))
-    floor, damping_sq = _of_every_row(floor, v), _of_every_row(damping_sq, v)
-    centre, free = torch.zeros_like(v), problem._replace(z=torch.zeros_like(z))
-    if first is not None:
-        # The first task alone; then both, with far less damping for the rows of the first.
-        top = (slice(None), slice(None, first))
-        alone = free._replace(J=J[top], v=v[top])
-        dq, centre[top] = _proximal_box_step(alone, damping_sq[top], floor[top], centre[top])
-        least = max(_FIRST_OF_TWO * relative, 30.0 * torch.finfo(J.dtype).eps)
-        ranked, left = floor.clone(), torch.maximum(damping_sq, floor)
-        ranked[top] *= least / relative
-        left[top] = 0.0
-        aim = torch.cat([apply_rows(J[top], dq), v[:, first:]], dim=-1)
-        dq, centre = _proximal_box_step(free._replace(v=aim), left, ranked, centre)
-        v, damping_sq = apply_rows(J, dq), torch.zeros_like(damping_sq)
-    rows = ((damping_sq > 0.0).any(-1) & (z != 0.0).any(-1)).nonzero()[:, 0]
+    centre = torch.zeros_like(v)
+    rows = ((damping_sq > 0.0) & (z != 0.0).any(-1)).nonzero()[:, 0]
     if rows.numel() > 0:
-        damped = free._replace(v=v).take(rows)
+        damped = problem._replace(z=torch.zeros_like(z)).take(rows)
         dq, mu = _proximal_box_step(damped, damping_sq[rows], floor[rows], centre[rows])
         v = v.index_put((rows,), apply_rows(damped.J, dq))
         # These multipliers hold what the limits hold already, also where v is out of reach.
-        centre = centre.index_put((rows,), mu)
-        damping_sq = damping_sq.index_put((rows,), torch.zeros_like(damping_sq[rows]))
+        centre[rows] = mu
+        damping_sq = damping_sq.index_fill(0, rows, 0.0)
     return _proximal_box_step(problem._replace(v=v), damping_sq, floor, centre)[0]
 
 
@@ -184,21 +165,15 @@ def _proximal_box_step(
     J dq + lambda^2 mu = v.
     """
     used = torch.maximum(damping_sq, floor)
-    excess = used - damping_sq
+    excess = (used - damping_sq)[:, None]
     dq, mu = box_limited_step(problem._replace(v=problem.v + excess * centre), used, centre)
-    weak = (excess > 0.0).any(-1).nonzero()[:, 0]
+    weak = (used > damping_sq).nonzero()[:, 0]
     if weak.numel() > 0:
-        part, last, excess, used = problem.take(weak), mu[weak], excess[weak], used[weak]
-        again = dq[weak]
+        part, excess, used = problem.take(weak), excess[weak], used[weak]
         for _ in range(_PROXIMAL_ROUNDS):
-            again, last = box_limited_step(part._replace(v=part.v + excess * last), used, last)
-        dq, mu = dq.index_put((weak,), again), mu.index_put((weak,), last)
+            aim = part.v + excess * mu[weak]
+            dq[weak], mu[weak] = box_limited_step(part._replace(v=aim), used, mu[weak])
     return dq, mu
-
-
-def _of_every_row(a: Tensor, v: Tensor) -> Tensor:
-    """Return numbers (N,) or (N, m) as (N, m), the shape of v."""
-    return a[:, None].expand_as(v) if a.ndim == 1 else a
 
 
 def _moved(y: Tensor, to: Tensor, lower: Tensor, upper: Tensor) -> Tensor:

@@ -101,7 +101,7 @@ def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> 
         Multipliers mu.
     """
     if len(gram.parts) == 6:
-        return _solve_3x3(gram.parts, v, (damping_sq,) * 3)
+        return _solve_3x3(gram.parts, v, damping_sq)
     if len(gram.parts) == 1:
         damping_sq = torch.as_tensor(damping_sq).to(v).expand_as(v[..., 0])
         factor = _factor(gram.parts[0], damping_sq)
@@ -149,7 +149,7 @@ def apply_columns(J: Tensor, mu: Tensor) -> Tensor:
     return (mu[..., None, :] @ J)[..., 0, :]
 
 
-def adaptive_damping(gram: RowGram, sigma_max: Tensor) -> Tensor:
+def adaptive_damping(gram: RowGram) -> Tensor:
     """Return lambda^2, zero for a healthy J and growing smoothly from there.
 
     With s = 0.02 sigma_max, lambda = s (1 - (sigma_min / s)^2) below sigma_min = s: free of units,
@@ -159,8 +159,6 @@ def adaptive_damping(gram: RowGram, sigma_max: Tensor) -> Tensor:
     ----------
     gram : RowGram
         From `row_gram`.
-    sigma_max : Tensor of shape (...,)
-        Largest singular value to compare with, usually that of `gram`.
 
     Returns
     -------
@@ -171,16 +169,17 @@ def adaptive_damping(gram: RowGram, sigma_max: Tensor) -> Tensor:
     ----------
     Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
     """
-    threshold = HEALTHY * sigma_max
+    threshold = HEALTHY * gram.sigma_max
     ratio = gram.sigma_min / torch.where(threshold > 0.0, threshold, torch.ones_like(threshold))
     return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
 
 
 def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
-    """Return mu with (J J^T + diag(lambda^2)) mu = v, for lambda^2 > 0 of shape (..., m)."""
+    """Return mu with (J J^T + lambda^2 1) mu = v, for lambda^2 > 0."""
     if J.shape[-2] == 3:
-        return _solve_3x3(_entries_3x3(J), v, damping_sq.unbind(-1))
-    factor = torch.linalg.cholesky_ex(J @ J.mT + torch.diag_embed(damping_sq))[0]
+        return _solve_3x3(_entries_3x3(J), v, damping_sq)
+    damping = damping_sq[..., None, None] * torch.eye(J.shape[-2]).to(J)
+    factor = torch.linalg.cholesky_ex(J @ J.mT + damping)[0]
     return torch.cholesky_solve(v[..., None], factor)[..., 0]
 
 
@@ -198,11 +197,11 @@ def _entries_3x3(J: Tensor) -> tuple[Tensor, ...]:
     return tuple(G[..., i, j] for i, j in pairs)
 
 
-def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: tuple) -> Tensor:
+def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float) -> Tensor:
     """Solve a symmetric semidefinite 3 x 3 system plus damping by LDL^T without pivoting."""
     g11, g21, g31, g22, g32, g33 = entries
     v1, v2, v3 = v.unbind(-1)
-    g11, g22, g33 = (g + d for g, d in zip((g11, g22, g33), damping_sq, strict=True))
+    g11, g22, g33 = g11 + damping_sq, g22 + damping_sq, g33 + damping_sq
     floor = 8.0 * torch.finfo(v.dtype).eps * (g11 + g22 + g33)
     i1 = _reciprocal(g11, floor)
     l21, l31 = g21 * i1, g31 * i1

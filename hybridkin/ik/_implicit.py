@@ -69,11 +69,9 @@ def _newton(
         scaled = held * unit
         mu = damped_solve(row_gram(scaled), apply_rows(scaled, unit * posture.detach()))
         pull = posture - apply_columns(J, mu)
-        rows = [
-            torch.autograd.grad(pull[:, i].sum(), leaf, retain_graph=True, allow_unused=True)[0]
-            for i in range(n)
-        ]
-        H = torch.stack([torch.zeros_like(q) if r is None else r for r in rows], dim=-2)
+        given = {"retain_graph": True, "materialize_grads": True}
+        rows = [torch.autograd.grad(a.sum(), leaf, **given)[0] for a in pull.unbind(-1)]
+        H = torch.stack(rows, dim=-2)
     both = free[:, :, None] & free[:, None, :]
     H = torch.where(both, H.detach(), torch.diag_embed((~free).to(q)))
     corner = held.new_zeros(len(q), held.shape[-2], held.shape[-2])

@@ -122,8 +122,6 @@ class Search:
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
         """Return what one start leads to."""
         found = self._lower(q, target)
-        if self.settings.task.first is not None:
-            self._give_way(found, self.settings.task.first)
         self._enter_domain(found)
         return found
 
@@ -141,10 +139,8 @@ class Search:
 
     def _rank(self, found: Found) -> Tensor:
         """Return 0 for rows that are done, 1 for those outside the domain, 2 for the others."""
-        rank = torch.where(found.reached, 0, 2)
-        if not len(rank):
-            return rank
-        return torch.where(found.reached & ~self.settings.task.in_domain(found.q), 1, rank)
+        inside = self.settings.task.in_domain(found.q)
+        return torch.where(found.reached, torch.where(inside, 0, 1), 2)
 
     def _point(self, q: Tensor, target: Tensor) -> Point:
         x, J = self.settings.evaluate(q)
@@ -156,19 +152,17 @@ class Search:
         parts = (*vars(point).values(), self._within(point.e), no, no, no.long())
         return Found(*(part.clone() for part in parts))
 
-    def _lower(self, q: Tensor, target: Tensor, first: int | None = None) -> Found:
-        """Lower the error, or its first rows, until it is within tol or cannot be lowered."""
-        found, head = self._start(q, target), slice(None, first)
-        start = found.e[:, head].norm(dim=-1)
+    def _lower(self, q: Tensor, target: Tensor) -> Found:
+        """Lower the error until it is within tol or cannot be lowered."""
+        found = self._start(q, target)
+        start = found.error
         nu, growth = torch.full_like(start, _FIRST_DAMPING), torch.full_like(start, 2.0)
         slow = torch.zeros_like(start)
         live = _Descent(**vars(found), start=start, nu=nu, growth=growth, slow=slow)
         rows = torch.arange(len(q), device=q.device)
         for iteration in range(self.max_iter + 1):
-            e, J = live.e[:, head], live.J[:, head]
-            error = e.norm(dim=-1)
-            live.reached = self._within(e, first)
-            live.stationary = self._blocked(live.q, J, e)
+            live.reached = self._within(live.e)
+            live.stationary = self._blocked(live)
             live.stationary |= (live.nu > _LAST_DAMPING) | (live.slow >= _SLOW_STEPS)
             live.n_iter = torch.full_like(live.n_iter, iteration)
             going = (~live.reached & ~live.stationary) & (iteration < self.max_iter)
@@ -177,15 +171,15 @@ class Search:
                 found.put(rows[done], live.take(done))
                 if going.numel() == 0:
                     break
-                rows, live, error = rows[going], live.take(going), error[going]
-                e, J = live.e[:, head], live.J[:, head]
+                rows, live = rows[going], live.take(going)
+            error = live.error
             # Damping in proportion to the error, so that the last iterations are Gauss-Newton's.
             trust = live.nu * (error / live.start)
             bounds = self.settings.step_bounds(live.q)
-            step = limited_step(self.settings, J, e, None, *bounds, trust, quick=True)
+            step = limited_step(self.settings, live.J, live.e, None, *bounds, trust, quick=True)
             new = self._point(live.q + step.dq, live.target)
-            error_new = new.e[:, head].norm(dim=-1)
-            predicted = (e - apply_rows(J, step.dq)).norm(dim=-1)
+            error_new = new.error
+            predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
             # The damping follows the share of the predicted gain that came true.
             gained = error.square() - error_new.square()
             quality = gained / (error.square() - predicted.square()).clamp_min(1e-30)
@@ -193,38 +187,12 @@ class Search:
             less = live.nu * (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
             live.nu = torch.where(better, less, live.nu * live.growth)
             live.growth = torch.where(better, 2.0, 2.0 * live.growth)
-            little = better & (error - error_new < 0.01 * self._metres)
+            metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
+            little = better & (error - error_new < 0.01 * metres)
             live.slow = torch.where(little, live.slow + 1.0, 0.0)
             live.held = step.saturated.any(-1)
             live = live.where(better, new)
         return found
-
-    def _give_way(self, found: Found, first: int) -> None:
-        """Where two tasks cannot both be done: the first one, and of the second what it leaves."""
-        settings = self.settings
-        rows = (~found.reached).nonzero()[:, 0]
-        if rows.numel() == 0:
-            return
-        live = self._lower(found.q[rows], found.target[rows], first)
-        nu, still = torch.full_like(live.error, _FIRST_DAMPING), torch.zeros_like(live.stationary)
-        for _ in range(self.max_iter):
-            bounds = settings.step_bounds(live.q)
-            step = limited_step(settings, live.J, live.e, None, *bounds, nu, first=first)
-            new = self._point(live.q + step.dq, live.target)
-            before, after = (a.e[:, :first].norm(dim=-1) for a in (live, new))
-            strict = self._within(new.e[:, :first], first) | (after <= before * (1.0 + 1e-9))
-            gain = live.e[:, first:].norm(dim=-1) - new.e[:, first:].norm(dim=-1)
-            better = strict & (gain > 0.0) & ~still
-            nu = torch.where(better, 0.2 * nu, 4.0 * nu)
-            still |= (better & (gain < 0.01 * self._metres)) | (nu > _LAST_DAMPING)
-            live = live.where(better, new)
-            live.n_iter += (~still).long()
-            if still.all():
-                break
-        live.stationary = ~live.reached & live.stationary | still
-        live.reached, live.held = self._within(live.e), found.held[rows]
-        live.n_iter += found.n_iter[rows]
-        found.put(rows, live)
 
     def _enter_domain(self, found: Found) -> None:
         """Slide rows that are reached outside the models' domain towards it."""
@@ -311,23 +279,16 @@ class Search:
         step = limited_step(self.settings, at.J, at.e, posture, lower, upper, quick=True)
         return step, self._point(at.q + step.dq, at.target)
 
-    @property
-    def _metres(self) -> float:
-        return self.tol[0] if isinstance(self.tol, tuple) else self.tol
+    def _within(self, e: Tensor) -> Tensor:
+        return self.settings.task.reached(e, self.tol)
 
-    def _within(self, e: Tensor, first: int | None = None) -> Tensor:
-        """Return whether errors, or those of the `first` rows alone, are within tol."""
-        task = self.settings.task
-        rest = 0 if first is None else sum(task.parts) - first
-        return task.reached(torch.nn.functional.pad(e, (0, rest)), self.tol)
-
-    def _blocked(self, q: Tensor, J: Tensor, e: Tensor) -> Tensor:
+    def _blocked(self, at: Point) -> Tensor:
         """Return where no motion within the limits lowers the error to first order."""
-        lower, upper = self.settings.box(q)
-        pull = apply_columns(J, e)
+        q, (lower, upper) = at.q, self.settings.box(at.q)
+        pull = apply_columns(at.J, at.e)
         out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
         left = torch.where(out, 0.0, pull).norm(dim=-1)
-        return left <= _STATIONARY * J.flatten(1).norm(dim=-1) * e.norm(dim=-1)
+        return left <= _STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
 
     def _nudged(self, found: Found) -> Tensor:
         """Return starts beside singular points, where the first-order motion is blind.

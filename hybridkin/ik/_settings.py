@@ -22,6 +22,27 @@ Array: TypeAlias = "ArrayLike | Tensor | Transform3d"  # what comes in, NumPy or
 Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 
+def bound(
+    value: Array | None,
+    name: str,
+    default: float = math.nan,
+    *,
+    finite: bool = False,
+    positive: bool = False,
+) -> Tensor:
+    """Return a limit, a posture or weights as a float64 tensor of shape () or (n,)."""
+    a = as_tensor(default if value is None else value, name).cpu().double()
+    good = a.ndim < 2 and a.numel() > 0 and not torch.isnan(a).any()
+    require(good, f"`{name}` must be a number or of shape (n,), without NaN, got {a.tolist()}.")
+    good = torch.isfinite(a).all() or not finite
+    require(good, f"`{name}` must be finite, got {a.tolist()}.")
+    lock = "to lock an actuator give it equal limits"
+    require(
+        (a > 0.0).all() or not positive, f"`{name}` must be positive, got {a.tolist()}; {lock}."
+    )
+    return a
+
+
 def require(good: bool | Tensor, message: str) -> None:
     """Raise a ValueError where an argument is not what it must be."""
     if not good:
@@ -52,20 +73,11 @@ class StepSettings:
         sizes, one = self._sizes(), "give scalars or one value per actuator"
         good = len(set(sizes.values())) < 2
         require(good, f"settings must agree in the number of actuators, got {sizes}; {one}.")
-        low, high, speed = (a.tolist() for a in (self.q_min, self.q_max, self.dq_max))
+        low, high = self.q_min.tolist(), self.q_max.tolist()
         good = (self.q_min <= self.q_max).all()
         require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
-        lock = "to lock an actuator give it equal limits."
-        good = (self.dq_max > 0.0).all()
-        require(good, f"`dq_max` must be positive [unit of q / s], got {speed}; {lock}")
         if self.q_pref is None:
             object.__setattr__(self, "q_pref", self.middle)
-        elif isinstance(self.q_pref, Tensor):
-            good = torch.isfinite(self.q_pref).all()
-            require(good, f"`q_pref` must be finite, got {self.q_pref.tolist()}.")
-        if self.weights is not None:
-            good = ((self.weights > 0.0) & torch.isfinite(self.weights)).all()
-            require(good, f"`weights` must be positive, got {self.weights.tolist()}; {lock}")
         good = 0.0 < self.dt < math.inf
         require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
         self.rates()
@@ -126,13 +138,12 @@ class StepSettings:
         dt = self.dt if period is None else period
         gain = 1.0 if self.gain is None else self.gain * dt
         beta = self.beta * dt
-        for name, rate, share in (("gain", self.gain, gain), ("beta", self.beta, beta)):
-            if not 0.0 <= share <= 1.0 + 1e-9 or (name == "gain" and share == 0.0):
-                raise ValueError(
-                    f"`{name}` times the period must lie in {'(' if name == 'gain' else '['}0, 1], "
-                    f"got {rate} 1/s x {dt:.6g} s = {share:.4g}; take a {name} up to "
-                    f"{1.0 / dt:.4g} 1/s or a shorter period."
-                )
+        for name, share, good in (("gain", gain, gain > 0.0), ("beta", beta, beta >= 0.0)):
+            need = "must lie in [0, 1], and a gain above 0"
+            got = f"got {share / dt:.6g} 1/s x {dt:.6g} s = {share:.4g}"
+            way = f"take a {name} up to {1.0 / dt:.4g} 1/s or a shorter period"
+            good = good and share <= 1.0 + 1e-9
+            require(good, f"`{name}` times the period {need}, {got}; {way}.")
         return min(gain, 1.0), min(beta, 1.0), dt
 
     def unit(self, q: Tensor) -> Tensor:
@@ -175,11 +186,8 @@ class StepSettings:
         """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
         q = as_tensor(value, name, self.task.device if like is None else like.device)
         n = self.n_actuators
-        good, shape = q.ndim > 0 and n in (None, q.shape[-1]), tuple(q.shape)
-        require(
-            good,
-            f"`{name}` must have shape (..., {n or 'n'}), one column per actuator, got {shape}.",
-        )
+        good, need = q.ndim > 0 and n in (None, q.shape[-1]), f"(..., {n or 'n'}), n actuators"
+        require(good, f"`{name}` must have shape {need}, got {tuple(q.shape)}.")
         return q if like is None else q.to(torch.promote_types(q.dtype, like.dtype))
 
     def points(
@@ -195,15 +203,13 @@ class StepSettings:
 
         `lead` says which axes come first: "..." any, "T" one, "" none.
         """
-        x, shape_of_one = as_tensor(value, name, self.task.device), shape or self.task.shape
-        axes = x.ndim - len(shape_of_one)
+        x, one = as_tensor(value, name, self.task.device), shape or self.task.shape
+        axes = x.ndim - len(one)
         fits = axes >= 0 if lead == "..." else axes == len(lead)
-        if not fits or tuple(x.shape[axes:]) != shape_of_one:
-            sizes = [*filter(None, [lead]), *map(str, shape_of_one)]
-            raise ValueError(
-                f"`{name}` must have shape ({', '.join(sizes)}{',' * (len(sizes) == 1)}) [m], got "
-                f"{tuple(x.shape)}; one target per row."
-            )
+        sizes = [*filter(None, [lead]), *map(str, one)]
+        need = f"({', '.join(sizes)}{',' * (len(sizes) == 1)}) [m], one target per row"
+        good = fits and tuple(x.shape[axes:]) == one
+        require(good, f"`{name}` must have shape {need}, got {tuple(x.shape)}.")
         if shape is None:
             self.task.check(x, name)
         return x if like is None else x.to(like)

@@ -10,10 +10,8 @@ from torch import Tensor
 
 from hybridkin.ik._box import BoxProblem, strict_box_step
 from hybridkin.ik._gram import (
-    RowGram,
     adaptive_damping,
     apply_columns,
-    apply_rows,
     damped_solve,
     null_projection,
     quick_gram,
@@ -29,15 +27,6 @@ class StepRows(NamedTuple):
     sigma_min: Tensor
     damping: Tensor
     saturated: Tensor
-
-
-class _Wanted(NamedTuple):
-    """The step that a task asks for without limits, and what it leaves to the posture."""
-
-    dq: Tensor
-    null_spaces: list[tuple[Tensor, RowGram]]
-    damping_sq: Tensor
-    sigma_min: Tensor
 
 
 def control_step(
@@ -80,7 +69,7 @@ def control_step(
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
     bounds = settings.step_bounds(q, settings.dq_max.to(q) * seconds)
     J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
-    step = limited_step(settings, J, v, posture, *bounds, first=settings.task.first)
+    step = limited_step(settings, J, v, posture, *bounds)
     return step._replace(
         dq=torch.where(torch.isnan(q), 0.0, step.dq),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
@@ -96,7 +85,6 @@ def limited_step(
     upper: Tensor,
     trust: Tensor | None = None,
     *,
-    first: int | None = None,
     quick: bool = False,
 ) -> StepRows:
     """Return the step for the task v and the posture step, within the bounds.
@@ -109,17 +97,16 @@ def limited_step(
     if settings.weights is not None:
         J, lower, upper = J * unit, lower / unit, upper / unit
         posture = None if posture is None else posture / unit
-    if first is None:
-        gram = quick_gram(J, trust is not None) if quick else row_gram(J)
-        wanted = _one_task(settings, J, gram, v, trust)
+    gram = quick_gram(J, trust is not None) if quick else row_gram(J)
+    if trust is not None:
+        damping_sq = trust * gram.sigma_max.square()
+    elif settings.damping == "adaptive":
+        damping_sq = adaptive_damping(gram)
     else:
-        wanted = _two_tasks(settings, J, v, trust, first)
-    dq, z = wanted.dq, torch.zeros_like(wanted.dq)
-    if posture is not None:
-        z = posture
-        for rows, gram in wanted.null_spaces:
-            z = null_projection(rows, gram, z)
-        dq = dq + z
+        damping_sq = (float(settings.damping) * gram.sigma_max).square()
+    dq = apply_columns(J, damped_solve(gram, v, damping_sq))
+    z = torch.zeros_like(dq) if posture is None else null_projection(J, gram, posture)
+    dq = dq + z
     if settings.limits != "off":
         # Rows that meet no limit keep the unlimited step; the others are solved in the box.
         clipped = torch.clamp(dq, lower, upper)
@@ -127,13 +114,11 @@ def limited_step(
         if over.numel() > 0:
             low, high = (a.expand_as(dq) for a in (lower, upper))
             problem = BoxProblem(J, v, z, low, high).take(over)
-            clipped[over] = strict_box_step(problem, wanted.damping_sq[over], first)
+            clipped[over] = strict_box_step(problem, damping_sq[over])
         dq = clipped
     if settings.weights is not None:
         dq = torch.clamp(dq * unit, *box)
-    damping_sq = wanted.damping_sq
-    damping = (damping_sq if damping_sq.ndim == 1 else damping_sq.amax(-1)).sqrt()
-    return StepRows(dq, wanted.sigma_min, damping, (dq <= box[0]) | (dq >= box[1]))
+    return StepRows(dq, gram.sigma_min, damping_sq.sqrt(), (dq <= box[0]) | (dq >= box[1]))
 
 
 def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:
@@ -141,40 +126,3 @@ def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:
     unit = settings.unit(J)
     J = J * unit
     return unit * null_projection(J, quick_gram(J), step / unit)
-
-
-def _one_task(
-    settings: StepSettings, J: Tensor, gram: RowGram, v: Tensor, trust: Tensor | None
-) -> _Wanted:
-    damping_sq = _damping_sq(settings, gram, gram.sigma_max, trust)
-    dq = apply_columns(J, damped_solve(gram, v, damping_sq))
-    return _Wanted(dq, [(J, gram)], damping_sq, gram.sigma_min)
-
-
-def _two_tasks(
-    settings: StepSettings, J: Tensor, v: Tensor, trust: Tensor | None, first: int
-) -> _Wanted:
-    """Return the step for two tasks, the second in the null space of the first `first` rows."""
-    top, below = J[:, :first], J[:, first:]
-    gram = row_gram(top)
-    dq, null_spaces, top_sq, sigma_min = _one_task(settings, top, gram, v[:, :first], None)
-    whole = torch.linalg.matrix_norm(below, ord=2) if len(J) else top_sq
-    per_row = RowGram(tuple(a[:, None] for a in gram.parts), *(a[:, None] for a in gram[1:]))
-    left = null_projection(top[:, None], per_row, below)
-    gram_left = row_gram(left)
-    left_sq = _damping_sq(settings, gram_left, whole, trust)
-    rest = v[:, first:] - apply_rows(below, dq)
-    dq = dq + apply_columns(left, damped_solve(gram_left, rest, left_sq))
-    pairs = ((top_sq, top.shape[1]), (left_sq, below.shape[1]))
-    damping_sq = torch.cat([a[:, None].expand(-1, size) for a, size in pairs], dim=-1)
-    return _Wanted(dq, [*null_spaces, (left, gram_left)], damping_sq, sigma_min)
-
-
-def _damping_sq(
-    settings: StepSettings, gram: RowGram, sigma_max: Tensor, trust: Tensor | None
-) -> Tensor:
-    if trust is not None:
-        return trust * sigma_max.square()
-    if settings.damping == "adaptive":
-        return adaptive_damping(gram, sigma_max)
-    return (float(settings.damping) * sigma_max).square()

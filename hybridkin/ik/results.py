@@ -59,8 +59,7 @@ def statuses(
     status[singular] = IKStatus.SINGULAR
     status[held] = IKStatus.AT_LIMITS
     status[reached] = IKStatus.CONVERGED
-    if len(q) > 0:
-        status[reached & ~task.in_domain(q)] = IKStatus.OUT_OF_DOMAIN
+    status[reached & ~task.in_domain(q)] = IKStatus.OUT_OF_DOMAIN
     status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
     return status
 
@@ -95,11 +94,8 @@ class Step(Generic[ArrayT]):
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
-        held = int(as_array(self.saturated).sum())
-        return (
-            f"Step(dq of shape {tuple(self.dq.shape)}, {held} saturated, "
-            f"{_errors(as_array(self.error))})"
-        )
+        held = f"{int(as_array(self.saturated).sum())} saturated"
+        return f"Step(dq of shape {tuple(self.dq.shape)}, {held}, {_errors(self.error)})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,7 +136,7 @@ class IKSolution(Generic[ArrayT]):
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
-        return f"IKSolution({_tally(as_array(self.status))}; {_errors(as_array(self.error))})"
+        return f"IKSolution({_tally(self.status)}; {_errors(self.error)})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -201,20 +197,17 @@ class Track(Generic[ArrayT]):
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
-        return (
-            f"Track({_tally(as_array(self.status))}; {_errors(as_array(self.error))}; "
-            f"largest step {self.largest_step:.3g})"
-        )
+        step = f"largest step {self.largest_step:.3g}"
+        return f"Track({_tally(self.status)}; {_errors(self.error)}; {step})"
 
 
-def _tally(status: np.ndarray) -> str:
-    codes, counts = np.unique(status, return_counts=True)
+def _tally(status: np.ndarray | Tensor) -> str:
+    codes, counts = np.unique(as_array(status), return_counts=True)
     parts = [f"{n} {IKStatus(int(c)).name}" for c, n in zip(codes, counts, strict=True)]
-    return f"{status.size} targets" + (": " if parts else "") + ", ".join(parts)
+    return f"{counts.sum()} targets" + (": " if parts else "") + ", ".join(parts)
 
 
-def _errors(error: np.ndarray) -> str:
-    known = error[np.isfinite(error)]
-    if known.size == 0:
-        return "no error known"
-    return f"error mean {known.mean():.3g} m, max {known.max():.3g} m"
+def _errors(error: np.ndarray | Tensor) -> str:
+    known = as_array(error)[np.isfinite(as_array(error))]
+    mean_and_max = "error mean {:.3g} m, max {:.3g} m".format
+    return mean_and_max(known.mean(), known.max()) if known.size else "no error known"

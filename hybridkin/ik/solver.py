@@ -9,18 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import as_array, as_tensor, bound, give_back, is_numpy, leading, rows_of
+from hybridkin._core.arrays import as_array, as_tensor, give_back, is_numpy, leading, rows_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
-from hybridkin.ik._settings import Array, Posture, StepSettings, require
+from hybridkin.ik._settings import Array, Posture, StepSettings, bound, require
 from hybridkin.ik._step import control_step
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
 from hybridkin.ik.tracker import Plant, Tracker
 from hybridkin.ik.trajectories import Trajectory
-
-__all__ = ["IKSolution", "IKStatus", "InverseKinematics", "Step", "Track", "Tracker"]
 
 
 class InverseKinematics:
@@ -37,7 +35,7 @@ class InverseKinematics:
     model : ForwardModel, fitted estimator, nn.Module, callable, (callable, callable) or Task
         Maps q ``(..., n)`` to tips ``(..., 3)`` [m], row by row, torch to torch; a pair is such a
         function and its Jacobian, see `as_forward_model`. Its `in_domain` decides between CONVERGED
-        and OUT_OF_DOMAIN. Poses, several points, priorities and NumPy functions are tasks, see
+        and OUT_OF_DOMAIN. Poses, several points and NumPy functions are tasks, see
         `hybridkin.tasks`; then x has the shape of their targets.
     q_min, q_max : float or array-like of shape (n,), optional
         Limits of q, in the unit of q.
@@ -81,9 +79,7 @@ class InverseKinematics:
     damped task is solved in the box without posture first, and the posture then only chooses
     among the steps that move the tip the same way (to 1e-8 of the step; where v is also out of
     reach, up to 1e-3 was seen). A start outside the limits walks back at
-    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q. Of two prioritised
-    tasks the first is exact where no limit is met; otherwise the second may cost it 1e-7 of the
-    step where it can be reached, and up to 1e-3 where it is out of reach too.
+    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q.
 
     References
     ----------
@@ -123,14 +119,14 @@ class InverseKinematics:
             as_task(model),
             bound(q_min, "q_min", -math.inf),
             bound(q_max, "q_max", math.inf),
-            bound(dq_max, "dq_max", math.inf),
-            q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", 0.0),
+            bound(dq_max, "dq_max", math.inf, positive=True),
+            q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
             float(beta),
             None if gain is None else float(gain),
             damping,
             limits,
             float(dt),
-            None if weights is None else bound(weights, "weights", 1.0),
+            None if weights is None else bound(weights, "weights", finite=True, positive=True),
         )
 
     def __repr__(self) -> str:
@@ -236,8 +232,8 @@ class InverseKinematics:
         good, given = max_iter >= 1 and restarts >= 0, (max_iter, restarts)
         require(good, f"`max_iter` must be at least 1 and `restarts` at least 0, got {given}.")
         as_numpy, axes = is_numpy(x_target), len(task.shape)
-        if differentiable and not isinstance(x_target, Tensor):
-            raise ValueError("`x_target` must be a torch tensor for differentiable=True.")
+        good = isinstance(x_target, Tensor) or not differentiable
+        require(good, "`x_target` must be a torch tensor for differentiable=True.")
         target = settings.points(x_target, "x_target")
         q = settings.start(target) if q0 is None else settings.configurations(q0, "q0", target)
         target = target.to(q.dtype)

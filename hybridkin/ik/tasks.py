@@ -1,9 +1,10 @@
-"""What inverse kinematics steers: positions, poses, several points, one task before another."""
+"""What inverse kinematics steers: positions, poses, several points."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -15,7 +16,7 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
 
-__all__ = ["PointsTask", "PoseTask", "PositionTask", "PrioritizedTask", "StackedTask", "Task"]
+__all__ = ["PointsTask", "PoseTask", "PositionTask", "StackedTask", "Task"]
 
 Tolerance: TypeAlias = float | tuple[float, ...]
 
@@ -33,8 +34,6 @@ class Task:
         Rows of the error that belong together, as the position and the rotation of a pose.
     units : tuple of float
         What one unit of every part counts in metres.
-    first : int or None
-        Number of leading rows that come before the others; None: all count alike.
     models : tuple of ForwardModel
         The models that are evaluated.
     """
@@ -42,7 +41,6 @@ class Task:
     shape: tuple[int, ...]
     parts: tuple[int, ...]
     units: tuple[float, ...]
-    first: int | None = None
     models: tuple[ForwardModel, ...]
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -87,7 +85,7 @@ class Task:
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies within the domains of all models, shape (N,)."""
-        return self.domain_distance(q) <= 1.0
+        return self.domain_distance(q) <= 1.0 if len(q) > 0 else q.new_ones(0, dtype=torch.bool)
 
 
 class PositionTask(Task):
@@ -147,7 +145,7 @@ class PositionTask(Task):
         PositionTask
             Without derivatives of solutions (`differentiable`).
         """
-        return cls(_NumpyModel(function, jacobian), size)
+        return cls([partial(_through_numpy, f) for f in (function, jacobian)], size)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (N, size) and J (N, size, n), in closed form where the model has one."""
@@ -272,9 +270,8 @@ class StackedTask(Task):
         if len(x) != len(self.tasks):
             raise ValueError(f"`x` must be {len(self.tasks)} targets, one per task, got {len(x)}.")
         tensors = [a if isinstance(a, Tensor) else torch.as_tensor(np.asarray(a)) for a in x]
-        parts = [
-            a.flatten(a.ndim - len(task.shape)) for a, task in zip(tensors, self.tasks, strict=True)
-        ]
+        pairs = zip(tensors, self.tasks, strict=True)
+        parts = [a.flatten(a.ndim - len(task.shape)) for a, task in pairs]
         lead = torch.broadcast_shapes(*(a.shape[:-1] for a in parts))
         joined = torch.cat([a.expand(*lead, -1) for a in parts], dim=-1)
         return joined if any(isinstance(a, Tensor) for a in x) else joined.numpy()
@@ -304,32 +301,6 @@ class StackedTask(Task):
         """Raise where the part of a task is not valid."""
         for task, part in zip(self.tasks, self.split(x_target), strict=True):
             task.check(part, name)
-
-
-class PrioritizedTask(StackedTask):
-    """Two tasks, the second one in the null space of the first, which it never disturbs.
-
-    Parameters
-    ----------
-    first, second : Task, nn.Module or callable
-        The tasks; a model stands for its `PositionTask`.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from hybridkin import InverseKinematics, robots
-    >>> from hybridkin.ik.tasks import PrioritizedTask
-    >>> chain = robots.bionic_handling_assistant()
-    >>> task = PrioritizedTask(chain, chain.with_tip(2.0))
-    >>> tip, elbow = torch.tensor([[0.1, 0.0, 0.75], [5.0, 0.0, 0.5]], dtype=torch.float64)
-    >>> solution = InverseKinematics(task, q_min=0.1, q_max=0.4).solve(task.join(tip, elbow))
-    >>> [bool((a - b).norm() < 1e-4) for a, b in zip(task.split(solution.x), (tip, elbow))]
-    [True, False]
-    """
-
-    def __init__(self, first: object, second: object) -> None:
-        super().__init__(first, second)
-        self.first = sum(self.tasks[0].parts)
 
 
 @runtime_checkable
@@ -369,25 +340,11 @@ def as_task(model: object) -> Task:
     return model if isinstance(model, Task) else PositionTask(model)
 
 
-class _NumpyModel(ForwardModel):
-    """A NumPy function and its Jacobian, without a graph."""
-
-    def __init__(
-        self, function: Callable[[NDArray], ArrayLike], jacobian: Callable[[NDArray], ArrayLike]
-    ) -> None:
-        super().__init__()
-        self._function, self._jacobian = function, jacobian
-
-    def forward(self, q: Tensor) -> Tensor:
-        return self._computed(self._function, q)
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self(q), self._computed(self._jacobian, q)
-
-    def _computed(self, function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:
-        if q.requires_grad and torch.is_grad_enabled():
-            raise ValueError(
-                "`model` must be twice differentiable by torch for derivatives of the solution, "
-                "got functions for NumPy."
-            )
-        return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)
+def _through_numpy(function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:
+    """Return what a NumPy function gives, without a graph."""
+    if q.requires_grad and torch.is_grad_enabled():
+        raise ValueError(
+            "`model` must be twice differentiable by torch for derivatives of the solution, got "
+            "functions for NumPy."
+        )
+    return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)

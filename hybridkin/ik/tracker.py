@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy
 from hybridkin.ik._gram import row_gram
-from hybridkin.ik._settings import Array, StepSettings
+from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
 from hybridkin.ik.results import IKStatus, statuses
 from hybridkin.ik.tasks import Tolerance
@@ -38,8 +38,6 @@ class Tracker:
         Actuators that the last step held at a limit of position or speed.
     sigma_min : float
         Smallest singular value of the Jacobian there, NaN where an input was not finite.
-    damping : float
-        Damping lambda of the last step, in the unit of `sigma_min`.
     backend : str
         What computes: "torch".
 
@@ -55,18 +53,13 @@ class Tracker:
     ('CONVERGED', 0)
     """
 
-    x: NDArray | Tensor
-    error: float
-    saturated: NDArray | Tensor
-    sigma_min: float
-    damping: float
     backend = "torch"
 
     def __init__(
         self, settings: StepSettings, q0: Array, tol: Tolerance, memory: float | None
     ) -> None:
-        if memory is not None and not 0.0 < memory < math.inf:
-            raise ValueError(f"`memory` must be a positive time [s], got {memory!r}.")
+        good = memory is None or 0.0 < memory < math.inf
+        require(good, f"`memory` must be a positive time [s], got {memory!r}.")
         self._settings, self._tol, self._memory = settings, tol, memory
         self._as_numpy = is_numpy(q0)
         self.reset(q0)
@@ -106,11 +99,9 @@ class Tracker:
         """
         given, settings = as_tensor(q, "q", self._settings.task.device), self._settings
         n = settings.n_actuators
-        if given.ndim != 1 or n not in (None, len(given)) or not torch.isfinite(given).all():
-            raise ValueError(
-                f"`q` must be finite and of shape ({n or 'n'},), got {given.tolist()}; read it "
-                "from the robot, or solve for a start."
-            )
+        good = given.ndim == 1 and n in (None, len(given)) and torch.isfinite(given).all()
+        need = f"finite and of shape ({n or 'n'},)"
+        require(good, f"`q` must be {need}, got {given.tolist()}; read it from the robot.")
         self._q = given.clone()[None]
         with torch.no_grad():
             x, _ = settings.evaluate(self._q)
@@ -190,7 +181,6 @@ class Tracker:
         self._before, self._x, self._e, self._last = self._q, x, e, step
         self.x, self.saturated = self._given_back(x), self._given_back(step.saturated)
         self.error, self.sigma_min = float(e.norm(dim=-1)), float(step.sigma_min)
-        self.damping = float(step.damping)
 
     def _given_back(self, row: Tensor) -> NDArray | Tensor:
         return as_array(row[0]).copy() if self._as_numpy else row[0].clone()
@@ -233,10 +223,10 @@ class Tracker:
         The plant is the user's robot, and may fail with any exception: the motion goes on, so that
         the rows before it are not lost.
         """
-        shape = self._settings.task.shape
         try:
             return self._settings.points(plant(self.q), "tip", self._q, lead="")[None]
         except Exception as error:
-            message = f"`plant` failed at point {i}: {error!r}; it counts as NaN."
-            warnings.warn(message, stacklevel=6)
-            return self._q.new_full((1, *shape), math.nan)
+            warnings.warn(
+                f"`plant` failed at point {i}: {error!r}; it counts as NaN.", stacklevel=6
+            )
+            return torch.full((1, *self._settings.task.shape), math.nan).to(self._q)

@@ -16,6 +16,8 @@ from hybridkin._core.units import METRES
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
 
 _FAR = 20.0  # no tip is that far from where it is measured [m]
+_ABOVE_ZERO = np.finfo(float).tiny
+_POINT = "3 finite numbers [m]"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -55,8 +57,7 @@ class Trajectory:
                 "in metres: divide by 1000, or read a file with unit='mm'.",
                 stacklevel=4,
             )
-        object.__setattr__(self, "t", t)
-        object.__setattr__(self, "x", x)
+        vars(self).update(t=t, x=x)
 
     @property
     def duration(self) -> float:
@@ -140,8 +141,8 @@ def figure_eight(
     >>> figure_eight([0.0, 0.0, 0.7], (0.4, 0.2), duration=8.0)
     Trajectory(801 points, 8 s, 0.4 x 0.2 x 0 m)
     """
-    center = _point(center, "center")
-    width, height = _sizes(size, "size")
+    center = _checked(center, "center", _POINT, (3,))
+    width, height = _checked(size, "size", "two numbers, positive [m]", (2,), _ABOVE_ZERO)
     t, s = _timing(duration, dt, timing)
     across, up, _ = _plane(normal)
     phase = 2.0 * math.pi * s[:, None]
@@ -198,10 +199,10 @@ def spiral(
     >>> spiral([0.0, 0.0, 0.7], (0.05, 0.2), rise=0.1, turns=2.0, duration=5.0)
     Trajectory(501 points, 5 s, 0.363 x 0.326 x 0.1 m)
     """
-    center = _point(center, "center")
-    first, last = _sizes((radius, radius) if np.ndim(radius) == 0 else radius, "radius", zero=True)
-    if not (math.isfinite(rise) and math.isfinite(turns)):
-        raise ValueError(f"`rise` [m] and `turns` must be finite, got {rise!r} and {turns!r}.")
+    center = _checked(center, "center", _POINT, (3,))
+    both = (radius, radius) if np.ndim(radius) == 0 else radius
+    first, last = _checked(both, "radius", "two numbers, not negative [m]", (2,), 0.0)
+    _checked((rise, turns), "(rise, turns)", "finite, the rise in metres", (2,))
     t, s = _timing(duration, dt, timing)
     across, up, along = _plane(normal)
     s = s[:, None]
@@ -243,7 +244,7 @@ def line(
     >>> line([0.1, 0.0, 0.7], [-0.1, 0.0, 0.7], duration=2.0).x[100].tolist()
     [0.0, 0.0, 0.7]
     """
-    start, end = _point(start, "start"), _point(end, "end")
+    start, end = (_checked(*a, _POINT, (3,)) for a in ((start, "start"), (end, "end")))
     t, s = _timing(duration, dt, timing)
     # Weighting both ends meets both exactly.
     return Trajectory(t, (1.0 - s)[:, None] * start + s[:, None] * end)
@@ -272,8 +273,7 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     with open(path, encoding="utf-8-sig") as file:
         lines = [text.strip() for text in file]
     rows = [text.split(",") for text in lines if text and not text.startswith("#")]
-    columns = 4 if dt is None else 3
-    need = "t, x, y, z" if dt is None else "x, y, z, because `dt` is given"
+    columns, need = (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
     named = bool(rows) and not _is_number(rows[0][0])
     try:
         table = np.array(rows[named:], dtype=float)
@@ -282,55 +282,45 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
         raise ValueError(f"{path} must hold {need}: {error}.") from error
     if table.ndim != 2 or table.shape[1] != columns:
         raise ValueError(f"{path} must have rows of {columns} columns ({need}), got {table.shape}.")
-    if dt is not None:
-        _check_positive(dt, "dt")
-    t = table[:, 0] if dt is None else dt * np.arange(len(table))
+    t = table[:, 0] if dt is None else _period(dt, "dt") * np.arange(len(table))
     return Trajectory(t, METRES[unit] * table[:, -3:])
 
 
 def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.ndarray]:
     """Return times [s] and the share of the way at each."""
-    _check_positive(duration, "duration")
-    _check_positive(dt, "dt")
+    n = max(1, round(_period(duration, "duration") / _period(dt, "dt")))
     if timing not in ("min_jerk", "uniform"):
         raise ValueError(f'`timing` must be one of "min_jerk" and "uniform", got {timing!r}.')
-    n = max(1, round(duration / dt))
     s = np.arange(n + 1) / n
     return dt * np.arange(n + 1), s if timing == "uniform" else min_jerk(s)
 
 
 def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a right-handed frame (across, up, normal)."""
-    normal = _point(normal, "normal")
+    normal = _checked(normal, "normal", _POINT, (3,))
     norm = np.linalg.norm(normal)
     if norm == 0.0:
         raise ValueError("`normal` must not be zero; it is the normal of the plane.")
     normal = normal / norm
     axis = np.eye(3)[0 if abs(normal[0]) < 1.0 - 1e-9 else 1]
     across = axis - (axis @ normal) * normal
-    across = across / np.linalg.norm(across)
+    across /= np.linalg.norm(across)
     return across, np.cross(normal, across), normal
 
 
-def _point(value: ArrayLike, name: str) -> np.ndarray:
-    point = np.array(value, dtype=float)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(f"`{name}` must be 3 finite numbers [m], got {value!r}.")
-    return point
+def _checked(
+    value: ArrayLike, name: str, need: str, shape: tuple[int, ...], least: float = -math.inf
+) -> np.ndarray:
+    """Return finite numbers of this shape, each at least `least`."""
+    numbers = np.array(value, dtype=float)
+    finite = numbers.shape == shape and np.isfinite(numbers).all()
+    if not finite or (numbers < least).any():
+        raise ValueError(f"`{name}` must be {need}, got {value!r}.")
+    return numbers
 
 
-def _sizes(value: ArrayLike, name: str, *, zero: bool = False) -> tuple[float, float]:
-    pair = np.array(value, dtype=float)
-    good = pair.shape == (2,) and np.isfinite(pair).all()
-    if not good or not (pair >= 0.0 if zero else pair > 0.0).all():
-        need = "not negative" if zero else "positive"
-        raise ValueError(f"`{name}` must be two numbers, {need} [m], got {value!r}.")
-    return float(pair[0]), float(pair[1])
-
-
-def _check_positive(value: float, name: str) -> None:
-    if not (value > 0.0 and math.isfinite(value)):
-        raise ValueError(f"`{name}` must be positive [s], got {value!r}.")
+def _period(value: float, name: str) -> float:
+    return float(_checked(value, name, "positive [s]", (), _ABOVE_ZERO))
 
 
 def _is_number(text: str) -> bool:

@@ -10,14 +10,7 @@ from sklearn.utils import Bunch
 
 from hybridkin import datasets, robots
 from hybridkin.calibration.calibrate import calibrate
-from hybridkin.workflow.report import (
-    GEOMETRY_HEADER,
-    IDENTIFIED,
-    Report,
-    distance,
-    geometry_entries,
-    geometry_rows,
-)
+from hybridkin.workflow.report import IDENTIFIED, Report, distance, geometry_entries
 
 ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
 """The geometry that `identifiability` asks for at once."""
@@ -76,12 +69,12 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
         f"{len(asked['entries'])} parameters. The others stay near the published geometry. The "
         "base is given by its rotation from the start and its position.",
     )
-    report.table(GEOMETRY_HEADER, geometry_rows(asked["entries"]))
+    report.geometry(asked["entries"])
     report.text("What the samples do not identify, and which measurement would:")
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
     n = sum(entry["identified"] for entry in fewer["entries"])
     report.text(f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:")
-    report.table(GEOMETRY_HEADER, geometry_rows(fewer["entries"]))
+    report.geometry(fewer["entries"])
     base = {entry["name"]: entry for entry in fewer["entries"]}
     true = dict(zip("xyz", 1e3 * np.array(data.parameters["plant"]["base_error"][:3]), strict=True))
     away = {axis: base[f"base[{axis}]"]["value"] - true[axis] for axis in true}

@@ -32,30 +32,27 @@ def describe(loaded: LoadedModel) -> Report:
         "training", "domain", "radius", "play" (width [m]), "auto", "log_format", "limits",
         "created" and "versions" of the program that wrote the file; None where nothing is known.
     """
-    title = f"{loaded.name}: {type(loaded.model).__name__}, {loaded.n_actuators} actuators"
-    report = Report(title)
-    header, description, trained = loaded.header or {}, loaded.description, loaded.trained_range
+    header, description, hybrid = loaded.header or {}, loaded.description, loaded.hybrid
+    kind, trained = type(loaded.model).__name__, loaded.trained_range
+    log_format = None if description is None else description.log
+    report = Report(f"{loaded.name}: {kind}, {loaded.n_actuators} actuators")
     report.record = {
         "name": loaded.name,
         "path": str(loaded.path),
-        "kind": type(loaded.model).__name__,
+        "kind": kind,
         "n_actuators": loaded.n_actuators,
         "geometry": None if loaded.chain is None else geometry(loaded.chain),
         "error_model": None,
         "play": loaded.play_width,
         "auto": None,
         "radius": None,
-        "domain": None if trained is None else _lists(trained, ("q_min", "q_max")),
-        "log_format": None,
-        "limits": None,
+        "domain": None if trained is None else dict(vars(trained)),
+        "log_format": None if log_format is None else dict(vars(log_format)),
+        "limits": None if description is None else dict(vars(description.limits)),
         **{key: header.get(key) for key in ("training", "created", "versions")},
     }
-    if description is not None:
-        if description.log is not None:
-            report.record["log_format"] = dict(vars(description.log))
-        report.record["limits"] = _lists(description.limits, ("q_min", "q_max", "dq_max"))
-    if loaded.hybrid is not None:
-        _add_hybrid(report.record, loaded.hybrid)
+    if hybrid is not None:
+        _add_hybrid(report.record, hybrid)
     _write_geometry(report, report.record["geometry"])
     _write_model(report)
     _write_training(report, report.record["training"] or {})
@@ -86,32 +83,25 @@ def geometry(chain: Chain) -> dict[str, Any]:
     """
     pose = _numbers(chain.base)
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec(degrees=True)
-    base = {"position": pose[:3, 3].tolist(), "rotation_vector_deg": turn.tolist()}
+    base = {"position": pose[:3, 3], "rotation_vector_deg": turn}
     found: dict[str, Any] = {"kind": type(chain).__name__, "base": base}
     if not isinstance(chain, ArcChain):
         return found
     parts = {name: _numbers(value) for name, value in chain.geometry().items()}
-    angles = np.split(parts["angles"], np.cumsum(chain.actuators_per_segment)[:-1])
-    segments = []
-    for k, radius in enumerate(parts["radii"].tolist()):
-        segments.append(
-            {
-                "radius": radius,
-                "length": float(parts["lengths"][k]) if "lengths" in parts else None,
-                "offset": float(parts["offsets"][k]),
-                "angles_deg": np.degrees(angles[k]).tolist(),
-                "rest_bend_deg": np.degrees(parts["rest_bends"].reshape(-1, 2)[k]).tolist(),
-            }
-        )
-        for name in ("bending_stiffness", "axial_stiffness"):
-            if name in parts:
-                segments[-1][name] = float(parts[name].ravel()[k])
+    angles = np.split(np.degrees(parts["angles"]), np.cumsum(chain.actuators_per_segment)[:-1])
+    columns = {
+        "radius": parts["radii"],
+        "length": parts.get("lengths", [None] * len(angles)),
+        "offset": parts["offsets"],
+        "angles_deg": angles,
+        "rest_bend_deg": np.degrees(parts["rest_bends"].reshape(-1, 2)),
+    }
+    for name in ("bending_stiffness", "axial_stiffness"):
+        if name in parts:
+            columns[name] = parts[name].ravel()
+    rows = zip(*columns.values(), strict=True)
+    segments = [dict(zip(columns, row, strict=True)) for row in rows]
     return {**found, "routing": chain.routing, "segments": segments}
-
-
-def _lists(limits: Any, names: Iterable[str]) -> dict[str, list[float] | None]:
-    found = {name: vars(limits)[name] for name in names}
-    return {name: None if value is None else value.tolist() for name, value in found.items()}
 
 
 def _numbers(value: torch.Tensor) -> np.ndarray:
@@ -133,9 +123,8 @@ def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
         header = ["segment", "radius [mm]", "length [mm]", "offset [mm]", "actuators at [deg]"]
         report.table(header, rows)
     turn = ", ".join(f"{v:.1f}" for v in geometry["base"]["rotation_vector_deg"])
-    report.text(
-        f"Base at ({_millimetres(geometry['base']['position'])}) mm, turned by ({turn}) deg."
-    )
+    position = _millimetres(geometry["base"]["position"])
+    report.text(f"Base at ({position}) mm, turned by ({turn}) deg.")
 
 
 def _write_model(report: Report) -> None:

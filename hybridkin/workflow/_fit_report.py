@@ -12,15 +12,7 @@ from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.workflow.log import MeasuredLog
-from hybridkin.workflow.report import (
-    GEOMETRY_HEADER,
-    IDENTIFIED,
-    Report,
-    geometry_entries,
-    geometry_rows,
-    millimetres,
-    statistics,
-)
+from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries, millimetres, statistics
 
 _SHOWN = ("mechanical, calibrated", "hybrid, ELM", "hybrid, auto")
 
@@ -56,24 +48,17 @@ def write_comparison(
     report.errors(record, ("mean", "std", "p95", "max", "std_folds"))
     present = [name for name in _SHOWN if name in record]
     calibrated, *hybrids = (record[name]["mean"] for name in present)
-    ratios = [
-        f"over {name}: **{calibrated / mean:.2f}**"
-        for name, mean in zip(present[1:], hybrids, strict=True)
-    ]
+    pairs = zip(present[1:], hybrids, strict=True)
+    ratios = [f"over {name}: **{calibrated / mean:.2f}**" for name, mean in pairs]
     best = min(record, key=lambda name: record[name]["mean"])
     report.text(f"Calibrated mechanical model {', '.join(ratios)}. Least mean error: {best}.")
     _add_figures(report, errors, (present[0], present[-1]))
-    motions = np.unique(log.motions)
-    means = {n: [1000 * errors[n][log.motions == m].mean() for m in motions] for n in present}
-    worst = np.argsort(means[present[-1]])[::-1][:5]
+    motions, counts = np.unique(log.motions, return_counts=True)
+    means = np.array([[errors[n][log.motions == m].mean() for n in present] for m in motions])
     report.text(f"The five motions with the largest errors of {present[-1]}, mean error in mm:")
     rows = [
-        [
-            str(motions[i]),
-            str((log.motions == motions[i]).sum()),
-            *(f"{m[i]:.1f}" for m in means.values()),
-        ]
-        for i in worst
+        [str(motions[i]), str(counts[i]), *(f"{1e3 * mean:.1f}" for mean in means[i])]
+        for i in np.argsort(means[:, -1])[::-1][:5]
     ]
     report.table(["motion", "rows", *present], rows)
 
@@ -82,11 +67,8 @@ def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, s
     figure, ax = plots.new_figure(7.0, 3.9)
     plots.ErrorBoxDisplay(errors).plot(ax, unit="mm")
     ax.set_xlim(0.0, 1100 * float(np.percentile(errors["mechanical, nominal"], 99)))
-    report.figure(
-        "held_out",
-        figure,
-        "Tip error on held-out motions: quartiles, 5 and 95 %; larger errors lie beyond the axis.",
-    )
+    caption = "Tip error on held-out motions: quartiles, 5 and 95 %; larger errors beyond the axis."
+    report.figure("held_out", figure, caption)
     figure, ax = plots.new_figure(5.5, 3.4)
     plots.ErrorHistogramDisplay({name: errors[name] for name in shown}).plot(ax, unit="mm")
     ax.set(ylabel="rows")
@@ -110,7 +92,7 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "taken": type(model.mechanical_model_).__name__,
         "mechanical_models": {name: float(e) for name, e in found["mechanical_model"].items()},
         "candidates": dict(
-            zip(found["candidate"], np.asarray(found["mean_distance"]).tolist(), strict=True)
+            zip(found["candidate"], map(float, found["mean_distance"]), strict=True)
         ),
         "play": None if model.play_ is None else np.ravel(model.play_.width).tolist(),
         "play_asked": model.play is not None,
@@ -175,7 +157,6 @@ def write_calibration(
     key: str = "calibration",
 ) -> None:
     """Add what the calibration found, and what the log does not identify."""
-    entries = geometry_entries(chain, result)
     report.text(
         f"## {title}",
         f"Root mean square tip error {1000 * result.rmse:.2f} mm. Standard errors count every row "
@@ -183,17 +164,12 @@ def write_calibration(
         f"identified where the data narrow its prior at least {IDENTIFIED:.0f} times; other values "
         "are assumptions. The base by its turn from the start and its position.",
     )
-    report.table(GEOMETRY_HEADER, geometry_rows(entries))
+    entries = geometry_entries(chain, result)
+    report.geometry(entries)
     report.text(*(f"Warning: {message}" for message in warnings))
     if result.unidentified:
         report.text("What the log does not identify:")
         report.text("\n".join(f"- {line}" for line in result.unidentified))
-    report.record[key] = {
-        "values": result.values,
-        "std_errors": result.std_errors,
-        "rmse": result.rmse,
-        "warnings": warnings,
-        "identifiable": result.identifiable,
-        "entries": entries,
-        "unidentified": result.unidentified,
-    }
+    names = ("values", "std_errors", "rmse", "identifiable", "unidentified")
+    report.record[key] = {name: vars(result)[name] for name in names}
+    report.record[key] |= {"warnings": warnings, "entries": entries}

@@ -72,28 +72,26 @@ def evaluate_log(
             _, radius = loaded.hybrid.predict(log.q, return_radius=True, groups=motion)
             columns["share_in_radius"] = errors <= radius
             report.record["coverage_asked"] = loaded.hybrid.radius_.coverage
-    names = dict.fromkeys(measured.motions.tolist())
+    motions = {str(name): measured.motions == name for name in dict.fromkeys(measured.motions)}
     report.record.update(
         model=str(loaded.path),
         log=log.source,
-        all=_entry(columns),
-        motions={
-            str(name): _entry({k: v[measured.motions == name] for k, v in columns.items()})
-            for name in names
-        },
+        all=_entry(columns, slice(None)),
+        motions={name: _entry(columns, rows) for name, rows in motions.items()},
         split=measured.split,
     )
     write_check(report, measured)
     _write_errors(report)
     if out is None:
         return report, []
-    _add_figures(report, loaded, measured, predicted, motion)
+    _add_figures(report, loaded, measured, predicted, errors, motion)
     return report, report.write(out)
 
 
-def _entry(columns: dict[str, NDArray]) -> dict[str, Any]:
-    shares = {key: values.mean() for key, values in columns.items() if key in _SHARES}
-    return {"rows": len(columns["error"]), **statistics(columns["error"]), **shares}
+def _entry(columns: dict[str, NDArray], rows: NDArray | slice) -> dict[str, Any]:
+    error = columns["error"][rows]
+    shares = {key: columns[key][rows].mean() for key in _SHARES if key in columns}
+    return {"rows": len(error), **statistics(error), **shares}
 
 
 def _write_errors(report: Report) -> None:
@@ -108,9 +106,13 @@ def _write_errors(report: Report) -> None:
 
 
 def _add_figures(
-    report: Report, loaded: LoadedModel, log: MeasuredLog, predicted: NDArray, motion: NDArray
+    report: Report,
+    loaded: LoadedModel,
+    log: MeasuredLog,
+    predicted: NDArray,
+    errors: NDArray,
+    motion: NDArray,
 ) -> None:
-    errors = distance(predicted, log.x)
     figure, ax = plots.new_figure(6.0, 3.6)
     plots.ErrorHistogramDisplay({loaded.name: errors}).plot(ax, unit="mm")
     ax.set(ylabel="rows")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from hybridkin import datasets, robots
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
@@ -108,24 +109,26 @@ class Comparison(NamedTuple):
 class _Choice(NamedTuple):
     """An ELM by its ridge weight and guard; no ridge weight: no correction at all."""
 
-    alpha: float | None
-    guard: str | None
+    alpha: float | None = None
+    guard: str | None = None
 
     def __str__(self) -> str:
         if self.alpha is None:
             return "no correction"
         return f"alpha = {self.alpha:g}, guard: {self.guard or 'none'}"
 
-    def model(self, chain: Chain | None, seed: int) -> HybridForwardModel:
+    def model(self, chain: Chain | None, seed: int = 0) -> HybridForwardModel:
         if self.alpha is None:
             return HybridForwardModel(chain, "drop")
         elm = ELMRegressor(_N_HIDDEN, self.alpha, random_state=seed)
         return HybridForwardModel(chain, elm, guard=self.guard)
 
 
-_DATA_CHOICES = tuple(_Choice(alpha, None) for alpha in ALPHAS)
-_GUARDED = tuple(_Choice(a, guard) for guard in ("leverage", "box", None) for a in ALPHAS)
-_HYBRID_CHOICES = (_Choice(None, None), *_GUARDED)
+_DATA_CHOICES = tuple(_Choice(alpha) for alpha in ALPHAS)
+_HYBRID_CHOICES = (
+    _Choice(),
+    *(_Choice(alpha, guard) for guard in ("leverage", "box", None) for alpha in ALPHAS),
+)
 
 
 class _Rows(NamedTuple):
@@ -140,10 +143,12 @@ class _Rows(NamedTuple):
     def of(self, rows: NDArray) -> _Rows:
         return self._replace(q=self.q[rows], x=self.x[rows], groups=self.groups[rows])
 
-    def calibrated(self, parameters: Sequence[str] | None = None) -> CalibrationResult:
-        """Return the calibration to these rows, by default of all that the robot asks for."""
+    def calibrated(
+        self, parameters: Sequence[str] | None = None
+    ) -> tuple[CalibrationResult, list[str]]:
+        """Return the calibration, by default of all that the robot asks for, and its warnings."""
         names = self.robot.calibrate if parameters is None else parameters
-        return fit_geometry(self.robot.chain, self.q, self.x, names, loss=self.settings.loss)[0]
+        return fit_geometry(self.robot.chain, self.q, self.x, names, self.settings.loss)
 
     def auto_model(self, calibrated: Chain) -> HybridForwardModel:
         """Return the hybrid that chooses for itself.
@@ -151,11 +156,14 @@ class _Rows(NamedTuple):
         It calibrates anew in every fold of its own, by least squares; a loss that bounds outliers
         is kept by starting from the chain so calibrated.
         """
-        names, start = self.robot.calibrate, self.robot.chain
-        if self.settings.loss != "linear":
-            names, start = (), calibrated
-        play = self.settings.play
-        return HybridForwardModel(start, "auto", calibrate=names, play=play, random_state=0)
+        linear_loss = self.settings.loss == "linear"
+        return HybridForwardModel(
+            self.robot.chain if linear_loss else calibrated,
+            "auto",
+            calibrate=self.robot.calibrate if linear_loss else (),
+            play=self.settings.play,
+            random_state=0,
+        )
 
 
 def compare_by_group(
@@ -264,18 +272,35 @@ def fit_log(
     saved = min(errors, key=lambda name: (errors[name], name))
     progress(f"fitting {saved} to all motions", 0, 1)
     rows = _Rows(data.q, data.x, data.motions, robot, settings)
-    result, messages = fit_geometry(
-        robot.chain, data.q, data.x, robot.calibrate, loss=settings.loss
-    )
+    result, messages = rows.calibrated()
     for message in messages:
         warnings.warn(message, stacklevel=2)
     model, chosen = _fit_saved(saved, rows, result.chain)
     progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
-    report.record.update(_facts(whole, data, robot, settings), saved=saved, chosen=chosen)
+    report.record.update(
+        log=Path(whole.source).name,
+        robot=robot.name,
+        n=len(data.q),
+        n_whole=len(whole.q),
+        n_motions=len(np.unique(whole.motions)),
+        excluded=list(whole.excluded),
+        n_seeds=settings.n_seeds,
+        loss=settings.loss,
+        saved=saved,
+        chosen=chosen,
+        choices_by_fold=compared.choices,
+    )
     write_check(report, whole)
     write_comparison(report, compared.errors, compared.fold, data)
-    _write_choice(report, compared.choices, model)
+    by_fold = "; ".join(choices.get(saved, "-") for choices in compared.choices)
+    report.text(
+        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error here. "
+        f"Chosen in the folds: {by_fold}."
+    )
+    if saved == AUTO:
+        report.record["auto"] = auto_entry(model)
+        report.text(" ".join(report.record["auto"]["words"]))
     write_calibration(report, robot.chain, result, messages)
     _write_elastic_calibration(report, robot.chain, model)
     _add_model(report, model, robot, whole.split)
@@ -302,69 +327,26 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
     log.check(force)
 
 
-@contextlib.contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Suppress warnings on parts of the log; the calibration to all of it repeats them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
-
-
-@_without_warnings()
 def _fit_saved(saved: str, rows: _Rows, calibrated: Chain) -> tuple[HybridForwardModel, str]:
     """Return the model to save, fitted to all rows, and what was chosen for it."""
-    chosen = {CALIBRATED: "no correction", LINEAR: "linear"}.get(saved, "")
-    if saved == AUTO:
+    choice = _choose(rows, _HYBRID_CHOICES, rows.robot.chain) if saved == ELM else _Choice()
+    model, chosen = choice.model(calibrated), str(choice)
+    if saved == LINEAR:
+        model, chosen = HybridForwardModel(calibrated, linear()), "linear"
+    elif saved == AUTO:
         model = rows.auto_model(calibrated)
-    elif saved == ELM:
-        choice = _choose(rows, _HYBRID_CHOICES, rows.robot.chain)
-        model, chosen = choice.model(calibrated, 0), str(choice)
-    else:
-        model = HybridForwardModel(calibrated, linear() if saved == LINEAR else "drop")
-    model.set_params(coverage=rows.settings.coverage).fit(rows.q, rows.x, groups=rows.groups)
+    model.set_params(coverage=rows.settings.coverage)
+    model.fit_with_messages(rows.q, rows.x, groups=rows.groups)
     return model, auto_in_short(auto_entry(model)) if saved == AUTO else chosen
-
-
-def _facts(
-    whole: MeasuredLog,
-    data: MeasuredLog,
-    robot: robots.RobotDescription,
-    settings: FitSettings,
-) -> dict[str, Any]:
-    return {
-        "log": Path(whole.source).name,
-        "robot": robot.name,
-        "n": len(data.q),
-        "n_whole": len(whole.q),
-        "n_motions": len(np.unique(whole.motions)),
-        "excluded": list(whole.excluded),
-        "n_seeds": settings.n_seeds,
-        "loss": settings.loss,
-    }
-
-
-def _write_choice(report: Report, choices: list[dict[str, str]], model: HybridForwardModel) -> None:
-    saved = report.record["saved"]
-    report.record["choices_by_fold"] = choices
-    report.text(
-        f"Saved: **{saved}**, fitted to all motions: {report.record['chosen']}. It has the least "
-        "mean error here. Chosen in the folds: "
-        + "; ".join(c.get(saved, "-") for c in choices)
-        + "."
-    )
-    if saved == AUTO:
-        report.record["auto"] = auto_entry(model)
-        report.text(" ".join(report.record["auto"]["words"]))
 
 
 def _write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:
     """Add the calibration of the elastic tendons where auto took them in place of the chain."""
     if isinstance(model.mechanical_model_, ElasticTendonChain) and model.calibration_ is not None:
-        start = (
-            chain if isinstance(chain, ElasticTendonChain) else ElasticTendonChain.from_chain(chain)
-        )
+        if isinstance(chain, ConstantCurvatureChain):
+            chain = ElasticTendonChain.from_chain(chain)
         title = "Calibration of the elastic tendons that auto took"
-        write_calibration(report, start, model.calibration_, [], title, "calibration_of_saved")
+        write_calibration(report, chain, model.calibration_, [], title, "calibration_of_saved")
 
 
 def _add_model(
@@ -382,39 +364,43 @@ def _add_model(
         report.text("`robot.toml` is the description it was made from.")
 
 
-@_without_warnings()
 @threadpool_limits.wrap(limits=1)  # the processes share the cores already
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors on test rows of every model fitted to training rows, and the choices."""
-
-    def held_out(*models: HybridForwardModel) -> NDArray:
-        fitted = (model.fit(train.q, train.x) for model in models)
-        return np.mean([distance(model.predict(test.q), test.x) for model in fitted], axis=0)
-
-    def with_elm(chain: Chain | None, choice: _Choice) -> NDArray:
-        return held_out(*(choice.model(chain, seed) for seed in range(train.settings.n_seeds)))
-
-    nominal, calibrated = train.robot.chain, train.calibrated().chain
+    seeds = range(train.settings.n_seeds)
+    nominal, calibrated = train.robot.chain, train.calibrated()[0].chain
     data_choice = _choose(train, _DATA_CHOICES, None)
     hybrid_choice = _choose(train, _HYBRID_CHOICES, nominal)
     if "base" in train.robot.calibrate:
-        nominal = train.calibrated(("base",)).chain
-    errors = {
-        "mechanical, nominal": held_out(HybridForwardModel(nominal, "drop")),
-        CALIBRATED: held_out(HybridForwardModel(calibrated, "drop")),
-        "data-driven, linear": held_out(HybridForwardModel(None, linear())),
-        "data-driven, quadratic": held_out(HybridForwardModel(None, quadratic())),
-        "data-driven, ELM": with_elm(None, data_choice),
-        LINEAR: held_out(HybridForwardModel(calibrated, linear())),
-        "hybrid, quadratic": held_out(HybridForwardModel(calibrated, quadratic())),
-        ELM: with_elm(calibrated, hybrid_choice),
+        nominal = train.calibrated(("base",))[0].chain
+    models = {
+        "mechanical, nominal": [HybridForwardModel(nominal, "drop")],
+        CALIBRATED: [HybridForwardModel(calibrated, "drop")],
+        "data-driven, linear": [HybridForwardModel(None, linear())],
+        "data-driven, quadratic": [HybridForwardModel(None, quadratic())],
+        "data-driven, ELM": [data_choice.model(None, seed) for seed in seeds],
+        LINEAR: [HybridForwardModel(calibrated, linear())],
+        "hybrid, quadratic": [HybridForwardModel(calibrated, quadratic())],
+        ELM: [hybrid_choice.model(calibrated, seed) for seed in seeds],
     }
     chosen = {"data-driven, ELM": str(data_choice), ELM: str(hybrid_choice)}
     if train.settings.auto:
-        auto = train.auto_model(calibrated).fit(train.q, train.x, groups=train.groups)
-        errors[AUTO] = distance(auto.predict(test.q, groups=test.groups), test.x)
-        chosen[AUTO] = auto_in_short(auto_entry(auto))
+        models[AUTO] = [train.auto_model(calibrated)]
+    errors = {
+        name: np.mean([_held_out(model, train, test) for model in some], axis=0)
+        for name, some in models.items()
+    }
+    if train.settings.auto:
+        chosen[AUTO] = auto_in_short(auto_entry(models[AUTO][0]))
     return errors, chosen
+
+
+def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
+    """Return the errors (N,) on test rows of a model, fitted to training rows; it does not warn."""
+    model.fit_with_messages(train.q, train.x, groups=train.groups)
+    q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
+    with torch.no_grad():
+        return distance(model.module_(torch.tensor(q, dtype=torch.float64)).numpy(), test.x)
 
 
 def _choose(rows: _Rows, candidates: Sequence[_Choice], chain: Chain | None) -> _Choice:
@@ -424,8 +410,6 @@ def _choose(rows: _Rows, candidates: Sequence[_Choice], chain: Chain | None) -> 
     for train, test in folds.split(rows.q, groups=rows.groups):
         known, new, fitted = rows.of(train), rows.of(test), chain
         if chain is not None and rows.robot.calibrate:
-            fitted = known.calibrated().chain
-        for i, candidate in enumerate(candidates):
-            model = candidate.model(fitted, 0).fit(known.q, known.x)
-            errors[i] += distance(model.predict(new.q), new.x).sum()
+            fitted = known.calibrated()[0].chain
+        errors += [_held_out(choice.model(fitted), known, new).sum() for choice in candidates]
     return candidates[int(errors.argmin())]

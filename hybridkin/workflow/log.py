@@ -130,10 +130,9 @@ def read_log(
     columns = dict(vars(log_format))
     suffix = columns.pop("group_suffix")
     log = datasets.load_log(path, **columns, delimiter=delimiter, drop_invalid=True)
-    if log.groups is None:
-        if exclude:
-            raise ValueError("`exclude` needs `groups`, the column that names the motions.")
-    else:
+    if log.groups is None and exclude:
+        raise ValueError("`exclude` needs `groups`, the column that names the motions.")
+    if log.groups is not None:
         motions = [str(name).removesuffix(suffix) for name in log.groups]
         kept = np.array([not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions])
         if not kept.any():
@@ -142,9 +141,8 @@ def read_log(
                 f"{len({*motions})}; keep some."
             )
         log = replace(log, groups=np.array(motions)).rows(kept)
-    report = datasets.check_log(
-        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
-    )
+    checks = {"chain": chain, "base_is_free": base_is_free, "drop_invalid": drop_invalid}
+    report = datasets.check_log(log, **checks)
     measured = _with_motions(log, report, tuple(exclude))
     if drop_frozen:
         frozen = [f.rows for f in report.findings if f.kind == "frozen tip"]

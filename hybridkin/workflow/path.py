@@ -110,11 +110,10 @@ def shape_path(
         center = tips[np.linalg.norm(tips - tips.mean(axis=0), axis=1).argmin()]
     if normal is None:
         normal = (0.0, 0.0, 1.0) if loaded.chain is None else loaded.chain.base[:3, 2].tolist()
+    timing = {"duration": duration, "dt": dt}
     if shape == "figure-eight":
-        return trajectories.figure_eight(center, size, normal=normal, duration=duration, dt=dt)
+        return trajectories.figure_eight(center, size, normal=normal, **timing)
     if shape == "spiral":
-        return trajectories.spiral(
-            center, size, normal=normal, turns=turns, rise=rise, duration=duration, dt=dt
-        )
-    start, end = (np.asarray(center) + share * np.asarray(size) for share in (-0.5, 0.5))
-    return trajectories.line(start, end, duration=duration, dt=dt)
+        return trajectories.spiral(center, size, normal=normal, turns=turns, rise=rise, **timing)
+    half = 0.5 * np.asarray(size)
+    return trajectories.line(np.asarray(center) - half, np.asarray(center) + half, **timing)

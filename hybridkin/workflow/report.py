@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
-import shutil
 import tempfile
 import textwrap
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -117,49 +117,6 @@ def _start_value(start: Chain, name: str) -> NDArray:
     return geometry[name]
 
 
-def geometry_rows(entries: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """Return entries of a calibration as rows of a table; see `GEOMETRY_HEADER`."""
-    return [
-        [
-            f"{entry['name']} [{entry['unit']}]",
-            *(f"{entry[key]:.2f}" for key in ("start", "value", "std_error")),
-            f"{entry['narrowing']:.3g}",
-            "yes" if entry["identified"] else "no",
-        ]
-        for entry in entries
-    ]
-
-
-GEOMETRY_HEADER = (
-    *("parameter", "start", "calibrated", "standard error", "prior narrowed", "identified"),
-)
-
-
-class _Table(NamedTuple):
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-    def markdown(self) -> str:
-        lines = [self.header, ["---"] * len(self.header), *self.rows]
-        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-    def plain(self) -> str:
-        lines = [self.header, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        cells = (  # the first column to the left, the others to the right
-            [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in lines
-        )
-        return "\n".join("  " + "  ".join(line) for line in cells)
-
-
-class _Figure(NamedTuple):
-    name: str
-    caption: str
-
-    def markdown(self) -> str:
-        return f"![{self.caption}]({self.name}.png)\n\n*{self.caption}*"
-
-
 class Report:
     """Markdown blocks, a JSON record and named files, written in one go.
 
@@ -171,16 +128,24 @@ class Report:
 
     def __init__(self, title: str) -> None:
         self.record: dict[str, Any] = {"title": title, "versions": versions()}
-        self._blocks: list[str | _Table | _Figure] = [f"# {title}"]
+        self._blocks: list[tuple[str, str]] = []  # as Markdown, and for a terminal
         self._files: dict[str, Callable[[Path], Any]] = {}
+        self.text(f"# {title}")
 
     def text(self, *paragraphs: str) -> None:
         """Add paragraphs."""
-        self._blocks.extend(paragraphs)
+        self._blocks += [(text, _wrapped(text)) for text in paragraphs]
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Add a table."""
-        self._blocks.append(_Table(header, rows))
+        ruled = [header, ["---"] * len(header), *rows]
+        widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+        plain = (  # the first column to the left, the others to the right
+            [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]
+            for line in [header, *rows]
+        )
+        markdown = "\n".join("| " + " | ".join(line) + " |" for line in ruled)
+        self._blocks.append((markdown, "\n".join("  " + "  ".join(line) for line in plain)))
 
     def errors(self, record: dict[str, dict[str, Any]], columns: Sequence[str]) -> None:
         """Add a table of tip errors [mm] by name, with some of their `statistics`."""
@@ -191,20 +156,29 @@ class Report:
             rows.append([name, *map(format, values, formats)])
         self.table(["tip error [mm]", *titles], rows)
 
+    def geometry(self, entries: Sequence[dict[str, Any]]) -> None:
+        """Add a table of what a calibration found, see `geometry_entries`."""
+        header = ["parameter", "start", "calibrated", "standard error", "prior narrowed"]
+        rows = []
+        for entry in entries:
+            numbers = (f"{entry[key]:.2f}" for key in ("start", "value", "std_error"))
+            answer = "yes" if entry["identified"] else "no"
+            label, narrowing = f"{entry['name']} [{entry['unit']}]", f"{entry['narrowing']:.3g}"
+            rows.append([label, *numbers, narrowing, answer])
+        self.table([*header, "identified"], rows)
+
     def figure(self, name: str, figure: Any, caption: str) -> None:
         """Add a figure that becomes `name`.png."""
-        self._blocks.append(_Figure(name, caption))
-        self.file(f"{name}.png", lambda path: figure.savefig(path))
+        self._blocks.append((f"![{caption}]({name}.png)\n\n*{caption}*", ""))
+        self.file(f"{name}.png", figure.savefig)
 
     def markdown(self) -> str:
         """Return the report as it is written."""
-        blocks = (b if isinstance(b, str) else b.markdown() for b in self._blocks)
-        return "\n\n".join(blocks) + "\n"
+        return "\n\n".join(markdown for markdown, _ in self._blocks) + "\n"
 
     def plain(self) -> str:
         """Return the text and the tables for a terminal."""
-        blocks = [block for block in self._blocks if not isinstance(block, _Figure)]
-        return "\n\n".join(_wrapped(b) if isinstance(b, str) else b.plain() for b in blocks)
+        return "\n\n".join(plain for _, plain in self._blocks if plain)
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Add a file that `write` makes when handed its path."""
@@ -217,30 +191,27 @@ class Report:
         """
         out = Path(out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-        try:
+        texts = {"report.json": json_text(self.record) + "\n", "report.md": self.markdown()}
+        names = [*self._files, *texts]
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
+            staging = Path(folder)
             for name, write in self._files.items():
                 write(staging / name)
-            record = json.dumps(self.record, indent=2, default=_plain)
-            (staging / "report.json").write_text(record + "\n", encoding="utf-8")
-            (staging / "report.md").write_text(self.markdown(), encoding="utf-8")
+            for name, text in texts.items():
+                (staging / name).write_text(text, encoding="utf-8")
             out.mkdir(exist_ok=True)
-            names = [*self._files, "report.json", "report.md"]
             for name in names:
                 os.replace(staging / name, out / name)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
         return [out / name for name in names]
 
 
 def _wrapped(text: str) -> str:
     """Return lines of Markdown as text of the width of a terminal."""
     lines: list[str] = []
+    wrapper = textwrap.TextWrapper(_WIDTH, break_on_hyphens=False)
     for line in text.replace("**", "").splitlines():
-        indent = "  " if line.startswith("- ") else ""
-        lines += textwrap.wrap(
-            line.lstrip("# "), _WIDTH, subsequent_indent=indent, break_on_hyphens=False
-        )
+        wrapper.subsequent_indent = "  " if line.startswith("- ") else ""
+        lines += wrapper.wrap(line.lstrip("# "))
     return "\n".join(lines)
 
 
@@ -258,10 +229,21 @@ def quiet(label: str, done: int, total: int) -> None:
     """Report no progress."""
 
 
+def json_text(record: Any) -> str:
+    """Return a record as JSON; numbers that are not finite become null."""
+    return json.dumps(_plain(record), indent=2, allow_nan=False)
+
+
 def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} has no JSON form")
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
 
 
 def versions() -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ from hybridkin.workflow.report import Progress, Report, check_out, millimetres, 
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
+_COLUMNS = ("q", "q_unit", "q_sign", "x", "x_unit")  # of a log format, that track.csv keeps to
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
 _GUESSES = 16
@@ -78,33 +80,29 @@ def track_path(
     limits = path_limits(loaded) if limits is None else limits
     track = _best_track(loaded, path, limits, tol, progress)
     sent = track.q if loaded.play is None else loaded.play.command(track.q)[0]
-    effective = None if loaded.play is None else track.q
     names = [IKStatus(int(code)).name for code in track.status]
     speeds = np.abs(np.diff(track.q, axis=0) / np.diff(path.t)[:, None])
-    columns = {name: vars(log_format)[name] for name in ("q", "q_unit", "q_sign", "x", "x_unit")}
+    inside = loaded.module.in_domain(torch.from_numpy(track.q)).double().mean()
     report = Report(f"{loaded.name}: a path of {len(path)} points")
     report.record.update(
         model=str(loaded.path),
         n=len(path),
         duration_s=path.duration,
-        reached=int(np.isin(track.status, _REACHED).sum()),
+        reached=_score(track)[1],
         errors={"mean": track.mean_error, "p95": track.p95_error, "max": track.max_error},
         tol=tol,
-        in_domain=None,
+        in_domain=None if loaded.hybrid is None else float(inside),
         play=loaded.play_width,
-        statuses={name: names.count(name) for name in dict.fromkeys(names)},
+        statuses=dict(Counter(names)),
         limits=dict(vars(limits)),
         largest_speed=speeds.max(initial=0.0),
-        columns=columns,
+        columns={name: vars(log_format)[name] for name in _COLUMNS},
     )
-    if loaded.hybrid is not None:
-        inside = loaded.module.in_domain(torch.from_numpy(track.q))
-        report.record["in_domain"] = float(inside.double().mean())
     _write_summary(report)
     _add_figures(report, loaded, track, sent)
-    report.file(
-        "track.csv", lambda file: _write_track(file, track, sent, effective, names, log_format)
-    )
+    effective = None if loaded.play is None else track.q
+    write = partial(_write_track, track, sent, effective, names, log_format)
+    report.file("track.csv", write)
     return report, report.write(out)
 
 
@@ -117,24 +115,21 @@ def _best_track(
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     fine, every = _in_steps(path, max(1, math.ceil(way / (_STEP * extent))))
     dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
+    bounds: Any = {name: vars(limits)[name] for name in ("q_min", "q_max", "dq_max")}
     tracks: list[Track] = []
     for attempt, pull in enumerate(_PULLS):
-        ik = InverseKinematics(
-            loaded.module,
-            q_min=limits.q_min,
-            q_max=limits.q_max,
-            dq_max=limits.dq_max,
-            q_pref=preferred_posture(loaded, limits, pull),
-            beta=min(1.0, 1.0 / dt),
-            dt=dt,
-        )
+        posture = preferred_posture(loaded, limits, pull)
+        options = {"q_pref": posture, "beta": min(1.0, 1.0 / dt), "dt": dt}
+        ik = InverseKinematics(loaded.module, **bounds, **options)
 
         def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
             progress(what, done + 1, total)
 
         first = _initial_guesses(ik, path.x[0], commands, tips, 0.1 * tol)[attempt % 2]
         found: Any = ik.track(fine, q0=first, tol=tol, progress=report)
-        tracks.append(_thinned(found, every))
+        # Of the steps between the points only the points are kept.
+        rows = {k: v[::every] for k, v in vars(found).items() if v is not None}
+        tracks.append(replace(found, **rows))
         if _score(tracks[-1]) == (len(path), len(path)):
             break
     return max(tracks, key=_score)  # of equals the first
@@ -175,11 +170,6 @@ def _score(track: Track) -> tuple[int, int]:
     """Return how many points were reached within the domain, and how many at all."""
     statuses = np.asarray(track.status)
     return int((statuses == IKStatus.CONVERGED).sum()), int(np.isin(statuses, _REACHED).sum())
-
-
-def _thinned(track: Track, every: int) -> Track:
-    """Return every k-th row of a track."""
-    return replace(track, **{k: v[::every] for k, v in vars(track).items() if v is not None})
 
 
 def animate_track(
@@ -235,7 +225,6 @@ def animate_track(
         loaded.chain, q, target=target, t=t, x=tips, n_frames=n_frames
     )
     film.name = "tip (model)"
-
     staging = out.with_name(f".{out.stem}-unfinished{out.suffix}")
     try:
         film.save(staging, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
@@ -272,26 +261,28 @@ def _read_track(
 
 
 def _write_track(
-    file: Path,
     track: Track,
     sent: NDArray,
     effective: NDArray | None,
     statuses: list[str],
     log_format: robots.LogFormat,
+    file: Path,
 ) -> None:
     """Write commands, and what the actuators do where that is something else, point by point."""
     unit, scale = log_format.q_sign / METRES[log_format.q_unit], 1 / METRES[log_format.x_unit]
     columns = np.column_stack([track.t, unit * sent, scale * track.x, scale * track.target])
-    further = [] if effective is None else [f"effective_{name}" for name in log_format.q]
-    tails = np.empty((len(sent), 0)) if effective is None else unit * effective
+    head = [TIME, *log_format.q, *log_format.x, *TARGET, "error", "status"]
+    cells = [*_text("%.9g", columns).T, _text("%.6g", scale * track.error), statuses]
+    if effective is not None:
+        head += [f"effective_{name}" for name in log_format.q]
+        cells += [*_text("%.9g", unit * effective).T]
     with open(file, "w", encoding="utf-8", newline="") as lines:
         writer = csv.writer(lines, lineterminator="\n")
-        head = [TIME, *log_format.q, *log_format.x, *TARGET, "error", "status", *further]
-        writer.writerow(head)
-        rows = zip(columns, scale * track.error, statuses, tails, strict=True)
-        for row, error, status, tail in rows:
-            cells, more = ([f"{v + 0.0:.9g}" for v in part] for part in (row, tail))
-            writer.writerow([*cells, f"{error:.6g}", status, *more])
+        writer.writerows([head, *zip(*cells, strict=True)])
+
+
+def _text(form: str, values: NDArray) -> NDArray:
+    return np.char.mod(form, values + 0.0)  # no -0
 
 
 def _add_figures(report: Report, loaded: LoadedModel, track: Track, sent: NDArray) -> None:
@@ -318,12 +309,11 @@ def _add_figures(report: Report, loaded: LoadedModel, track: Track, sent: NDArra
 
 def _write_summary(report: Report) -> None:
     record = report.record
-    columns, errors = record["columns"], record["errors"]
+    columns, source = record["columns"], record["limits"]["source"]
+    mean, most, largest = (f"{1e3 * record['errors'][key]:.3g}" for key in ("mean", "p95", "max"))
     report.text(
         f"{record['reached']} of {record['n']} points reached to within {1e3 * record['tol']:g} "
-        f"mm, by the model. Error in mm: mean {1e3 * errors['mean']:.3g}, 95 % "
-        f"{1e3 * errors['p95']:.3g}, max {1e3 * errors['max']:.3g}. Limits: "
-        f"{record['limits']['source']}."
+        f"mm, by the model. Error in mm: mean {mean}, 95 % {most}, max {largest}. Limits: {source}."
     )
     report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
     if record["in_domain"] is not None:

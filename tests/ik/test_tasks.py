@@ -14,7 +14,6 @@ from hybridkin.ik.tasks import (
     PointsTask,
     PoseTask,
     PositionTask,
-    PrioritizedTask,
     StackedTask,
     rotation_vector,
 )
@@ -255,48 +254,6 @@ def test_weights_trade_conflicting_tasks(rng):
     (tip_light, elbow_light), (tip_even, elbow_even), (tip_heavy, elbow_heavy) = sizes
     assert tip_light < tip_even < tip_heavy
     assert elbow_light > elbow_even > elbow_heavy
-
-
-def test_the_second_task_never_costs_the_first(rng):
-    tip, elbow = conflict(rng, 40)
-    task = PrioritizedTask(CHAIN, CHAIN.with_tip(2.0))
-    ik = InverseKinematics(task, **LIMITS)
-    solution = ik.solve(task.join(tip, elbow))
-    x, second = task.split(solution.x)
-    assert (x - tip).norm(dim=-1).max() <= 1e-4
-    assert not solution.converged.any()
-    alone = InverseKinematics(CHAIN, **LIMITS).solve(tip)
-    without = (CHAIN.with_tip(2.0)(alone.q) - elbow).norm(dim=-1)
-    assert ((second - elbow).norm(dim=-1) <= without + 1e-4).all()
-    assert (second - elbow).norm(dim=-1).mean() < 0.9 * without.mean()
-    # Both together where both can be had.
-    q = uniform(rng, 0.22, 0.28, 40, 9)
-    both = ik.solve(task.join(CHAIN(q), CHAIN.with_tip(2.0)(q)))
-    assert both.converged.all()
-
-
-def test_prioritized_step_is_the_textbook_law_and_strict_at_limits(rng):
-    A = randn(rng, 5, 9)
-    task = PrioritizedTask(PositionTask(Linear(A[:3])), PositionTask(Linear(A[3:]), size=2))
-    q, target, q_pref = randn(rng, 9), randn(rng, 5), randn(rng, 9)
-    ik = InverseKinematics(task, q_pref=q_pref, beta=100.0)
-    assert_close(A @ (q + ik.step(q, target).dq), target, rtol=0.0, atol=1e-11)
-    # Rows in conflict: the second asks for what contradicts the first.
-    A[3] = A[0] + A[1]
-    task = PrioritizedTask(PositionTask(Linear(A[:3])), PositionTask(Linear(A[3:]), size=2))
-    dq = InverseKinematics(task, q_pref=q_pref, beta=100.0, damping=0.0).step(q, target).dq
-    assert_close(A[:3] @ (q + dq), target[:3], rtol=0.0, atol=1e-11)
-    assert_close(A[4] @ (q + dq), target[4], rtol=0.0, atol=1e-9)
-    # In a box: the first as near as without the second one.
-    rows = {"q_min": -0.3, "q_max": 0.3, "q_pref": 0.0}
-    q, target = uniform(rng, -0.3, 0.3, 200, 9), randn(rng, 200, 5)
-    target[:100, :3] = apply_rows(A[:3].expand(100, -1, -1), uniform(rng, -0.25, 0.25, 100, 9))
-    both = InverseKinematics(task, **rows).step(q, target).dq
-    alone = InverseKinematics(Linear(A[:3]), **rows).step(q, target[:, :3]).dq
-    first = A[:3].expand(200, -1, -1)
-    assert apply_rows(first, both - alone)[:100].norm(dim=-1).max() < 1e-7
-    assert apply_rows(first, both - alone).norm(dim=-1).max() < 1e-3
-    assert ((q + both >= -0.3) & (q + both <= 0.3)).all()
 
 
 # ---------------------------------------------------------------- models

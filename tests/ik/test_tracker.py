@@ -14,7 +14,7 @@ from hybridkin import (
     robots,
 )
 from hybridkin.ik.results import IKStatus
-from hybridkin.ik.tasks import PointsTask, PoseTask, PrioritizedTask
+from hybridkin.ik.tasks import PointsTask, PoseTask, StackedTask
 from hybridkin.ik.trajectories import figure_eight
 
 CHAIN = robots.bionic_handling_assistant()
@@ -129,11 +129,11 @@ def test_posture_as_a_function(draw):
 def test_any_task_is_followed(draw):
     limits, q = {"q_min": 0.1, "q_max": 0.4}, 0.25 + 0.02 * draw.standard_normal(9)
     middle, start = CHAIN.with_tip(2.0), torch.from_numpy(q)
-    ranked = PrioritizedTask(CHAIN, middle)
+    stacked = StackedTask(CHAIN, middle)
     cases = [
         (PoseTask(CHAIN), CHAIN.pose(start)),
         (PointsTask(CHAIN, [1.5, 3.0]), torch.stack([CHAIN.with_tip(1.5)(start), CHAIN(start)])),
-        (ranked, ranked.join(CHAIN(start), middle(start))),
+        (stacked, stacked.join(CHAIN(start), middle(start))),
     ]
     for task, target in cases:
         ik = InverseKinematics(task, **limits)
