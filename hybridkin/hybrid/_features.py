@@ -31,8 +31,6 @@ class Features(PortableModule):
     """
 
     layout = Layout("linear_features", {"center": "n", "scale": "n"})
-    center: Tensor
-    scale: Tensor
 
     def __init__(self, center: Tensor, scale: Tensor) -> None:
         super().__init__()
@@ -126,8 +124,6 @@ class HiddenFeatures(Features):
         {"center": "n", "scale": "n", "input_weights": "hn", "input_bias": "h"},
         {"activation": str},
     )
-    input_weights: Tensor
-    input_bias: Tensor
 
     def __init__(
         self,
@@ -267,7 +263,6 @@ class Readout(ForwardModel):
     """
 
     layout = Layout("readout", {"weights": "cp"}, parts=("features",))
-    weights: Tensor
 
     def __init__(self, features: Features, weights: Tensor) -> None:
         super().__init__()
@@ -282,7 +277,6 @@ class Readout(ForwardModel):
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return W phi(q) (..., C) and its derivative (..., C, n)."""
         rows = min(4096, max(256, _BLOCK // self.weights.shape[1]))
-        value, slope = in_blocks(
-            partial(self.features.readout, weights=self.weights.to(q)), q, rows
-        )
+        readout = partial(self.features.readout, weights=self.weights.to(q))
+        value, slope = in_blocks(readout, q, rows)
         return value, slope

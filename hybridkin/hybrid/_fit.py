@@ -26,10 +26,7 @@ from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
 from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
 from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.learning.network import LeverageModule
 from hybridkin.learning.regressor_modules import error_module
-
-__all__ = ["Blend", "FittedHybrid", "NamedFeatures", "Part", "Rows", "Spec", "fit_hybrid"]
 
 
 class Rows(NamedTuple):
@@ -106,6 +103,11 @@ class FittedHybrid(NamedTuple):
     module: HybridModule
     messages: tuple[str, ...]
 
+    def predict(self, X: NDArray) -> NDArray:
+        """Return the tips (N, m) at actuator vectors (N, n) [m]."""
+        with torch.no_grad():
+            return self.module.rows()(torch.from_numpy(X.astype(np.float64))).numpy()
+
 
 def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     """Return the hybrid: calibrate the mechanical model, fit every error model to its residuals.
@@ -131,13 +133,9 @@ def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
     if not spec.calibrate:
         return spec
     tips = rows.tips[:, :3] if spec.output == "pose" else rows.tips
+    chain, x = cast(Chain, spec.mechanical), torch.from_numpy(tips)
     result, messages = fit_geometry(
-        cast(Chain, spec.mechanical),
-        rows.q,
-        torch.from_numpy(tips),
-        spec.calibrate,
-        groups=groups,
-        sample_weight=rows.weights,
+        chain, rows.q, x, spec.calibrate, groups=groups, sample_weight=rows.weights
     )
     return replace(
         spec, mechanical=result.chain, calibrate=(), calibration=result, messages=tuple(messages)
@@ -165,15 +163,11 @@ def _fit_part(part: Part, spec: Spec, rows: Rows, error: NDArray) -> tuple[Any, 
     model, mechanical, q = part.error_model, spec.mechanical, rows.q
     if isinstance(model, str) and model == "drop":
         return None, None
-    counted = q[torch.from_numpy(rows.counts > 0)]
-    readout = part.coupling == "serial" or isinstance(model, NamedFeatures)
-    if mechanical is not None and readout:
+    counted, serial = q[torch.from_numpy(rows.counts > 0)], part.coupling == "serial"
+    if mechanical is not None and (serial or isinstance(model, NamedFeatures)):
         fitted = _fit_features(part, mechanical, rows, counted)
-        correction = (
-            InnerCorrection(mechanical, fitted.readout)
-            if part.coupling == "serial"
-            else TipCorrection(fitted.readout)
-        )
+        readout = fitted.readout
+        correction = InnerCorrection(mechanical, readout) if serial else TipCorrection(readout)
     else:
         fitted = _fit_regressor(model, rows, error)
         correction = TipCorrection(error_module(fitted, q))
@@ -182,7 +176,6 @@ def _fit_part(part: Part, spec: Spec, rows: Rows, error: NDArray) -> tuple[Any, 
     alone = HybridModule(mechanical, [correction], torch.ones(1, dtype=torch.float64))
     with torch.no_grad():
         own = correction.module if isinstance(correction, TipCorrection) else None
-        own = own if isinstance(own, LeverageModule) else None
         correction.guard = fit_guard(spec.guard, alone.error_part(counted), own, counted)
     return fitted, correction
 
@@ -190,9 +183,7 @@ def _fit_part(part: Part, spec: Spec, rows: Rows, error: NDArray) -> tuple[Any, 
 def _fit_regressor(model: Any, rows: Rows, error: NDArray) -> Any:
     if isinstance(model, str):  # "kernel"
         model = tuned_kernel(rows.X, error, rows.counts, rows.groups)
-    given: dict[str, NDArray] = {}
-    if rows.weights is not None:
-        given["sample_weight"] = rows.weights
+    given = {} if rows.weights is None else {"sample_weight": rows.weights}
     if rows.groups is not None and has_fit_parameter(model, "groups"):
         given["groups"] = rows.groups
     regressor: Any = clone(model)
@@ -241,11 +232,8 @@ def _named(kind: str, mechanical: ForwardModel, q: Tensor) -> Features:
 def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, Pair | None]:
     params, alphas = model, None
     if isinstance(model, ELMRegressorCV):
-        params = ELMRegressor(
-            n_hidden=int(np.max(model.n_hidden)),
-            activation=model.activation,
-            random_state=model.random_state,
-        )
+        n_hidden, seed = int(np.max(model.n_hidden)), model.random_state
+        params = ELMRegressor(n_hidden, activation=model.activation, random_state=seed)
     elif np.ndim(model.alpha):
         raise ValueError(
             "`alpha` of the error model must be one number where it acts inside the robot, got "
@@ -254,7 +242,5 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
     else:
         alphas = float(model.alpha), float(model.alpha)
     layer = draw_layer(params, q.numpy(), None)
-    features = HiddenFeatures.of_range(
-        q, layer.input_weights, layer.input_bias, activation=layer.activation
-    )
-    return features, alphas
+    inner = layer.input_weights, layer.input_bias, layer.activation
+    return HiddenFeatures.of_range(q, *inner), alphas

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.model import PortableModule, reverse_jacobian
 from hybridkin._core.stored import Layout
 from hybridkin.learning.network import LeverageModule
-
-__all__ = ["GUARDS", "BoxGuard", "Guard", "LeverageGuard", "QuadraticLeverage", "fit_guard"]
 
 GUARDS = ("leverage", "box", None)
 _STILL = 1e-3  # of the largest spread: the log does not move in such a direction
@@ -30,7 +28,6 @@ class Guard(PortableModule):
     """
 
     MOST = 1.5
-    largest: Tensor
 
     def __init__(self, largest: Tensor) -> None:
         super().__init__()
@@ -111,7 +108,6 @@ class LeverageGuard(Guard):
     """
 
     layout = Layout("leverage_guard", {"limit": "", "largest": ""}, parts=("model",))
-    limit: Tensor
 
     def __init__(self, model: LeverageModule, limit: Tensor, largest: Tensor) -> None:
         super().__init__(largest)
@@ -150,8 +146,6 @@ class BoxGuard(Guard):
     """
 
     layout = Layout("box_guard", {"low": "n", "high": "n", "largest": ""})
-    low: Tensor
-    high: Tensor
 
     def __init__(self, low: Tensor, high: Tensor, largest: Tensor) -> None:
         super().__init__(largest)
@@ -178,9 +172,6 @@ class QuadraticLeverage(LeverageModule):
     """
 
     layout = Layout("quadratic_leverage", {"center": "n", "half_width": "n", "factor": "ff"})
-    center: Tensor
-    half_width: Tensor
-    factor: Tensor
 
     def __init__(self, center: Tensor, half_width: Tensor, factor: Tensor) -> None:
         super().__init__()
@@ -216,7 +207,7 @@ class QuadraticLeverage(LeverageModule):
 
 
 def fit_guard(
-    kind: str | None, corrections: Tensor, model: LeverageModule | None, q: Tensor
+    kind: str | None, corrections: Tensor, model: nn.Module | None, q: Tensor
 ) -> Guard | None:
     """Return the guard of an error model trained on rows q (N, n).
 
@@ -226,8 +217,8 @@ def fit_guard(
         The guard.
     corrections : Tensor of shape (N, m)
         What the error model gives for these rows [m].
-    model : LeverageModule or None
-        The error model where it has a leverage of its own.
+    model : nn.Module or None
+        The error model, which may have a leverage of its own.
     q : Tensor of shape (N, n)
         The training rows.
     """
@@ -237,7 +228,7 @@ def fit_guard(
     if kind == "box":
         return BoxGuard(q.amin(0), q.amax(0), largest)
     with torch.no_grad():
-        if model is None or _unexcited(q).numel():
+        if not isinstance(model, LeverageModule) or _unexcited(q).numel():
             # Every configuration counts once, however often the log returns to it.
             model = QuadraticLeverage.fit(torch.unique(q, dim=0))
         return LeverageGuard.fit(model, q, largest)

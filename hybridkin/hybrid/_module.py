@@ -17,8 +17,6 @@ from hybridkin.hybrid._features import Readout
 from hybridkin.hybrid._guards import Guard, LeverageGuard
 from hybridkin.learning.regressor_modules import AffineModule
 
-__all__ = ["Correction", "HybridModule", "InnerCorrection", "TipCorrection"]
-
 _ROUNDING = 1e-7  # of weights that sum to one
 
 
@@ -48,6 +46,9 @@ class Fading(NamedTuple):
     slope: Tensor  # dg/dq, (k, 1, n)
 
 
+Guarded = tuple[Tensor, Tensor, Fading | None]  # a correction, its derivative, what fades
+
+
 class TipCorrection(PortableModule):
     """A learned correction at the tip, c(q) = eps(q).
 
@@ -72,9 +73,7 @@ class TipCorrection(PortableModule):
         """Return eps(q) at rows q (N, n), shape (N, m) [m]."""
         return self.module(q)
 
-    def guarded_and_jacobian(
-        self, q: Tensor, inside: Inside | None
-    ) -> tuple[Tensor, Tensor, Fading | None]:
+    def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
         """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and the rows that fade."""
         guard = self.guard
         if guard is None:
@@ -125,9 +124,7 @@ class InnerCorrection(PortableModule):
         assert inside is not None
         return self.mechanical.from_coordinates(inside.z + self.readout(q)) - inside.x
 
-    def guarded_and_jacobian(
-        self, q: Tensor, inside: Inside | None
-    ) -> tuple[Tensor, Tensor, Fading | None]:
+    def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
         """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and what fades.
 
         It is F(z + W phi) but for rows that fade or are too long: only these need df/dq.
@@ -174,7 +171,6 @@ class HybridModule(ForwardModel):
     """
 
     layout = Layout("hybrid_module", {"weights": "k"}, parts=("mechanical", "corrections", "drift"))
-    weights: Tensor
 
     def __init__(
         self,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -13,8 +11,6 @@ from hybridkin._core.model import PoseModel
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._module import HybridModule
-
-__all__ = ["PoseHybridModule", "PoseRows", "pose_errors"]
 
 
 class PoseHybridModule(HybridModule, PoseModel):
@@ -37,15 +33,12 @@ class PoseHybridModule(HybridModule, PoseModel):
 
     layout = HybridModule.layout._replace(kind="pose_hybrid_module")
     n_outputs = 3
+    mechanical: PoseModel  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def rows(self) -> HybridModule:
         """Return the same model with poses as rows of six numbers."""
         corrections = [correction for _, correction in self._parts()]
         return PoseRows(self.mechanical, corrections, self.weights, self.drift)
-
-    def error_part(self, q: Tensor) -> Tensor:
-        """Return (e_p, e_r), shape (..., 6) [m]."""
-        return super().error_part(q)
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
@@ -57,7 +50,7 @@ class PoseHybridModule(HybridModule, PoseModel):
         return T, J
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
-        return (self._pose_model(q) + self._learned(q, None)[:, :3],)
+        return (self.mechanical(q) + self._learned(q, None)[:, :3],)
 
     def _nothing(self, q: Tensor) -> Tensor:
         return q.new_zeros(len(q), 6)
@@ -66,28 +59,24 @@ class PoseHybridModule(HybridModule, PoseModel):
         return self._added((self._nothing(q), q.new_zeros(len(q), 6, q.shape[1])), q, None)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        x, J = self._pose_model.forward_and_jacobian(q)
+        x, J = self.mechanical.forward_and_jacobian(q)
         error, slope = self._learned_and_jacobian(q)
         return x + error[:, :3], J + slope[:, :3]
 
     def _pose(self, q: Tensor) -> tuple[Tensor]:
         error = self._learned(q, None)
-        turn = rotation(error[:, 3:] / reach_of(self._pose_model))[0]
-        return (_moved(self._pose_model.pose(q), error[:, :3], turn),)
+        turn = rotation(error[:, 3:] / reach_of(self.mechanical))[0]
+        return (_moved(self.mechanical.pose(q), error[:, :3], turn),)
 
     def _pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        T, J = self._pose_model.pose_and_jacobian(q)
+        T, J = self.mechanical.pose_and_jacobian(q)
         error, slope = self._learned_and_jacobian(q)
-        reach = reach_of(self._pose_model)
+        reach = reach_of(self.mechanical)
         turn, left = rotation(error[:, 3:] / reach)
         # exp(phi) R_mech has the angular velocity J_l(phi) dphi/dq + exp(phi) omega_mech.
         angular = left @ (slope[:, 3:] / reach) + turn @ J[:, 3:]
         J = torch.cat([J[:, :3] + slope[:, :3], angular], dim=-2)
         return _moved(T, error[:, :3], turn), J
-
-    @property
-    def _pose_model(self) -> PoseModel:
-        return cast(PoseModel, self.mechanical)
 
 
 class PoseRows(PoseHybridModule):
@@ -101,12 +90,12 @@ class PoseRows(PoseHybridModule):
 
     def mechanical_part(self, q: Tensor) -> Tensor:
         """Return positions and rotation vectors of the mechanical model, shape (..., 6)."""
-        return _rows(self._pose_model.pose(q))
+        return _rows(self.mechanical.pose(q))
 
     def error_part(self, q: Tensor) -> Tensor:
         """Return the way [m] and the rotation vector [rad] from there to the hybrid's pose."""
         error = super().error_part(q)
-        return torch.cat([error[..., :3], error[..., 3:] / reach_of(self._pose_model)], dim=-1)
+        return torch.cat([error[..., :3], error[..., 3:] / reach_of(self.mechanical)], dim=-1)
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         return (_rows(self._pose(q)[0]),)

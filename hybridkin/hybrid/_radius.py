@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold, KFold
 
-from hybridkin.hybrid._fit import Rows, Spec
+from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid
 from hybridkin.hybrid._kernel import distance
-from hybridkin.hybrid._selection import fit_selected
+from hybridkin.hybrid._selection import choose_mechanics, select
 
 _FOLDS = 5
 
@@ -51,7 +51,9 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> Radius:
     splitter = KFold(n_folds, shuffle=True, random_state=0) if groups is None else None
     trust, errors, mechanical = (np.full(len(y), np.nan) for _ in range(3))
     for train, test in (splitter or GroupKFold(n_folds)).split(X, y, groups):
-        module = fit_selected(spec, rows.take(train)).module
+        part = rows.take(train)
+        chosen = spec if spec.parts else select(choose_mechanics(spec, part), part)[0]
+        module = fit_hybrid(chosen, part).module
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():
             trust[test] = module.error_weight(q).numpy()
@@ -59,9 +61,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> Radius:
             mechanical[test] = distance(module.mechanical_part(q).numpy(), y[test])
     trusted = weights * (trust >= 0.5)
     inside = _rms(errors, trusted if trusted.any() else weights)
-    outside = inside
-    if spec.mechanical is not None:
-        outside = max(inside, _rms(mechanical, weights))
+    outside = inside if spec.mechanical is None else max(inside, _rms(mechanical, weights))
     relative = errors / (trust * inside + (1.0 - trust) * outside)
     factor = _quantile(relative, weights, coverage)
     return Radius(factor * inside, factor * outside, coverage, len(y))

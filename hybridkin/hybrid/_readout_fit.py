@@ -25,8 +25,6 @@ from hybridkin.hybrid._linearised import (
     quasi_newton,
 )
 
-__all__ = ["ReadoutFit", "fit_readout"]
-
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
 _SETTLED = 1e-9  # of the gradient without a correction

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
@@ -17,21 +16,11 @@ from hybridkin._core.model import ForwardModel
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
-from hybridkin.hybrid._fit import (
-    FittedHybrid,
-    NamedFeatures,
-    Part,
-    Rows,
-    Spec,
-    calibrated,
-    fit_hybrid,
-)
+from hybridkin.hybrid._fit import NamedFeatures, Part, Rows, Spec, calibrated, fit_hybrid
 from hybridkin.hybrid._kernel import distance, folds_of
 from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
-
-__all__ = ["Mechanics", "choose_mechanics", "fit_selected", "select"]
 
 _PICKS = 10  # of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with their cube
@@ -52,7 +41,7 @@ class Mechanics(NamedTuple):
         weighed = rows._replace(weights=rows.counts, groups=None)
         for train, test in folds_of(rows.X, rows.groups):
             fitted = fit_hybrid(alone, weighed.take(train))
-            held_out[test] = distance(predicted(fitted, rows.X[test]), rows.tips[test])
+            held_out[test] = distance(fitted.predict(rows.X[test]), rows.tips[test])
             chains.append(fitted.mechanical)
         score = float(np.average(held_out, weights=rows.counts))
         return cls(spec, chains, {type(spec.mechanical).__name__: score})
@@ -67,13 +56,6 @@ def choose_mechanics(spec: Spec, rows: Rows) -> Mechanics:
     tried = [Mechanics.of(one, rows) for one in _rivals(spec, rows)]
     scores = {name: score for one in tried for name, score in one.scores.items()}
     return min(tried, key=lambda one: min(one.scores.values()))._replace(scores=scores)
-
-
-def fit_selected(spec: Spec, rows: Rows) -> FittedHybrid:
-    """Return the fit of a specification, after the choice of what it leaves open."""
-    if not spec.parts:
-        spec, _ = select(choose_mechanics(spec, rows), rows)
-    return fit_hybrid(spec, rows)
 
 
 def select(mechanics: Mechanics, rows: Rows) -> tuple[Spec, dict[str, Any]]:
@@ -117,19 +99,13 @@ def select(mechanics: Mechanics, rows: Rows) -> tuple[Spec, dict[str, Any]]:
         settled.append(part)
         for (train, test), chain in zip(folds, mechanics.chains, strict=True):
             alone = replace(spec, mechanical=chain, parts=(part,))
-            held_out[i, test] = predicted(fit_hybrid(alone, weighed.take(train)), rows.X[test])
+            held_out[i, test] = fit_hybrid(alone, weighed.take(train)).predict(rows.X[test])
         seconds[i] = time.process_time() - start
     shares = _shares(held_out, y, counts)
     parts = [part._replace(weight=float(w)) for w, part in zip(shares, settled, strict=True)]
     results = _results([*candidates], held_out, shares, fold_of, rows)
     results |= {"seconds": seconds, "mechanical_model": mechanics.scores}
     return replace(spec, parts=tuple(part for part in parts if part.weight > 0.0)), results
-
-
-def predicted(fitted: FittedHybrid, X: NDArray) -> NDArray:
-    """Return the tips (N, m) that a fitted hybrid predicts [m]."""
-    with torch.no_grad():
-        return fitted.module.rows()(torch.from_numpy(X.astype(np.float64))).numpy()
 
 
 def _results(
@@ -139,19 +115,13 @@ def _results(
     y, counts = rows.tips, rows.counts
     # The blend is judged by weights that were chosen without the fold.
     blend = np.empty_like(y)
-    for fold in np.unique(fold_of):
-        test = fold_of == fold
+    tests = [fold_of == fold for fold in np.unique(fold_of)]
+    for test in tests:
         own = _shares(held_out[:, ~test], y[~test], counts[~test])
         blend[test] = np.tensordot(own, held_out[:, test], 1)
     distances = np.array([distance(x, y) for x in (*held_out, blend)])
-    tests = [fold_of == fold for fold in np.unique(fold_of)]
-    by_fold = np.array(
-        [
-            np.average(distances[:, test], axis=1, weights=counts[test])
-            for test in tests
-            if counts[test].any()
-        ]
-    ).T
+    kept = [test for test in tests if counts[test].any()]
+    by_fold = np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in kept]).T
     means = np.average(distances, axis=1, weights=counts)
     return {
         "candidate": [*names, "blend"],

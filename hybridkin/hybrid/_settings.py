@@ -17,11 +17,8 @@ from hybridkin.hybrid._guards import GUARDS
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
-__all__ = ["COUPLINGS", "FEATURES", "GUARDS", "check_settings", "resolved_error_model"]
-
 COUPLINGS = ("parallel", "serial")
-FEATURES = ("linear", "quadratic", "pose")
-"""Error models by the name of their features."""
+FEATURES = ("linear", "quadratic", "pose")  # error models by the name of their features
 _OUTPUTS = ("position", "pose")
 _REGRESSORS = ("elm", "kernel")
 _HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)  # whose features can act inside the robot
@@ -47,10 +44,8 @@ def check_settings(estimator: BaseEstimator) -> None:
         raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}.")
     wanted = model.calibrate
     if wanted != "default" and (isinstance(wanted, str) or not isinstance(wanted, Iterable)):
-        raise ValueError(
-            f'`calibrate` must be a sequence of names or "default", got {wanted!r}; for example '
-            '["radii", "base"].'
-        )
+        need = "a sequence of names, such as ['radii', 'base'], or 'default'"
+        raise ValueError(f"`calibrate` must be {need}, got {wanted!r}.")
     if isinstance(model.play, str) and model.play != "auto":
         raise ValueError(
             f"`play` must be a width, one per actuator, 'auto' or None, got {model.play!r}."

@@ -102,6 +102,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.error_model = _estimator(asked) if isinstance(asked, dict) else asked
     check_settings(model)
     model.module_ = restore(stored.part("module"))
+    if isinstance(model.module_, PoseHybridModule) != (model.output == "pose"):
+        raise ValueError(f"`output` {model.output!r} does not fit {stored.part('module').kind!r}")
     model.mechanical_model_ = model.module_.mechanical
     model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
     restore_columns(model, stored, n)
@@ -112,8 +114,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]))
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
-    model.calibration_, model.play_, model.radius_ = None, None, None
-    model._play_state = None
+    model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     if "play_width" in stored.arrays:
         one = stored.array("play_width").ndim == 0
         model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))

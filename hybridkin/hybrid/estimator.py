@@ -24,16 +24,8 @@ from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._selection import choose_mechanics, select
-from hybridkin.hybrid._settings import (
-    COUPLINGS,
-    FEATURES,
-    GUARDS,
-    check_settings,
-    resolved_error_model,
-)
+from hybridkin.hybrid._settings import check_settings, resolved_error_model
 from hybridkin.learning.elm import ELMRegressor
-
-__all__ = ["COUPLINGS", "FEATURES", "GUARDS", "HybridForwardModel"]
 
 _DTYPES = (np.float64, np.float32)
 
