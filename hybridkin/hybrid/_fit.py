@@ -120,11 +120,9 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     weights = tuple(part.weight for part in spec.parts)
     error_model = fits[0][0] if len(fits) == 1 else Blend(weights, tuple(one for one, _ in fits))
     shares = [w for w, (_, found) in zip(weights, fits, strict=True) if found is not None]
-    module = (PoseHybridModule if spec.output == "pose" else HybridModule)(
-        spec.mechanical,
-        [found for _, found in fits if found is not None],
-        torch.tensor(shares, dtype=torch.float64),
-    )
+    corrections = [found for _, found in fits if found is not None]
+    kind = PoseHybridModule if spec.output == "pose" else HybridModule
+    module = kind(spec.mechanical, corrections, torch.tensor(shares, dtype=torch.float64))
     return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
 
 
@@ -202,16 +200,10 @@ def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, counted: Ten
     else:
         features, alphas = _hidden(cast("ELMRegressor | ELMRegressorCV", model), counted)
         noise_ratio = inf
+    x = torch.from_numpy(rows.tips)
+    weight = None if rows.weights is None else torch.from_numpy(rows.weights)
     return fit_readout(
-        mechanical,
-        features,
-        rows.q,
-        torch.from_numpy(rows.tips),
-        coupling=part.coupling,
-        sample_weight=None if rows.weights is None else torch.from_numpy(rows.weights),
-        groups=rows.groups,
-        alphas=alphas,
-        noise_ratio=noise_ratio,
+        mechanical, features, rows.q, x, part.coupling, weight, rows.groups, alphas, noise_ratio
     )
 
 
@@ -222,9 +214,8 @@ def _named(kind: str, mechanical: ForwardModel, q: Tensor) -> Features:
         return QuadraticFeatures.of_range(q)
     if not isinstance(mechanical, ArcChain):
         raise TypeError(
-            f"`mechanical_model` must be a chain of arcs, a ConstantCurvatureChain or an "
-            f"ElasticTendonChain, with error_model='pose', got {type(mechanical).__name__}; use "
-            "error_model='quadratic'."
+            "`mechanical_model` must be a chain of arcs with error_model='pose', got "
+            f"{type(mechanical).__name__}; use error_model='quadratic'."
         )
     return PoseFeatures.of_range(q, mechanical)
 

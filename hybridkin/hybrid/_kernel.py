@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -13,10 +14,8 @@ _FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 _GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # over the mean variance of the inputs
 
-Folds = list[tuple[NDArray, NDArray]]
 
-
-def folds_of(X: NDArray, groups: NDArray | None) -> Folds:
+def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
     """Return training and held-out rows of 5 folds of groups, or of rows; 10 of a small log."""
     n_folds = _FOLDS if len(X) >= _FEW else _FOLDS_OF_FEW
     if groups is None:
@@ -45,19 +44,18 @@ def tuned_kernel(
     """
     folds = folds_of(X, groups)
     spread = X.var(axis=0).mean() or 1.0
-    totals: dict[tuple[int, int], float] = {}
 
     def ridge(at: tuple[int, int]) -> KernelRidge:
         gamma = _GAMMAS[at[0]] / spread
         return KernelRidge(kernel="rbf", gamma=gamma).set_params(alpha=_ALPHAS[at[1]])
 
+    @cache
     def held_out(at: tuple[int, int]) -> float:
-        if at not in totals:
-            totals[at] = 0.0
-            for train, test in folds:
-                fitted = ridge(at).fit(X[train], error[train], sample_weight=weights[train])
-                totals[at] += float(weights[test] @ distance(fitted.predict(X[test]), error[test]))
-        return totals[at]
+        total = 0.0
+        for train, test in folds:
+            fitted = ridge(at).fit(X[train], error[train], sample_weight=weights[train])
+            total += float(weights[test] @ distance(fitted.predict(X[test]), error[test]))
+        return total
 
     widths, penalties = range(len(_GAMMAS)), range(len(_ALPHAS))
     best, previous = min(product(widths[::2], penalties[1::2]), key=held_out), None

@@ -50,10 +50,6 @@ class Linearised:
         system.diagonal().add_(penalty[kept].repeat(len(self.gram)))
         return kept, torch.linalg.cholesky(system)
 
-    def solve(self, penalty: Tensor) -> Tensor:
-        """Return the optimal readout W (C, K)."""
-        return solve_kept(self.moment, *self.factor(penalty))
-
     def residual(self, readout: Tensor) -> Tensor:
         """Return y - J W phi, shape (N, m)."""
         return self.y - (self.J @ (self.phi @ readout.mT)[..., None])[..., 0]

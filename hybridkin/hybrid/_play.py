@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -66,18 +67,16 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     parts = np.arange(len(X)) * 10 // len(X) if groups is None else motions
     counted = rows.counts > 0
     names = np.unique(parts[counted])
-    tried: dict[float, NDArray] = {}
 
+    @cache
     def error_by_motion(width: float) -> NDArray:
-        if width not in tried:
-            effective = PlayOperator(width).apply_by_group(X, motions)
-            q = torch.from_numpy(effective.astype(np.float64))
-            error = residuals(spec.mechanical, q, y, spec.output)
-            network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
-            held_out = network.fit(effective, error, weights, parts).left_out_errors_
-            distance = np.linalg.norm(held_out.reshape(len(y), -1), axis=1)
-            tried[width] = np.array([distance[counted & (parts == a)].mean() for a in names])
-        return tried[width]
+        effective = PlayOperator(width).apply_by_group(X, motions)
+        q = torch.from_numpy(effective.astype(np.float64))
+        error = residuals(spec.mechanical, q, y, spec.output)
+        network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
+        held_out = network.fit(effective, error, weights, parts).left_out_errors_
+        distance = np.linalg.norm(held_out.reshape(len(y), -1), axis=1)
+        return np.array([distance[counted & (parts == a)].mean() for a in names])
 
     def mean_error(width: float) -> float:
         return float(error_by_motion(width).mean())

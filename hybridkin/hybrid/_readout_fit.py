@@ -14,16 +14,9 @@ from torch import Tensor
 
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Restore, Stored
+from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
-from hybridkin.hybrid._linearised import (
-    Linearised,
-    Pair,
-    basis,
-    choose,
-    members_of,
-    moment,
-    quasi_newton,
-)
+from hybridkin.hybrid._linearised import Linearised, Pair
 
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
@@ -77,8 +70,7 @@ class _AtTip(ForwardModel):
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         return self.model.forward_and_jacobian(q)
 
-    def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self.model.forward_and_jacobian(q)
+    coordinates = forward_and_jacobian
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
         return z, torch.eye(z.shape[1], dtype=z.dtype, device=z.device).expand(len(z), -1, -1)
@@ -89,7 +81,6 @@ def fit_readout(
     features: Features,
     q: Tensor,
     x: Tensor,
-    *,
     coupling: str = "serial",
     sample_weight: Tensor | None = None,
     groups: ArrayLike | None = None,
@@ -138,7 +129,8 @@ def fit_readout(
     q, x = q.detach().double(), x.detach().double()
     weight = torch.ones_like(q[:, 0]) if sample_weight is None else sample_weight.to(q)
     kept = weight > 0
-    members = None if groups is None else members_of(np.asarray(groups)[kept.cpu().numpy()])
+    counted = kept.numpy(force=True)
+    members = None if groups is None else _linearised.members_of(np.asarray(groups)[counted])
     model = mechanical if coupling == "serial" else _AtTip(mechanical)
     with torch.no_grad():
         problem = _Problem(model, features, q[kept], x[kept], weight[kept])
@@ -152,7 +144,7 @@ def fit_readout(
                 if problem.mean_distance(other.residual) < problem.mean_distance(found.residual):
                     found = other
     residual = np.full(x.shape, nan)
-    residual[kept.cpu().numpy()] = found.residual
+    residual[counted] = found.residual
     return found._replace(residual=residual)
 
 
@@ -163,9 +155,8 @@ def _chosen(
     weights, alphas, scores = problem.nothing, start, {}
     for _ in range(2):
         # Linearised without a correction first, then about the one found.
-        alphas, scores = choose(
-            partial(problem.score, problem.linearised(weights), members), alphas
-        )
+        score = partial(problem.score, problem.linearised(weights), members)
+        alphas, scores = _linearised.choose(score, alphas)
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
     assert alphas is not None
     found = _fitted(problem, members, alphas, weights)._replace(scores=scores)
@@ -206,7 +197,7 @@ class _Problem:
         self.units = torch.where(moves, 1.0 / torch.where(moves, moved, 1.0), 0.0)
         phi = features(q)
         most = max(_LARGEST // len(self.units) - features.n_linear, 0)
-        self.basis = basis(self.root * phi, features.n_linear, most)
+        self.basis = _linearised.basis(self.root * phi, features.n_linear, most)
         self.phi = phi @ self.basis
         self.nothing = phi.new_zeros(len(self.units), self.phi.shape[1])
 
@@ -290,7 +281,7 @@ class _Problem:
                 break
             if factor is None or k < _FACTORS or k % _REFRESH == 0:
                 factor, pairs = self.linearised(readout).factor(penalty), []
-            step = -quasi_newton(slope, pairs, factor)
+            step = -_linearised.quasi_newton(slope, pairs, factor)
             share, descent = 1.0, float((slope * step).sum())
             while share > 1e-6:  # a full step may overshoot where the tip curves away
                 tried = readout + share * step
@@ -324,5 +315,6 @@ class _Problem:
     ) -> tuple[float, Tensor]:
         """Return the objective and half its gradient (C, K)."""
         J, rest = self._about(readout)
-        slope = torch.where(taking_part, weight * readout - moment(J, rest, self.phi), 0.0)
+        slope = weight * readout - _linearised.moment(J, rest, self.phi)
+        slope = torch.where(taking_part, slope, 0.0)
         return float(rest.square().sum() + (weight * readout.square()).sum()), slope

@@ -21,7 +21,7 @@ COUPLINGS = ("parallel", "serial")
 FEATURES = ("linear", "quadratic", "pose")  # error models by the name of their features
 _OUTPUTS = ("position", "pose")
 _REGRESSORS = ("elm", "kernel")
-_HIDDEN_LAYERS = (ELMRegressor, ELMRegressorCV)  # whose features can act inside the robot
+_INSIDE = (str, type(None), ELMRegressor, ELMRegressorCV)  # may act inside the robot
 
 
 def resolved_error_model(error_model: Any, seed: int | np.random.RandomState | None) -> Any:
@@ -47,9 +47,7 @@ def check_settings(estimator: BaseEstimator) -> None:
         need = "a sequence of names, such as ['radii', 'base'], or 'default'"
         raise ValueError(f"`calibrate` must be {need}, got {wanted!r}.")
     if isinstance(model.play, str) and model.play != "auto":
-        raise ValueError(
-            f"`play` must be a width, one per actuator, 'auto' or None, got {model.play!r}."
-        )
+        raise ValueError(f"`play` must be a width or n widths, 'auto' or None, got {model.play!r}.")
     if model.output == "pose":
         _check_pose_settings(model)
     if isinstance(error_model, str) and error_model not in names:
@@ -57,11 +55,7 @@ def check_settings(estimator: BaseEstimator) -> None:
             f"`error_model` must be an estimator, None or one of {[*names]}, got {error_model!r}."
         )
     serial = model.coupling == "serial" and error_model != "drop"
-    if serial and not (
-        error_model is None
-        or isinstance(error_model, _HIDDEN_LAYERS)
-        or (isinstance(error_model, str) and error_model != "kernel")
-    ):
+    if serial and (not isinstance(error_model, _INSIDE) or error_model == "kernel"):
         raise TypeError(
             f"`error_model` must give features that can act inside the robot with "
             f"coupling='serial': None, one of {['elm', *FEATURES]}, an ELMRegressor or an "
