@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from sklearn.utils import Bunch
 
-from hybridkin import datasets, robots
 from hybridkin.calibration.calibrate import calibrate
+from hybridkin.chains import robots
+from hybridkin.datasets import paper_split
 from hybridkin.workflow.report import IDENTIFIED, Report, distance, geometry_entries
 
 ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
@@ -38,7 +39,7 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
         that is not identified), and "rmse", "test" and "test_max", tip errors on the training rows
         and on the test rows [m].
     """
-    train, test = datasets.paper_split(data, split)
+    train, test = paper_split(data, split)
     chain = robots.bionic_handling_assistant()
     n_random = int((data.part[train] == 3).sum())
     found: dict[str, Any] = {"n_train": len(train), "n_random": n_random}
@@ -60,12 +61,13 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
     """Add what `identifiability` found to a report."""
     report.record["identifiability"] = found
     asked, fewer, default = (found[label] for label in ("asked", "identifiable", "default"))
+    n = sum(entry["identified"] for entry in asked["entries"])
     report.text(
         "## Which geometry the samples identify",
         f"All of {', '.join(ASKED)} at once, from the {found['n_train']} training rows of one "
         f"split of the **simulated** data: {found['n_single']} rows of one segment moving alone "
         f"and {found['n_random']} fully random ones. Identified means that the rows narrow the "
-        f"prior at least {IDENTIFIED:.0f} times: {sum(e['identified'] for e in asked['entries'])} of "
+        f"prior at least {IDENTIFIED:.0f} times: {n} of "
         f"{len(asked['entries'])} parameters. The others stay near the published geometry. The "
         "base is given by its rotation from the start and its position.",
     )

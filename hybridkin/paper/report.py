@@ -8,10 +8,12 @@ import numpy as np
 import torch
 from sklearn.utils import Bunch
 
-from hybridkin import datasets, plots, robots
+from hybridkin.chains import robots
+from hybridkin.datasets import load_trunk, paper_split
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.paper import tables, tracks
 from hybridkin.paper.identifiability import identifiability, write_identifiability
+from hybridkin.plots import ErrorHistogramDisplay, WorkspaceDisplay, new_figure
 from hybridkin.simulation import TrunkPlant
 from hybridkin.workflow.report import Progress, Report, check_out, distance, quiet
 
@@ -45,9 +47,9 @@ def run_paper(
     """
     check_out(out)
     TrunkPlant()  # fails at once, with advice, where MuJoCo is missing
-    data = datasets.load_trunk()
+    data = load_trunk()
     table = tables.table1(data, n_splits, n_seeds, n_jobs=n_jobs, progress=progress)
-    train, _ = datasets.paper_split(data, 0)
+    train, _ = paper_split(data, 0)
     models = tracks.tracked_models(data.q[train], data.x[train])
     modules = {name: model.module_ for name, model in models.items()}
     paths, plant = tracks.paper_paths(n_points), data.parameters["plant"]
@@ -87,13 +89,13 @@ def _write_errors(report: Report, data: Bunch, models: dict[str, HybridForwardMo
         f"{100 * errors[mechanical].max():.1f} cm (paper: 2.5 and 9.3). The hybrid model was "
         "trained on 1900 of these rows.",
     )
-    figure, ax = plots.new_figure(5.5, 3.4)
+    figure, ax = new_figure(5.5, 3.4)
     shown = {name: errors[name] for name in (mechanical, "hybrid on nominal")}
-    plots.ErrorHistogramDisplay(shown).plot(ax)
+    ErrorHistogramDisplay(shown).plot(ax)
     report.figure("error_histogram", figure, "Tip errors over all rows (Fig. 2, right).")
     row = int(np.argsort(errors[mechanical])[int(0.95 * len(data.q))])
     chain = robots.bionic_handling_assistant()
     backbone = chain.backbone(torch.from_numpy(data.q[row])).numpy()
-    figure, ax = plots.new_figure(6.0, 5.0, subplot_kw={"projection": "3d"})
-    plots.WorkspaceDisplay(data.x, predictions[mechanical], backbone, row).plot(ax)
+    figure, ax = new_figure(6.0, 5.0, subplot_kw={"projection": "3d"})
+    WorkspaceDisplay(data.x, predictions[mechanical], backbone, row).plot(ax)
     report.figure("workspace", figure, "Measured tips, error of the nominal model (Fig. 2, left).")

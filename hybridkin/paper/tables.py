@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from sklearn.utils import Bunch
 from threadpoolctl import threadpool_limits
 
-from hybridkin import datasets, plots, robots
 from hybridkin.calibration.calibrate import calibrate
+from hybridkin.chains import robots
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.datasets import paper_split
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
+from hybridkin.plots import new_figure
 from hybridkin.workflow.report import Progress, Report, distance, linear, quadratic, quiet
 
 PAPER_TABLE_1 = {
@@ -110,7 +112,7 @@ def _one_split(
     q: NDArray, x: NDArray, part: NDArray, split: int, n_seeds: int
 ) -> dict[tuple[str, str], list[tuple[NDArray, NDArray]]]:
     """Return (train, test) errors by model and learner, one pair per network seed."""
-    train, test = datasets.paper_split(part, split)
+    train, test = paper_split(part, split)
     errors: dict[tuple[str, str], list[tuple[NDArray, NDArray]]] = {}
 
     def record(model: str, learner: str, estimator: HybridForwardModel) -> None:
@@ -165,7 +167,7 @@ def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
         cells = [cell(entry["train"]), paper[0], cell(entry["test"]), paper[1], *spread]
         rows.append([entry["model"], entry["learner"], *cells])
     report.table([*header, "± test sets", "± hidden layers"], rows)
-    figure, ax = plots.new_figure(7.0, 3.6)
+    figure, ax = new_figure(7.0, 3.6)
     names = [f"{e['model']}, {e['learner']}".removesuffix(", -") for e in table]
     means, spreads = (100 * np.array([e["test"][key] for e in table]) for key in ("mean", "std"))
     places = np.arange(len(table))[::-1]

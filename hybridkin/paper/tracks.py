@@ -10,14 +10,16 @@ from joblib import delayed
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from hybridkin import plots, robots, trajectories
 from hybridkin._core.model import ForwardModel
+from hybridkin.chains import robots
 from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.ik import trajectories
 from hybridkin.ik.results import Track
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.paper.tables import PAPER_ELM, cell, chains_of, run_all
+from hybridkin.plots import ActuatorDisplay, ErrorBoxDisplay, TrackingDisplay, new_figure
 from hybridkin.simulation import TrunkPlant
 from hybridkin.workflow.report import Progress, Report, quiet
 
@@ -149,18 +151,18 @@ def write_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Trac
 
 def _draw_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Tracks) -> None:
     shown = ("mechanical, nominal", "hybrid on nominal")
-    figure, axes = plots.new_figure(8.0, 6.4, 2, 2)
+    figure, axes = new_figure(8.0, 6.4, 2, 2)
     for column, (label, path) in zip(axes.T, paths.items(), strict=True):
         reached = {name: tracks[label][name].x_measured for name in shown}
-        plots.TrackingDisplay(path.x, reached).plot(column[0]).plot_time(column[1])
+        TrackingDisplay(path.x, reached).plot(column[0]).plot_time(column[1])
         column[0].set_title(label)
     report.figure("tracking", figure, "Targets (black) and reached tips (Fig. 3).")
-    figure, ax = plots.new_figure(6.0, 3.0)
-    plots.ErrorBoxDisplay({f"{p}, {n}": tracks[p][n].error for p in tracks for n in shown}).plot(ax)
+    figure, ax = new_figure(6.0, 3.0)
+    ErrorBoxDisplay({f"{p}, {n}": tracks[p][n].error for p in tracks for n in shown}).plot(ax)
     report.figure("tracking_error", figure, "Tracking error on the simulated trunk (Fig. 4, left).")
-    figure, axes = plots.new_figure(6.0, 5.0, 3, 1, sharex=True)
+    figure, axes = new_figure(6.0, 5.0, 3, 1, sharex=True)
     commanded = {name: tracks["figure eight"][name].q for name in shown}
-    plots.ActuatorDisplay(commanded, (3, 3, 3)).plot(axes)
+    ActuatorDisplay(commanded, (3, 3, 3)).plot(axes)
     report.figure("configurations", figure, "Chamber lengths on the figure eight (Fig. 4, right).")
 
 

@@ -15,8 +15,6 @@ _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
 _MARKERS = {"o": ("circle", 5), "x": ("x", 4), ".": ("circle", 3)}
 _FAR = 1.6  # the eye from the scene's middle, in longest sides of the scene
 
-Numbers = list[float | None]
-
 
 def page(
     scene: Scene,
@@ -93,14 +91,12 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
     frame = {"duration": 1000.0 / fps, "redraw": True}
     play = {**at_once, "frame": frame, "fromcurrent": True}
     jump = {**at_once, "frame": {**frame, "duration": 0}}
-    buttons = [
-        {"label": "Play", "method": "animate", "args": [None, play]},
-        {"label": "Pause", "method": "animate", "args": [[None], jump]},
-    ]
-    steps = [
-        {"label": caption, "method": "animate", "args": [[str(k)], jump]}
-        for k, caption in enumerate(scene.captions)
-    ]
+
+    def animate(label: str, *args: Any) -> dict[str, Any]:
+        return {"label": label, "method": "animate", "args": [*args]}
+
+    buttons = [animate("Play", None, play), animate("Pause", [None], jump)]
+    steps = [animate(caption, [str(k)], jump) for k, caption in enumerate(scene.captions)]
     slider = {
         **{"steps": steps, "x": 0.14, "len": 0.84, "y": 0.0, "pad": {"t": 30}, "ticklen": 0},
         "minorticklen": 0,
@@ -111,11 +107,9 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
         **{"type": "buttons", "direction": "left", "buttons": buttons, "showactive": False},
         **{"x": 0.0, "xanchor": "left", "y": 0.0, "yanchor": "top", "pad": {"t": 40}},
     }
-    corners = zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True)
-    axes = {
-        f"{letter}axis": {"title": {"text": f"{letter} [{scene.unit}]"}, "range": [low, high]}
-        for letter, low, high in corners
-    }
+    axes = {}
+    for letter, *corners in zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True):
+        axes[f"{letter}axis"] = {"title": {"text": f"{letter} [{scene.unit}]"}, "range": corners}
     width = 1.0 if scene.error is None else 0.66
     sides = (scene.high - scene.low) / (scene.high - scene.low).max()
     up, around = np.radians(view)
@@ -142,10 +136,10 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
     return layout
 
 
-def _xyz(points: NDArray, digits: int) -> dict[str, Numbers]:
+def _xyz(points: NDArray, digits: int) -> dict[str, list[float | None]]:
     return {letter: _numbers(points[:, i], digits) for i, letter in enumerate("xyz")}
 
 
-def _numbers(values: NDArray, digits: int) -> Numbers:
+def _numbers(values: NDArray, digits: int) -> list[float | None]:
     """Return rounded numbers, None for what is not known."""
     return [v if np.isfinite(v) else None for v in values.round(digits).tolist()]

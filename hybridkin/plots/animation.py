@@ -20,8 +20,6 @@ from hybridkin.plots._page import page
 from hybridkin.plots._scene import Line, Scene, Stage
 from hybridkin.plots.space import BackboneDisplay
 
-__all__ = ["TrackAnimation"]
-
 _FORMATS = (".mp4", ".gif", ".html")
 _PACE = 20.0  # frames per second without times
 _SIZE = (9.0, 4.5)  # [inch]

@@ -12,8 +12,6 @@ from typing_extensions import Self
 from hybridkin.plots._arrays import distance, named, plain, positions
 from hybridkin.plots._canvas import COLORS, Display, axes_or_new, look_of, scale_of
 
-__all__ = ["ErrorBoxDisplay", "ErrorHistogramDisplay"]
-
 
 class _ErrorDisplay(Display):
     """Tip errors by model, however they are drawn."""

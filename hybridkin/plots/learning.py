@@ -18,8 +18,6 @@ from hybridkin.plots._arrays import distance, named, plain, positions
 from hybridkin.plots._canvas import COLORS, MARKERS, STYLES, Display, axes_or_new, scale_of
 from hybridkin.plots._models import Predictor, predicted
 
-__all__ = ["LearningCurveDisplay"]
-
 _MOST_TICKS = 8
 
 

@@ -16,8 +16,6 @@ from hybridkin.plots._canvas import COLORS, Display, label_space, scale_of, spac
 from hybridkin.plots._models import Model, body_of
 from hybridkin.plots._scene import Line
 
-__all__ = ["BackboneDisplay", "WorkspaceDisplay"]
-
 _BODY = "#404040"
 # Of the segments' actuators: dark and light take turns, for prints without colour.
 _SEGMENTS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")

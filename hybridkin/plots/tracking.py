@@ -22,8 +22,6 @@ from hybridkin.plots._canvas import (
     steps_of,
 )
 
-__all__ = ["ActuatorDisplay", "TrackingDisplay"]
-
 _ACTUATOR_UNITS = {**LENGTHS, "rad": 1.0, "deg": 180.0 / np.pi}
 _PLANES = ("xy", "xz", "yx", "yz", "zx", "zy")
 

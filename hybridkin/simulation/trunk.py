@@ -13,8 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from hybridkin.simulation._mjcf import REST_LENGTH, TIME_STEP, trunk_mjcf
 
-__all__ = ["NotSettledError", "TrunkPlant"]
-
 # What "settled" means, and the hold over which it is checked with the length servos on.
 MAX_LENGTH_ERROR = 1e-5  # [m]
 MAX_SPEED = 1e-4  # of the tip [m/s]
@@ -160,7 +158,7 @@ class TrunkPlant:
         # A state is the joint positions and the forces of the nine chambers.
         self._n_dof = self._model.nv
         straight, lengths = np.zeros(self._n_dof + 9), np.full(9, REST_LENGTH)
-        self._rest, _ = self._equilibrium(straight, lengths, _Budget(self._max_iter))
+        self._rest, _ = self._equilibrium(straight, lengths, iter(range(self._max_iter)))
         self.reset()
 
     def reset(self) -> None:
@@ -214,7 +212,7 @@ class TrunkPlant:
             If the trunk did not come to rest at a stable shape.
         """
         target = self._check_lengths(q_target)
-        state, held = self._equilibrium(self._rest, target, _Budget(self._max_iter))
+        state, held = self._equilibrium(self._rest, target, iter(range(self._max_iter)))
         self._check_stable(state, held)
         lengths, T_base_tip = self._hold(state, target, held)
         rng = self._rng if random_state is None else np.random.default_rng(random_state)
@@ -273,7 +271,11 @@ class TrunkPlant:
             gap = np.where(held, lengths - target, 0.0)
             if np.abs(forces).max() < FORCE_TOL and np.abs(gap).max() < LENGTH_TOL:
                 return state
-            budget.spend()
+            if next(budget, None) is None:
+                raise NotSettledError(
+                    f"Not settled: no equilibrium within max_iter={self._max_iter} Newton "
+                    "iterations; raise `max_iter`."
+                )
             stiffness, jacobian = self._derivatives(state, forces, lengths)
             kkt = np.zeros((n + 9, n + 9))
             kkt[:n, :n] = stiffness
@@ -293,9 +295,8 @@ class TrunkPlant:
         begin, done, fraction = self._forces(state)[1], 0.0, 1.0
         while done < 1.0:
             fraction = min(fraction, 1.0 - done)
-            reached = self._newton(
-                state, begin + (done + fraction) * (target - begin), held, budget
-            )
+            next_target = begin + (done + fraction) * (target - begin)
+            reached = self._newton(state, next_target, held, budget)
             if reached is not None:
                 state, done = reached, done + fraction
                 continue
@@ -376,18 +377,3 @@ def _check_number(name: str, value: Any) -> None:
     if not enough or (value == 0 and name not in _MAY_BE_ZERO):
         sign = ">=" if name in _MAY_BE_ZERO else ">"
         raise ValueError(f"`{name}` must be a finite number {sign} {low:g}, got {value!r}.")
-
-
-class _Budget:
-    """Newton iterations left to one settling."""
-
-    def __init__(self, n_iter):
-        self.n_iter = self.left = n_iter
-
-    def spend(self):
-        if self.left == 0:
-            raise NotSettledError(
-                f"Not settled: no equilibrium within max_iter={self.n_iter} Newton iterations; "
-                "raise `max_iter`."
-            )
-        self.left -= 1

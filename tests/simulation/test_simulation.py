@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hybridkin import ConstantCurvatureChain
 from hybridkin.simulation import NotSettledError, TrunkPlant
 from hybridkin.simulation._mjcf import RADII, TIME_STEP
-from hybridkin.simulation.trunk import SERVO_GAINS, _Budget
+from hybridkin.simulation.trunk import SERVO_GAINS
 
 mujoco = pytest.importorskip("mujoco", reason="the simulated trunk needs hybridkin[sim]")
 
@@ -138,8 +138,8 @@ def test_lengths_reach_the_command_and_the_pose_is_rigid(plant, working):
 def test_start_shape_does_not_matter(plant, working):
     state = plant._rest
     for q_target in working:
-        cold = plant._equilibrium(plant._rest, q_target, _Budget(200))[0]
-        state = plant._equilibrium(state, q_target, _Budget(200))[0]  # from the last shape
+        cold = plant._equilibrium(plant._rest, q_target, iter(range(200)))[0]
+        state = plant._equilibrium(state, q_target, iter(range(200)))[0]  # from the last shape
         tips = [plant._hold(s, q_target, np.ones(9, dtype=bool))[1][:3, 3] for s in (cold, state)]
         assert_allclose(*tips, atol=1e-7)
 
@@ -195,7 +195,7 @@ def test_noise_has_the_stated_standard_deviation(monkeypatch, working):
     noisy = TrunkPlant(cable_noise=2e-3, mocap_noise=1e-3, random_state=0)
     clean_q, clean_pose = TrunkPlant().settle(working[0])
     # The shape is the same each time: settle once, measure often.
-    state = noisy._equilibrium(noisy._rest, working[0], _Budget(200))
+    state = noisy._equilibrium(noisy._rest, working[0], iter(range(200)))
     held_result = noisy._hold(state[0], working[0], state[1])
     monkeypatch.setattr(noisy, "_equilibrium", lambda *_: state)
     monkeypatch.setattr(noisy, "_check_stable", lambda *_: None)
@@ -244,7 +244,7 @@ def test_a_trunk_that_moves_is_not_settled(plant, working, monkeypatch, limit, m
     module = importlib.import_module("hybridkin.simulation.trunk")
     for name in ("MAX_SPEED", "MAX_DRIFT", "MAX_LENGTH_ERROR"):
         monkeypatch.setattr(module, name, np.inf if name != limit else getattr(module, name))
-    state, held = plant._equilibrium(plant._rest, working[0], _Budget(200))
+    state, held = plant._equilibrium(plant._rest, working[0], iter(range(200)))
     plant._hold(state, working[0], held)  # at rest all is well
     state = state.copy()
     state[0] += 1e-2
