@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hybridkin._core.version import __version__
+
 if TYPE_CHECKING:
     from hybridkin import datasets, paper, plots, simulation, workflow
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
     from hybridkin.learning.elm import ELMRegressor
     from hybridkin.learning.elm_cv import ELMRegressorCV
     from hybridkin.saving.saved_model import load_model, save_model
-
-__version__ = "0.1.0"
 
 __all__ = [
     "CalibrationResult",

@@ -76,9 +76,6 @@ class ConstantCurvatureChain(ArcChain):
     layout = Layout("constant_curvature", dict.fromkeys(_entries, ""), STRUCTURE)
 
     lengths: Tensor | None
-    actuator_zeros: Tensor
-    arc_matrix: Tensor
-    arc_offset: Tensor
 
     def __init__(
         self,

@@ -106,11 +106,6 @@ class ElasticTendonChain(ArcChain):
     layout = Layout("elastic_tendons", dict.fromkeys(_entries, ""), STRUCTURE)
     _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
 
-    lengths: Tensor
-    bending_stiffness: Tensor
-    axial_stiffness: Tensor
-    tendon_zeros: Tensor
-
     def __init__(
         self,
         radii: Numbers,

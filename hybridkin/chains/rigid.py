@@ -80,16 +80,6 @@ class RigidChain(Chain):
     _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "base")
     layout = Layout("rigid", dict.fromkeys(_arrays, ""), {"kinds": list, "names": list})
 
-    origins: Tensor
-    axes: Tensor
-    q_min: Tensor
-    q_max: Tensor
-    tip: Tensor
-    tool: Tensor
-    slides: Tensor
-    motions: Tensor
-    carriers: Tensor
-
     def __init__(
         self,
         origins: Numbers,

@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     if arguments.json:
         written = {"written": [str(path) for path in outcome.paths]} if outcome.paths else {}
-        print(hybridkin.workflow.report.json_text({**outcome.record, **written}))
+        print(hybridkin.workflow.json_text({**outcome.record, **written}))
         return outcome.code
     print(outcome.text)
     if outcome.paths:

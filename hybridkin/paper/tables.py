@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from hybridkin.calibration.calibrate import calibrate
 from hybridkin.chains import robots
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
@@ -133,7 +133,7 @@ def _one_split(
     return errors
 
 
-def chains_of(q: NDArray, x: NDArray) -> dict[str, ConstantCurvatureChain]:
+def chains_of(q: NDArray, x: NDArray) -> dict[str, Chain]:
     """Return the published mechanical model, and the same with radii and base from the rows."""
     nominal = robots.bionic_handling_assistant()
     return {"nominal": nominal, "calibrated": calibrate(nominal, q, x).chain}

@@ -153,7 +153,7 @@ def _draw_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Trac
     shown = ("mechanical, nominal", "hybrid on nominal")
     figure, axes = new_figure(8.0, 6.4, 2, 2)
     for column, (label, path) in zip(axes.T, paths.items(), strict=True):
-        reached = {name: tracks[label][name].x_measured for name in shown}
+        reached = {name: np.asarray(tracks[label][name].x_measured) for name in shown}
         TrackingDisplay(path.x, reached).plot(column[0]).plot_time(column[1])
         column[0].set_title(label)
     report.figure("tracking", figure, "Targets (black) and reached tips (Fig. 3).")

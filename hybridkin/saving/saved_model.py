@@ -13,9 +13,9 @@ import numpy as np
 import sklearn
 import torch
 
-from hybridkin import __version__
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import plain
+from hybridkin._core.version import __version__
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.rigid import RigidChain
 from hybridkin.hybrid.description import hybrid_of, restorer, stored_hybrid, training_of

@@ -7,7 +7,7 @@ from hybridkin.workflow.fit import Comparison, FitSettings, compare_by_group, fi
 from hybridkin.workflow.log import LogError, MeasuredLog, read_log
 from hybridkin.workflow.model import LoadedModel, open_model
 from hybridkin.workflow.path import read_path, shape_path
-from hybridkin.workflow.report import Report
+from hybridkin.workflow.report import Report, json_text
 from hybridkin.workflow.track import animate_track, track_path
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "describe",
     "evaluate_log",
     "fit_log",
+    "json_text",
     "open_model",
     "path_limits",
     "read_log",

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import plots
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.plots import ErrorBoxDisplay, ErrorHistogramDisplay, new_figure
 from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries, millimetres, statistics
 
@@ -64,13 +64,13 @@ def write_comparison(
 
 
 def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, str]) -> None:
-    figure, ax = plots.new_figure(7.0, 3.9)
-    plots.ErrorBoxDisplay(errors).plot(ax, unit="mm")
+    figure, ax = new_figure(7.0, 3.9)
+    ErrorBoxDisplay(errors).plot(ax, unit="mm")
     ax.set_xlim(0.0, 1100 * float(np.percentile(errors["mechanical, nominal"], 99)))
     caption = "Tip error on held-out motions: quartiles, 5 and 95 %; larger errors beyond the axis."
     report.figure("held_out", figure, caption)
-    figure, ax = plots.new_figure(5.5, 3.4)
-    plots.ErrorHistogramDisplay({name: errors[name] for name in shown}).plot(ax, unit="mm")
+    figure, ax = new_figure(5.5, 3.4)
+    ErrorHistogramDisplay({name: errors[name] for name in shown}).plot(ax, unit="mm")
     ax.set(ylabel="rows")
     report.figure("error_histogram", figure, "Tip errors on held-out motions.")
 

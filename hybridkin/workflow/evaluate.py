@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import datasets, plots
+from hybridkin.datasets import Log
+from hybridkin.plots import BackboneDisplay, ErrorHistogramDisplay, WorkspaceDisplay, new_figure
 from hybridkin.workflow._fit_report import write_check
 from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.model import LoadedModel
@@ -19,7 +20,7 @@ _SHARES = ("share_in_domain", "share_in_radius")
 
 def evaluate_log(
     loaded: LoadedModel,
-    log: datasets.Log,
+    log: Log,
     out: str | Path | None = None,
     *,
     force: bool = False,
@@ -113,14 +114,14 @@ def _add_figures(
     errors: NDArray,
     motion: NDArray,
 ) -> None:
-    figure, ax = plots.new_figure(6.0, 3.6)
-    plots.ErrorHistogramDisplay({loaded.name: errors}).plot(ax, unit="mm")
+    figure, ax = new_figure(6.0, 3.6)
+    ErrorHistogramDisplay({loaded.name: errors}).plot(ax, unit="mm")
     ax.set(ylabel="rows")
     report.figure("error_histogram", figure, "Tip errors of all rows.")
-    figure, ax = plots.new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
+    figure, ax = new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
     row, body = int(np.argsort(errors)[int(0.95 * len(errors))]), None
     if loaded.chain is not None:
         q = loaded.effective(log.q, motion)[row]
-        body = plots.BackboneDisplay.from_estimator(loaded.chain, q).points[0]
-    plots.WorkspaceDisplay(log.x, predicted, body, row).plot(ax, unit="mm")
+        body = BackboneDisplay.from_estimator(loaded.chain, q).points[0]
+    WorkspaceDisplay(log.x, predicted, body, row).plot(ax, unit="mm")
     report.figure("workspace", figure, "Measured tips, coloured by the model's error.")

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
-from hybridkin import datasets, robots
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.saving.saved_model import save_model
@@ -167,7 +168,7 @@ class _Rows(NamedTuple):
 
 
 def compare_by_group(
-    log: datasets.Log,
+    log: Log,
     robot: robots.RobotDescription,
     settings: FitSettings = FitSettings(),
     *,
@@ -220,7 +221,7 @@ def compare_by_group(
 
 
 def fit_log(
-    log: datasets.Log,
+    log: Log,
     robot: robots.RobotDescription,
     out: str | Path,
     settings: FitSettings = FitSettings(),

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import datasets, robots
+from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
+from hybridkin.datasets import Log, LogReport, check_log, load_log
 
 _BLOCKS = 10
 
@@ -25,7 +26,7 @@ class LogError(ValueError):
         What was found.
     """
 
-    def __init__(self, report: datasets.LogReport) -> None:
+    def __init__(self, report: LogReport) -> None:
         first = report.errors[0]
         more = f" ({len(report.errors) - 1} more above)" if len(report.errors) > 1 else ""
         super().__init__(f"the log did not pass its check: {first.message} {first.advice}{more}")
@@ -33,7 +34,7 @@ class LogError(ValueError):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MeasuredLog(datasets.Log):
+class MeasuredLog(Log):
     """A checked log in which every row belongs to a motion.
 
     Attributes
@@ -46,7 +47,7 @@ class MeasuredLog(datasets.Log):
         Patterns of the motions that were left out.
     """
 
-    report: datasets.LogReport
+    report: LogReport
     named: bool
     excluded: tuple[str, ...] = ()
 
@@ -129,7 +130,7 @@ def read_log(
     """
     columns = dict(vars(log_format))
     suffix = columns.pop("group_suffix")
-    log = datasets.load_log(path, **columns, delimiter=delimiter, drop_invalid=True)
+    log = load_log(path, **columns, delimiter=delimiter, drop_invalid=True)
     if log.groups is None and exclude:
         raise ValueError("`exclude` needs `groups`, the column that names the motions.")
     if log.groups is not None:
@@ -141,9 +142,7 @@ def read_log(
                 f"{len({*motions})}; keep some."
             )
         log = replace(log, groups=np.array(motions)).rows(kept)
-    report = datasets.check_log(
-        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
-    )
+    report = check_log(log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid)
     measured = _with_motions(log, report, tuple(exclude))
     if drop_frozen:
         frozen = [f.rows for f in report.findings if f.kind == "frozen tip"]
@@ -152,16 +151,14 @@ def read_log(
     return measured
 
 
-def checked(log: datasets.Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
+def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
     """Return a log with its check and its motions, itself where it has them already."""
     if isinstance(log, MeasuredLog):
         return log
-    return _with_motions(log, datasets.check_log(log, chain=chain, base_is_free=base_is_free))
+    return _with_motions(log, check_log(log, chain=chain, base_is_free=base_is_free))
 
 
-def _with_motions(
-    log: datasets.Log, report: datasets.LogReport, excluded: tuple[str, ...] = ()
-) -> MeasuredLog:
+def _with_motions(log: Log, report: LogReport, excluded: tuple[str, ...] = ()) -> MeasuredLog:
     named, n, columns = log.groups is not None, len(log.q), dict(vars(log))
     if not named:
         columns["groups"] = np.arange(n) * _BLOCKS // n

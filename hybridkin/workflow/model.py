@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin import robots
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid.estimator import HybridForwardModel

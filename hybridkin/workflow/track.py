@@ -15,12 +15,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin import datasets, plots, robots
 from hybridkin._core.units import METRES
+from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.datasets import load_log
 from hybridkin.ik.results import IKStatus, Track
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
+from hybridkin.plots import ActuatorDisplay, TrackAnimation, TrackingDisplay, new_figure
 from hybridkin.workflow._domain import PathLimits, path_limits, preferred_posture, sample_domain
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, millimetres, quiet
@@ -221,7 +223,7 @@ def animate_track(
     q = loaded.effective(q)
     with torch.no_grad():
         tips = loaded.module(torch.from_numpy(q)).numpy()
-    film = plots.TrackAnimation.from_estimator(
+    film = TrackAnimation.from_estimator(
         loaded.chain, q, target=target, t=t, x=tips, n_frames=n_frames
     )
     film.name = "tip (model)"
@@ -256,7 +258,7 @@ def _read_track(
     columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
     if has_targets:
         columns["x"] = TARGET
-    log = datasets.load_log(file, **columns)
+    log = load_log(file, **columns)
     return log.q, log.x if has_targets else None, log.time
 
 
@@ -286,8 +288,8 @@ def _text(form: str, values: NDArray) -> NDArray:
 
 
 def _add_figures(report: Report, loaded: LoadedModel, track: Track, sent: NDArray) -> None:
-    figure, axes = plots.new_figure(11.0, 4.2, 1, 3)
-    display = plots.TrackingDisplay.from_tracks({"model": track})
+    figure, axes = new_figure(11.0, 4.2, 1, 3)
+    display = TrackingDisplay.from_tracks({"model": track})
     i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])  # the plane of the largest moves
     display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
     display.plot_time(axes[1], unit="mm")
@@ -297,11 +299,11 @@ def _add_figures(report: Report, loaded: LoadedModel, track: Track, sent: NDArra
     chain = loaded.chain
     shares = chain.actuators_per_segment if isinstance(chain, ArcChain) else (loaded.n_actuators,)
     n = len(shares)
-    figure, axes = plots.new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
+    figure, axes = new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
     shown = {"commands": replace(track, q=sent)}
     if loaded.play is not None:
         shown["what the actuators do"] = track
-    plots.ActuatorDisplay.from_tracks(shown, shares).plot(axes[:, 0], unit="mm")
+    ActuatorDisplay.from_tracks(shown, shares).plot(axes[:, 0], unit="mm")
     if len(shown) == 1:
         axes[0, 0].get_legend().remove()
     report.figure("commands", figure, "Commands as the model counts them.")
