@@ -92,8 +92,8 @@ def held_out(model, folds):
 # The same five folds, once of rows and once of whole motions.
 
 ways = {
-    "random rows held out": list(KFold(5, shuffle=True, random_state=0).split(q)),
-    "whole motions held out": list(GroupKFold(5).split(q, groups=groups)),
+    "held-out random rows": list(KFold(5, shuffle=True, random_state=0).split(q)),
+    "held-out motions": list(GroupKFold(5).split(q, groups=groups)),
 }
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), sharex=True, sharey=True, layout="constrained")
 for ax, (way, folds) in zip(axes, ways.items(), strict=True):

@@ -8,7 +8,7 @@ by models that have not seen its motion. The recording is not part of the packag
 is that of :doc:`another run </slack_tendons>`.
 
 .. image:: /images/slack_tendons.png
-   :alt: Tip error of every row, motions held out, before and after
+   :alt: Tip error of every row of held-out motions, before and after
 """
 
 # sphinx_gallery_thumbnail_path = "images/slack_tendons.png"
@@ -65,7 +65,7 @@ def tips(chain, q):
 
 
 def with_kernel(chain, q, x, groups):
-    """Return chain + kernel ridge on all displacements, tuned by motions held out."""
+    """Return chain + kernel ridge on all displacements, tuned by held-out motions."""
     error, best = x - tips(chain, q), (np.inf, None)
     splits = list(GroupKFold(min(4, len(np.unique(groups)))).split(q, groups=groups))
     for gamma in (0.003, 0.01, 0.03, 0.1, 0.3):

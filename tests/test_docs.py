@@ -188,8 +188,8 @@ def test_arrays_have_a_shape_and_a_unit(name):
             assert "shape" in what + text, f"{names or kind}: {what}"
             is_number = not re.search(r"\b(bool|int|str)\b|Bool|of Axes", what + text)
             if is_number and not {*names} & (OF_THE_ACTUATORS | WITHOUT_UNIT):
-                told = re.search(r"\[.+\]|unit of|As for|as for", text, re.DOTALL)
-                assert told or not names, f"{names}: {text}"
+                stated = re.search(r"\[.+\]|unit of|As for|as for", text, re.DOTALL)
+                assert stated or not names, f"{names}: {text}"
 
 
 @pytest.mark.parametrize("name", [n for n in PUBLIC if inspect.isclass(PUBLIC[n])])

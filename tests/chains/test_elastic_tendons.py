@@ -119,11 +119,11 @@ def test_forces_balance_where_it_rests(chain, rng):
 WAYS = [(_slack, "_WHOLE_STEPS"), (_slack, "_MANY"), (tendons, "_TABLE")]
 
 
-@pytest.mark.parametrize(("room", "limit"), WAYS)
-def test_every_way_to_find_the_taut_tendons_agrees(room, limit, monkeypatch, rng):
+@pytest.mark.parametrize(("module", "limit"), WAYS)
+def test_every_way_to_find_the_taut_tendons_agrees(module, limit, monkeypatch, rng):
     chain, q = robot(), random_q(rng, 500)
     expected, taut = change_of_shape(chain, q), chain.slack(q)
-    monkeypatch.setattr(room, limit, 0)
+    monkeypatch.setattr(module, limit, 0)
     chain = robot()
     assert torch.equal(chain.slack(q), taut)
     assert_close(change_of_shape(chain, q), expected, rtol=0, atol=1e-12)

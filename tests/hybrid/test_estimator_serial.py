@@ -159,7 +159,7 @@ def test_other_mechanical_models_take_the_error_on_q():
     origins[1:, 0, 3] = 0.3
     arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], tool=[0.2, 0, 0])
     q = rng.uniform(-1, 1, (300, 3))
-    bent = q + 0.1 * np.sin(q) * q[:, ::-1]  # joints that do not go where they are told
+    bent = q + 0.1 * np.sin(q) * q[:, ::-1]  # joints that miss their commands
     x = arm(torch.from_numpy(bent)).numpy()
     serial, parallel = (
         HybridForwardModel(arm, "quadratic", coupling=coupling).fit(q[:200], x[:200])

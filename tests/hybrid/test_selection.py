@@ -1,4 +1,4 @@
-"""The error model that is chosen by motions left out: what it takes, and what it says of it."""
+"""The error model chosen by held-out motions: what it takes, and what it reports."""
 
 import warnings
 from concurrent.futures import ThreadPoolExecutor
