@@ -118,12 +118,12 @@ def test_commands_for_a_log_of_ones_own_run(tmp_path, monkeypatch):
 
 
 def test_commands_for_the_recording_run(tmp_path, data_home):
-    """On every sixth row, which leaves the motions whole."""
+    """On every sixth row, which leaves the motions whole, and without auto, which takes minutes."""
     lines = (data_home / "ftdcr_v4" / "train.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "train.csv").write_text("\n".join([lines[0], *lines[1::6]]), encoding="utf-8")
     shutil.copytree(ROOT / "examples" / "robots", tmp_path / "examples" / "robots")
     command = RECORDING[-1]  # the longer one
-    out = hybridkin([*command, *QUICK], tmp_path)
+    out = hybridkin([*command, *QUICK, "--no-auto"], tmp_path)
     found = re.findall(r"^ +(mechanical, calibrated|hybrid, ELM) +([\d.]+)", out, re.MULTILINE)
     assert {name: float(mean) < 12.0 for name, mean in found} == {
         "mechanical, calibrated": True,
