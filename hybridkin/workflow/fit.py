@@ -279,26 +279,9 @@ def fit_log(
     model, chosen = _fit_saved(saved, rows, result.chain)
     progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
-    report.record.update(
-        log=Path(whole.source).name,
-        robot=robot.name,
-        n=len(data.q),
-        n_whole=len(whole.q),
-        n_motions=len(np.unique(whole.motions)),
-        excluded=list(whole.excluded),
-        n_seeds=settings.n_seeds,
-        loss=settings.loss,
-        saved=saved,
-        chosen=chosen,
-        choices_by_fold=compared.choices,
-    )
-    write_check(report, whole)
-    write_comparison(report, compared.errors, compared.fold, data)
-    by_fold = "; ".join(choices.get(saved, "-") for choices in compared.choices)
-    report.text(
-        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error here. "
-        f"Chosen in the folds: {by_fold}."
-    )
+    report.record.update(n=len(data.q), saved=saved, chosen=chosen)
+    _write_log(report, whole, robot, settings)
+    _write_choice(report, compared, data)
     if saved == AUTO:
         report.record["auto"] = auto_entry(model)
         report.text(" ".join(report.record["auto"]["words"]))
@@ -326,6 +309,34 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
             )
         log.check_order("`play`")
     log.check(force)
+
+
+def _write_log(
+    report: Report, log: MeasuredLog, robot: robots.RobotDescription, settings: FitSettings
+) -> None:
+    """Add what was fitted to what, and what the check of the log found."""
+    report.record.update(
+        log=Path(log.source).name,
+        robot=robot.name,
+        n_whole=len(log.q),
+        n_motions=len(np.unique(log.motions)),
+        excluded=list(log.excluded),
+        n_seeds=settings.n_seeds,
+        loss=settings.loss,
+    )
+    write_check(report, log)
+
+
+def _write_choice(report: Report, compared: Comparison, data: MeasuredLog) -> None:
+    """Add the errors on held-out motions, and which model was saved for them."""
+    saved, chosen = report.record["saved"], report.record["chosen"]
+    report.record["choices_by_fold"] = compared.choices
+    write_comparison(report, compared.errors, compared.fold, data)
+    by_fold = "; ".join(choices.get(saved, "-") for choices in compared.choices)
+    report.text(
+        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error here. "
+        f"Chosen in the folds: {by_fold}."
+    )
 
 
 def _fit_saved(saved: str, rows: _Rows, calibrated: Chain) -> tuple[HybridForwardModel, str]:
