@@ -16,7 +16,7 @@ test: $(VENV)/.installed
 	$(BIN)/python -m pytest $(TESTS)
 
 quick: $(VENV)/.installed
-	$(BIN)/python -m pytest $(TESTS) -m "not slow"
+	$(BIN)/python -m pytest tests $(TESTS) -m "not slow"
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet

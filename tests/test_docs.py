@@ -73,6 +73,7 @@ def test_equations_are_numbered_as_they_come():
     assert {int(n) for n in re.findall(r"(?<=[\s~])\((\d{1,2})\)", outside)} <= {*numbers}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", ["getting_started.md", "your_robot.md"])
 def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -93,6 +94,7 @@ def test_code_of_every_page_is_python(page):
         compile(block, page, "exec")
 
 
+@pytest.mark.slow
 def test_code_of_the_learners_page_runs_as_printed(capsys):
     exec(compile(blocks("elm.md", "python")[0], "elm.md", "exec"), {})
     new_rows, left_out = map(float, capsys.readouterr().out.split()[:2])

@@ -51,6 +51,7 @@ def hybridkin(command, folder):
     return done.stdout
 
 
+@pytest.mark.slow
 def test_python_runs_as_printed(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert blocks
@@ -97,6 +98,7 @@ def test_make_knows_its_targets():
 QUICK = ["--folds", "2", "--seeds", "1", "--jobs", "1"]  # of `fit`, in place of 5, 5 and all cores
 
 
+@pytest.mark.slow
 def test_commands_for_a_log_of_ones_own_run(tmp_path, monkeypatch):
     """Those of the README and of the docs, on the robot and the simulated log of the docs."""
     page = (ROOT / "docs" / "your_robot.md").read_text(encoding="utf-8")
@@ -117,6 +119,7 @@ def test_commands_for_a_log_of_ones_own_run(tmp_path, monkeypatch):
     assert {"s1", "s6"} <= {*track.dtype.names}
 
 
+@pytest.mark.slow
 def test_commands_for_the_recording_run(tmp_path, data_home):
     """On every sixth row, which leaves the motions whole, and without auto, which takes minutes."""
     lines = (data_home / "ftdcr_v4" / "train.csv").read_text(encoding="utf-8").splitlines()
@@ -141,6 +144,7 @@ def test_number_of_examples():
     assert f"a gallery of {words[len(EXAMPLES)]} examples" in README
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_run_and_draw(example, monkeypatch, capsys):
     shown = []

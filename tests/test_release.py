@@ -75,6 +75,7 @@ def test_extras():
     assert {"sim", "dask", "interactive", "parquet"} <= {*re.findall(r"\w+", whole)[1:]}
 
 
+@pytest.mark.slow
 def test_what_is_imported_is_declared():
     needed = modules_of(PROJECT["dependencies"])
     extras = PROJECT["optional-dependencies"]
@@ -86,6 +87,7 @@ def test_what_is_imported_is_declared():
         assert imports_of(tree, everywhere=True) <= optional, path
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_the_package_and_nothing_else(built):
     wheel = zipfile.ZipFile(built[1])
     names = {*wheel.namelist()}
@@ -122,6 +124,7 @@ def test_the_sdist_builds_the_same_and_can_be_tested(built):
     assert package <= names
 
 
+@pytest.mark.slow
 def test_the_index_would_take_them(built):
     pytest.importorskip("twine")
     command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, built)]

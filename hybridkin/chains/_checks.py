@@ -17,7 +17,7 @@ _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
     """Return one positive length per segment, shape (S,)."""
-    lengths = shaped(value, name, (size,), dtype)
+    lengths = shaped(value, name, (size,), dtype, unknown="S")
     if not len(lengths) or not (lengths > 0).all():
         raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
     return lengths
@@ -59,12 +59,13 @@ def shaped(
     dtype: torch.dtype = torch.float64,
     *,
     finite: bool = True,
+    unknown: str = "n",
 ) -> Tensor:
-    """Return an array as a tensor of the given shape; None is any length."""
+    """Return an array as a tensor of the given shape; None is any length, called `unknown`."""
     tensor = numeric(value, name, dtype, finite=finite)
     pairs = zip(tensor.shape, shape, strict=False)
     if tensor.ndim != len(shape) or any(need not in (None, size) for size, need in pairs):
-        need = ", ".join("n" if size is None else str(size) for size in shape)
+        need = ", ".join(unknown if size is None else str(size) for size in shape)
         need = f"({need},)" if len(shape) == 1 else f"({need})"
         raise ValueError(f"`{name}` must have shape {need}, got {tuple(tensor.shape)}.")
     return tensor

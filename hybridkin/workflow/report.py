@@ -230,7 +230,18 @@ def quiet(label: str, done: int, total: int) -> None:
 
 
 def json_text(record: Any) -> str:
-    """Return a record as JSON; numbers that are not finite become null."""
+    """Return a record as JSON; numbers that are not finite become null.
+
+    Parameters
+    ----------
+    record : dict
+        Of numbers, strings, paths, arrays, and lists and dicts of them.
+
+    Returns
+    -------
+    str
+        JSON text.
+    """
     return json.dumps(_plain(record), indent=2, allow_nan=False)
 
 

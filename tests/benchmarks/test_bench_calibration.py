@@ -1,6 +1,7 @@
 """Calibration with exact derivatives against the same least squares by finite differences."""
 
 import numpy as np
+import pytest
 import torch
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -8,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from hybridkin import calibrate
 
 
+@pytest.mark.slow
 def test_against_finite_differences(race, chain, draw, timed):
     q = draw(1500 if timed else 60)
     truth = chain.with_geometry(

@@ -7,6 +7,7 @@ from torch.testing import assert_close
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, jacobian
 
 
+@pytest.mark.slow
 def test_against_automatic_derivatives(race, chain, draw, batch, autodiff):
     q = draw(batch)
     name, derive, goal = autodiff

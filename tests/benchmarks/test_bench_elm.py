@@ -1,6 +1,7 @@
 """The ELM against scikit-learn on the same features, and the choosing ELM against kernel ridge."""
 
 import numpy as np
+import pytest
 from learners import LEARNERS, make_arm
 from numpy.testing import assert_allclose
 from scipy.special import expit
@@ -17,6 +18,7 @@ def features(elm, X):
     return expit(u @ elm.input_weights_.T + elm.input_bias_)
 
 
+@pytest.mark.slow
 def test_fit_against_ridge_on_the_same_features(race, draw, timed):
     """Nine inputs, three outputs; the peer's time includes its features."""
     rows = 100_000 if timed else 200
@@ -40,6 +42,7 @@ def test_fit_against_ridge_on_the_same_features(race, draw, timed):
     )
 
 
+@pytest.mark.slow
 def test_exact_leave_one_out_against_ridge_cv(race, timed):
     """Forty penalties, one hidden layer; both times include the features."""
     rows, n_hidden = (4000, N_HIDDEN) if timed else (200, 50)
@@ -63,6 +66,7 @@ def test_exact_leave_one_out_against_ridge_cv(race, timed):
     )
 
 
+@pytest.mark.slow
 def test_choosing_elm_against_tuned_kernel_ridge(race, timed):
     """Defaults against 7 x 7 values of alpha and gamma by 5 folds; ours must err less, too."""
     rows = 2000 if timed else 300

@@ -26,6 +26,7 @@ def lap(trunk):
     return figure_eight(trunk.x.mean(0), (0.12, 0.06), duration=2.0).x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", SPEEDS)
 @pytest.mark.parametrize("guard", [None, "leverage"], ids=["no guard", "guard"])
 def test_hybrid_trunk(race, hybrids, lap, arm, draw, guard, limits):

@@ -131,6 +131,7 @@ PLANTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", PLANTED)
 def test_planted_geometry_is_recovered_from_exact_data(case, rng):
     truth, start, draw, names = PLANTED[case]
@@ -147,6 +148,7 @@ def test_planted_geometry_is_recovered_from_exact_data(case, rng):
         assert_close(value, before[name], rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_a_common_turn_of_all_rings_is_a_turn_of_the_base(rng):
     q = tendons(rng)
     geometry = {"routing": "base", "offsets": [0.0, 0.0, 0.02], "base": planted_base()}
@@ -190,6 +192,7 @@ def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
         assert "does not move the tips" in sentence
 
 
+@pytest.mark.slow
 def test_segments_beyond_the_tip_are_not_identified(rng):
     q = tendons(rng)
     truth = tendon_robot(base=planted_base(), offsets=[0.01, 0.02, 0.0]).with_tip(1.5)
@@ -262,6 +265,7 @@ def test_derivatives_of_the_geometry_by_the_free_parameters(aliases, rng):
 CLOCKWISE = [(0,), (1,), (0, 1), (2,), (0, 2), (0, 1, 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clockwise", CLOCKWISE)
 @pytest.mark.parametrize("kind", ["chambers", "tendons"])
 def test_rings_that_run_the_other_way_round_are_found(kind, clockwise, rng):
@@ -288,6 +292,7 @@ TURNS = [(90.0, 0.0), (180.0, 90.0), (120.0, -150.0), (0.0, 180.0)]
 TURNS += [(90.0, 180.0, -90.0), (0.0, 135.0, -100.0), (180.0, 0.0, 180.0), (100.0, 100.0, -170.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.002])
 @pytest.mark.parametrize("turns", TURNS)
 def test_turns_of_the_rings_are_found_from_none(turns, noise, rng):
@@ -302,6 +307,7 @@ def test_turns_of_the_rings_are_found_from_none(turns, noise, rng):
     assert between.abs().max() < (1e-9 if noise == 0 else 0.02)
 
 
+@pytest.mark.slow
 def test_a_mirror_image_is_found_where_only_the_base_is_free_and_it_warns(rng):
     q = chambers(rng)
     truth = trunk(angles=rings([0.0] * 3, (0, 1, 2)), base=planted_base())
@@ -313,6 +319,7 @@ def test_a_mirror_image_is_found_where_only_the_base_is_free_and_it_warns(rng):
     assert_close(result.chain.radii, truth.radii, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bend", [1.0, 0.1, 0.01])
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.02])
 @pytest.mark.parametrize("names", [("radii", "base"), ("radii", "turns", "base")])
@@ -325,6 +332,7 @@ def test_a_right_handed_robot_stays_so(bend, noise, names, rng):
     assert_close(steps, torch.full((3,), THIRD).double(), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_honest(rng):
     q = chambers(rng)
     truth = trunk(base=planted_base(), offsets=[0.0, 0.0, 0.12])
@@ -485,6 +493,7 @@ def test_sentences_describe_unidentified_directions_and_their_effect(case, rng):
     assert expected in named
 
 
+@pytest.mark.slow
 def test_singular_values_and_standard_errors_agree(rng):
     q = chambers(rng)
     x = trunk()(q) + 0.005 * gauss(rng, 100, 3)
@@ -580,6 +589,7 @@ def distances(chain, data):
 NAIVE = ("radii", "lengths", "angles", "base", "tool")
 
 
+@pytest.mark.slow
 def test_real_robot_of_three_cables_from_a_naive_start(data_home):
     data = datasets.load_armlab(data_home)
     start = ConstantCurvatureChain([0.01], lengths=[0.1])
@@ -591,6 +601,7 @@ def test_real_robot_of_three_cables_from_a_naive_start(data_home):
     assert any("lengths[0]" in sentence and "tool" in sentence for sentence in result.unidentified)
 
 
+@pytest.mark.slow
 def test_real_nine_tendon_robot_from_a_naive_start(data_home):
     data = datasets.load_ftdcr(data_home)
     start = ConstantCurvatureChain([0.0045] * 3, lengths=[0.06, 0.0625, 0.064], routing="base")

@@ -163,6 +163,7 @@ BENDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theta", BENDS)
 @pytest.mark.parametrize("n_segments", [1, 3])
 @pytest.mark.parametrize("kind", ["chambers", "tendons"])
@@ -333,6 +334,7 @@ def test_actuator_zeros_are_read_too_much(routing, rng):
     assert_close(common(q + 0.001), plain(q), rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_gradcheck_of_rest_bends_and_zeros(rng):
     chain, q = CHAINS["pre-curved"][0], random_q(rng, 2, center=0.0, width=0.005)
 
@@ -369,6 +371,7 @@ def test_singular_values_of_three_equal_straight_segments():
     assert_close(torch.linalg.svdvals(J), expected, rtol=1e-14, atol=0)
 
 
+@pytest.mark.slow
 @each_chain
 def test_gradcheck_at_straight_and_beside_it(chain, center, width, rng):
     size = chain.n_actuators
@@ -607,6 +610,7 @@ def test_functional_transforms(rng):
     assert_close(lifted[:, 2], chain(q)[:, 2] + 1.0, rtol=1e-14, atol=0)
 
 
+@pytest.mark.slow
 def test_blocks_of_rows_are_as_one(rng):
     """More rows than a block has: under every transform what one pass would give."""
     chain, q = bha(), random_q(rng, 4097)
@@ -635,6 +639,7 @@ def test_blocks_of_rows_are_as_one(rng):
     assert [tuple(part.shape) for part in empty] == [(2, 0, 3), (2, 0, 3, 9)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
 def test_compiled(backend, rng):
     chain, q = tendons(), random_q(rng, 3, center=0.0, width=0.005)

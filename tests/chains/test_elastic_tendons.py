@@ -132,6 +132,7 @@ def test_every_way_to_find_the_taut_tendons_agrees(module, limit, monkeypatch, r
     assert_close(J, chain.jacobian(q), rtol=0, atol=1e-12 * float(J.abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["through", "soft", "pre-tensioned", "uneven"])
 @pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 3e-6)])
 def test_single_precision_leaves_what_is_too_close(name, dtype, rounding, monkeypatch, rng):
@@ -295,6 +296,7 @@ def test_closed_form_jacobians_are_those_of_autograd(chain, rng):
     assert_close(*second, rtol=0, atol=1e-12 * float(second[0].abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["through", "pre-tensioned", "sixteen tendons"])
 def test_gradcheck(name, rng):
     chain = ROBOTS[name]
@@ -313,6 +315,7 @@ def test_at_a_kink_the_derivative_is_the_taut_side():
     assert_close(chain.jacobian(straight) @ ones, pulled, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 @each_robot
 def test_geometry_jacobian_is_that_of_autograd(chain, rng):
     q = random_q(rng, 6, chain.n_actuators)
@@ -328,6 +331,7 @@ def test_geometry_jacobian_is_that_of_autograd(chain, rng):
     assert_close(J, sum(each), rtol=0, atol=1e-12 * float(J.abs().max()))
 
 
+@pytest.mark.slow
 def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
     chain, q = robot(), random_q(rng, 3)
     before = {name: value.clone() for name, value in chain.geometry().items()}
@@ -457,6 +461,7 @@ def test_pickle_copy_and_hash(chain, rng):
     assert set(chain.state_dict()) == set(chain.geometry())
 
 
+@pytest.mark.slow
 def test_another_tip(rng):
     whole, q = robot(), random_q(rng, 4)
     for at in (0.3, 1.0, 1.5, 3.0):
@@ -498,6 +503,7 @@ def logged(truth, rng, n=300):
 PLANTED = ("rest_bends", "bending_stiffness", "axial_stiffness", "tendon_zeros")
 
 
+@pytest.mark.slow
 def test_calibration_finds_stiffness_rest_bends_and_zeros(rng):
     truth = robot()
     q, x = logged(truth, rng)
@@ -515,6 +521,7 @@ def test_calibration_finds_stiffness_rest_bends_and_zeros(rng):
         assert_close(result.values[name] / scale, geometry[name] / scale, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_calibration_turns_the_rings(rng):
     truth = robot()
     q, x = logged(truth, rng)

@@ -78,6 +78,7 @@ def test_a_larger_swing_wipes_out_the_past(q, width):
     close(play.apply(np.concatenate([q, end]))[1].effective, play.apply(end)[1].effective)
 
 
+@pytest.mark.slow
 @CHECKS
 @given(q=ROWS, width=WIDTHS, data=st.data())
 def test_chunks_with_the_state_carried_are_the_whole(q, width, data):
@@ -173,6 +174,7 @@ def log_of(width, noise):
     return truth, q, x + noise * rng.standard_normal(x.shape), groups
 
 
+@pytest.mark.slow
 def test_play_in_a_log_is_found():
     truth, q, x, groups = log_of(0.2e-3, 1e-4)
     start = truth.with_geometry(radii=truth.radii * 1.2)
@@ -190,6 +192,7 @@ def test_play_in_a_log_is_found():
     close(as_torch.cv_rmse, fit.cv_rmse)
 
 
+@pytest.mark.slow
 def test_no_play_is_kept_where_there_is_none():
     truth, q, x, groups = log_of(0.0, 1e-3)
     fit = fit_play(truth, q, x, groups, (0.1e-3, 0.4e-3), ("radii",), loss="soft_l1")
@@ -204,6 +207,7 @@ def test_one_motion_is_too_few():
         fit_play(truth, q, x, np.zeros(len(q)))
 
 
+@pytest.mark.slow
 def test_example_shows_what_slack_costs(data_home, monkeypatch):
     monkeypatch.setenv("HYBRIDKIN_DATA", str(data_home))
     space = runpy.run_path(str(EXAMPLE))

@@ -239,6 +239,7 @@ def test_derivatives(rows, rng):
     assert_close(vmapped, (x, J), rtol=0, atol=4e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [2, 65], ids=["few rows", "many rows"])
 def test_gradcheck(rows, rng):
     chain, q = arm(tool=[0.1, 0.02, 0.2]), random_q(rng, rows)
@@ -327,6 +328,7 @@ def test_float32_keeps_its_dtype_and_accuracy(rng):
     assert_close(J.double(), J_reference, rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [3, 200], ids=["few rows", "many rows"])
 def test_compiled(rows, rng):
     chain, q = arm(), random_q(rng, rows)

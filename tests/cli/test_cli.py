@@ -109,6 +109,7 @@ def document(capsys, *arguments):
 # fit
 
 
+@pytest.mark.slow
 def test_fit_compares_auto_and_saves_the_best(fitted):
     record = json.loads((fitted / "model" / "report.json").read_text())
     held_out = {name: entry["mean"] for name, entry in record["held_out"].items()}
@@ -145,6 +146,7 @@ def test_fit_prints_the_check_the_table_and_what_was_written(fitted):
     assert str(fitted / "model" / "model.safetensors") in printed
 
 
+@pytest.mark.slow
 def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
     out = tmp_path / "m"
     arguments = [log, "--robot", robot, "--out", out, "--no-auto", "--coverage", "0.9", *FIT]
@@ -313,6 +315,7 @@ def test_an_interrupt_leaves_cleanly(log, robot, tmp_path, capsys, monkeypatch):
     assert errors.split("\n\n")[-1] == "hybridkin: interrupted; nothing was written\n"
 
 
+@pytest.mark.slow
 def test_an_error_of_the_program_keeps_its_traceback(log, robot, tmp_path, monkeypatch):
     def broken(*_, **__):
         raise AssertionError
@@ -325,6 +328,7 @@ def test_an_error_of_the_program_keeps_its_traceback(log, robot, tmp_path, monke
 # evaluate, track, animate, describe
 
 
+@pytest.mark.slow
 def test_evaluate_tells_errors_by_motion(fitted, tmp_path, capsys):
     out = tmp_path / "evaluation"
     code, record = document(capsys, "evaluate", fitted / "model", fitted / "log.csv", "--out", out)
@@ -366,6 +370,7 @@ def test_evaluate_of_a_description_is_the_mechanical_model(fitted, capsys):
     assert document(capsys, "evaluate", *arguments, "--fail-above", "1000")[0] == 0
 
 
+@pytest.mark.slow
 def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
     out = tmp_path / "track"
     shape = ["--shape", "figure-eight", "--size", "20,10", "--duration", "2", "--dt", "0.05"]
@@ -394,6 +399,7 @@ def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
     assert (out / "track.png").stat().st_size > 500
 
 
+@pytest.mark.slow
 def test_track_of_points_within_given_limits(fitted, tmp_path, capsys):
     tip = 1e3 * load_model(fitted / "model" / "model.safetensors").predict(np.zeros((1, 6)))[0]
     far = tip + np.array([[0, 0, -1], [15, 0, -4], [30, 0, -8]])
@@ -432,6 +438,7 @@ def test_track_needs_a_path(fitted, tmp_path, capsys, options, message):
     assert not (tmp_path / "t").exists()
 
 
+@pytest.mark.slow
 def test_track_without_known_limits_asks_for_them(fitted, tmp_path, capsys):
     bare = tmp_path / "robot.toml"
     bare.write_text(ROBOT[: ROBOT.index("[limits]")])
@@ -449,6 +456,7 @@ def test_track_without_known_limits_asks_for_them(fitted, tmp_path, capsys):
     assert record["columns"]["q"] == ["q1", "q2", "q3", "q4", "q5", "q6"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gif", "html"])
 def test_animate_a_track(fitted, tmp_path, capsys, kind):
     if kind == "html":
@@ -554,6 +562,7 @@ def test_evaluate_knows_where_the_motions_of_play_begin(playful, tmp_path, capsy
     assert "A model with play needs the rows of a motion in the order of time, but 23" in errors
 
 
+@pytest.mark.slow
 def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, capsys):
     out = tmp_path / "track"
     shape = ["--shape", "figure-eight", "--size", "20,10", "--duration", "2", "--dt", "0.05"]
@@ -609,6 +618,7 @@ def test_play_needs_motions_in_the_order_of_time(robot, tmp_path, capsys):
     assert "`play` needs motions" in errors
 
 
+@pytest.mark.slow
 def test_first_track_of_a_kernel_model_stays_where_the_model_is_at_home(tmp_path, capsys):
     """Most of the box around its training rows lies outside the domain of such a model."""
     table = rows()
@@ -664,6 +674,7 @@ def test_wrong_options_end_with_2(arguments, capsys):
     assert capsys.readouterr().err.startswith("hybridkin: error: ")
 
 
+@pytest.mark.slow
 def test_help_comes_at_once_and_json_is_alone_on_stdout(fitted):
     code = "import sys, hybridkin.__main__; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -676,6 +687,7 @@ def test_help_comes_at_once_and_json_is_alone_on_stdout(fitted):
 # the recordings of real robots, rows thinned for speed
 
 
+@pytest.mark.slow
 def test_fit_of_ftdcr_with_nothing_but_a_robot_description(data_home, tmp_path, capsys):
     log, out = data_home / "ftdcr_v4" / "train.csv", tmp_path / "m"
     arguments = [log, "--robot", "examples/robots/ftdcr_v4.toml", "--out", out]
@@ -689,6 +701,7 @@ def test_fit_of_ftdcr_with_nothing_but_a_robot_description(data_home, tmp_path, 
     assert (out / "model.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_fit_of_armlab_as_csv_with_nothing_but_a_robot_description(data_home, tmp_path, capsys):
     data = datasets.load_armlab(data_home)
     table = np.column_stack([-1e3 * data.q, 1e3 * data.x, data.groups])

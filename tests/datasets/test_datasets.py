@@ -142,6 +142,7 @@ def test_paper_split_needs_parts():
 # making data
 
 
+@pytest.mark.slow
 def test_make_trunk_follows_the_plant(sim):
     data = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0, tilt=0.1)
     plant = sim(tilt=0.1)
@@ -151,6 +152,7 @@ def test_make_trunk_follows_the_plant(sim):
         assert_allclose(x, plant(q_target), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_make_trunk_noise_leaves_the_truth_alone(sim):
     clean = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0)
     noisy = make_trunk(**SMALL, cable_noise=1e-3, mocap_noise=5e-4)
@@ -159,12 +161,14 @@ def test_make_trunk_noise_leaves_the_truth_alone(sim):
     assert_allclose((noisy.x - clean.x).std(), 5e-4, rtol=0.4)
 
 
+@pytest.mark.slow
 def test_result_does_not_depend_on_processes(sim, small_chunks):
     alone, shared = make_trunk(**SMALL), make_trunk(**SMALL, n_jobs=2)
     assert_allclose(shared.q, alone.q, rtol=0, atol=1e-9)
     assert_allclose(shared.x, alone.x, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_resumed_equals_uninterrupted(sim, small_chunks, monkeypatch, tmp_path):
     settled = []
 
@@ -229,6 +233,7 @@ def stubborn(sim, monkeypatch):
     monkeypatch.setattr(_trunk, "TrunkPlant", Stubborn)
 
 
+@pytest.mark.slow
 def test_rows_that_do_not_settle_are_drawn_again(stubborn):
     with pytest.warns(UserWarning, match="did not settle and were drawn again"):
         data = make_trunk(n_segment=2, n_random=12, random_state=0)

@@ -50,6 +50,7 @@ def mean(parts, function):
     return sum(w * function(part) for w, part in zip(WEIGHTS, parts, strict=True))
 
 
+@pytest.mark.slow
 def test_all_is_the_mean_of_the_parts(blend, parts, q):
     assert_close(blend(q), mean(parts, lambda part: part(q)))
     assert_close(blend.jacobian(q), mean(parts, lambda part: part.jacobian(q)))
@@ -89,6 +90,7 @@ def test_single_precision_and_inversion(blend, q):
     assert np.abs(ik.solve(target).x - target).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_blend_of_a_hybrid_with_itself_is_the_hybrid():
     data, rng = datasets.load_trunk(), np.random.default_rng(0)
     chain = robots.bionic_handling_assistant()

@@ -35,6 +35,7 @@ def rms(model, q, x):
     return np.sqrt(np.mean(np.sum((model.predict(q) - x) ** 2, axis=1)))
 
 
+@pytest.mark.slow
 def test_a_change_is_learned_and_left_again(fitted, trunk):
     q, x = trunk
     loaded = x + changed(q)

@@ -150,6 +150,7 @@ def test_guard_leaves_the_training_rows_and_falls_back_to_mechanics(log):
         assert free.in_domain(far).all()
 
 
+@pytest.mark.slow
 def test_guard_is_smooth(log):
     q, x, _ = log
     model = HybridForwardModel(bha(), random_state=0).fit(q, x)
@@ -160,6 +161,7 @@ def test_guard_is_smooth(log):
     assert torch.autograd.gradgradcheck(model.module_, line[::4].detach().requires_grad_())
 
 
+@pytest.mark.slow
 def test_calibration_happens_inside_fit(log):
     q, x, groups = log
     nominal = ConstantCurvatureChain([0.12, 0.12, 0.12])
@@ -173,6 +175,7 @@ def test_calibration_happens_inside_fit(log):
     assert model.calibration_.cv_rmse > model.calibration_.rmse
 
 
+@pytest.mark.slow
 def test_cross_validation_and_search_by_groups(log):
     q, x, groups = log
     model = HybridForwardModel(bha(), ELMRegressor(random_state=0))
@@ -283,6 +286,7 @@ def elastic():
     return ElasticTendonChain([0.005] * 2, [0.1, 0.1])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(f"ignore:{SLACK}")
 def test_slack_is_better_known_than_learned(slack_log):
     q, x, groups = slack_log
@@ -304,6 +308,7 @@ def test_slack_is_better_known_than_learned(slack_log):
     assert errors[1] < 0.001
 
 
+@pytest.mark.slow
 def test_elastic_chain_as_the_mechanical_model(slack_log):
     q, x, _ = slack_log
     model = HybridForwardModel(elastic(), calibrate="default", random_state=0).fit(q, x)
@@ -362,6 +367,7 @@ def test_guard_in_single_precision_never_errs(alpha):
     assert_close(J[::50], expected, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guard", ["leverage", "box"])
 @pytest.mark.parametrize(
     "error_model",
@@ -455,6 +461,7 @@ def test_rows_that_cannot_be_written_to_are_read_without_a_word():
     HybridForwardModel(chain, "linear", calibrate="default").fit(q, x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error_model", [KernelRidge(kernel="rbf", gamma=1e4, alpha=1e-3), None, "quadratic"]
 )

@@ -56,6 +56,7 @@ def error(model, q, x):
     return np.linalg.norm(model.predict(q) - x, axis=1).mean()
 
 
+@pytest.mark.slow
 def test_inside_is_better_than_at_the_tip(trunk):
     q, x = trunk
     mechanical = HybridForwardModel(bha(), "drop", calibrate="default")
@@ -68,6 +69,7 @@ def test_inside_is_better_than_at_the_tip(trunk):
     assert errors[0] < 0.7 * errors[3]
 
 
+@pytest.mark.slow
 def test_module_jacobian_and_parts_in_and_out_of_the_domain(fitted, trunk):
     rng = np.random.default_rng(0)
     q = torch.from_numpy(trunk[0][:30] + rng.uniform(-0.12, 0.12, (30, 9)))
@@ -104,6 +106,7 @@ def test_it_comes_back_from_a_file(fitted, trunk, tmp_path):
     assert back.error_model_.alphas == fitted.error_model_.alphas
 
 
+@pytest.mark.slow
 def test_it_follows_a_payload(fitted, trunk):
     q, x = trunk
     model = copy.deepcopy(fitted)
@@ -124,6 +127,7 @@ def test_inverse_kinematics_reaches_its_tips(fitted, trunk):
     assert_allclose(fitted.predict(solution.q), fitted.predict(q[:20]), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_groups_weights_and_grid_search(trunk):
     q, x = trunk
     groups = np.arange(len(q)) // 10

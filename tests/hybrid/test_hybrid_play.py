@@ -40,6 +40,7 @@ def rms(model, q, x, groups):
     return np.sqrt(np.mean(np.sum((model.predict(q, groups=groups) - x) ** 2, axis=1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mechanical", [CHAIN, None])
 def test_the_width_is_found_and_used(log, mechanical):
     train, test = split(log)
@@ -50,6 +51,7 @@ def test_the_width_is_found_and_used(log, mechanical):
     assert rms(model, *test) < (0.1 if mechanical else 0.6) * rms(without, *test)
 
 
+@pytest.mark.slow
 def test_a_given_play_is_that_of_the_operator(log):
     train, (q, _, groups) = split(log)
     model = HybridForwardModel(CHAIN, "quadratic", play=WIDTH).fit(*train[:2], groups=train[2])
@@ -64,6 +66,7 @@ def test_a_given_play_is_that_of_the_operator(log):
     assert_array_equal(one, still.predict(y[groups == 9]))
 
 
+@pytest.mark.slow
 def test_no_play_is_found_where_there_is_none(log):
     q, _, groups = log
     x = tips(q) + 2e-4 * np.random.default_rng(1).standard_normal((len(q), 3))
@@ -71,6 +74,7 @@ def test_no_play_is_found_where_there_is_none(log):
     assert model.play_ is None
 
 
+@pytest.mark.slow
 def test_commands_for_a_path(log):
     q, x, groups = log
     model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=WIDTH)
@@ -85,6 +89,7 @@ def test_commands_for_a_path(log):
     assert errors[1] > 5e-3  # what the play does where it is not made up for
 
 
+@pytest.mark.slow
 def test_measurements_go_on_where_the_last_ones_ended(log):
     train, (q, x, _) = split(log)
     payload = x + np.array([0.0, 0.0, -0.01])
@@ -98,6 +103,7 @@ def test_measurements_go_on_where_the_last_ones_ended(log):
     assert_allclose(models[0].predict(q[:40]), models[1].predict(q[:40]), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_with_auto_and_a_radius(log):
     train, test = split(log)
     model = HybridForwardModel(CHAIN, "auto", play="auto", coverage=0.9, random_state=0)
@@ -109,6 +115,7 @@ def test_with_auto_and_a_radius(log):
     assert rms(model, *test) < 1.5e-3
 
 
+@pytest.mark.slow
 def test_a_recording_with_friction():
     try:
         data = datasets.load_asl_trunk()

@@ -209,6 +209,7 @@ def test_turning_the_measuring_frame_turns_the_answers(log, error_model):
     assert_close(there, turned, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_pose_errors_of_a_trunk_fall_far_below_those_of_its_model():
     # The real trunk: other radii, its end plate tilted, and twisted more the more it is bent.
     rng = np.random.default_rng(5)

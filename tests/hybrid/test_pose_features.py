@@ -103,6 +103,7 @@ def test_a_moment_of_weight_is_a_readout(rng):
     assert_close(chain.reach * (phi.unflatten(1, (3, 3)) @ g), moment)
 
 
+@pytest.mark.slow
 @every_robot
 def test_slope(robot, rng):
     chain, q = rows_of(robot, rng, 40)
@@ -124,6 +125,7 @@ def test_slope(robot, rng):
     assert_close(slope, torch.stack(exact), atol=1e-10, rtol=1e-9)
 
 
+@pytest.mark.slow
 @every_robot
 def test_derivatives_by_autograd(robot, rng):
     chain, q = rows_of(robot, rng, 3)
@@ -153,6 +155,7 @@ def test_batches_equal_loops(robot, rng):
     assert_close(features(long), features(q).repeat(500, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["trunk", "cables", "elastic tendons"])
 def test_planted_correction_is_found(robot, rng):
     chain, q = rows_of(robot, rng, 700)

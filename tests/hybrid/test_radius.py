@@ -30,6 +30,7 @@ def motions(seed, n_motions=240, n=6, noise=2e-3):
     return q, x, motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coverage", [0.5, 0.9])
 @pytest.mark.parametrize("error_model", [None, "drop", Ridge(1e-3)], ids=["elm", "drop", "ridge"])
 def test_unseen_motions_are_covered(coverage, error_model):

@@ -179,6 +179,7 @@ def test_planted_linear_correction_is_recovered_by_linear_features(rng):
     assert_close(fit.readout.weights, weights, atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["trunk", "tendons", "arm"])
 @pytest.mark.parametrize("kind", ["linear", "quadratic", "hidden"])
 def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
@@ -303,6 +304,7 @@ def test_pure_noise_chooses_no_correction(rng):
     assert fit.scores[inf, inf] <= 1.01 * min(fit.scores.values())
 
 
+@pytest.mark.slow
 def test_choice_is_never_worse_than_nothing_on_rows_left_out(rng):
     chain, q = rows_of("tendons", rng, 24)
     for size in (0.003, 0.01, 0.03):
@@ -313,6 +315,7 @@ def test_choice_is_never_worse_than_nothing_on_rows_left_out(rng):
         assert left.norm() <= (1 + 1e-9) * (x - chain(q)).norm()
 
 
+@pytest.mark.slow
 def test_choice_is_no_worse_than_its_parts(rng):
     chain, q = rows_of("trunk", rng, 120)
     truth, x = disturbed(chain, q, rng, noise=0.004)
@@ -341,6 +344,7 @@ def test_noise_of_the_actuators_is_told_from_that_of_the_tip(rng):
     assert problem.likeliest_ratio(1e-3 * uniform(rng, 1500, 3)) > 100.0
 
 
+@pytest.mark.slow
 def test_noise_of_the_actuators_is_allowed_for(rng):
     errors = []
     for _ in range(4):
@@ -490,6 +494,7 @@ def test_state_dict_holds_all(kind, rng):
     assert_close(pickle.loads(pickle.dumps(module))(q), module(q), atol=0, rtol=0)
 
 
+@pytest.mark.slow
 def test_derivatives_by_autograd(rng):
     chain, q = rows_of("trunk", rng, 2)
     module = hybrid(chain, Readout(QuadraticFeatures.of_range(q), 0.01 * uniform(rng, 9, 55)))

@@ -41,6 +41,7 @@ def chosen(trunk):
     return model.fit(q[:250], x[:250], groups=np.arange(250) // 5)
 
 
+@pytest.mark.slow
 def test_no_worse_than_the_single_candidates(chosen, trunk):
     q, x = trunk
     error = np.linalg.norm(chosen.predict(q[250:]) - x[250:], axis=1).mean()
@@ -73,6 +74,7 @@ def test_it_says_what_it_chose(chosen):
     assert results["mean_distance"][-1] < 1.01 * results["mean_distance"].min()
 
 
+@pytest.mark.slow
 def test_nothing_to_learn_is_left_alone():
     rng = np.random.default_rng(0)
     q = rng.uniform(0.18, 0.32, (150, 9))
@@ -82,6 +84,7 @@ def test_nothing_to_learn_is_left_alone():
     assert np.linalg.norm(off, axis=1).max() < 0.003
 
 
+@pytest.mark.slow
 def test_clone_refit_and_file(chosen, trunk, tmp_path):
     q, x = trunk
     again = clone(chosen).fit(q[:250], x[:250], groups=np.arange(250) // 5)
@@ -90,6 +93,7 @@ def test_clone_refit_and_file(chosen, trunk, tmp_path):
     assert_array_equal(load_model(tmp_path / "model.safetensors").predict(q), chosen.predict(q))
 
 
+@pytest.mark.slow
 def test_slack_tendons_get_elastic_ones(tmp_path):
     plain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], routing="base")
     stiffness = {"bending_stiffness": 4e-6, "axial_stiffness": 8.0}
@@ -113,6 +117,7 @@ def test_slack_tendons_get_elastic_ones(tmp_path):
     assert isinstance(as_given.mechanical_model_, ConstantCurvatureChain)
 
 
+@pytest.mark.slow
 def test_other_mechanical_models_and_single_outputs():
     rng = np.random.default_rng(0)
     origins = np.tile(np.eye(4), (2, 1, 1))
@@ -126,6 +131,7 @@ def test_other_mechanical_models_and_single_outputs():
     assert errors[0] < 0.3 * errors[1]
 
 
+@pytest.mark.slow
 def test_fits_in_threads_are_independent():
     """The filters for warnings belong to the process: no fit may touch them."""
     rng, groups = np.random.default_rng(0), np.arange(40) // 8
@@ -150,6 +156,7 @@ def test_fits_in_threads_are_independent():
     assert_allclose(at_once, 4 * one_by_one, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["parallel", "serial"])
 def test_the_default_error_model_is_a_network(trunk, coupling):
     q, x = trunk
@@ -162,6 +169,7 @@ def test_the_default_error_model_is_a_network(trunk, coupling):
         assert_array_equal(model.predict(q), models[2].predict(q))
 
 
+@pytest.mark.slow
 def test_kernel_by_name_is_tuned_on_motions(trunk):
     q, x = trunk
     groups = np.arange(250) // 5

@@ -126,6 +126,7 @@ def reference_qp(J, v, z, lower, upper, damping_sq):
     return x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("relative", "m"), [(1e-6, 3), (1e-3, 3), (1.0, 3), (1e-6, 6)])
 def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
     N, n = 350, 9
@@ -177,6 +178,7 @@ def test_strict_step_reaches_a_reachable_task_and_ignores_posture_in_the_task(rn
 # ---------------------------------------------------------------- one step
 
 
+@pytest.mark.slow
 def test_linear_model_is_reached_in_one_step_and_settles_at_the_preferred_posture(rng, A):
     q_pref, target = randn(rng, 7), randn(rng, 3)
     ik = InverseKinematics(Linear(A), q_pref=q_pref, beta=20.0, dt=0.01)
@@ -218,6 +220,7 @@ def test_step_takes_the_measured_tip_in_place_of_the_models(rng):
     assert_close(CHAIN.jacobian(q) @ dq, x - seen, rtol=1e-10, atol=1e-15)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**31), dtype=st.sampled_from([torch.float64, torch.float32]))
 def test_limits_hold_to_the_last_bit(seed, dtype):
@@ -237,6 +240,7 @@ def test_limits_hold_to_the_last_bit(seed, dtype):
     assert ((q == low) | (q == high)).any()
 
 
+@pytest.mark.slow
 def test_solver_evaluates_the_model_inside_the_limits_only(rng):
     class Witness(torch.nn.Module):
         lowest, highest = np.inf, -np.inf
@@ -306,6 +310,7 @@ def coupled_tendons():
     return ConstantCurvatureChain([0.02] * 3, lengths=[0.1] * 3, routing="base")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("chain", "low", "high"),
     [(CHAIN, 0.1, 0.4), (coupled_tendons(), -0.02, 0.02)],
@@ -365,6 +370,7 @@ def test_posture_after_convergence_is_the_nearest_solution(rng, A):
     assert_close(solution.q, expected, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_warm_start_restarts_and_the_seed(rng):
     target = CHAIN(uniform(rng, 0.1, 0.4, 300, 9))
     starts = uniform(rng, 0.1, 0.4, 300, 9)
@@ -395,6 +401,7 @@ def solve_whole_and_in_parts(ik, target):
     return whole, single, [torch.stack([s.q for s in single]), torch.cat([s.q for s in parts])]
 
 
+@pytest.mark.slow
 def test_batch_equals_loop_and_any_split(rng):
     ik = bha()
     whole, single, others = solve_whole_and_in_parts(ik, CHAIN(uniform(rng, 0.1, 0.4, 60, 9)))
@@ -465,6 +472,7 @@ def closed_path(n, laps=1):
     return x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("feedback", "order"), [(None, 1.0), ("model", 2.0)])
 def test_order_of_tracking_in_the_period(feedback, order):
     errors = []
@@ -476,6 +484,7 @@ def test_order_of_tracking_in_the_period(feedback, order):
     np.testing.assert_allclose(rates, order, atol=0.2)
 
 
+@pytest.mark.slow
 def test_posture_makes_a_closed_path_cyclic():
     n, period, laps, beta = 100, 2.0, 5, 1.0
     q0 = bha().solve(closed_path(n)[0]).q
@@ -493,6 +502,7 @@ def test_posture_makes_a_closed_path_cyclic():
     assert ((decay[0.0] > 0.9) & (decay[0.0] < 1.0)).all()
 
 
+@pytest.mark.slow
 def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
     path = closed_path(200)
 
@@ -518,6 +528,7 @@ def wrong_plant(q):
     return CHAIN(torch.from_numpy(1.03 * q)).numpy() + 0.01
 
 
+@pytest.mark.slow
 def test_a_reading_counts_on_where_the_next_ones_are_missing():
     path, calls = closed_path(30), []
 
@@ -572,6 +583,7 @@ def test_a_failing_plant_loses_only_its_own_point():
     assert seen == [(i, 10) for i in range(10)]
 
 
+@pytest.mark.slow
 def test_track_takes_a_trajectory_uneven_times_and_gaps_in_the_path():
     ik = bha()
     path = figure_eight([0.0, 0.0, 0.75], (0.3, 0.15), duration=2.0, dt=0.02)
@@ -589,6 +601,7 @@ def test_track_takes_a_trajectory_uneven_times_and_gaps_in_the_path():
     assert track.error[47:].max() < 1e-3  # one jump to the path, one step to settle
 
 
+@pytest.mark.slow
 def test_a_path_out_of_reach_is_followed_at_the_limits():
     start, end = np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.0, 1.5])
     path = start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start)
@@ -647,6 +660,7 @@ def test_float32_solves_to_a_tenth_of_a_millimetre(rng):
     assert (exact - target[solution.converged].double()).norm(dim=-1).max() < 1.01e-4
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     values=st.lists(

@@ -185,6 +185,7 @@ def test_poses_need_a_model_that_knows_them(rng):
         PoseTask(Linear(randn(rng, 3, 9)))
 
 
+@pytest.mark.slow
 def test_a_rigid_arm_reaches_poses_within_its_limits(rng, rigid):
     q = uniform(rng, -2.5, 2.5, 300, 7)
     ik = InverseKinematics(PoseTask(rigid), q_min=-2.6, q_max=2.6)
@@ -242,6 +243,7 @@ def conflict(rng, n):
     return tip, elbow
 
 
+@pytest.mark.slow
 def test_weights_trade_conflicting_tasks(rng):
     tip, elbow = conflict(rng, 40)
     sizes = []
@@ -324,6 +326,7 @@ def test_answers_do_not_depend_on_the_start(rng):
 # ---------------------------------------------------------------- the error model's domain
 
 
+@pytest.mark.slow
 def test_the_solver_stays_in_the_domain_of_a_hybrid_where_it_can(rng):
     data = datasets.load_trunk()
     model = HybridForwardModel(CHAIN, random_state=0).fit(data.q, data.x)
@@ -380,6 +383,7 @@ def finite_differences(ik, target, q, h=1e-5, **options):
     return torch.stack(columns, dim=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [{}, {"weights": np.arange(1.0, 10.0)}, {"q_pref": lambda q: q - 0.5 * uneven(q)}],
@@ -400,6 +404,7 @@ def test_derivatives_of_the_solution_against_finite_differences(rng, settings):
     assert_close(slope, expected, rtol=0.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_with_held_actuators_and_by_the_models_parameters(rng):
     q = uniform(rng, 0.2, 0.3, 9)
     target = CHAIN(q)

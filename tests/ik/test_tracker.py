@@ -90,6 +90,7 @@ def random_case(draw):
     return Linear(J, -J @ q), settings, q, target, dx, measured
 
 
+@pytest.mark.slow
 def test_step_is_that_of_inverse_kinematics():
     draw, kinds = np.random.default_rng(1), set()
     for _ in range(300):
@@ -109,6 +110,7 @@ def test_step_is_that_of_inverse_kinematics():
     assert len(kinds) >= 5
 
 
+@pytest.mark.slow
 def test_one_step_reaches_the_target_of_a_linear_model(draw):
     A, target = draw.standard_normal((3, 7)), draw.standard_normal(3)
     ik = InverseKinematics(Linear(A), q_pref=0.5, beta=20.0)
@@ -147,6 +149,7 @@ def test_any_task_is_followed(draw):
 # ---------------------------------------------------------------- streams
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dq_max", [None, 0.05, 0.01])
 @pytest.mark.parametrize("guard", ["leverage", None])
 def test_a_streamed_lap_is_the_loop_over_steps(hybrids, guard, dq_max):
@@ -319,6 +322,7 @@ def test_commands_are_of_the_kind_of_the_start(dtype):
     assert isinstance(InverseKinematics(CHAIN).tracker([0.25] * 9).q, np.ndarray)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow(hybrids):
     ik = InverseKinematics(hybrids["leverage"], q_min=0.17, q_max=0.32, dq_max=0.05)
     tracker = ik.tracker(np.full(9, 0.25), memory=1.0)

@@ -266,6 +266,7 @@ def test_block_size_does_not_matter(block_size):
 # Derivatives
 
 
+@pytest.mark.slow
 @variants
 @pytest.mark.parametrize("m", [0, 1, 3])
 def test_jacobian(params, m):
@@ -391,6 +392,7 @@ def test_leverage_grows_outside_the_data():
 # Hard data
 
 
+@pytest.mark.slow
 def test_float32_data_are_accumulated_in_float64():
     X, Y = trunk(3000)
     X32 = X.astype(np.float32)
@@ -479,6 +481,7 @@ def test_features_of_different_units_are_not_singular():
     assert model.solver_ == "cholesky"
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 12), st.integers(1, 5), st.integers(0, 3), st.integers(1, 20), st.booleans())
 def test_shapes(n, d, m, n_hidden, single):
@@ -519,6 +522,7 @@ def test_pickle_clone_copy_and_hash():
     assert joblib.hash(fresh) == joblib.hash(elm(input_scaling=BOUNDS))
 
 
+@pytest.mark.slow
 def test_pickle_is_the_same_in_another_process():
     code = (
         "import sys, pickle, numpy as np; from hybridkin import ELMRegressor;"

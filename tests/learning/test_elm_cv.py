@@ -50,6 +50,7 @@ def refitted(model, alpha, X, y, train, test, sample_weight=None):
     return y[test] - fresh.fit(X[train], y[train], weights).predict(X[test])
 
 
+@pytest.mark.slow
 @parametrize_with_checks(
     [
         ELMRegressorCV(n_hidden=20, max_hidden=40),
@@ -66,6 +67,7 @@ def test_scikit_learn_checks(estimator, check):
 # Errors on held-out rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fit_intercept", [False, True])
 @pytest.mark.parametrize("n", [12, 24, 60])  # fewer rows than features, about as many, more
 def test_each_row_alone_equals_brute_force(n, fit_intercept):
@@ -174,6 +176,7 @@ def test_best_params_give_the_chosen_model():
     assert len(results["alphas"]) >= 2 * 2 + 4
 
 
+@pytest.mark.slow
 def test_irrelevant_and_linear_inputs_cost_nothing():
     # Friedman's first: five of ten inputs do nothing, two act linearly.
     X, y = make_friedman1(1000, noise=1.0, random_state=0)
@@ -201,6 +204,7 @@ def test_no_worse_than_a_straight_line_where_that_is_the_truth():
     assert np.std(model.predict(X_test) - truth) < 1.5 * np.std(straight - truth)
 
 
+@pytest.mark.slow
 def test_groups_protect_from_leaking_motions():
     # Ten rows of a motion share its offset: row by row it can be memorised, by groups it cannot.
     rng = np.random.default_rng(0)
@@ -265,6 +269,7 @@ def test_float32_data_give_float32_and_the_same_choice():
     assert_allclose(single.predict(X.astype(np.float32)), double.predict(X), atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("m", [1, 3])
 def test_return_std_covers_new_measurements(m):
     """90 % intervals on 2000 new rows of the noise model, means over ten draws."""
@@ -370,6 +375,7 @@ def test_clear_errors(params, fit, message):
         quick(**params).fit(X, y, **fit)
 
 
+@pytest.mark.slow
 def test_errors_of_the_trunk_beat_the_paper_s_fixed_settings():
     trunk = load_trunk()
     X, y = trunk.q[:600], trunk.x[:600]

@@ -174,6 +174,7 @@ def scaled_out():
         yield example, client, example.compare(cluster, client, BLOCKS, N_ROWS)
 
 
+@pytest.mark.slow
 def test_dask_example_equals_one_fit(scaled_out):
     example, client, (model, looped, tree, curve, seconds) = scaled_out
     rows = [example.chunk(number, N_ROWS) for number in range(11)]
@@ -194,6 +195,7 @@ def test_dask_example_equals_one_fit(scaled_out):
     assert len(example.draw(tree, curve, seconds).axes) == 2
 
 
+@pytest.mark.slow
 def test_order_of_merges_does_not_matter():
     example = load_example()
     bounds = np.array([[0.2] * 9, [0.25] * 9])
@@ -219,6 +221,7 @@ def test_dask_example_says_so_where_dask_is_missing(monkeypatch, capsys):
     assert "Skipped: this example needs dask" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_joblib_on_dask_gives_the_same_scores(scaled_out):
     X, y = data()
     here = cross_validate(WatchedELM(20, random_state=0), X, y, return_estimator=True)
@@ -249,6 +252,7 @@ def two_processes():
     get_reusable_executor().shutdown(wait=True)
 
 
+@pytest.mark.slow
 def test_processes_share_the_cores(two_processes):
     X, y = data()
     estimator = WatchedELM(20, random_state=0)
@@ -262,6 +266,7 @@ def test_processes_share_the_cores(two_processes):
         assert_same_predictions(a, b, X)
 
 
+@pytest.mark.slow
 def test_thread_counts_are_left_alone():
     q = np.random.default_rng(0).uniform(0.1, 0.3, (60, 9))
     chain = ConstantCurvatureChain([0.1, 0.093, 0.079])
@@ -291,6 +296,7 @@ def as_frames(library, X, y):
     return library.DataFrame(columns), library.DataFrame({"x": y[:, 0], "z": y[:, 1]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library", [pd, pl], ids=["pandas", "polars"])
 def test_frames_through_a_search(library):
     X, y = data()
@@ -322,6 +328,7 @@ def test_pipeline_that_hands_on_frames(transform, last):
     assert_allclose(framed.score(X_frame, y), plain.score(X, y), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "estimator",
     [
@@ -346,6 +353,7 @@ def test_html_repr(estimator):
     assert name in estimator_html_repr(GridSearchCV(fresh, {"random_state": [0, 1]}).fit(X, y))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", [(True, True), (True, False), (False, True)], ids=str)
 def test_weights_reach_the_folds(weighted):
     X, y = data()

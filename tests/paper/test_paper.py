@@ -16,6 +16,7 @@ def test_the_kinds_of_spread_differ():
     assert summary(wide) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_table1_orders_the_models_as_the_paper_does():
     table = paper.table1(datasets.load_trunk(), n_splits=3, n_seeds=2, n_jobs=1)
     test = {(e["model"], e["learner"]): e["test"]["mean"] for e in table}
@@ -29,6 +30,7 @@ def test_table1_orders_the_models_as_the_paper_does():
     assert test["hybrid on calibrated", "ELM"] < test["mechanical, calibrated", "-"]
 
 
+@pytest.mark.slow
 def test_which_geometry_the_protocol_identifies():
     found = identifiability(datasets.load_trunk())
     assert (found["n_train"], found["n_single"], found["n_random"]) == (1900, 1500, 400)

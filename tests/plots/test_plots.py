@@ -185,6 +185,7 @@ def test_learning_curve_draws_mean_and_band(tmp_path):
 # Space
 
 
+@pytest.mark.slow
 def test_workspace_colours_are_the_errors(data, hybrid, tmp_path):
     q, x = data.q[:100], data.x[:100].copy()
     x[7] = np.nan
@@ -294,6 +295,7 @@ def test_several_bodies_and_rows_without_one(data):
 # Tracks
 
 
+@pytest.mark.slow
 def test_tracking_draws_target_and_tracks(x, tmp_path):
     figure, axes = plots.new_figure(6, 3, 1, 2)
     display = plots.TrackingDisplay(x, {"one": x + 0.01, "two": x})
@@ -306,6 +308,7 @@ def test_tracking_draws_target_and_tracks(x, tmp_path):
     assert drawn(figure, tmp_path)
 
 
+@pytest.mark.slow
 def test_tracks_show_what_was_measured(track, tmp_path):
     display = plots.TrackingDisplay.from_tracks({"a": track, "b": track})
     np.testing.assert_array_equal(display.tracks["a"], track.x_measured)
@@ -324,6 +327,7 @@ def test_tracks_show_what_was_measured(track, tmp_path):
         plots.TrackingDisplay.from_tracks({"a": track, "b": free})
 
 
+@pytest.mark.slow
 def test_unknown_tips_leave_gaps(x, tmp_path):
     reached = x + 1.5 * SHIFT
     reached[10:20] = np.nan
@@ -391,6 +395,7 @@ def test_a_frame_shows_body_tip_and_target(track, film):
     figure.draw_without_rendering()
 
 
+@pytest.mark.slow
 def test_gif_has_every_frame_and_reports_progress(film, tmp_path):
     calls = []
     path = film.save(
@@ -405,6 +410,7 @@ def test_gif_has_every_frame_and_reports_progress(film, tmp_path):
         assert np.abs(np.array(image.convert("RGB"), dtype=int) - first).max() > 100
 
 
+@pytest.mark.slow
 def test_film_is_seen_from_where_asked(film, tmp_path):
     pictures = []
     for view in ((30.0, -60.0), (90.0, -90.0)):
@@ -426,6 +432,7 @@ def test_mp4_plays_as_long_as_the_motion(film, tmp_path):
     assert stream == {"pix_fmt": "yuv420p", "r_frame_rate": "2/1", "nb_frames": "5"}
 
 
+@pytest.mark.slow
 def test_film_of_rows_that_are_not_known(tmp_path):
     q = np.tile(BENT, (4, 1))
     q[1], target = np.nan, np.full((4, 3), 0.5)

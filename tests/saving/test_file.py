@@ -72,6 +72,7 @@ def test_stored_hybrids_learn_on(path):
     assert np.abs(model.predict(q[:1]) - wanted[:1]).max() < 0.3 * before
 
 
+@pytest.mark.slow
 def test_there_is_a_file_of_every_kind_and_writing_keeps_it(tmp_path, fitted):
     names = {path.stem for path in FOLDER.glob("*.safetensors")}
     assert names == {*fitted}
@@ -87,6 +88,7 @@ def test_there_is_a_file_of_every_kind_and_writing_keeps_it(tmp_path, fitted):
     assert_array_equal(said_of(tmp_path / "models" / "rigid.safetensors")[0][0], [-1, -0.75, -0.5])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["chain", "drift_and_radius"])
 def test_flipped_bits_are_noticed(tmp_path, kind):
     source = FOLDER / f"{kind}.safetensors"
@@ -161,6 +163,7 @@ def _damages(array):
     return damages
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ONE_OF_EACH)
 def test_arrays_that_do_not_fit_are_refused_with_a_right_checksum_too(tmp_path, kind):
     source, path = FOLDER / f"{kind}.safetensors", tmp_path / "model"
@@ -218,6 +221,7 @@ def _may_be(entry, value):
     return number or (type(value) is type(entry) and bool(value))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["chain", "elm", "drift_and_radius", "parallel_kernel", "serial_elm"]
 )

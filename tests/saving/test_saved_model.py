@@ -156,6 +156,7 @@ def test_hybrid_comes_back(tmp_path, log, error_model, guard):
     assert_allclose(twin.fit(q, x).predict(q).mean(), model.predict(q).mean(), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_hybrid_comes_back_in_another_process(tmp_path, fitted):
     model, q = fitted["parallel_elm"]
     path = tmp_path / "model.safetensors"
@@ -175,6 +176,7 @@ def test_a_loaded_network_can_learn_on(tmp_path, log):
     assert_array_equal(twin.error_model_.partial_fit(q[100:], x[100:]).predict(q), was)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "elm",
     [
@@ -293,6 +295,7 @@ def settings(model):
     return {**params, "error_model": type(error) if error else error, "chain": repr(chain)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["serial_elm", "parallel_elm", "parallel_kernel", "blend"])
 def test_a_loaded_hybrid_is_fitted_again_as_what_it_was(tmp_path, kind, fitted):
     model, q = fitted[kind]

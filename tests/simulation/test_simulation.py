@@ -71,6 +71,7 @@ def test_quarter_circle_without_gravity(ideal):
     assert_allclose(pose[:3, 2], [1, 0, 0], atol=1e-2)
 
 
+@pytest.mark.slow
 def test_without_gravity_the_trunk_is_a_constant_curvature_chain(ideal, working):
     chain = ConstantCurvatureChain(RADII)
     for q_target in working[:8]:
@@ -127,6 +128,7 @@ def test_base_error_moves_the_measured_pose(working):
 # the map q -> x
 
 
+@pytest.mark.slow
 def test_lengths_reach_the_command_and_the_pose_is_rigid(plant, working):
     for q_target in working:
         q, pose = plant.settle(q_target)
@@ -135,6 +137,7 @@ def test_lengths_reach_the_command_and_the_pose_is_rigid(plant, working):
         assert_allclose(pose[3], [0, 0, 0, 1])
 
 
+@pytest.mark.slow
 def test_start_shape_does_not_matter(plant, working):
     state = plant._rest
     for q_target in working:
@@ -144,6 +147,7 @@ def test_start_shape_does_not_matter(plant, working):
         assert_allclose(*tips, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_tip_is_a_smooth_function_of_the_command(plant, working):
     direction = np.random.default_rng(1).standard_normal(9)
     direction /= np.linalg.norm(direction)
@@ -154,6 +158,7 @@ def test_tip_is_a_smooth_function_of_the_command(plant, working):
         assert np.linalg.norm(ahead - 2 * here + behind) / 1e-6 < 100  # curvature [1/m]
 
 
+@pytest.mark.slow
 def test_running_the_servos_from_straight_ends_in_the_same_shape(plant, working):
     target, model = working[0], plant._model
     data, integral = mujoco.MjData(model), np.zeros(9)
@@ -306,6 +311,7 @@ def test_missing_mujoco_names_the_extra(monkeypatch):
         TrunkPlant()
 
 
+@pytest.mark.slow
 def test_importing_the_folder_does_not_import_mujoco():
     code = "import sys, hybridkin.simulation, hybridkin.datasets; sys.exit('mujoco' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

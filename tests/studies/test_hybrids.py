@@ -12,6 +12,8 @@ from hybridkin.datasets._recordings import FTDCR_FILES, FTDCR_SERVOS
 PAPER, NOMINAL, CALIBRATED = cases.PAPER, cases.NOMINAL, cases.CALIBRATED
 SHOWN = (NOMINAL, CALIBRATED, PAPER, "serial, linear", "serial, quadratic", "auto")
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def one_plant():

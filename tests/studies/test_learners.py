@@ -24,6 +24,7 @@ def table(sets):
     return compare_learners(sets, {name: LEARNERS[name] for name in QUICK}, n_folds=3)
 
 
+@pytest.mark.slow
 def test_one_entry_for_every_set_and_learner(sets, table):
     assert [(e["set"], e["learner"]) for e in table] == [(s, name) for s in sets for name in QUICK]
     for entry in table:
@@ -41,6 +42,7 @@ def test_the_choosing_elm_is_best_on_smooth_sets(table):
         assert mean[name, "ELMRegressorCV"] < mean[name, "RidgeCV"]
 
 
+@pytest.mark.slow
 def test_the_same_again_from_the_same_seed(sets, table):
     again = learning_sets(300)
     for name, (X, y) in sets.items():
@@ -87,6 +89,7 @@ def test_error_of_several_outputs_is_a_distance():
     assert compare_learners(data, zero, n_folds=2)[0]["rmse"] == pytest.approx([5.0, 5.0])
 
 
+@pytest.mark.slow
 def test_every_learner_of_the_table_fits():
     progress = []
     X, y = make_arm(60)
@@ -108,6 +111,7 @@ def test_arm_of_more_rows_is_the_same_arm():
     assert np.std(y[:100] - y_few) == pytest.approx(np.sqrt(2) * noise, rel=0.3)
 
 
+@pytest.mark.slow
 def test_the_speed_curve_stops_and_the_report_shows_all(tmp_path, table):
     def slow(d, seed):
         class Slow(DummyRegressor):
@@ -131,6 +135,7 @@ def test_the_speed_curve_stops_and_the_report_shows_all(tmp_path, table):
     assert text.count("**") == 2 * 6
 
 
+@pytest.mark.slow
 def test_runs_from_the_command_line(tmp_path, capsys):
     out = tmp_path / "results"
     options = ["--learners", "ELMRegressor", "RidgeCV", "--rows", "60"]

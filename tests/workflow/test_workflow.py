@@ -63,6 +63,7 @@ def log(tmp_path):
     return path, robot
 
 
+@pytest.mark.slow
 def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
     pytest.importorskip("mujoco")
     out = tmp_path / "results"
@@ -119,6 +120,7 @@ def test_entries_of_a_calibration_have_units_a_user_reads(rng):
         assert entry["narrowing"] > 10
 
 
+@pytest.mark.slow
 def test_turns_of_rings_are_not_identified_apart_from_the_base(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace('"base"]', '"turns", "base"]'))
@@ -130,6 +132,7 @@ def test_turns_of_rings_are_not_identified_apart_from_the_base(log, tmp_path):
     assert f"- {sentence}" in text
 
 
+@pytest.mark.slow
 def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace("0.11", "0.05"))
@@ -167,6 +170,7 @@ q_sign = -1
 """
 
 
+@pytest.mark.slow
 def test_fit_of_elastic_tendons(slack_log, tmp_path):
     path, data = slack_log
     robot = tmp_path / "elastic.toml"
@@ -193,6 +197,7 @@ def test_fit_of_elastic_tendons(slack_log, tmp_path):
     assert errors.mean() < 0.0005
 
 
+@pytest.mark.slow
 def test_fit_of_the_plain_chain_warns_of_slack_once(slack_log, tmp_path):
     path, _ = slack_log
     robot = tmp_path / "plain.toml"
@@ -205,12 +210,14 @@ def test_fit_of_the_plain_chain_warns_of_slack_once(slack_log, tmp_path):
     assert f"Warning: {caught[0].message}" in text
 
 
+@pytest.mark.slow
 def test_without_a_column_of_motions_the_log_is_cut_into_stretches(log, tmp_path):
     path, robot = log
     report, _ = fit(path, robot, tmp_path / "m")
     assert report.record["n_motions"] == 10
 
 
+@pytest.mark.slow
 def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home, tmp_path):
     robot = robots.read_description("examples/robots/ftdcr_v4.toml")
     data = datasets.load_ftdcr(data_home)
@@ -222,6 +229,7 @@ def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home, t
     assert mean["hybrid, ELM"] < mean["data-driven, ELM"]
 
 
+@pytest.mark.slow
 def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
     path, data = slack_log
     robot = tmp_path / "plain.toml"
@@ -249,6 +257,7 @@ def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
     assert np.linalg.norm(predicted - data["x"], axis=1).mean() < 0.0005
 
 
+@pytest.mark.slow
 def test_play_lowers_the_errors_of_auto_on_held_out_motions():
     rng = np.random.default_rng(0)
     chain = ConstantCurvatureChain([0.005], lengths=[0.1])
