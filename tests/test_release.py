@@ -100,6 +100,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
     assert built[1].stat().st_size < 1_000_000
 
 
+@pytest.mark.slow
 def test_the_wheel_says_what_it_needs(built):
     about = f"hybridkin-{hybridkin.__version__}.dist-info/"
     wheel = zipfile.ZipFile(built[1])

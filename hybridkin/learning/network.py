@@ -73,7 +73,7 @@ class ELM(LeverageModule):
         super().__init__()
         self.activation = activation
         for name in LAYER + READOUT:
-            self.register_buffer(name, torch.tensor(np.array(arrays[name], order="C")))
+            self.register_buffer(name, torch.tensor(np.asarray(arrays[name], order="C")))
         n_hidden, self.n_actuators = self.input_weights.shape
         n_features, self.n_outputs = self.output_weights.shape
         if n_features not in (n_hidden, n_hidden + self.n_actuators):

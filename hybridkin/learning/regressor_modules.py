@@ -61,7 +61,7 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
 
 def _register(module: nn.Module, **arrays: ArrayLike) -> None:
     for name, array in arrays.items():
-        module.register_buffer(name, torch.tensor(np.array(array, order="C"), dtype=torch.float64))
+        module.register_buffer(name, torch.tensor(np.asarray(array, order="C"), dtype=torch.float64))
 
 
 class AffineModule(ForwardModel):

@@ -36,6 +36,7 @@ def test_against_a_rigid_arm(race, chain, draw, arm, batch):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["tip", "tip + J"])
 def test_tendons_that_can_only_pull(race, batch, what):
     """What slack costs: half of the rows have slack tendons."""

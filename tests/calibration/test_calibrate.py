@@ -235,6 +235,7 @@ def any_robot(lengths, routing, n, tip, rng):
     return chain, draw(rng, 7, 2 * n)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_by_the_geometry(kind, rng):
     chain, q = any_robot(*kind, rng)

@@ -260,6 +260,7 @@ def test_change_of_units(rng):
     assert_close(in_mm.tensions(1e3 * q), 1e3 * chain.tensions(q), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @each_robot
 def test_jacobian_against_central_differences(chain, rng):
     q, step = random_q(rng, 100, chain.n_actuators), 1e-6

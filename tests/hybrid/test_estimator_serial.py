@@ -89,6 +89,7 @@ def test_module_jacobian_and_parts_in_and_out_of_the_domain(fitted, trunk):
     assert_close(single.double(), tips, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_far_out_the_mechanical_model_remains(fitted, trunk):
     far = torch.from_numpy(trunk[0][:50] * 3)
     module = fitted.module_

@@ -159,6 +159,7 @@ def test_jacobian(robot, kind, coupling, rng):
         assert_close(J, central_differences(module, q), atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["trunk", "cables", "arm"])
 def test_planted_correction_is_recovered(robot, rng):
     chain, q = rows_of(robot, rng, 500)

@@ -58,6 +58,7 @@ def test_no_worse_than_the_single_candidates(chosen, trunk):
     assert error < 0.75 * errors[-1]
 
 
+@pytest.mark.slow
 def test_it_says_what_it_chose(chosen):
     results = chosen.cv_results_
     n = len(results["candidate"])

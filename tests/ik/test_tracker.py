@@ -173,6 +173,7 @@ def closed_path(n):
     return np.stack([0.1 * np.sin(phase), 0.06 * np.sin(2.0 * phase), height], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feedback", ["model", "measured", None])
 def test_steps_follow_a_path_as_track_does(feedback):
     def plant(q):
@@ -360,6 +361,7 @@ def test_bad_input_says_what_is_needed():
         InverseKinematics(Linear(np.ones((3, 4))), q_min=np.zeros(4)).tracker(np.zeros(5))
 
 
+@pytest.mark.slow
 def test_many_segments_and_more_actuators(draw):
     """Nothing depends on nine actuators or three segments."""
     chain = ConstantCurvatureChain([0.1, 0.09, 0.08, 0.07, 0.06], n_actuators=4)

@@ -71,6 +71,7 @@ def differences(predict, X, step=1e-6):
     return np.stack([column.reshape(len(X), -1) for column in columns], axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("m", [1, 2])
 @pytest.mark.parametrize(("kind", "regressor"), CLOSED, ids=names)
 def test_closed_form(kind, regressor, m):

@@ -264,6 +264,7 @@ def test_a_rigid_arm_shows_its_links():
     assert "links and joints" in ax.get_legend_handles_labels()[1]
 
 
+@pytest.mark.slow
 def test_a_fitted_hybrid_shows_its_correction(hybrid, data, tmp_path):
     display = plots.BackboneDisplay.from_estimator(hybrid, data.q[3])
     np.testing.assert_allclose(display.predicted[0], hybrid.predict(data.q[3:4])[0])
@@ -340,6 +341,7 @@ def test_unknown_tips_leave_gaps(x, tmp_path):
     assert drawn(figure, tmp_path)
 
 
+@pytest.mark.slow
 def test_actuators_share_out_over_segments(track, tmp_path):
     figure, axes = plots.new_figure(4, 4, 2, 1)
     q = np.arange(21.0).reshape(3, 7)
@@ -447,6 +449,7 @@ def test_film_of_rows_that_are_not_known(tmp_path):
     assert None not in frames[0]["data"][0]["x"]
 
 
+@pytest.mark.slow
 def test_small_errors_are_distinguished(tmp_path):
     """Micrometres of an error on a robot of a metre: rounded by its own size, not the robot's."""
     chain, q = robots.bionic_handling_assistant(), np.tile(BENT, (5, 1))

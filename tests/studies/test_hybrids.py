@@ -112,6 +112,7 @@ def test_one_entry_for_every_model_and_size(curves):
     assert set(entry(curves, "auto", 120)["scores"]) >= {"mechanical", "serial quadratic"}
 
 
+@pytest.mark.slow
 def test_serial_and_auto_beat_the_papers_hybrid(curves):
     paper = mean(curves, PAPER, 120)
     assert mean(curves, "serial, quadratic", 120) < 0.8 * paper
