@@ -61,7 +61,8 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
 
 def _register(module: nn.Module, **arrays: ArrayLike) -> None:
     for name, array in arrays.items():
-        module.register_buffer(name, torch.tensor(np.asarray(array, order="C"), dtype=torch.float64))
+        rows = np.asarray(array, dtype=np.float64, order="C")
+        module.register_buffer(name, torch.tensor(rows))
 
 
 class AffineModule(ForwardModel):
