@@ -42,8 +42,12 @@ autodoc_typehints = "none"
 autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
+# Modules that the package opens as its attributes are documented under these names.
+for _name in ("robots", "tasks", "trajectories"):
+    sys.modules[f"hybridkin.{_name}"] = getattr(hybridkin, _name)
+
 nitpicky = True
-nitpick_ignore = [("py:class", "sklearn.utils.Bunch")]
+nitpick_ignore = [("py:class", "sklearn.utils.Bunch"), ("py:obj", "Trajectory")]
 # Single quotes also mark arguments, methods and constants, which have no page of their own.
 nitpick_ignore_regex = [("py:obj", r"[a-z_].*|[A-Z_]+")]
 

@@ -81,7 +81,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         What y holds. "pose": rows of tip position [m] and rotation vector [rad] of the tip's frame
         in the measuring frame. The errors of both are learned as six numbers [m], a radian as the
         reach of the chain, and set p = p_mech + eps_p and R = exp(eps_r / reach) R_mech. For a
-        `PoseModel` and regressors, parallel, without `coverage`; a calibration uses the positions.
+        ``PoseModel`` and regressors, parallel, no `coverage`; a calibration uses the positions.
     random_state : int, RandomState or None, default=None
         Seed of the named error models; a given regressor has its own.
 
