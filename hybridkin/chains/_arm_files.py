@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import math
+import warnings
 from collections.abc import Sequence
+from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -17,6 +19,7 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain
 
+_UNLIMITED = (-math.inf, math.inf)
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 
 
@@ -41,10 +44,7 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
             pending = np.eye(4)
     if not moving:
         raise ValueError("the path from the root to `end_link` must have a moving joint.")
-    # Limits that are missing or empty (lower = upper) are infinite.
-    given = [(0.0, 0.0) if joint.limits is None else joint.limits for joint in moving]
-    limits = np.array(given, dtype=float)
-    limits[limits[:, 0] >= limits[:, 1]] = -math.inf, math.inf
+    limits = np.array([_limits(joint) for joint in moving])
     return {
         "origins": np.stack([joint.origin for joint in moving]),
         "axes": [joint.axis for joint in moving],
@@ -54,6 +54,17 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
         "q_max": limits[:, 1],
         "tip": pending,
     }
+
+
+def _limits(joint: Joint) -> tuple[float, float]:
+    """Return the limits of a joint: infinite without any; equal ones lock it."""
+    low, high = _UNLIMITED if joint.limits is None else map(float, joint.limits)
+    if not low <= high or math.inf in (low, -high):
+        raise ValueError(
+            f"joint {joint.name!r} must have a lower and an upper limit, the smaller first, got "
+            f"{low:g} and {high:g}; correct them in the robot description."
+        )
+    return low, high
 
 
 def _source(text_or_path: str | PathLike[str]) -> str | Path:
@@ -68,11 +79,11 @@ def _source(text_or_path: str | PathLike[str]) -> str | Path:
     return path
 
 
-def _one_of(name: str, known: Sequence[str], argument: str) -> str:
+def _one_of(name: str, known: Sequence[str], what: str) -> str:
     if name not in known:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {close[0]!r}? It has" if close else "it has"
-        raise ValueError(f"`{argument}` {name!r} is not in the robot; {hint} {list(known)}.")
+        raise ValueError(f"{what} {name!r} is not in the robot; {hint} {list(known)}.")
     return name
 
 
@@ -86,18 +97,57 @@ def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         robot: Any = URDF.from_xml_string(text)
     except Exception as error:  # the reader has no exception of its own for all its failures
         raise ValueError(f"`text_or_path` must be a valid URDF: {error}.") from error
-    by_child = {joint.child: joint for joint in robot.joints}
     known = [link.name for link in robot.links]
-    link = _one_of(end_link, known, "end_link")
-    root = None if root_link is None else _one_of(root_link, known, "root_link")
+    _check_tree(known, robot.joints)
+    by_child = {joint.child: joint for joint in robot.joints}
+    link = _one_of(end_link, known, "`end_link`")
+    root = None if root_link is None else _one_of(root_link, known, "`root_link`")
     path: list[Joint] = []
     while link != root and link in by_child:
-        joint = by_child.pop(link)  # so that a circle ends
-        path.insert(0, _urdf_joint(joint))
-        link = joint.parent
+        path.insert(0, _urdf_joint(by_child[link]))
+        link = by_child[link].parent
     if root is not None and link != root:
         raise ValueError(f"`root_link` must lead to {end_link!r}, but {root!r} does not.")
+    moving = [joint for joint in path if joint.kind != "fixed"]
+    missing = [joint.name for joint in moving if joint.limits is None]
+    if missing:
+        warnings.warn(
+            f"joints {missing} have no <limit>, which URDF requires; they are taken as unlimited. "
+            'Add <limit>, or set type="continuous" if they turn without end.',
+            stacklevel=3,
+        )
+    locked = [joint.name for joint in moving if joint.limits == (0.0, 0.0)]
+    if locked:
+        warnings.warn(
+            f"joints {locked} are locked at 0: their limits are 0 and 0, which URDF also takes "
+            "where `lower` and `upper` are left out. Give both if they move.",
+            stacklevel=3,
+        )
     return path
+
+
+def _check_tree(links: list[str], joints: Sequence[Any]) -> None:
+    """Raise unless links and joints are one tree, with names that occur once."""
+    children = [joint.child for joint in joints]
+    names = {"link": links, "joint": [joint.name for joint in joints], "<child>": children}
+    for what, given in names.items():
+        doubled = sorted({name for name in given if given.count(name) > 1})
+        if doubled:
+            raise ValueError(f"every {what} of a URDF must occur once, got {doubled} more often.")
+    for joint in joints:
+        for what, link in (("<parent>", joint.parent), ("<child>", joint.child)):
+            _one_of(link, links, f"{what} of joint {joint.name!r}")
+    try:
+        TopologicalSorter({joint.child: [joint.parent] for joint in joints}).prepare()
+    except CycleError as error:
+        loop = " -> ".join(error.args[1])
+        raise ValueError(f"the links of a URDF must be a tree, got a cycle: {loop}.") from error
+    roots = [link for link in links if link not in children]
+    if len(roots) > 1:
+        raise ValueError(
+            f"a URDF must have one root, but no joint leads to any of {roots}; connect them by a "
+            "joint, or remove all but one."
+        )
 
 
 def _urdf_joint(joint: Any) -> Joint:
@@ -117,7 +167,7 @@ def _urdf_joint(joint: Any) -> Joint:
         origin = _matrix(turn, joint.origin.xyz or [0, 0, 0])
     kind = "revolute" if joint.type == "continuous" else joint.type
     axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # the URDF default
-    limits = None
+    limits = _UNLIMITED if joint.type == "continuous" else None
     if joint.type != "continuous" and joint.limit is not None:
         limits = (joint.limit.lower, joint.limit.upper)
     return Joint(origin, kind, axis, joint.name, limits)
@@ -141,8 +191,8 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         raise ValueError(f"`text_or_path` must be a valid MJCF: {error}.") from error
     bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
     sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
-    _one_of(end_link, [*bodies, *sites], "end_link")
-    root = 0 if root_link is None else bodies[_one_of(root_link, list(bodies), "root_link")]
+    _one_of(end_link, [*bodies, *sites], "`end_link`")
+    root = 0 if root_link is None else bodies[_one_of(root_link, list(bodies), "`root_link`")]
     path: list[Joint] = []
     body = bodies.get(end_link, -1)
     if body < 0:
@@ -169,7 +219,15 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
                 "and slides are supported on the way to `end_link`; choose a `root_link` after it."
             )
         axis, anchor, zero = model.jnt_axis[j], model.jnt_pos[j], model.qpos0[model.jnt_qposadr[j]]
-        limits = model.jnt_range[j] if model.jnt_limited[j] else None
+        # MuJoCo ignores a range that is not in order; the default, two zeros, stands for none.
+        limits = tuple(model.jnt_range[j].tolist())
+        if not model.jnt_limited[j] and (limits[0] < limits[1] or not any(limits)):
+            limits = None
+        elif limits[0] == limits[1]:
+            raise ValueError(
+                f"`range` of joint {name!r} must be an interval, got {limits}: MuJoCo would ignore "
+                'it. Remove the joint to lock it, or set limited="false".'
+            )
         back, none = -zero * axis, np.zeros(3)  # from MuJoCo's reference to q = 0
         turn, slide = (back, none) if _MJCF_KINDS[kind] == "revolute" else (none, back)
         origin = _matrix(Rotation.from_rotvec(turn), anchor + slide)
@@ -204,5 +262,6 @@ def chain_path(chain: Chain) -> list[Joint]:
                 origin = origin @ offset.get_matrix()[0].detach().cpu().double().numpy()
         joint = frame.joint
         axis = joint.axis.detach().cpu().double().numpy()
-        path.append(Joint(origin, joint.joint_type, axis, joint.name, joint.limits))
+        limits = joint.limits if any(joint.limits or ()) else None  # two zeros: none in an MJCF
+        path.append(Joint(origin, joint.joint_type, axis, joint.name, limits))
     return path

@@ -161,16 +161,21 @@ class RigidChain(Chain):
         Returns
         -------
         RigidChain
-            Its actuators are the moving joints of the path, in order. Limits that are missing or
-            empty (lower = upper) are infinite.
+            Its actuators are the moving joints of the path, in order. Equal limits lock a joint;
+            continuous joints, and with a warning joints without <limit>, have infinite ones.
 
         Raises
         ------
         FileNotFoundError
             If there is no such file.
         ValueError
-            For text that is no URDF, links that are not there or not connected, a path without
-            moving joint, and joints that are floating, planar or mimic another one.
+            For text that is no URDF, links that are not one tree, a path without moving joint,
+            limits that are swapped or NaN, and joints that are floating, planar or mimic another.
+
+        Warns
+        -----
+        UserWarning
+            Of joints without <limit>, and of joints whose limits are both zero.
         """
         return cls(**moving_joints(urdf_path(text_or_path, end_link, root_link)), **options)
 
@@ -200,6 +205,7 @@ class RigidChain(Chain):
         -------
         RigidChain
             Its actuators are the hinges and slides of the path, in order; q is MuJoCo's qpos.
+            Limits are those of `range`, infinite without one or with ``limited="false"``.
 
         Raises
         ------
@@ -209,7 +215,7 @@ class RigidChain(Chain):
             If there is no such file.
         ValueError
             For text that is no MJCF, bodies that are not there or not connected, a path without
-            moving joint, and free or ball joints.
+            moving joint, a `range` that is no interval, and free or ball joints.
         """
         return cls(**moving_joints(mjcf_path(text_or_path, end_link, root_link)), **options)
 

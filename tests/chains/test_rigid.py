@@ -31,18 +31,18 @@ URDF = """<?xml version="1.0" encoding="utf-8"?>
   <joint name="j3" type="prismatic"><parent link="l2"/><child link="l3"/>
     <origin xyz="0 -0.3 0" rpy="1.5707963 0 0.4"/><axis xyz="0.6 0 0.8"/>
     <limit lower="0" upper="0.4" effort="1" velocity="1"/></joint>
-  <joint name="j4" type="revolute"><parent link="l3"/><child link="l4"/>
+  <joint name="j4" type="continuous"><parent link="l3"/><child link="l4"/>
     <origin xyz="0.08 0 0" rpy="1.57 0 0"/><axis xyz="0 1 0"/>
     <limit effort="1" velocity="1"/></joint>
   <joint name="screws" type="fixed"><parent link="l4"/><child link="plate"/>
     <origin xyz="0 0 0.05" rpy="0 0.3 0"/></joint>
-  <joint name="j5" type="revolute"><parent link="plate"/><child link="l5"/>
+  <joint name="j5" type="continuous"><parent link="plate"/><child link="l5"/>
     <origin xyz="-0.08 0.38 0" rpy="-1.57 0 0"/><axis xyz="0 0 1"/></joint>
-  <joint name="j6" type="revolute"><parent link="l5"/><child link="l6"/>
+  <joint name="j6" type="continuous"><parent link="l5"/><child link="l6"/>
     <origin rpy="1.57 0 0"/><axis xyz="-1 0 0"/></joint>
-  <joint name="j7" type="revolute"><parent link="l6"/><child link="l7"/>
+  <joint name="j7" type="continuous"><parent link="l6"/><child link="l7"/>
     <origin xyz="0.09 0 0" rpy="1.57 0 0"/><axis xyz="0 0.28 0.96"/></joint>
-  <joint name="j8" type="revolute"><parent link="l7"/><child link="l8"/>
+  <joint name="j8" type="continuous"><parent link="l7"/><child link="l8"/>
     <origin xyz="0 0 0.1"/><axis xyz="1 0 0"/></joint>
   <joint name="weld" type="fixed"><parent link="l8"/><child link="flange"/>
     <origin xyz="0 0.02 0.1" rpy="0 0 0.7"/></joint>
@@ -484,13 +484,105 @@ EYES = np.stack([np.eye(4)] * 2)
             lambda: RigidChain.from_urdf(LINKS.format(JOINT.format("floating", "")), "b"),
             "joint 'j' is floating",
         ),
-        (lambda: RigidChain.from_urdf(CIRCLE, "b"), "must have a moving joint"),
+        (lambda: RigidChain.from_urdf(CIRCLE, "b"), "must be a tree, got a cycle"),
         (lambda: RigidChain.from_urdf(MIMIC, "b"), "joint 'j' mimics 'k'"),
     ],
 )
 def test_bad_input_says_what_is_needed(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def one_joint(low, high):
+    limit = f'<limit lower="{low}" upper="{high}" effort="1" velocity="1"/>'
+    return LINKS.format(JOINT.format("revolute", limit))
+
+
+@pytest.mark.parametrize("limits", [(1, -1), ("nan", 1), (0, "nan"), ("inf", "inf"), (0, "-inf")])
+def test_wrong_urdf_limits_name_the_joint(limits):
+    with pytest.raises(ValueError, match="joint 'j' must have a lower and an upper limit"):
+        RigidChain.from_urdf(one_joint(*limits), "b")
+
+
+def test_equal_urdf_limits_lock_the_joint(rng):
+    arm = RigidChain.from_urdf(one_joint(0.3, 0.3), "b")
+    assert (float(arm.q_min), float(arm.q_max)) == (0.3, 0.3)
+    with pytest.warns(UserWarning, match=r"\['j'\] are locked at 0"):
+        arm = RigidChain.from_urdf(one_joint(0, 0), "b")
+    assert (float(arm.q_min), float(arm.q_max)) == (0.0, 0.0)
+
+
+def test_missing_urdf_limits_are_unlimited_with_a_warning():
+    with pytest.warns(UserWarning, match=r"\['j'\] have no <limit>") as caught:
+        arm = RigidChain.from_urdf(LINKS.format(JOINT.format("revolute", "")), "b")
+    assert caught[0].filename == __file__
+    assert (float(arm.q_min), float(arm.q_max)) == (-math.inf, math.inf)
+
+
+def test_inverse_kinematics_keeps_a_locked_joint(rng):
+    low, high = torch.tensor([-2.0, 0.4, -2.0]), torch.tensor([2.0, 0.4, 2.0])
+    origins = np.stack([translation(0.2, 0.0, 0.0)] * 3)
+    locked = RigidChain(origins, [Z, [0, 1, 0], Z], tool=[0.2, 0, 0.1], q_min=low, q_max=high)
+    q = low + (high - low) * torch.rand(50, 3, generator=rng, dtype=torch.float64)
+    ik = InverseKinematics(locked, q_min=locked.q_min, q_max=locked.q_max)
+    found = ik.solve(locked(q), restarts=8, random_state=0)
+    assert found.converged.all()
+    assert_close(found.q[:, 1], torch.full((50,), 0.4, dtype=torch.float64), rtol=0, atol=1e-7)
+
+
+EXTRA = '<link name="c"/>' + JOINT.replace('"j"', '"k"').format("fixed", "")
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        (JOINT.replace('"a"', '"z"'), "<parent> of joint 'j' 'z' is not in the robot"),
+        (JOINT + EXTRA.replace('"b"', '"z"'), "<child> of joint 'k' 'z' is not in the robot"),
+        (JOINT + EXTRA.replace('"a"', '"b"').replace('"b"', '"c"'), "got a cycle: c -> c"),
+        (JOINT + '<link name="c"/>', r"one root, but no joint leads to any of \['a', 'c'\]"),
+        (JOINT + EXTRA.replace('"a"', '"c"'), r"every <child> .* once, got \['b'\]"),
+        (JOINT + '<link name="a"/>', r"every link .* once, got \['a'\]"),
+        (JOINT + EXTRA.replace('"b"', '"c"').replace('"k"', '"j"'), r"every joint .* \['j'\]"),
+    ],
+)
+def test_a_urdf_must_be_a_tree(joints, message):
+    with pytest.raises(ValueError, match=message):
+        RigidChain.from_urdf(LINKS.format(joints.format("fixed", "")), "b")
+
+
+HINGE = '<mujoco><compiler {}/><worldbody><body name="b"><joint name="j" {}/>'
+HINGE += '<geom size="0.1"/></body></worldbody></mujoco>'
+
+
+@pytest.mark.parametrize(
+    ("compiler", "joint", "limits"),
+    [
+        ("", 'range="-30 60"', (-math.pi / 6, math.pi / 3)),
+        ('angle="radian"', 'range="-1 2"', (-1.0, 2.0)),
+        ("", 'type="slide" range="-0.1 0.2"', (-0.1, 0.2)),
+        ("", 'range="-30 60" limited="false"', (-math.inf, math.inf)),
+        ("", "", (-math.inf, math.inf)),
+    ],
+)
+def test_mjcf_limits(compiler, joint, limits):
+    pytest.importorskip("mujoco")
+    arm = RigidChain.from_mjcf(HINGE.format(compiler, joint), "b")
+    assert (float(arm.q_min), float(arm.q_max)) == pytest.approx(limits, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("joint", "message"),
+    [
+        ('range="30 -30"', "joint 'j' must have a lower and an upper limit"),
+        ('range="nan 1"', "joint 'j' must have a lower and an upper limit"),
+        ('range="5 5"', "`range` of joint 'j' must be an interval"),
+        ('limited="true"', "must be a valid MJCF"),
+    ],
+)
+def test_wrong_mjcf_limits_name_the_joint(joint, message):
+    pytest.importorskip("mujoco")
+    with pytest.raises(ValueError, match=message):
+        RigidChain.from_mjcf(HINGE.format("", joint), "b")
 
 
 @pytest.mark.parametrize(
