@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # the command line reads the table before torch is loaded
     from torch import Tensor
 
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 """Metres in each unit of length that logs, paths and options are given in."""
+
+UNITS = {**METRES, "rad": 1.0, "deg": math.pi / 180, "1": 1.0}
+"""Metres or radians in each unit of actuators; "1" is left as it is."""
 
 _TURNS = 4.0 * math.pi  # [rad]; a joint or an angle that goes further is more likely in degrees
 _SPANS = 10.0  # a tip moves within two lengths of its robot; millimetres look like 2000

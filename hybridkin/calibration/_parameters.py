@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.rotations import cross_matrix, rotation
-from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
 
 _Vector = TypeVar("_Vector", NDArray, Tensor)
 
-ALIASES = {"turns": "angles", "tool": "offsets"}  # name -> the entry of which it moves a part
 # Positive geometry, and the factor of its start within which it stays, both ways.
 SCALED = {"radii": 5.0, "lengths": 5.0, "bending_stiffness": 1e4, "axial_stiffness": 1e4}
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end

@@ -20,6 +20,14 @@ if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain
 
 _UNLIMITED = (-math.inf, math.inf)
+_MISSING = (
+    "have no <limit>, which URDF requires; they are taken as unlimited. Add <limit>, or set "
+    'type="continuous" if they turn without end.'
+)
+_LOCKED = (
+    "are locked at 0: their limits are 0 and 0, as URDF has it where `lower` and `upper` are left "
+    "out. Give both if they move."
+)
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 
 
@@ -110,19 +118,10 @@ def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         raise ValueError(f"`root_link` must lead to {end_link!r}, but {root!r} does not.")
     moving = [joint for joint in path if joint.kind != "fixed"]
     missing = [joint.name for joint in moving if joint.limits is None]
-    if missing:
-        warnings.warn(
-            f"joints {missing} have no <limit>, which URDF requires; they are taken as unlimited. "
-            'Add <limit>, or set type="continuous" if they turn without end.',
-            stacklevel=3,
-        )
     locked = [joint.name for joint in moving if joint.limits == (0.0, 0.0)]
-    if locked:
-        warnings.warn(
-            f"joints {locked} are locked at 0: their limits are 0 and 0, which URDF also takes "
-            "where `lower` and `upper` are left out. Give both if they move.",
-            stacklevel=3,
-        )
+    for names, what in ((missing, _MISSING), (locked, _LOCKED)):
+        if names:
+            warnings.warn(f"joints {names} {what}", stacklevel=3)
     return path
 
 

@@ -72,19 +72,21 @@ def shaped(
 
 
 def actuator_counts(
-    n_actuators: int | Sequence[int], n_segments: int, name: str, least: int
+    n_actuators: int | Sequence[int], n_segments: int, least: int
 ) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
-    given = np.asarray(n_actuators).astype(int).tolist()
-    counts = tuple(given) if isinstance(given, list) else (given,) * n_segments
-    if len(counts) != n_segments:
+    given = np.asarray(n_actuators)
+    if given.dtype.kind not in "iu" or given.shape not in ((), (n_segments,)):
         raise ValueError(
-            f"`{name}` must be one number or {n_segments} numbers, one per segment as in "
-            f"`radii`, got {len(counts)}."
+            f"`n_actuators` must be one whole number or {n_segments} of them, one per segment as "
+            f"in `radii`, got {n_actuators!r}."
         )
+    counts = tuple(np.broadcast_to(given, n_segments).tolist())
     if min(counts) < least:
         why = "; two actuators do not determine which way a segment bends" if least == 3 else ""
-        raise ValueError(f"`{name}` must be at least {least} on every segment, got {counts}{why}.")
+        raise ValueError(
+            f"`n_actuators` must be at least {least} on every segment, got {counts}{why}."
+        )
     return counts
 
 

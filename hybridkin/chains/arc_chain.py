@@ -6,7 +6,7 @@ import copy
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +24,11 @@ from hybridkin.chains.chain import Chain
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+ALIASES = {"turns": "angles", "tool": "offsets"}
+"""Names of `calibrate` that move a part of an entry of the geometry, and that entry."""
+
 _ROUTINGS = ("segment", "base")
+_MOST_UNLIKE = 1000.0  # radii of one robot; more leave too few digits to the routing "base"
 STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "routing": str}
 
 
@@ -46,8 +50,6 @@ class ArcChain(Chain):
 
     _structure = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
 
-    _counts: ClassVar[str]  # what the constructor calls the actuators per segment
-
     n_segments: int
     actuators_per_segment: tuple[int, ...]
     routing: str
@@ -61,7 +63,8 @@ class ArcChain(Chain):
         self,
         radii: Numbers,
         lengths: Numbers | None,
-        counts: tuple[str, int | Sequence[int], int],
+        n_actuators: int | Sequence[int],
+        fewest: int,
         angles: Numbers | None,
         routing: str,
         offsets: Numbers,
@@ -71,15 +74,18 @@ class ArcChain(Chain):
     ) -> dict[str, Tensor]:
         """Set the structure of the chain, and return the checked geometry that all kinds have.
 
-        `counts` is the argument that counts the actuators: its name, its value, and how few a
-        segment may have.
+        `fewest` is how few actuators a segment may have.
         """
         if routing not in _ROUTINGS:
             raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
         radii = lengths_of(radii, "radii", dtype)
+        if radii.max() > _MOST_UNLIKE * radii.min():
+            raise ValueError(
+                f"`radii` must be within a factor of {_MOST_UNLIKE:g} of each other, got "
+                f"{radii.tolist()} m; check their units."
+            )
         S = radii.numel()
-        name, n_actuators, least = counts
-        self.actuators_per_segment = actuator_counts(n_actuators, S, name, least)
+        self.actuators_per_segment = actuator_counts(n_actuators, S, fewest)
         self.n_segments, self.n_actuators = S, sum(self.actuators_per_segment)
         self.routing, self.tip_at = routing, float(S)
         warn_millimetres("radii", radii, 1.0)
@@ -427,6 +433,6 @@ class ArcChain(Chain):
         if sum(counts) != len(entries["angles"]):
             raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
         entries["angles"] = np.split(entries["angles"], np.cumsum(counts)[:-1])
-        entries |= {"routing": stored.value("routing", str), cls._counts: counts}
+        entries |= {"routing": stored.value("routing", str), "n_actuators": counts}
         chain = cls(**entries, dtype=torch.from_numpy(entries["base"]).dtype)
         return chain.with_tip(stored.value("tip_at", float))

@@ -71,7 +71,6 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
-    _counts = "n_actuators"
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
     layout = Layout("constant_curvature", dict.fromkeys(_entries, ""), STRUCTURE)
 
@@ -92,9 +91,8 @@ class ConstantCurvatureChain(ArcChain):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        counts = ("n_actuators", n_actuators, 3)
         geometry = self._checked(
-            radii, lengths, counts, angles, routing, offsets, rest_bends, base, dtype
+            radii, lengths, n_actuators, 3, angles, routing, offsets, rest_bends, base, dtype
         )
         zeros = filled(actuator_zeros, "actuator_zeros", dtype, (self.n_actuators,))
         rows = geometry["angles"].split(self.actuators_per_segment)

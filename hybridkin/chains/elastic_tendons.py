@@ -45,7 +45,7 @@ class ElasticTendonChain(ArcChain):
         Radius of the tendon circle of each segment, base to tip [m].
     lengths : array-like of shape (S,)
         Backbone lengths without any pull [m].
-    n_tendons : int or sequence of S ints, default=3
+    n_actuators : int or sequence of S ints, default=3
         Tendons that end at each segment.
     angles : array-like, optional
         Tendon angles about the backbone, counter-clockwise from the base x-axis [rad]: shape
@@ -101,7 +101,6 @@ class ElasticTendonChain(ArcChain):
     tensor([0.0376, 0.0000, 0.0899], dtype=torch.float64)
     """
 
-    _counts = "n_tendons"
     _entries = (*_SHAPING, "lengths", "offsets", "base")
     layout = Layout("elastic_tendons", dict.fromkeys(_entries, ""), STRUCTURE)
     _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
@@ -111,7 +110,7 @@ class ElasticTendonChain(ArcChain):
         radii: Numbers,
         lengths: Numbers,
         *,
-        n_tendons: int | Sequence[int] = 3,
+        n_actuators: int | Sequence[int] = 3,
         angles: Numbers | None = None,
         routing: str = "base",
         bending_stiffness: Numbers | None = None,
@@ -125,13 +124,12 @@ class ElasticTendonChain(ArcChain):
         super().__init__()
         if lengths is None:
             raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
-        counts = ("n_tendons", n_tendons, 1)
         geometry = self._checked(
-            radii, lengths, counts, angles, routing, offsets, rest_bends, base, dtype
+            radii, lengths, n_actuators, 1, angles, routing, offsets, rest_bends, base, dtype
         )
         if self.n_actuators > _slack.MOST:
             raise ValueError(
-                f"`n_tendons` must be at most {_slack.MOST} in all, got {self.n_actuators}."
+                f"`n_actuators` must be at most {_slack.MOST} in all, got {self.n_actuators}."
             )
         bending = 0.01 * geometry["radii"] ** 2 if bending_stiffness is None else bending_stiffness
         axial = 10.0 if axial_stiffness is None else axial_stiffness
@@ -173,7 +171,7 @@ class ElasticTendonChain(ArcChain):
         geometry, counts = chain.geometry(), chain.actuators_per_segment
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros")
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
-        given = {"n_tendons": counts, "routing": chain.routing, "dtype": chain.radii.dtype}
+        given = {"n_actuators": counts, "routing": chain.routing, "dtype": chain.radii.dtype}
         return cls(**{**geometry, "angles": angles, **given, **options}).with_tip(chain.tip_at)
 
     @property

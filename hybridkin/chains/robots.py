@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
-import math
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from hybridkin._core.units import METRES
+from hybridkin._core.units import METRES, UNITS
+from hybridkin.chains._robot_files import chain_of, each, read_tables
+from hybridkin.chains.arc_chain import ALIASES
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = [
     "BHA_LENGTH_LIMITS",
@@ -36,8 +29,7 @@ __all__ = [
 BHA_LENGTH_LIMITS = (0.10, 0.40)
 """Shortest and longest chamber of the Bionic Handling Assistant [m]."""
 
-_MODELS = {"constant-curvature": ConstantCurvatureChain, "elastic-tendon": ElasticTendonChain}
-_STIFFNESS = ("bending_stiffness", "axial_stiffness")
+_COLUMNS = ("groups", "time")
 
 
 def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
@@ -78,24 +70,33 @@ class LogFormat:
     ----------
     q, x : tuple of str
         Columns of the actuator vector and of the tip position, in the chain's order.
-    q_unit, x_unit : {"m", "cm", "mm"}
-        Units of these columns.
-    q_sign : int
+    q_unit, x_unit : {"m", "cm", "mm", "um", "in"}
+        Units of these columns. With `q_scale` that of q is any name; of a robot without segments it
+        may be "rad", "deg" or "1" as well.
+    q_sign : int or tuple of int
         -1 where the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
         Rows whose motion ends in this belong to the motion named without it.
     groups, time : str or None
         Columns of the motion that a row belongs to, and of its time stamp [s].
+    q_scale : float, tuple of float or None
+        Of actuators that are motors or pressures: the length [m] that one unit of the log moves.
     """
 
     q: tuple[str, ...]
     x: tuple[str, ...]
     q_unit: str = "m"
     x_unit: str = "m"
-    q_sign: int = 1
+    q_sign: int | tuple[int, ...] = 1
     group_suffix: str = ""
     groups: str | None = None
     time: str | None = None
+    q_scale: float | tuple[float, ...] | None = None
+
+    @property
+    def q_factor(self) -> np.ndarray:
+        """What the model counts per unit of the log, sign included, shape () or (n,)."""
+        return np.multiply(self.q_sign, self.q_scale or UNITS[self.q_unit])
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +124,19 @@ class Limits:
             found[name] = functools.reduce(tighter, given) if given else None
         return Limits(**found)
 
+    def scaled(self, factor: float | np.ndarray) -> Limits:
+        """Return the limits in other units; where `factor` is negative, low and high swap."""
+        ends = [
+            np.multiply(factor, side if value is None else value)
+            for value, side in ((self.q_min, -np.inf), (self.q_max, np.inf))
+        ]
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        return Limits(
+            None if np.isinf(low).all() else low,
+            None if np.isinf(high).all() else high,
+            None if self.dq_max is None else np.multiply(np.abs(factor), self.dq_max),
+        )
+
     def narrowed(self, by: float | np.ndarray) -> Limits:
         """Return the limits with the range of every actuator smaller by `by` at both ends [m]."""
         low, high = self.q_min, self.q_max
@@ -139,8 +153,8 @@ class RobotDescription:
     ----------
     name : str
         What to call it.
-    chain : ConstantCurvatureChain or ElasticTendonChain
-        Its nominal kinematics.
+    chain : ConstantCurvatureChain, ElasticTendonChain or None
+        Its nominal kinematics; None of a robot without segments, for models of data alone.
     calibrate : tuple of str
         Geometry that should be fitted to data.
     log : LogFormat or None
@@ -152,11 +166,18 @@ class RobotDescription:
     """
 
     name: str
-    chain: ConstantCurvatureChain | ElasticTendonChain
+    chain: ConstantCurvatureChain | ElasticTendonChain | None
     calibrate: tuple[str, ...]
     log: LogFormat | None
     limits: Limits = Limits()
     path: Path | None = None
+
+    @property
+    def n_actuators(self) -> int:
+        """Size of q."""
+        if self.chain is not None:
+            return self.chain.n_actuators
+        return 0 if self.log is None else len(self.log.q)
 
 
 def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
@@ -177,7 +198,8 @@ def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not TOML, lacks a key, or has one that is not known; the message names it.
+        If the file is not TOML, lacks a key, or has one that is not known or whose value is not
+        of its kind; the message names it.
 
     Examples
     --------
@@ -190,7 +212,10 @@ def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
     >>> chain.n_actuators
     6
     """
-    return read_description(path).chain
+    chain = read_description(path).chain
+    if chain is None:
+        raise ValueError(f"{path} describes no chain: it has no [[segment]] table.")
+    return chain
 
 
 def read_description(path: str | Path) -> RobotDescription:
@@ -227,9 +252,12 @@ def read_description(path: str | Path) -> RobotDescription:
             [log]                           # how its logs are written, optional
             q = ["servo_1", "servo_2", "servo_3"]
             x = ["tip_x", "tip_y", "tip_z"]
-            q_unit = "mm"
+            q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; of motors "deg", "rad"
+            spool_radius = 0.006            # [m], of motors; one number or one each
+            q_scale = 2.0e-5                # or of pressures, steps ...: metres per unit of the
+                                            # log, one number or one each; q_unit is any name
             x_unit = "mm"
-            q_sign = -1                     # -1: the log counts a pulled tendon as positive
+            q_sign = -1                     # -1: a pulled tendon counts as positive; or one each
             groups = "motion"               # column that names the motion of a row, optional
             group_suffix = "_hold"          # rows of motion "a_hold" belong to motion "a"
             time = "t"                      # column of the time stamp [s], optional
@@ -238,6 +266,10 @@ def read_description(path: str | Path) -> RobotDescription:
             q_min = -0.010                  # as the chain counts them: shortening < 0 [m]
             q_max = 0.010
             dq_max = 0.020                  # [m/s]
+            unit = "m"                      # the default; "log": in unit and sign of [log]
+
+        A file of [log] alone, with [limits] or without, is a robot whose model is learned from data
+        alone. Its `q_unit` may also be "deg", "rad" or "1" (as it is) without a spool.
 
     Returns
     -------
@@ -249,154 +281,85 @@ def read_description(path: str | Path) -> RobotDescription:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not TOML, lacks a key, or has one that is not known; the message names it.
+        If the file is not TOML, lacks a key, or has one that is not known or whose value is not
+        of its kind; the message names it.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` must name a robot description, got {path}: no such file.")
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a TOML file: {error}.") from error
-    try:
-        return replace(_description(content, path.stem), path=path)
-    except (TypeError, ValueError) as error:
+        return replace(_description(read_tables(path), path.stem), path=path)
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _description(content: Mapping[str, Any], stem: str) -> RobotDescription:
-    top = {"name", "model", "routing", "calibrate", "segment", "base", "log", "limits"}
-    _known(content, top, "the file")
-    chain = _chain(content)
-    calibrate = content.get("calibrate", chain.default_parameters)
-    if not isinstance(calibrate, (list, tuple)):
-        raise ValueError(f"`calibrate` must be a list of names, got {calibrate!r}.")
-    log = _log_format(content["log"], chain.n_actuators) if "log" in content else None
-    limits = _limits(content.get("limits", {}), chain.n_actuators)
-    return RobotDescription(str(content.get("name", stem)), chain, tuple(calibrate), log, limits)
+def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
+    chain = chain_of(tables) if "segment" in tables else None
+    log = _log_format(tables["log"]) if "log" in tables else None
+    if chain is None and (log is None or {"model", "routing", "calibrate", "base"} & {*tables}):
+        raise ValueError(
+            "`segment` is missing; describe each segment in a [[segment]] table. For a model of "
+            "data alone give [log], and none of `model`, `routing`, `calibrate` and `base`."
+        )
+    if chain is not None and log is not None:
+        _check_columns(log, chain.n_actuators)
+    names = () if chain is None else tables.get("calibrate", chain.default_parameters)
+    known = () if chain is None else (*chain.geometry(), *ALIASES)
+    if not {*names} <= {*known} or len({*names}) < len(names):
+        raise ValueError(f"`calibrate` must name different ones of {known}, got {names}.")
+    robot = RobotDescription(tables.get("name", stem), chain, tuple(names), log)
+    return replace(robot, limits=_limits(tables.get("limits", {}), robot))
 
 
-def _chain(content: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendonChain:
-    model = content.get("model", "constant-curvature")
-    if model not in _MODELS:
-        raise ValueError(f"`model` must be one of {(*_MODELS,)}, got {model!r}.")
-    tables = content.get("segment", [])
-    if not isinstance(tables, list) or not tables:
-        raise ValueError("`segment` is missing; describe each segment in a [[segment]] table.")
-    segments: list[dict[str, Any]] = []
-    for i, table in enumerate(tables):
-        segments += _segments(table, f"[[segment]] {i + 1}")
-    given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
-    elastic = model == "elastic-tendon"
-    for key in ("length", *_STIFFNESS):
-        missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
-        if elastic and key == "length" and missing:
-            raise ValueError(
-                f"`length` is missing for segment {missing[0]}; model 'elastic-tendon' needs the "
-                "backbone length [m] in every [[segment]]."
-            )
-        if not elastic and key != "length" and len(missing) < len(segments):
-            raise ValueError(
-                f"`{key}` in [[segment]] is not known to model 'constant-curvature'; leave it "
-                'out, or set model = "elastic-tendon".'
-            )
-        if 0 < len(missing) < len(segments):
-            kinds = " (tendons) or in none (chambers)" if key == "length" else " or in none"
-            raise ValueError(f"`{key}` must stand in every [[segment]]{kinds}.")
-        given[key] = None if missing else given[key]
-    build, lengths, zeros = _MODELS[model], given.pop("length"), given.pop("zeros")
-    counts = [len(angles) for angles in given["angles"]]
-    if elastic:
-        given |= {"n_tendons": counts, "tendon_zeros": zeros}
-    else:
-        given = {key: value for key, value in given.items() if key not in _STIFFNESS}
-        given |= {"n_actuators": counts, "actuator_zeros": zeros}
-    given |= {"routing": content["routing"]} if "routing" in content else {}
-    return build(lengths=lengths, base=_base(content.get("base", {})), **given)
-
-
-def _segments(table: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
-    keys = {"radius", "length", "actuators", "angle_deg", "angles_deg", "clockwise", "offset"}
-    _known(table, keys | {"rest_bend_deg", "zeros", "repeat", *_STIFFNESS}, where)
-    if "radius" not in table:
-        raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
-    if "angles_deg" in table:
-        for other in ("angle_deg", "actuators", "clockwise"):
-            if other in table:
-                raise ValueError(f"`{other}` cannot stand beside `angles_deg` in {where}.")
-        angles = np.radians(np.asarray(table["angles_deg"], dtype=float))
-    else:
-        n = _number(table, "actuators", where, 3)
-        step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
-        angles = math.radians(_number(table, "angle_deg", where, 0.0)) + step * np.arange(n)
-    segment = {
-        "radii": _number(table, "radius", where),
-        "offsets": _number(table, "offset", where, 0.0),
-        "angles": angles,
-        "rest_bends": np.radians(_numbers(table, "rest_bend_deg", where, 2)),
-        "zeros": _numbers(table, "zeros", where, len(angles)),
-    }
-    for key in ("length", *_STIFFNESS):
-        segment[key] = _number(table, key, where) if key in table else None
-    return [segment] * int(_number(table, "repeat", where, 1))
-
-
-def _base(table: Mapping[str, Any]) -> np.ndarray:
-    _known(table, {"position", "rotation_vector_deg"}, "[base]")
-    pose = np.eye(4)
-    pose[:3, 3] = _numbers(table, "position", "[base]", 3)
-    turn = _numbers(table, "rotation_vector_deg", "[base]", 3)
-    pose[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
-    return pose
-
-
-def _log_format(table: Mapping[str, Any], n_actuators: int) -> LogFormat:
-    _known(table, set(LogFormat.__dataclass_fields__), "[log]")
-    given = dict(table)
-    for key, size in (("q", n_actuators), ("x", 3)):
-        value = table.get(key, [])
-        if not isinstance(value, list) or len(value) != size:
-            raise ValueError(f"`{key}` in [log] must name {size} columns, got {value!r}.")
-        given[key] = tuple(str(name) for name in value)
-    for key, allowed in (("q_unit", [*METRES]), ("x_unit", [*METRES]), ("q_sign", [1, -1])):
-        if key in table and table[key] not in allowed:
-            raise ValueError(f"`{key}` in [log] must be one of {allowed}, got {table[key]!r}.")
-    for key in ("group_suffix", "groups", "time"):
-        if not isinstance(table.get(key, ""), str):
-            raise ValueError(f"`{key}` in [log] must be text, got {table[key]!r}.")
+def _log_format(table: Mapping[str, Any]) -> LogFormat:
+    if not {"q", "x"} <= {*table}:
+        raise ValueError("`q` or `x` is missing in [log]; name the columns of actuators and tip.")
+    columns = [*table["q"], *table["x"], *(table[key] for key in _COLUMNS if key in table)]
+    if doubled := sorted({name for name in columns if columns.count(name) > 1}):
+        raise ValueError(f"[log] must name every column once, got {doubled} more often.")
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+    unit = given.setdefault("q_unit", "1" if "q_scale" in given else "m")
+    known = [*UNITS]
+    if "spool_radius" in given:
+        known = [] if "q_scale" in given else ["deg", "rad"]
+    elif "q_scale" in given:
+        known = [unit] if unit not in METRES else []
+    if unit not in known:
+        raise ValueError(
+            f'`q_unit` in [log] must be one of {[*UNITS]}; with `spool_radius` "deg" or "rad"; '
+            f"with `q_scale` (instead of it) any name but a length; got {unit!r}."
+        )
+    for key in ("q_sign", "q_scale", "spool_radius"):
+        values = each(table, key, "[log]", len(table["q"]))
+        if key == "spool_radius" and key in given:
+            del given[key]
+            given["q_scale"] = tuple((UNITS[unit] * values).tolist())
     return LogFormat(**given)
 
 
-def _limits(table: Mapping[str, Any], n_actuators: int) -> Limits:
-    _known(table, set(Limits.__dataclass_fields__), "[limits]")
-    each = {key: v if isinstance(v, list) else [v] * n_actuators for key, v in table.items()}
-    limits = Limits(**{key: _numbers(each, key, "[limits]", n_actuators) for key in each})
+def _check_columns(log: LogFormat, n_actuators: int) -> None:
+    if len(log.q) != n_actuators:
+        raise ValueError(
+            f"`q` in [log] must name {n_actuators} columns, one for each actuator of the "
+            f"[[segment]] tables, got {len(log.q)}: {list(log.q)}."
+        )
+    if log.q_scale is None and log.q_unit not in METRES:
+        raise ValueError(
+            f"`q_unit` in [log] must be a length, one of {[*METRES]}, since the actuators of "
+            f"[[segment]] tables are lengths, got {log.q_unit!r}; of motors give the "
+            "`spool_radius` [m], of pressures or other units `q_scale` [m per unit]."
+        )
+
+
+def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
+    given = {key: value for key, value in table.items() if key != "unit"}
+    unit, log = table.get("unit", "m"), robot.log
+    need = "m" if log is None else "log" if robot.chain is None else unit
+    if given and unit != need:
+        lacks = "[log]" if log is None else "[[segment]]"
+        raise ValueError(f'`unit` in [limits] must be "{need}" without {lacks}, got "{unit}".')
+    limits = Limits(**{key: each(given, key, "[limits]", robot.n_actuators) for key in given})
     low, high = limits.q_min, limits.q_max
     if low is not None and high is not None and (low > high).any():
         raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
-    if limits.dq_max is not None and not (limits.dq_max > 0).all():
-        raise ValueError(f"`dq_max` in [limits] must be positive, got {table['dq_max']!r}.")
-    return limits
-
-
-def _number(table: Mapping[str, Any], key: str, where: str, default: float | None = None) -> Any:
-    value = table.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"`{key}` in {where} must be a number, got {value!r}.")
-    return value
-
-
-def _numbers(table: Mapping[str, Any], key: str, where: str, size: int) -> np.ndarray:
-    value = table.get(key, [0.0] * size)
-    wrong = not isinstance(value, list) or len(value) != size
-    if wrong or not all(type(v) in (int, float) and math.isfinite(v) for v in value):
-        raise ValueError(f"`{key}` in {where} must hold {size} numbers, got {value!r}.")
-    return np.array(value, dtype=float)
-
-
-def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
-    for key in table:
-        if key not in keys:
-            close = difflib.get_close_matches(key, keys, n=1)
-            hint = f"did you mean `{close[0]}`?" if close else f"known: {sorted(keys)}."
-            raise ValueError(f"`{key}` in {where} is not known; {hint}")
+    return limits if log is None or unit == "m" else limits.scaled(log.q_factor)

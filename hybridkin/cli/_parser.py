@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hybridkin
-from hybridkin._core.units import METRES
+from hybridkin._core.units import METRES, UNITS
 
 EXIT_CODES = """\
 exit codes: 0 success; 1 the result is not as asked for (points not reached, errors above
@@ -267,7 +267,7 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     log = command.add_argument_group("how the log is written, over what [log] of the robot says")
     log.add_argument("--q", type=_names, metavar="A,B,...", help="columns of the actuators")
     log.add_argument("--x", type=_names, metavar="X,Y,Z", help="columns of the tip")
-    log.add_argument("--q-unit", choices=METRES)
+    log.add_argument("--q-unit", choices=UNITS)
     log.add_argument("--x-unit", choices=METRES)
     log.add_argument("--q-sign", type=int, choices=(1, -1), help="-1: pulled counts as positive")
     log.add_argument("--groups", metavar="COLUMN", help="column that names the motion of a row")

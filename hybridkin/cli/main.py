@@ -122,7 +122,7 @@ def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         n_folds=arguments.folds,
         n_seeds=arguments.seeds,
         auto=not arguments.no_auto,
-        play=METRES[log_format.q_unit] * play if isinstance(play, float) else play,
+        play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
     )
     log = _read_for(robot, arguments, log_format)
@@ -242,7 +242,7 @@ def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: 
     given = {name: vars(arguments)[name] for name in names}
     given = {name: value for name, value in given.items() if value is not None}
     if known is not None:
-        return replace(known, **given)
+        return replace(known, **given, **({"q_scale": None} if "q_unit" in given else {}))
     if "q" not in given or "x" not in given:
         raise ValueError(
             f"{source} does not say how logs are written: it has no [log] table, as in "
@@ -253,13 +253,6 @@ def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: 
 
 def _limits(arguments: argparse.Namespace, log_format: LogFormat) -> dict[str, Any]:
     """Return the limits [m] as the model counts them, from options in the log's unit and sign."""
-    metre, sign, found = METRES[log_format.q_unit], log_format.q_sign, {}
-    for name in ("q_min", "q_max", "dq_max"):
-        value = vars(arguments)[name]
-        if value is not None:
-            numbers = [(1 if name == "dq_max" else sign) * metre * v for v in value]
-            found[name] = numbers if len(numbers) > 1 else numbers[0]
-    if sign < 0:  # the least of one sign is the largest of the other
-        other = {"q_min": "q_max", "q_max": "q_min", "dq_max": "dq_max"}
-        found = {other[name]: value for name, value in found.items()}
-    return found
+    given = {name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max")}
+    given = {k: v[0] if v is not None and len(v) == 1 else v for k, v in given.items()}
+    return vars(hybridkin.robots.Limits(**given).scaled(log_format.q_factor))

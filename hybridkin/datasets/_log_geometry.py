@@ -9,11 +9,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.units import METRES
 from hybridkin.datasets._log_report import LogFinding
-from hybridkin.datasets._logs import LENGTHS, Log
+from hybridkin.datasets._logs import Log
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to tell one robot from its mirror image
+_CONVERT = (
+    "set `spool_radius` (of motors) or `q_scale` (of pressures or steps: metres per unit) in [log] "
+    "of the robot description"
+)
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 # Of the tip's spread over the robot's reach, of strokes over radii (a bend, in rad) and of
 # chamber lengths over radii: what cannot be, what is usual.
@@ -54,6 +59,10 @@ def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFindi
 
 def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
     q, radii = log.q, robot.radii
+    if log.units["q"] != "m":
+        message = f"the actuators of the robot are lengths, but q is in {log.file_units['q']}."
+        yield LogFinding("units", "error", message, f"{_CONVERT}.")
+        return
     if robot.extensible and (q <= 0).any():
         yield _not_lengths(q)
         return
@@ -89,17 +98,19 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
 
 
 def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
-    true = next(
-        (u for u in _NAMES if np.isclose(LENGTHS[u] * factor, LENGTHS.get(unit, 0.0))), None
-    )
+    true = next((u for u in _NAMES if np.isclose(METRES[u] * factor, METRES.get(unit, 0.0))), None)
     looks = f"these look like {_NAMES[true]}" if true else f"they are off by about {factor:g}"
-    remedy, option = (f'{name}_unit = "{true}"', f" {true}") if true else (f"`{name}_unit`", "")
+    where = f"in [log] of the robot description or --{name}-unit"
+    remedy = (
+        f'set {name}_unit = "{true}" {where} {true}' if true else f"check `{name}_unit` {where}"
+    )
+    if name == "q" and true is None:
+        remedy = f"where these are no lengths, {_CONVERT}"
     return LogFinding(
         "units",
         "error",
         f"columns of {name} are declared as {unit}, but {what}; {looks}.",
-        f"set {remedy} in [log] of the robot description or --{name}-unit{option}; or correct the "
-        "radii and lengths of the description, which are metres.",
+        f"{remedy}; or correct the radii and lengths of the description, which are metres.",
     )
 
 

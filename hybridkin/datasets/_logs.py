@@ -17,10 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.units import METRES
-
-LENGTHS = {**METRES, "um": 1e-6, "in": 0.0254}
-UNITS = {**LENGTHS, "rad": 1.0, "deg": np.pi / 180, "1": 1.0}
+from hybridkin._core.units import METRES, UNITS
 
 _PARQUET = (".parquet", ".pq")
 _DELIMITERS = (",", ";", "\t")
@@ -90,6 +87,7 @@ def load_log(
     q_unit: str = "m",
     x_unit: str = "m",
     q_sign: ArrayLike = 1,
+    q_scale: ArrayLike | None = None,
     delimiter: str | None = None,
     drop_invalid: bool = False,
 ) -> Log:
@@ -117,6 +115,10 @@ def load_log(
     q_sign : 1, -1 or sequence of them, default=1
         Factor of the actuator columns: -1 where the file counts a pulled tendon as positive, since
         length changes here are negative for shortening.
+    q_scale : float or sequence of float, optional
+        Of actuators that are motors or pressures: the length [m] that one unit of the file moves,
+        for each column or for all; of a spool its radius times pi / 180 per degree. `q_unit` then
+        is only a name.
     delimiter : str or None, default=None
         Separator of a text file. None: comma, semicolon or tab, whichever the header has most of.
     drop_invalid : bool, default=False
@@ -163,7 +165,9 @@ def load_log(
     q, x = table.names("q", q), table.names("x", x)
     if len(x) != 3:
         raise ValueError(f"`x` must name 3 columns, got {len(x)}: {x}.")
-    sign = _checked_sign(len(q), q_unit, x_unit, q_sign)
+    if q_scale is not None and q_unit == "m":  # the default
+        q_unit = "1"
+    factor = _checked_factor(len(q), q_unit, x_unit, q_sign, q_scale)
     values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
     places = np.arange(len(values)) if table.lines is None else table.lines
     valid = np.isfinite(values).all(axis=1)
@@ -190,8 +194,8 @@ def load_log(
                 stacklevel=2,
             )
     return Log(
-        columns["q"] * UNITS[q_unit] * sign,
-        columns["x"] * LENGTHS[x_unit],
+        columns["q"] * factor,
+        columns["x"] * METRES[x_unit],
         groups=None if labels is None else labels[valid],
         time=None if time is None else values[:, -1],
         line=places[valid],
@@ -199,7 +203,7 @@ def load_log(
         q_names=q,
         x_names=x,
         q_sign=q_sign,
-        units={"q": "m" if q_unit in LENGTHS else "1" if q_unit == "1" else "rad", "x": "m"},
+        units={"q": _model_unit(q_unit, q_scale), "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )
@@ -275,15 +279,32 @@ class _Table(NamedTuple):
         return np.column_stack([*found.values()]), labels
 
 
-def _checked_sign(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
-    """Return the sign of the n columns of q, once units and sign are known to be such."""
-    for name, unit, known in (("q_unit", q_unit, UNITS), ("x_unit", x_unit, LENGTHS)):
-        if unit not in known:
-            raise ValueError(f"`{name}` must be one of {list(known)}, got {unit!r}.")
+def _model_unit(q_unit: str, q_scale: ArrayLike | None) -> str:
+    if q_scale is not None or q_unit in METRES:
+        return "m"
+    return "1" if q_unit == "1" else "rad"
+
+
+def _checked_factor(
+    n: int, q_unit: str, x_unit: str, q_sign: ArrayLike, q_scale: ArrayLike | None
+) -> NDArray:
+    """Return the factor of the n columns of q, once units, sign and scale are known to be such."""
+    if q_scale is None and q_unit not in UNITS:
+        other = "of other units give `q_scale` [m per unit]"
+        raise ValueError(f"`q_unit` must be one of {list(UNITS)}, got {q_unit!r}; {other}.")
+    if x_unit not in METRES:
+        raise ValueError(f"`x_unit` must be one of {list(METRES)}, got {x_unit!r}.")
+    scale = np.asarray(UNITS.get(q_unit) if q_scale is None else q_scale, dtype=float)
+    sound = scale.shape in ((), (n,)) and ((scale > 0) & (scale < np.inf)).all()
+    if not sound or (q_scale is not None and q_unit in METRES):
+        raise ValueError(
+            f"`q_scale` must be a positive number, or {n}, one per column of `q`, and `q_unit` no "
+            f"length, got {q_scale!r} and {q_unit!r}."
+        )
     sign = np.asarray(q_sign, dtype=float)
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
         raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
-    return sign
+    return sign * scale
 
 
 def _read(path: Path, delimiter: str | None) -> _Table:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.robots import Limits, LogFormat
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.workflow._fit_report import auto_entry, auto_in_short
 from hybridkin.workflow.model import LoadedModel
@@ -54,7 +55,7 @@ def describe(loaded: LoadedModel) -> Report:
     if hybrid is not None:
         _add_hybrid(report.record, hybrid)
     _write_geometry(report, report.record["geometry"])
-    _write_model(report)
+    _write_model(report, loaded)
     _write_training(report, report.record["training"] or {})
     return report
 
@@ -127,9 +128,15 @@ def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
     report.text(f"Base at ({position}) mm, turned by ({turn}) deg.")
 
 
-def _write_model(report: Report) -> None:
-    """Add error model, radius, play, domain, limits and the format of the logs."""
-    record = report.record
+def _write_model(report: Report, loaded: LoadedModel) -> None:
+    """Add error model, radius, play, domain, limits and the format of the logs.
+
+    Domain and limits are in unit and sign of the logs, where these are known.
+    """
+    record, description = report.record, loaded.description
+    log_format = LogFormat((), (), "1" if loaded.chain is None else "mm")
+    if description is not None and description.log is not None:
+        log_format = description.log
     if record["error_model"] is not None:
         kind, coupling, guard, _ = record["error_model"].values()
         parts = [kind, coupling, f"guard {guard or 'none'}"]
@@ -142,10 +149,14 @@ def _write_model(report: Report) -> None:
         )
     if record["play"] is not None:
         report.text(f"Backlash (play) of the actuators: {millimetres(record['play'])}.")
-    for what, limits in (("Fitted for", record["domain"]), ("Limits:", record["limits"])):
-        for name, value in (limits or {}).items():
+    known = {"Fitted for": loaded.trained_range, "Limits:": description and description.limits}
+    for what, limits in known.items():
+        shown = Limits() if limits is None else limits.scaled(1 / log_format.q_factor)
+        for name, value in vars(shown).items():
             if value is not None:
-                report.text(f"{what} {name} = {_millimetres(value)} mm.")
+                unit = log_format.q_unit + ("/s" if name == "dq_max" else "")
+                numbers = ", ".join(f"{v:.4g}" for v in value)
+                report.text(f"{what} {name} = {numbers} {unit}.")
     if record["log_format"] is not None:
         q, x, q_unit, x_unit, q_sign, *_ = record["log_format"].values()
         columns = f"q in {q_unit}, q_sign {q_sign} ({', '.join(q)}), x in {x_unit} ({', '.join(x)})"

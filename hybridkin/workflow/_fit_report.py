@@ -46,12 +46,13 @@ def write_comparison(
         record[name] = {**statistics(values), "std_folds": by_fold.std(), "by_fold": by_fold}
     report.record["held_out"] = record
     report.errors(record, ("mean", "std", "p95", "max", "std_folds"))
-    present = [name for name in _SHOWN if name in record]
+    present = [name for name in _SHOWN if name in record] or [*record]
     calibrated, *hybrids = (record[name]["mean"] for name in present)
     pairs = zip(present[1:], hybrids, strict=True)
     ratios = [f"over {name}: **{calibrated / mean:.2f}**" for name, mean in pairs]
     best = min(record, key=lambda name: record[name]["mean"])
-    report.text(f"Calibrated mechanical model {', '.join(ratios)}. Least mean error: {best}.")
+    first = "Calibrated mechanical model" if present[0] == _SHOWN[0] else f"Model {present[0]},"
+    report.text(f"{first} {', '.join(ratios)}. Least mean error: {best}.")
     _add_figures(report, errors, (present[0], present[-1]))
     motions, counts = np.unique(log.motions, return_counts=True)
     means = np.array([[errors[n][log.motions == m].mean() for n in present] for m in motions])
@@ -66,7 +67,7 @@ def write_comparison(
 def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, str]) -> None:
     figure, ax = new_figure(7.0, 3.9)
     ErrorBoxDisplay(errors).plot(ax, unit="mm")
-    ax.set_xlim(0.0, 1100 * float(np.percentile(errors["mechanical, nominal"], 99)))
+    ax.set_xlim(0.0, 1100 * float(np.percentile(next(iter(errors.values())), 99)))
     caption = "Tip error on held-out motions: quartiles, 5 and 95 %; larger errors beyond the axis."
     report.figure("held_out", figure, caption)
     figure, ax = new_figure(5.5, 3.4)

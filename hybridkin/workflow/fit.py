@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,7 +50,10 @@ AUTO = "hybrid, auto"
 CALIBRATED = "mechanical, calibrated"
 ELM = "hybrid, ELM"
 LINEAR = "hybrid, linear"
+DATA_ELM = "data-driven, ELM"
+DATA_LINEAR = "data-driven, linear"
 _SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # what a file can hold
+_SAVED_OF_DATA = (DATA_LINEAR, DATA_ELM)  # of a robot without segments
 _N_HIDDEN = 100
 _INNER_FOLDS = 4
 _ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto: fewer do not pay for a start
@@ -145,11 +148,11 @@ class _Rows(NamedTuple):
         return self._replace(q=self.q[rows], x=self.x[rows], groups=self.groups[rows])
 
     def calibrated(
-        self, parameters: Sequence[str] | None = None
+        self, chain: Chain, parameters: Sequence[str] | None = None
     ) -> tuple[CalibrationResult, list[str]]:
         """Return the calibration, by default of all that the robot asks for, and its warnings."""
         names = self.robot.calibrate if parameters is None else parameters
-        return fit_geometry(self.robot.chain, self.q, self.x, names, self.settings.loss)
+        return fit_geometry(chain, self.q, self.x, names, self.settings.loss)
 
     def auto_model(self, calibrated: Chain) -> HybridForwardModel:
         """Return the hybrid that chooses for itself.
@@ -233,7 +236,8 @@ def fit_log(
     """Check a log, compare models on held-out motions, fit the best to all of it, and report.
 
     Saved is the model with the least mean error on held-out motions, of the calibrated mechanical
-    model and the hybrids with a linear error model, an ELM, and what ``error_model="auto"`` takes.
+    model and the hybrids with a linear error model, an ELM, and what ``error_model="auto"`` takes;
+    of a robot without segments the linear model and the ELM that learn from data alone.
 
     Parameters
     ----------
@@ -265,18 +269,21 @@ def fit_log(
         If the log or the settings do not allow the comparison.
     """
     check_out(out)
+    if robot.chain is None:
+        settings = replace(settings, auto=False)
     whole = checked(log, robot.chain, "base" in robot.calibrate)
     _check(whole, settings, force)
     data = whole.thinned(settings.max_rows)
     compared = compare_by_group(data, robot, settings, n_jobs=n_jobs, progress=progress)
-    errors = {name: values.mean() for name, values in compared.errors.items() if name in _SAVED}
+    savable = _SAVED_OF_DATA if robot.chain is None else _SAVED
+    errors = {name: values.mean() for name, values in compared.errors.items() if name in savable}
     saved = min(errors, key=lambda name: (errors[name], name))
     progress(f"fitting {saved} to all motions", 0, 1)
     rows = _Rows(data.q, data.x, data.motions, robot, settings)
-    result, messages = rows.calibrated()
+    result, messages = (None, []) if robot.chain is None else rows.calibrated(robot.chain)
     for message in messages:
         warnings.warn(message, stacklevel=2)
-    model, chosen = _fit_saved(saved, rows, result.chain)
+    model, chosen = _fit_saved(saved, rows, None if result is None else result.chain)
     progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
     report.record.update(n=len(data.q), saved=saved, chosen=chosen)
@@ -285,8 +292,9 @@ def fit_log(
     if saved == AUTO:
         report.record["auto"] = auto_entry(model)
         report.text(" ".join(report.record["auto"]["words"]))
-    write_calibration(report, robot.chain, result, messages)
-    _write_elastic_calibration(report, robot.chain, model)
+    if robot.chain is not None and result is not None:
+        write_calibration(report, robot.chain, result, messages)
+        _write_elastic_calibration(report, robot.chain, model)
     _add_model(report, model, robot, whole.split)
     return report, report.write(out)
 
@@ -301,7 +309,9 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
         )
     if settings.play is not None:
         if not settings.auto:
-            raise ValueError("`play` requires `auto=True`; leave out --no-auto.")
+            raise ValueError(
+                "`play` requires `auto=True` and a robot with segments; leave out --no-auto."
+            )
         if not log.named:
             raise ValueError(
                 "`play` needs motions, their rows in the order of time; name the column that tells "
@@ -339,13 +349,16 @@ def _write_choice(report: Report, compared: Comparison, data: MeasuredLog) -> No
     )
 
 
-def _fit_saved(saved: str, rows: _Rows, calibrated: Chain) -> tuple[HybridForwardModel, str]:
+def _fit_saved(saved: str, rows: _Rows, calibrated: Chain | None) -> tuple[HybridForwardModel, str]:
     """Return the model to save, fitted to all rows, and what was chosen for it."""
-    choice = _choose(rows, _HYBRID_CHOICES, rows.robot.chain) if saved == ELM else _Choice()
+    choice = _Choice()
+    if saved in (ELM, DATA_ELM):
+        choices = _HYBRID_CHOICES if saved == ELM else _DATA_CHOICES
+        choice = _choose(rows, choices, rows.robot.chain)
     model, chosen = choice.model(calibrated), str(choice)
-    if saved == LINEAR:
+    if saved in (LINEAR, DATA_LINEAR):
         model, chosen = HybridForwardModel(calibrated, linear()), "linear"
-    elif saved == AUTO:
+    elif saved == AUTO and calibrated is not None:
         model = rows.auto_model(calibrated)
     model.set_params(coverage=rows.settings.coverage)
     model.fit_with_messages(rows.q, rows.x, groups=rows.groups)
@@ -379,30 +392,35 @@ def _add_model(
 @threadpool_limits.wrap(limits=1)  # the processes share the cores already
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors on test rows of every model fitted to training rows, and the choices."""
-    seeds = range(train.settings.n_seeds)
-    nominal, calibrated = train.robot.chain, train.calibrated()[0].chain
-    data_choice = _choose(train, _DATA_CHOICES, None)
-    hybrid_choice = _choose(train, _HYBRID_CHOICES, nominal)
-    if "base" in train.robot.calibrate:
-        nominal = train.calibrated(("base",))[0].chain
+    seeds, chain = range(train.settings.n_seeds), train.robot.chain
+    choice = _choose(train, _DATA_CHOICES, None)
     models = {
-        "mechanical, nominal": [HybridForwardModel(nominal, "drop")],
-        CALIBRATED: [HybridForwardModel(calibrated, "drop")],
-        "data-driven, linear": [HybridForwardModel(None, linear())],
+        DATA_LINEAR: [HybridForwardModel(None, linear())],
         "data-driven, quadratic": [HybridForwardModel(None, quadratic())],
-        "data-driven, ELM": [data_choice.model(None, seed) for seed in seeds],
-        LINEAR: [HybridForwardModel(calibrated, linear())],
-        "hybrid, quadratic": [HybridForwardModel(calibrated, quadratic())],
-        ELM: [hybrid_choice.model(calibrated, seed) for seed in seeds],
+        DATA_ELM: [choice.model(None, seed) for seed in seeds],
     }
-    chosen = {"data-driven, ELM": str(data_choice), ELM: str(hybrid_choice)}
-    if train.settings.auto:
-        models[AUTO] = [train.auto_model(calibrated)]
+    chosen = {DATA_ELM: str(choice)}
+    if chain is not None:
+        calibrated = train.calibrated(chain)[0].chain
+        choice = _choose(train, _HYBRID_CHOICES, chain)
+        if "base" in train.robot.calibrate:
+            chain = train.calibrated(chain, ("base",))[0].chain
+        models = {
+            "mechanical, nominal": [HybridForwardModel(chain, "drop")],
+            CALIBRATED: [HybridForwardModel(calibrated, "drop")],
+            **models,
+            LINEAR: [HybridForwardModel(calibrated, linear())],
+            "hybrid, quadratic": [HybridForwardModel(calibrated, quadratic())],
+            ELM: [choice.model(calibrated, seed) for seed in seeds],
+        }
+        chosen[ELM] = str(choice)
+        if train.settings.auto:
+            models[AUTO] = [train.auto_model(calibrated)]
     errors = {
         name: np.mean([_held_out(model, train, test) for model in some], axis=0)
         for name, some in models.items()
     }
-    if train.settings.auto:
+    if AUTO in models:
         chosen[AUTO] = auto_in_short(auto_entry(models[AUTO][0]))
     return errors, chosen
 
@@ -422,6 +440,6 @@ def _choose(rows: _Rows, candidates: Sequence[_Choice], chain: Chain | None) -> 
     for train, test in folds.split(rows.q, groups=rows.groups):
         known, new, fitted = rows.of(train), rows.of(test), chain
         if chain is not None and rows.robot.calibrate:
-            fitted = known.calibrated()[0].chain
+            fitted = known.calibrated(chain)[0].chain
         errors += [_held_out(choice.model(fitted), known, new).sum() for choice in candidates]
     return candidates[int(errors.argmin())]

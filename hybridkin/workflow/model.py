@@ -136,6 +136,11 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     path = Path(path)
     if path.suffix.lower() == ".toml":
         description = robots.read_description(path)
+        if description.chain is None:
+            raise ValueError(
+                f"`model` {path} describes a robot without segments, which has no model before a "
+                f"fit: hybridkin fit LOG --robot {path} --out MODEL."
+            )
         return LoadedModel(description.name, path, description.chain, description)
     if path.is_dir():
         if not (path / _MODEL).is_file():
@@ -147,9 +152,9 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     description = None if robot is None else robots.read_description(robot)
     name = path.stem if description is None else description.name
     loaded = LoadedModel(name, path, model, description, model_header(path))
-    if description is not None and description.chain.n_actuators != loaded.n_actuators:
+    if description is not None and description.n_actuators not in (0, loaded.n_actuators):
         raise ValueError(
-            f"`robot` {description.name!r} has {description.chain.n_actuators} actuators, the "
+            f"`robot` {description.name!r} has {description.n_actuators} actuators, the "
             f"model {path} has {loaded.n_actuators}; give the description it was fitted with."
         )
     return loaded

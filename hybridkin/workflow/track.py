@@ -29,7 +29,7 @@ from hybridkin.workflow.report import Progress, Report, check_out, millimetres, 
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
-_COLUMNS = ("q", "q_unit", "q_sign", "x", "x_unit")  # of a log format, that track.csv keeps to
+_COLUMNS = ("q", "q_unit", "q_sign", "q_scale", "x", "x_unit")  # of a log format, in the record
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
 _GUESSES = 16
@@ -271,7 +271,7 @@ def _write_track(
     file: Path,
 ) -> None:
     """Write commands, and what the actuators do where that is something else, point by point."""
-    unit, scale = log_format.q_sign / METRES[log_format.q_unit], 1 / METRES[log_format.x_unit]
+    unit, scale = 1 / log_format.q_factor, 1 / METRES[log_format.x_unit]
     columns = np.column_stack([track.t, unit * sent, scale * track.x, scale * track.target])
     head = [TIME, *log_format.q, *log_format.x, *TARGET, "error", "status"]
     cells = [*_text("%.9g", columns).T, _text("%.6g", scale * track.error), statuses]
@@ -320,7 +320,7 @@ def _write_summary(report: Report) -> None:
     report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
     if record["in_domain"] is not None:
         report.text(f"{100 * record['in_domain']:.0f} % of the points lie in the model's domain.")
-    sign = ", shortening positive" if columns["q_sign"] < 0 else ""
+    sign = ", shortening positive" if np.all(np.less(columns["q_sign"], 0)) else ""
     units = f"q in {columns['q_unit']}{sign}; x, target and error in {columns['x_unit']}; t in s."
     report.text(f"track.csv: {units}")
     if record["play"] is not None:

@@ -77,13 +77,13 @@ ROBOTS = {
     "uneven": ElasticTendonChain(
         RADII[:2],
         LENGTHS[:2],
-        n_tendons=[2, 4],
+        n_actuators=[2, 4],
         angles=[[0.0, 2.0], [0.1, 1.5, 3.0, 4.4]],
         tendon_zeros=[[1e-3, 0.0], [0.0, 2e-3, 0.0, -1e-3]],
         base=[[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.2], [0.0, 0.0, 1.0, 0.3], [0, 0, 0, 1]],
     ),
     "sixteen tendons": ElasticTendonChain(
-        [*RADII, 0.003], [*LENGTHS, 0.05], n_tendons=4, rest_bends=0.1, tendon_zeros=1e-3
+        [*RADII, 0.003], [*LENGTHS, 0.05], n_actuators=4, rest_bends=0.1, tendon_zeros=1e-3
     ),
 }
 each_robot = pytest.mark.parametrize("chain", ROBOTS.values(), ids=ROBOTS)
@@ -537,9 +537,9 @@ def test_calibration_turns_the_rings(rng):
     ("make", "message"),
     [
         (lambda: ElasticTendonChain([0.1, -0.1], [1.0, 1.0]), "`radii` must be positive"),
-        (lambda: robot(n_tendons=[3, 3]), "`n_tendons` must be one number or 3 numbers"),
-        (lambda: robot(n_tendons=0), "`n_tendons` must be at least 1 on every segment"),
-        (lambda: robot(n_tendons=30, angles=None, tendon_zeros=0.0), "at most 62 in all, got 90"),
+        (lambda: robot(n_actuators=[3, 3]), "`n_actuators` must be one whole number or 3"),
+        (lambda: robot(n_actuators=0), "`n_actuators` must be at least 1 on every segment"),
+        (lambda: robot(n_actuators=30, angles=None, tendon_zeros=0.0), "at most 62 in all, got 90"),
         (lambda: robot(angles=[[0.0, 2.0, 4.0]] * 2), "`angles` must hold"),
         (lambda: ElasticTendonChain(RADII, LENGTHS[:2]), r"`lengths` must have shape \(3,\)"),
         (lambda: robot(routing="through"), "`routing` must be one of"),

@@ -1,5 +1,8 @@
 import math
+import random
+import warnings
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -145,7 +148,7 @@ def test_elastic_tendons(write):
     expected = ElasticTendonChain(
         [0.0045, 0.0045, 0.004],
         [0.06, 0.06, 0.05],
-        n_tendons=[3, 3, 2],
+        n_actuators=[3, 3, 2],
         angles=[ring, ring, [0.0, math.pi / 2]],
         bending_stiffness=[1e-6, 1e-6, 2e-6],
         axial_stiffness=[3.0, 3.0, 4.0],
@@ -178,12 +181,21 @@ def test_elastic_tendons_by_default(write):
         (("length = 0.05\n", ""), "`length` is missing for segment 3"),
         (("axial_stiffness = 4\n", ""), "`axial_stiffness` must stand in every"),
         (("bending_stiffness = 1e-6\n", ""), "`bending_stiffness` must stand in every"),
-        (("axial_stiffness = 4", "axial_stiffness = 'soft'"), "`axial_stiffness` in .* a number"),
+        (
+            ("axial_stiffness = 4", "axial_stiffness = 'soft'"),
+            "`axial_stiffness` in .* a positive number",
+        ),
         (("axial_stiffness = 4", "axial_stifness = 4"), "did you mean `axial_stiffness`"),
-        (("axial_stiffness = 4", "axial_stiffness = -4"), "`axial_stiffness` must be positive"),
+        (
+            ("axial_stiffness = 4", "axial_stiffness = -4"),
+            "`axial_stiffness` in .* positive number",
+        ),
         (("zeros = [0.001, 0, -0.002]", "zeros = [0.001]"), "`zeros` in .* must hold 3"),
-        (('"elastic-tendon"', '"elastic"'), "`model` must be one of .*'elastic-tendon'"),
-        (("[[segment]]", "routing = 'tip'\n[[segment]]"), "`routing` must be one of"),
+        (
+            ('"elastic-tendon"', '"elastic"'),
+            "`model` in the file must be one of .*'elastic-tendon'",
+        ),
+        (("[[segment]]", "routing = 'tip'\n[[segment]]"), "`routing` in the file must be one of"),
     ],
 )
 def test_bad_elastic_descriptions_name_the_key(write, change, message):
@@ -203,27 +215,34 @@ def test_defaults_are_chambers_named_after_the_file(write):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("segment = 3", "`segment` is missing"),
-        ("name = ", "is not a TOML file"),
+        ("name = 'a'", "`segment` is missing"),
+        ("segment = 3", r"`segment` in the file must hold tables, .* \[\[segment\]\], got 3"),
+        ("name = ", "this is not a TOML file"),
         ("[[segment]]\nlength = 1.0", "`radius` is missing in .*segment.* 1"),
         ("[[segment]]\nradius = 0.1\nlenght = 0.2", "`lenght` in .* did you mean `length`"),
-        ("[[segment]]\nradius = '0.1'", "`radius` in .* must be a number"),
-        ("[[segment]]\nradius = -0.1", "`radii` must be positive"),
+        ("[[segment]]\nradius = '0.1'", "`radius` in .* must be a positive number"),
+        ("[[segment]]\nradius = -0.1", "`radius` in .* must be a positive number"),
         ("[[segment]]\nradius = 0.1\nactuators = 2", "at least 3"),
         ("[[segment]]\nradius = 0.1\nrest_bend_deg = [1]", "`rest_bend_deg` in .* 1 must hold 2"),
         ("[[segment]]\nradius = 0.1\nrest_bend_deg = 90", "`rest_bend_deg` in .* must hold 2"),
         ("[[segment]]\nradius = 0.1\nzeros = [0, 0]", "`zeros` in .*segment.* 1 must hold 3"),
-        ("[[segment]]\nradius = 0.1\nzeros = ['0', '0', '0']", "`zeros` in .* must hold 3"),
-        ("[[segment]]\nradius = 0.1\nzeros = [0, [0], 0]", "`zeros` in .* must hold 3"),
-        ("[[segment]]\nradius = 0.1\nzeros = [0, nan, 0]", "`zeros` in .* must hold 3"),
+        ("[[segment]]\nradius = 0.1\nzeros = ['0', '0', '0']", "`zeros` in .* must hold numbers"),
+        ("[[segment]]\nradius = 0.1\nzeros = [0, [0], 0]", "`zeros` in .* must hold numbers"),
+        ("[[segment]]\nradius = 0.1\nzeros = [0, nan, 0]", "`zeros` in .* must hold numbers"),
         ("[[segment]]\nradius = 0.1\n[base]\nposition = 'here'", "`position` in .* must hold 3"),
         ("[[segment]]\nradius = 0.1\nlength = 1\n[[segment]]\nradius = 0.1", "in every"),
-        ("model = 'rigid'\n[[segment]]\nradius = 0.1", "`model` must be"),
-        ("calibrate = 'radii'\n[[segment]]\nradius = 0.1", "`calibrate` must be a list"),
-        ("[[segment]]\nradius = 0.1\n[base]\nposition = [1]", "`position` in .base. must hold 3"),
-        ("[[segment]]\nradius = 0.1\n[log]\nq = ['a']", "`q` in .log. must name 3 columns"),
+        ("model = 'rigid'\n[[segment]]\nradius = 0.1", "`model` in the file must be"),
         (
-            "[[segment]]\nradius = 0.1\n[log]\nq = ['a','b','c']\nx = ['x','y','z']\nq_unit = 'in'",
+            "calibrate = 'radii'\n[[segment]]\nradius = 0.1",
+            "`calibrate` in the file must be a list",
+        ),
+        ("[[segment]]\nradius = 0.1\n[base]\nposition = [1]", "`position` in .base. must hold 3"),
+        (
+            "[[segment]]\nradius = 0.1\n[log]\nq = ['a']\nx = ['x', 'y', 'z']",
+            "`q` in .log. must name 3",
+        ),
+        (
+            "[[segment]]\nradius = 0.1\n[log]\nq = ['a','b','c']\nx = ['x','y','z']\nq_unit = 'ft'",
             "`q_unit` in .log. must be one of",
         ),
         (
@@ -233,7 +252,10 @@ def test_defaults_are_chambers_named_after_the_file(write):
         ("[[segment]]\nradius = 0.1\n[limits]\nq_mni = 1", "did you mean `q_min`"),
         ("[[segment]]\nradius = 0.1\n[limits]\nq_min = [1, 2]", "`q_min` in .* must hold 3"),
         ("[[segment]]\nradius = 0.1\n[limits]\nq_min = 2\nq_max = 1", "must not exceed `q_max`"),
-        ("[[segment]]\nradius = 0.1\n[limits]\ndq_max = 0", "`dq_max` .* must be positive"),
+        (
+            "[[segment]]\nradius = 0.1\n[limits]\ndq_max = 0",
+            "`dq_max` .* must be positive",
+        ),
     ],
 )
 def test_bad_descriptions_name_the_key(write, text, message):
@@ -244,3 +266,138 @@ def test_bad_descriptions_name_the_key(write, text, message):
 def test_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         robots.from_toml(tmp_path / "none.toml")
+
+
+SEGMENT = "[[segment]]\nradius = 0.1\nlength = 1\n"
+LOG = "[log]\nq = ['a', 'b', 'c']\nx = ['x', 'y', 'z']\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (SEGMENT + "clockwise = 'false'", "`clockwise` in .* 1 must be true or false, got 'false'"),
+        (SEGMENT + "actuators = 2.5", "`actuators` in .* a whole number from 1 to 64, got 2.5"),
+        (SEGMENT + "actuators = 0", "`actuators` in .* a whole number from 1 to 64, got 0"),
+        (SEGMENT + "repeat = 1.9", "`repeat` in .* a whole number .* got 1.9"),
+        (SEGMENT + "repeat = 0", "`repeat` in .* a whole number .* got 0"),
+        (SEGMENT + "repeat = true", "`repeat` in .* a whole number .* got True"),
+        (SEGMENT + "repeat = inf", "`repeat` in .* a whole number .* got inf"),
+        (SEGMENT + "repeat = 1e12", "`repeat` in .* a whole number .* got 1000000000000"),
+        (SEGMENT + "repeat = 1000000", "`repeat` in .* a whole number .* got 1000000"),
+        ((SEGMENT + "repeat = 64\n") * 2, "at most 64 segments in all, got 128; check `repeat`"),
+        (SEGMENT + "angles_deg = [0, 120, nan]", "`angles_deg` in .* must hold numbers"),
+        (SEGMENT + "angles_deg = [[0, 120, 240]]", "`angles_deg` in .* must hold numbers"),
+        (SEGMENT + "angles_deg = [0, 120]", "`angles_deg` in .* at least 3 actuators, got 2"),
+        (SEGMENT + "angle_deg = inf", "`angle_deg` in .* must be a number, got inf"),
+        (SEGMENT + "offset = 1e300", "`offset` in .* must be a number"),
+        (SEGMENT.replace("0.1", "nan"), "`radius` in .* must be a positive number, got nan"),
+        (SEGMENT.replace("0.1", "true"), "`radius` in .* must be a positive number, got True"),
+        (SEGMENT.replace("0.1", "1" + 400 * "0"), "`radius` in .* must be a positive number"),
+        (SEGMENT + SEGMENT.replace("0.1", "1e-9"), "`radii` must be within a factor of 1000"),
+        (SEGMENT + "bending_stifness = 1", "did you mean `bending_stiffness`"),
+        ("calibrate = ['nope']\n" + SEGMENT, "`calibrate` must name different ones of .'radii'"),
+        ("calibrate = ['base', 'base']\n" + SEGMENT, "`calibrate` must name different ones of"),
+        ("calibrate = [1]\n" + SEGMENT, "`calibrate` in the file must be a list of names"),
+        ("name = 5\n" + SEGMENT, "`name` in the file must be text, got 5"),
+        ("model = ['a']\n" + SEGMENT, "`model` in the file must be one of"),
+        ("base = 3\n" + SEGMENT, "`base` in the file must be a table of keys, got 3"),
+        ("segment = [1, 2]", "`segment` in the file must hold tables"),
+        ("[segment]\nradius = 0.1", r"under the heading \[\[segment\]\]"),
+        (SEGMENT + LOG.replace("'b'", "'a'"), r"every column once, got \['a'\]"),
+        (SEGMENT + LOG.replace("'b'", "'x'"), r"every column once, got \['x'\]"),
+        (SEGMENT + LOG + "time = 'a'", r"every column once, got \['a'\]"),
+        (SEGMENT + LOG.replace("'a'", "1"), "`q` in .log. must hold names of columns"),
+        (SEGMENT + "[log]\nq = ['a', 'b', 'c']", "`q` or `x` is missing in .log."),
+        (SEGMENT + LOG + "groups = ''", "`groups` in .log. must be text"),
+        (SEGMENT + LOG + "q_sign = true", "`q_sign` in .log. must be 1 or -1"),
+        (SEGMENT + LOG + "q_sign = [1, -1]", "`q_sign` in .log. must hold 3 numbers"),
+        (SEGMENT + LOG + "q_unit = ['mm']", "`q_unit` in .log. must be text"),
+        (SEGMENT + LOG + "q_unit = 'deg'", "`q_unit` in .log. must be a length, .* `spool_radius`"),
+        (SEGMENT + LOG + "spool_radius = 0.01", '`spool_radius` "deg" or "rad"; .* got \'m\''),
+        (SEGMENT + LOG + "q_unit = 'mm'\nq_scale = 2", "any name but a length; got 'mm'"),
+        (SEGMENT + LOG + "q_scale = 0.0", "`q_scale` in .log. must be positive"),
+        (SEGMENT + LOG + "q_scale = [1, 2]", "`q_scale` in .log. must hold 3 numbers"),
+        (SEGMENT + "[limits]\nq_min = nan", "`q_min` in .limits. must be a number"),
+        (SEGMENT + "[limits]\nq_min = 0\nunit = 'log'", 'must be "m" without .log., got "log"'),
+        (LOG + "[limits]\nq_min = 0", 'must be "log" without ..segment.., got "m"'),
+        (LOG + "[base]", "`segment` is missing"),
+        (LOG.replace("z'", "'").replace(", '']", "]"), "`x` in .log. must hold 3 names"),
+        ("x = " + 2000 * "[" + 2000 * "]", "this is not a TOML file: maximum recursion depth"),
+        ("x = " + 5000 * "1", "this is not a TOML file: .* digits"),
+        ("name." + 500 * "x." + "x = 1", "`name` in the file must be text, got {'x': {'x'"),
+        ("#" * 30_001, "at most 30000 bytes"),
+    ],
+)
+def test_every_value_is_checked(write, text, message):
+    with pytest.raises(ValueError, match=message):
+        robots.read_description(write(text))
+
+
+def test_spools_scales_and_signs(write):
+    text = (
+        SEGMENT + LOG + "q_unit = 'deg'\nspool_radius = [0.01, 0.01, 0.02]\nq_sign = [1, -1, 1]\n"
+    )
+    robot = robots.read_description(
+        write(text + "[limits]\nunit = 'log'\nq_min = -90\nq_max = [180, 180, 90]\ndq_max = 360\n")
+    )
+    radian = math.radians(1.0) * np.array([0.01, -0.01, 0.02])
+    assert robot.log.q_unit == "deg"
+    assert robot.log.q_factor == pytest.approx(radian)
+    assert robot.limits.q_min == pytest.approx([-90, 180, -90] * radian)
+    assert robot.limits.q_max == pytest.approx([180, -90, 90] * radian)
+    assert robot.limits.dq_max == pytest.approx(360 * abs(radian))
+    back = robot.limits.scaled(1 / robot.log.q_factor)
+    assert (back.q_min.tolist(), back.dq_max.tolist()) == ([-90] * 3, pytest.approx([360] * 3))
+    one_sided = robots.Limits(q_min=np.zeros(3)).scaled(radian)
+    assert one_sided.q_max.tolist() == [math.inf, 0.0, math.inf]
+    scaled = robots.read_description(write(SEGMENT + LOG + "q_unit = 'kPa'\nq_scale = 2e-5"))
+    assert (scaled.log.q_unit, float(scaled.log.q_factor)) == ("kPa", 2e-5)
+
+
+def test_a_robot_of_a_log_alone(write):
+    text = LOG + "q_unit = 'deg'\nq_sign = -1\n[limits]\nunit = 'log'\nq_max = 90\n"
+    robot = robots.read_description(write(text))
+    assert (robot.chain, robot.calibrate, robot.n_actuators) == (None, (), 3)
+    assert robot.limits.q_min == pytest.approx([-math.pi / 2] * 3)
+    assert robot.limits.q_max is None
+    with pytest.raises(ValueError, match=r"describes no chain: it has no \[\[segment\]\] table"):
+        robots.from_toml(robot.path)
+
+
+VALUES = """true 0 -1 3 2.5 1e300 1e-300 nan -inf "x" "" "deg" [] [1] [[1]] ["a","b"] {} {a=1}
+    1979-05-27 [nan,0,0] [true,1,2] ["turns"] 10000000 99999999999999999999""".split()
+
+
+@pytest.mark.slow
+def test_a_changed_description_is_a_robot_or_an_error_of_ours(write):
+    rng = random.Random(0)
+    texts = [TENDONS, ELASTIC, SEGMENT + LOG + "q_unit = 'deg'\nspool_radius = 0.01\n", LOG]
+    keys = [line.split(" = ")[0] for text in texts for line in text.splitlines() if " = " in line]
+    errors, n_robots = [], 0
+    for _ in range(1500):
+        lines = rng.choice(texts).splitlines()
+        at = rng.randrange(len(lines))
+        if rng.random() < 0.6 and " = " in lines[at]:
+            lines[at] = lines[at].split(" = ")[0] + " = " + rng.choice(VALUES)
+        elif rng.random() < 0.5:
+            lines.insert(at, f"{rng.choice(keys)} = {rng.choice(VALUES)}")
+        else:
+            del lines[at]
+        path = write("\n".join(lines))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # radii in millimetres
+                robot = robots.read_description(path)
+        except ValueError as error:
+            errors.append(str(error))
+            continue
+        n_robots += 1
+        if robot.chain is not None:
+            for value in robot.chain.geometry().values():
+                assert torch.isfinite(value).all()
+        for limit in vars(robot.limits).values():
+            assert limit is None or limit.shape == (robot.n_actuators,)
+    assert min(len(errors), n_robots) > 100
+    for error in errors:
+        assert error.startswith(f"{path}: ")
+        assert "`" in error or "TOML" in error or "[log] must name every column once" in error

@@ -46,7 +46,7 @@ def elastic_chain(**options):
     return ElasticTendonChain(
         [0.005, 0.004],
         [0.06, 0.05],
-        n_tendons=[3, 4],
+        n_actuators=[3, 4],
         routing="segment",
         bending_stiffness=[2e-7, 3e-7],
         axial_stiffness=[3.0, 4.0],

@@ -1,0 +1,202 @@
+"""Robot descriptions in TOML files: every key and value checked, and the chain they describe."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import reprlib
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridkin._core.units import METRES
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+_STIFFNESS = ("bending_stiffness", "axial_stiffness")
+_MODELS = ("constant-curvature", "elastic-tendon")
+_MOST = 64  # segments of a robot, actuators of a segment
+
+_LEAST, _LARGEST = 1e-18, 1e9  # of positive numbers, and of all: beyond lie only mistakes
+_BYTES = 30_000  # of a file; the time to read hostile TOML grows with its square
+_Test = Callable[[Any], bool]
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= _LARGEST  # not NaN
+
+
+def _is_positive(value: Any) -> bool:
+    return _is_number(value) and value >= _LEAST
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _many(test: _Test, size: int = 0) -> _Test:
+    return lambda v: type(v) is list and len(v) == (size or len(v)) > 0 and all(map(test, v))
+
+
+def _one_or_many(test: _Test) -> _Test:
+    return lambda value: test(value) or _many(test)(value)
+
+
+def _among(*known: Any) -> tuple[str, _Test]:
+    return f"be one of {known}", lambda v: type(v) is type(known[0]) and v in known
+
+
+_TABLE = ("be a table of keys", lambda value: isinstance(value, dict))
+_TEXT = ("be text", _is_text)
+_POSITIVE = ("be positive, or a list of positive numbers", _one_or_many(_is_positive))
+_WHOLE = (f"be a whole number from 1 to {_MOST}", lambda v: type(v) is int and 0 < v <= _MOST)
+# Tables, their keys, and what the value of a key must do, in words and as a test.
+_ROWS: list[tuple[str, str, str, _Test]] = [
+    ("file", "name", *_TEXT),
+    ("file", "model", *_among(*_MODELS)),
+    ("file", "routing", *_among("segment", "base")),
+    ("file", "calibrate", "be a list of names", lambda v: v == [] or _many(_is_text)(v)),
+    ("file", "segment", "hold tables, each under the heading [[segment]]", _many(_TABLE[1])),
+    ("file", "base log limits", *_TABLE),
+    ("segment", "radius length " + " ".join(_STIFFNESS), "be a positive number", _is_positive),
+    ("segment", "angle_deg offset", "be a number", _is_number),
+    ("segment", "angles_deg zeros", "hold numbers", _many(_is_number)),
+    ("segment", "rest_bend_deg", "hold 2 numbers", _many(_is_number, 2)),
+    ("segment", "clockwise", "be true or false", lambda value: isinstance(value, bool)),
+    ("segment", "actuators repeat", *_WHOLE),
+    ("base", "position rotation_vector_deg", "hold 3 numbers", _many(_is_number, 3)),
+    ("log", "q", "hold names of columns", _many(_is_text)),
+    ("log", "x", "hold 3 names of columns", _many(_is_text, 3)),
+    ("log", "q_unit groups time", *_TEXT),
+    ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
+    ("log", "x_unit", *_among(*METRES)),
+    ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
+    ("log", "q_scale spool_radius", *_POSITIVE),
+    ("limits", "q_min q_max", "be a number, or a list of numbers", _one_or_many(_is_number)),
+    ("limits", "dq_max", *_POSITIVE),
+    ("limits", "unit", *_among("m", "log")),
+]
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file; a ValueError names a key that is not right."""
+    if path.stat().st_size > _BYTES:
+        raise ValueError(f"a robot description must be at most {_BYTES} bytes long.")
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # some numbers raise plain ValueErrors
+        raise ValueError(f"this is not a TOML file: {error}.") from error
+    _check(content, "file", "the file")
+    for k, table in enumerate(content.get("segment", ())):
+        _check(table, "segment", f"[[segment]] {k + 1}")
+    for name in {"base", "log", "limits"} & content.keys():
+        _check(content[name], name, f"[{name}]")
+    return content
+
+
+def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
+    rows = [(keys.split(), (words, fits)) for name, keys, words, fits in _ROWS if name == kind]
+    needs = {key: need for keys, need in rows for key in keys}
+    for key, value in table.items():
+        if key not in needs:
+            close = difflib.get_close_matches(key, needs, n=1)
+            hint = f"did you mean `{close[0]}`?" if close else f"known: {sorted(needs)}."
+            raise ValueError(f"`{key:.40}` in {where} is not known; {hint}")
+        words, fits = needs[key]
+        if not fits(value):
+            got = reprlib.repr(value)  # of a deep or long value not all
+            raise ValueError(f"`{key}` in {where} must {words}, got {got}.")
+
+
+def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendonChain:
+    """Return the chain of a description with segments."""
+    model = tables.get("model", _MODELS[0])
+    elastic = model == "elastic-tendon"
+    segments: list[dict[str, Any]] = []
+    for i, table in enumerate(tables["segment"]):
+        unused = [] if elastic else [key for key in _STIFFNESS if key in table]
+        if unused:
+            raise ValueError(
+                f"`{unused[0]}` in [[segment]] is not known to model 'constant-curvature'; leave "
+                'it out, or set model = "elastic-tendon".'
+            )
+        segments += _segments(table, f"[[segment]] {i + 1}", 1 if elastic else 3)
+    if len(segments) > _MOST:
+        raise ValueError(
+            f"[[segment]] must describe at most {_MOST} segments in all, got "
+            f"{len(segments)}; check `repeat`."
+        )
+    given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
+    for key in ("length", *_STIFFNESS):
+        missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
+        if elastic and key == "length" and missing:
+            raise ValueError(
+                f"`length` is missing for segment {missing[0]}; model 'elastic-tendon' needs the "
+                "backbone length [m] in every [[segment]]."
+            )
+        if 0 < len(missing) < len(segments):
+            kinds = " (tendons) or in none (chambers)" if key == "length" else " or in none"
+            raise ValueError(f"`{key}` must stand in every [[segment]]{kinds}.")
+        given[key] = None if missing else given[key]
+    given["n_actuators"] = [len(angles) for angles in given["angles"]]
+    given |= {"lengths": given.pop("length"), "base": _base(tables.get("base", {}))}
+    given |= {"routing": tables["routing"]} if "routing" in tables else {}
+    zeros = given.pop("zeros")
+    if elastic:
+        return ElasticTendonChain(tendon_zeros=zeros, **given)
+    given = {key: value for key, value in given.items() if key not in _STIFFNESS}
+    return ConstantCurvatureChain(actuator_zeros=zeros, **given)
+
+
+def _segments(table: Mapping[str, Any], where: str, fewest: int) -> list[dict[str, Any]]:
+    if "radius" not in table:
+        raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
+    key = "angles_deg" if "angles_deg" in table else "actuators"
+    if key == "angles_deg":
+        for other in ("angle_deg", "actuators", "clockwise"):
+            if other in table:
+                raise ValueError(f"`{other}` cannot stand beside `angles_deg` in {where}.")
+        angles = np.radians(np.array(table["angles_deg"], dtype=float))
+    else:
+        n = table.get("actuators", 3)
+        step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
+        angles = math.radians(table.get("angle_deg", 0.0)) + step * np.arange(n)
+    if len(angles) < fewest:
+        raise ValueError(
+            f"`{key}` in {where} must describe at least {fewest} actuators, got {len(angles)}; two "
+            "actuators do not determine which way a segment bends."
+        )
+    segment = {
+        "radii": table["radius"],
+        "offsets": table.get("offset", 0.0),
+        "angles": angles,
+        "rest_bends": np.radians(table.get("rest_bend_deg", [0.0, 0.0])),
+        "zeros": each(table, "zeros", where, len(angles)),
+        **{key: table.get(key) for key in ("length", *_STIFFNESS)},
+    }
+    return [segment] * table.get("repeat", 1)
+
+
+def _base(table: Mapping[str, Any]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = table.get("position", 0.0)
+    turn = table.get("rotation_vector_deg", [0.0, 0.0, 0.0])
+    pose[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    return pose
+
+
+def each(table: Mapping[str, Any], key: str, where: str, size: int) -> np.ndarray:
+    """Return one number for each of `size`, given as such or as one for all; zeros without any."""
+    value = np.array(table.get(key, 0.0), dtype=float)
+    if value.shape not in ((), (size,)):
+        raise ValueError(f"`{key}` in {where} must hold {size} numbers, got {table[key]!r}.")
+    return np.broadcast_to(value, size).copy()
