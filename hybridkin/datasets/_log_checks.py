@@ -89,6 +89,7 @@ def check_log(
         x_range=np.stack([x.min(axis=0), x.max(axis=0)], axis=1),
         duration=None if log.time is None else float(np.ptp(log.time)),
         source=log.source,
+        q_unit=log.units["q"],
     )
 
 

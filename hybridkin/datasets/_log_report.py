@@ -59,6 +59,8 @@ class LogReport:
         From the first to the last time stamp [s].
     source : str
         Where the log came from.
+    q_unit : str
+        Unit of q, "m", "rad" or "1".
     """
 
     findings: tuple[LogFinding, ...]
@@ -69,6 +71,7 @@ class LogReport:
     x_range: NDArray
     duration: float | None
     source: str
+    q_unit: str = "m"
 
     @property
     def errors(self) -> tuple[LogFinding, ...]:
@@ -122,11 +125,13 @@ class LogReport:
         """Return the report as text, one paragraph for each finding."""
         motions = "motions not named" if self.n_motions is None else f"{self.n_motions} motions"
         spans = 1e3 * np.ptp(self.x_range, axis=1)
+        scale, unit = {"m": (1e3, " mm"), "rad": (180.0 / np.pi, " deg")}.get(self.q_unit, (1, ""))
         lines = [
             f"Log {self.source}: {self.n_rows} rows, {motions}, {self.n_actuators} actuators"
             + ("" if self.duration is None else f", {self.duration:.4g} s"),
-            f"  q from {1e3 * self.q_range[:, 0].min():.4g} to {1e3 * self.q_range[:, 1].max():.4g}"
-            f" mm, tip within {spans[0]:.4g} x {spans[1]:.4g} x {spans[2]:.4g} mm",
+            f"  q from {scale * self.q_range[:, 0].min():.4g} to "
+            f"{scale * self.q_range[:, 1].max():.4g}{unit}, "
+            f"tip within {spans[0]:.4g} x {spans[1]:.4g} x {spans[2]:.4g} mm",
         ]
         for finding in self.findings:
             head = f"  {finding.severity.upper():8s} {finding.kind}: "

@@ -15,6 +15,12 @@ from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries, millimetres, statistics
 
 _SHOWN = ("mechanical, calibrated", "hybrid, ELM", "hybrid, auto")
+_SHOWN_OF_DATA = ("data-driven, linear", *_SHOWN[1:])  # of a robot without segments
+_MECHANICAL = (
+    '"Nominal" has the geometry of the robot description with only the base pose fitted, when that '
+    "is among the calibrated parameters."
+)
+_NO_MECHANICAL = "The robot has no segments: the hybrids correct the linear model of the data."
 
 
 def write_check(report: Report, log: MeasuredLog) -> None:
@@ -37,8 +43,7 @@ def write_comparison(
         f"{n_folds} folds. Cross-validation over motions within the training part chooses the "
         "ridge weight and the guard of the ELM, and coupling, features and penalties of "
         f'"auto"; the errors of the ELM are the mean over {report.record["n_seeds"]} random hidden '
-        'layers. "Nominal" has the geometry of the robot description with only the base pose '
-        "fitted, when that is among the calibrated parameters.",
+        f"layers. {_MECHANICAL if 'mechanical, nominal' in errors else _NO_MECHANICAL}",
     )
     record: dict[str, dict[str, Any]] = {}
     for name, values in errors.items():
@@ -46,12 +51,13 @@ def write_comparison(
         record[name] = {**statistics(values), "std_folds": by_fold.std(), "by_fold": by_fold}
     report.record["held_out"] = record
     report.errors(record, ("mean", "std", "p95", "max", "std_folds"))
-    present = [name for name in _SHOWN if name in record] or [*record]
+    shown = _SHOWN if _SHOWN[0] in record else _SHOWN_OF_DATA
+    present = [name for name in shown if name in record]
     calibrated, *hybrids = (record[name]["mean"] for name in present)
     pairs = zip(present[1:], hybrids, strict=True)
     ratios = [f"over {name}: **{calibrated / mean:.2f}**" for name, mean in pairs]
     best = min(record, key=lambda name: record[name]["mean"])
-    first = "Calibrated mechanical model" if present[0] == _SHOWN[0] else f"Model {present[0]},"
+    first = "Calibrated mechanical model" if shown is _SHOWN else "Linear model"
     report.text(f"{first} {', '.join(ratios)}. Least mean error: {best}.")
     _add_figures(report, errors, (present[0], present[-1]))
     motions, counts = np.unique(log.motions, return_counts=True)

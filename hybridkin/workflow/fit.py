@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
+from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
@@ -24,6 +25,7 @@ from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
+from hybridkin.learning.regressor_modules import error_module
 from hybridkin.saving.saved_model import save_model
 from hybridkin.workflow._fit_report import (
     auto_entry,
@@ -50,10 +52,9 @@ AUTO = "hybrid, auto"
 CALIBRATED = "mechanical, calibrated"
 ELM = "hybrid, ELM"
 LINEAR = "hybrid, linear"
-DATA_ELM = "data-driven, ELM"
-DATA_LINEAR = "data-driven, linear"
+_DATA_LINEAR = "data-driven, linear"
 _SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # what a file can hold
-_SAVED_OF_DATA = (DATA_LINEAR, DATA_ELM)  # of a robot without segments
+_SAVED_OF_DATA = (_DATA_LINEAR, ELM, AUTO)  # of a robot without segments
 _N_HIDDEN = 100
 _INNER_FOLDS = 4
 _ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto: fewer do not pay for a start
@@ -121,11 +122,11 @@ class _Choice(NamedTuple):
             return "no correction"
         return f"alpha = {self.alpha:g}, guard: {self.guard or 'none'}"
 
-    def model(self, chain: Chain | None, seed: int = 0) -> HybridForwardModel:
+    def model(self, mechanical: ForwardModel | None, seed: int = 0) -> HybridForwardModel:
         if self.alpha is None:
-            return HybridForwardModel(chain, "drop")
+            return HybridForwardModel(mechanical, "drop")
         elm = ELMRegressor(_N_HIDDEN, self.alpha, random_state=seed)
-        return HybridForwardModel(chain, elm, guard=self.guard)
+        return HybridForwardModel(mechanical, elm, guard=self.guard)
 
 
 _DATA_CHOICES = tuple(_Choice(alpha) for alpha in ALPHAS)
@@ -133,6 +134,8 @@ _HYBRID_CHOICES = (
     _Choice(),
     *(_Choice(alpha, guard) for guard in ("leverage", "box", None) for alpha in ALPHAS),
 )
+# Without a mechanical model nothing but this guard keeps a path near the data.
+_GUARDED_CHOICES = tuple(_Choice(alpha, "leverage") for alpha in ALPHAS)
 
 
 class _Rows(NamedTuple):
@@ -147,6 +150,11 @@ class _Rows(NamedTuple):
     def of(self, rows: NDArray) -> _Rows:
         return self._replace(q=self.q[rows], x=self.x[rows], groups=self.groups[rows])
 
+    @property
+    def hybrid_choices(self) -> tuple[_Choice, ...]:
+        """The ELMs of hybrids to choose from."""
+        return _GUARDED_CHOICES if self.robot.chain is None else _HYBRID_CHOICES
+
     def calibrated(
         self, chain: Chain, parameters: Sequence[str] | None = None
     ) -> tuple[CalibrationResult, list[str]]:
@@ -154,17 +162,23 @@ class _Rows(NamedTuple):
         names = self.robot.calibrate if parameters is None else parameters
         return fit_geometry(chain, self.q, self.x, names, self.settings.loss)
 
-    def auto_model(self, calibrated: Chain) -> HybridForwardModel:
+    def mechanical(self) -> ForwardModel:
+        """Return the calibrated chain; of a robot without segments a linear model of the rows."""
+        if self.robot.chain is not None:
+            return self.calibrated(self.robot.chain)[0].chain
+        return error_module(linear().fit(self.q, self.x), torch.from_numpy(self.q))
+
+    def auto_model(self, calibrated: ForwardModel) -> HybridForwardModel:
         """Return the hybrid that chooses for itself.
 
         It calibrates anew in every fold of its own, by least squares; a loss that bounds outliers
         is kept by starting from the chain so calibrated.
         """
-        linear_loss = self.settings.loss == "linear"
+        anew = self.settings.loss == "linear" and self.robot.chain is not None
         return HybridForwardModel(
-            self.robot.chain if linear_loss else calibrated,
+            self.robot.chain if anew else calibrated,
             "auto",
-            calibrate=self.robot.calibrate if linear_loss else (),
+            calibrate=self.robot.calibrate if anew else (),
             play=self.settings.play,
             random_state=0,
         )
@@ -237,7 +251,7 @@ def fit_log(
 
     Saved is the model with the least mean error on held-out motions, of the calibrated mechanical
     model and the hybrids with a linear error model, an ELM, and what ``error_model="auto"`` takes;
-    of a robot without segments the linear model and the ELM that learn from data alone.
+    of a robot without segments a linear model of the data stands for the mechanical one.
 
     Parameters
     ----------
@@ -269,8 +283,8 @@ def fit_log(
         If the log or the settings do not allow the comparison.
     """
     check_out(out)
-    if robot.chain is None:
-        settings = replace(settings, auto=False)
+    if robot.chain is None and settings.play is not None:
+        raise ValueError("`play` requires a robot with segments: its width is a length.")
     whole = checked(log, robot.chain, "base" in robot.calibrate)
     _check(whole, settings, force)
     data = whole.thinned(settings.max_rows)
@@ -283,7 +297,8 @@ def fit_log(
     result, messages = (None, []) if robot.chain is None else rows.calibrated(robot.chain)
     for message in messages:
         warnings.warn(message, stacklevel=2)
-    model, chosen = _fit_saved(saved, rows, None if result is None else result.chain)
+    mechanical = rows.mechanical() if result is None else result.chain
+    model, chosen = _fit_saved(saved, rows, mechanical)
     progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
     report.record.update(n=len(data.q), saved=saved, chosen=chosen)
@@ -309,9 +324,7 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
         )
     if settings.play is not None:
         if not settings.auto:
-            raise ValueError(
-                "`play` requires `auto=True` and a robot with segments; leave out --no-auto."
-            )
+            raise ValueError("`play` requires `auto=True`; leave out --no-auto.")
         if not log.named:
             raise ValueError(
                 "`play` needs motions, their rows in the order of time; name the column that tells "
@@ -344,22 +357,20 @@ def _write_choice(report: Report, compared: Comparison, data: MeasuredLog) -> No
     write_comparison(report, compared.errors, compared.fold, data)
     by_fold = "; ".join(choices.get(saved, "-") for choices in compared.choices)
     report.text(
-        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error here. "
+        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error of "
+        "the models that a fit saves. "
         f"Chosen in the folds: {by_fold}."
     )
 
 
-def _fit_saved(saved: str, rows: _Rows, calibrated: Chain | None) -> tuple[HybridForwardModel, str]:
+def _fit_saved(saved: str, rows: _Rows, mechanical: ForwardModel) -> tuple[HybridForwardModel, str]:
     """Return the model to save, fitted to all rows, and what was chosen for it."""
-    choice = _Choice()
-    if saved in (ELM, DATA_ELM):
-        choices = _HYBRID_CHOICES if saved == ELM else _DATA_CHOICES
-        choice = _choose(rows, choices, rows.robot.chain)
-    model, chosen = choice.model(calibrated), str(choice)
-    if saved in (LINEAR, DATA_LINEAR):
-        model, chosen = HybridForwardModel(calibrated, linear()), "linear"
-    elif saved == AUTO and calibrated is not None:
-        model = rows.auto_model(calibrated)
+    choice = _choose(rows, rows.hybrid_choices) if saved == ELM else _Choice()
+    model, chosen = choice.model(mechanical), str(choice)
+    if saved == LINEAR:
+        model, chosen = HybridForwardModel(mechanical, linear()), "linear"
+    elif saved == AUTO:
+        model = rows.auto_model(mechanical)
     model.set_params(coverage=rows.settings.coverage)
     model.fit_with_messages(rows.q, rows.x, groups=rows.groups)
     return model, auto_in_short(auto_entry(model)) if saved == AUTO else chosen
@@ -393,34 +404,36 @@ def _add_model(
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors on test rows of every model fitted to training rows, and the choices."""
     seeds, chain = range(train.settings.n_seeds), train.robot.chain
-    choice = _choose(train, _DATA_CHOICES, None)
-    models = {
-        DATA_LINEAR: [HybridForwardModel(None, linear())],
-        "data-driven, quadratic": [HybridForwardModel(None, quadratic())],
-        DATA_ELM: [choice.model(None, seed) for seed in seeds],
-    }
-    chosen = {DATA_ELM: str(choice)}
+    data_choice, hybrid_choice = _choose(train, _DATA_CHOICES), _choose(train, train.hybrid_choices)
+    mechanical, first, more = train.mechanical(), {}, {}
     if chain is not None:
-        calibrated = train.calibrated(chain)[0].chain
-        choice = _choose(train, _HYBRID_CHOICES, chain)
-        if "base" in train.robot.calibrate:
-            chain = train.calibrated(chain, ("base",))[0].chain
-        models = {
-            "mechanical, nominal": [HybridForwardModel(chain, "drop")],
-            CALIBRATED: [HybridForwardModel(calibrated, "drop")],
-            **models,
-            LINEAR: [HybridForwardModel(calibrated, linear())],
-            "hybrid, quadratic": [HybridForwardModel(calibrated, quadratic())],
-            ELM: [choice.model(calibrated, seed) for seed in seeds],
+        nominal = (
+            train.calibrated(chain, ("base",))[0].chain
+            if "base" in train.robot.calibrate
+            else chain
+        )
+        first = {
+            "mechanical, nominal": [HybridForwardModel(nominal, "drop")],
+            CALIBRATED: [HybridForwardModel(mechanical, "drop")],
         }
-        chosen[ELM] = str(choice)
-        if train.settings.auto:
-            models[AUTO] = [train.auto_model(calibrated)]
+        more = {LINEAR: [HybridForwardModel(mechanical, linear())]}
+    models = {
+        **first,
+        _DATA_LINEAR: [HybridForwardModel(None, linear())],
+        "data-driven, quadratic": [HybridForwardModel(None, quadratic())],
+        "data-driven, ELM": [data_choice.model(None, seed) for seed in seeds],
+        **more,
+        "hybrid, quadratic": [HybridForwardModel(mechanical, quadratic())],
+        ELM: [hybrid_choice.model(mechanical, seed) for seed in seeds],
+    }
+    chosen = {"data-driven, ELM": str(data_choice), ELM: str(hybrid_choice)}
+    if train.settings.auto:
+        models[AUTO] = [train.auto_model(mechanical)]
     errors = {
         name: np.mean([_held_out(model, train, test) for model in some], axis=0)
         for name, some in models.items()
     }
-    if AUTO in models:
+    if train.settings.auto:
         chosen[AUTO] = auto_in_short(auto_entry(models[AUTO][0]))
     return errors, chosen
 
@@ -433,13 +446,12 @@ def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
         return distance(model.module_(torch.tensor(q, dtype=torch.float64)).numpy(), test.x)
 
 
-def _choose(rows: _Rows, candidates: Sequence[_Choice], chain: Chain | None) -> _Choice:
+def _choose(rows: _Rows, candidates: Sequence[_Choice]) -> _Choice:
     """Return the candidate with the least mean error on held-out groups, calibrated anew."""
     errors = np.zeros(len(candidates))
     folds = GroupKFold(min(_INNER_FOLDS, len(np.unique(rows.groups))))
     for train, test in folds.split(rows.q, groups=rows.groups):
-        known, new, fitted = rows.of(train), rows.of(test), chain
-        if chain is not None and rows.robot.calibrate:
-            fitted = known.calibrated(chain)[0].chain
-        errors += [_held_out(choice.model(fitted), known, new).sum() for choice in candidates]
+        known, new = rows.of(train), rows.of(test)
+        mechanical = None if candidates is _DATA_CHOICES else known.mechanical()
+        errors += [_held_out(choice.model(mechanical), known, new).sum() for choice in candidates]
     return candidates[int(errors.argmin())]

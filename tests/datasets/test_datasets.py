@@ -324,6 +324,19 @@ def test_csv_angles_and_unitless(log):
     assert data.units["q"] == "1"
 
 
+def test_motor_angles_and_pressures_become_lengths(log):
+    path = log(HEADER + "0,r,90,180,-90,1,2,3\n")
+    radian = np.pi / 180
+    data = load_log(path, **COLUMNS, q_unit="deg", q_scale=0.01 * radian, q_sign=-1)
+    assert_allclose(data.q, [[-0.01 * np.pi / 2, -0.01 * np.pi, 0.01 * np.pi / 2]])
+    assert (data.units["q"], data.file_units["q"]) == ("m", "deg")
+    data = load_log(path, **COLUMNS, q_unit="kPa", q_scale=[1e-5, 2e-5, 1e-5])
+    assert_allclose(data.q, [[9e-4, 3.6e-3, -9e-4]])
+    assert "q from -0.9 to 3.6 mm" in str(check_log(data))
+    angles = check_log(load_log(path, **COLUMNS, q_unit="deg"))
+    assert "q from -90 to 180 deg" in str(angles)
+
+
 def test_csv_with_byte_order_mark_semicolons_blanks_and_empty_lines(log):
     text = "a; b;c;X;Y;Z\n1;2;3; 1;2;3\n\n4;5;6;1;2;3\n"
     path = log(text, encoding="utf-8-sig")
@@ -362,6 +375,10 @@ def test_csv_invalid_rows_are_counted_or_dropped(log):
         (HEADER, {"q": ["a", "a"]}, "`q` names a column twice"),
         (HEADER, {"q_unit": "inch"}, "`q_unit` must be one of"),
         (HEADER, {"x_unit": "deg"}, "`x_unit` must be one of"),
+        (HEADER, {"q_unit": "kPa"}, "of other units give `q_scale`"),
+        (HEADER, {"q_scale": [1, 2]}, "`q_scale` must be a positive number, or 3"),
+        (HEADER, {"q_scale": -1.0}, "`q_scale` must be a positive number, or 3"),
+        (HEADER, {"q_scale": 1.0, "q_unit": "mm"}, "`q_unit` no length, got 1.0 and 'mm'"),
         (HEADER, {"q_sign": 2}, "`q_sign` must be 1 or -1"),
         (HEADER, {"q_sign": [1, -1]}, "`q_sign` must be 1 or -1"),
     ],
@@ -589,6 +606,18 @@ def test_units_that_cannot_be(q, x, units, advice):
     assert [f.kind for f in report.errors] == ["units"] * len(advice)
     for finding, wanted in zip(report.errors, advice, strict=True):
         assert wanted in finding.advice
+
+
+def test_units_that_are_no_lengths():
+    log = tendon_log()
+    turns = {**log, "units": {"q": "rad", "x": "m"}, "file_units": {"q": "deg", "x": "mm"}}
+    (finding,) = check_log(Log(**turns), chain=CHAIN).errors
+    assert "the actuators of the robot are lengths, but q is in deg" in finding.message
+    assert "`spool_radius`" in finding.advice
+    assert check_log(Log(**turns)).ok
+    steps = {**log, "q": 1e3 * log["q"], "file_units": {"q": "mm", "x": "m"}}
+    (finding,) = check_log(Log(**steps), chain=CHAIN).errors
+    assert "`q_scale` (of pressures or steps: metres per unit)" in finding.advice
 
 
 @pytest.mark.parametrize("unit", ["mm", "cm"])

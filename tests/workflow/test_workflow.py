@@ -16,6 +16,7 @@ from hybridkin import (
     datasets,
     load_model,
     robots,
+    trajectories,
     workflow,
 )
 from hybridkin.cli.main import main
@@ -315,6 +316,95 @@ def test_given_limits_replace_those_of_the_description():
         workflow.path_limits(loaded, q_min=0.02)
     with pytest.raises(ValueError, match="--q-min"):
         workflow.path_limits(workflow.LoadedModel("robot", Path("robot.toml"), chain))
+
+
+MOTORS = """
+[[segment]]
+radius = 0.005
+length = 0.1
+[log]
+q = ["a", "b", "c"]
+x = ["x", "y", "z"]
+q_unit = "deg"
+spool_radius = [0.006, 0.006, 0.012]
+q_sign = -1
+[limits]
+unit = "log"
+q_min = -60
+q_max = 60
+dq_max = 90
+"""
+
+
+@pytest.mark.slow
+def test_motor_angles_from_the_log_to_the_commands(tmp_path, capsys):
+    robot = tmp_path / "motors.toml"
+    robot.write_text(MOTORS)
+    loaded = workflow.open_model(robot)
+    turn = np.radians([0.006, 0.006, 0.012])
+    limits = workflow.path_limits(loaded)
+    np.testing.assert_allclose(limits.q_min, -60 * turn)
+    path = trajectories.line([0.03, 0.0, 0.09], [0.03, 0.01, 0.09], duration=1.0, dt=0.5)
+    out = tmp_path / "track"
+    workflow.track_path(loaded, path, out, tol=0.1)
+    log = workflow.read_log(out / "track.csv", replace(loaded.log_format(), x_unit="m"))
+    angles = datasets.load_log(out / "track.csv", ["a", "b", "c"], ["x", "y", "z"], q_unit="1").q
+    np.testing.assert_allclose(log.q, -turn * angles, rtol=1e-12)
+    assert np.abs(angles).max() <= 60.0
+    np.testing.assert_allclose(loaded.predict(log.q), log.x, atol=1e-8)
+    assert main(["describe", str(robot)]) == 0
+    printed = capsys.readouterr().out
+    assert "Limits: q_min = -60, -60, -60 deg." in printed
+    assert "Limits: dq_max = 90, 90, 90 deg/s." in printed
+    options = ["--shape", "line", "--size", "0,0.01,0", "--unit", "m", "--q-min=-10", "--dt", "5"]
+    arguments = ["track", str(robot), *options, "--q-max", "20,20,30", "--out", str(out), "--json"]
+    main(arguments)
+    record = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(record["limits"]["q_min"], [-20, -20, -30] * turn)
+    np.testing.assert_allclose(record["limits"]["q_max"], 10 * turn)
+
+
+DATA_ROBOT = """
+name = "pneumatic arm"
+[log]
+q = ["l1", "l2", "l3", "l4", "l5", "l6"]
+x = ["x", "y", "z"]
+q_unit = "1"
+x_unit = "mm"
+groups = "motion"
+"""
+
+
+@pytest.mark.slow
+def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path, capsys):
+    path, _ = log
+    robot, model = tmp_path / "data.toml", tmp_path / "m"
+    robot.write_text(DATA_ROBOT)
+    with pytest.raises(ValueError, match="has no model before a fit: hybridkin fit LOG"):
+        workflow.open_model(robot)
+    description = robots.read_description(robot)
+    measured = workflow.read_log(path, description.log, chain=description.chain)
+    with pytest.raises(ValueError, match="`play` requires a robot with segments"):
+        workflow.fit_log(measured, description, model, workflow.FitSettings(play="auto"))
+    settings = workflow.FitSettings(n_folds=2, n_seeds=1, auto=False)
+    report, _ = workflow.fit_log(measured, description, model, settings, n_jobs=1)
+    errors = report.record["held_out"]
+    assert report.record["saved"] == "hybrid, ELM"
+    assert errors["hybrid, ELM"]["mean"] < errors["data-driven, linear"]["mean"]
+    loaded = workflow.open_model(model)
+    assert (loaded.name, loaded.chain) == ("pneumatic arm", None)
+    np.testing.assert_allclose(measured.q[0], 1e3 * np.array([0.25] * 6), rtol=0.3)  # as they are
+    evaluated, _ = workflow.evaluate_log(loaded, measured)
+    assert evaluated.record["all"]["mean"] < 0.005
+    assert loaded.hybrid.in_domain(measured.q).mean() > 0.9
+    assert not loaded.hybrid.in_domain(measured.q + 300).any()
+    text = workflow.describe(loaded).plain()
+    assert "No mechanical model." in text
+    assert "mm" not in text[text.index("Fitted for") : text.index("Logs:")]
+    x = loaded.predict(measured.q[:1])[0]
+    way = trajectories.line(x, (x[0] + 0.005, x[1], x[2]), duration=1.0, dt=0.5)
+    tracked, _ = workflow.track_path(loaded, way, tmp_path / "t", tol=1e-3)
+    assert tracked.record["reached"] == 3
 
 
 def test_a_report_prints_what_it_writes():
