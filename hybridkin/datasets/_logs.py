@@ -183,16 +183,11 @@ def load_log(
         raise ValueError(
             f"{str(path)!r} has no valid row left: all have a missing, NaN or infinite value."
         )
-    values, n = values[valid], len(q)
+    values, n, length = values[valid], len(q), q_scale is not None or q_unit in METRES
     columns = {"q": values[:, :n], "x": values[:, n : n + 3]}
     for name, unit in (("q", q_unit), ("x", x_unit)):
-        span, middle = np.ptp(columns[name], axis=0).max(), np.median(np.abs(columns[name]))
-        if unit == "m" and (middle > 10 or span > 5):
-            warnings.warn(
-                f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
-                f"millimetres, give {name}_unit='mm'.",
-                stacklevel=2,
-            )
+        if unit == "m":
+            _warn_of_millimetres(name, columns[name])
     return Log(
         columns["q"] * factor,
         columns["x"] * METRES[x_unit],
@@ -203,7 +198,7 @@ def load_log(
         q_names=q,
         x_names=x,
         q_sign=q_sign,
-        units={"q": _model_unit(q_unit, q_scale), "x": "m"},
+        units={"q": "m" if length else "1" if q_unit == "1" else "rad", "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )
@@ -279,10 +274,14 @@ class _Table(NamedTuple):
         return np.column_stack([*found.values()]), labels
 
 
-def _model_unit(q_unit: str, q_scale: ArrayLike | None) -> str:
-    if q_scale is not None or q_unit in METRES:
-        return "m"
-    return "1" if q_unit == "1" else "rad"
+def _warn_of_millimetres(name: str, values: NDArray) -> None:
+    span, middle = np.ptp(values, axis=0).max(), np.median(np.abs(values))
+    if middle > 10 or span > 5:
+        warnings.warn(
+            f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
+            f"millimetres, give {name}_unit='mm'.",
+            stacklevel=3,
+        )
 
 
 def _checked_factor(

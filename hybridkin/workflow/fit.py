@@ -54,6 +54,7 @@ ELM = "hybrid, ELM"
 LINEAR = "hybrid, linear"
 _DATA_LINEAR = "data-driven, linear"
 _SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # what a file can hold
+_OF_CHAINS = ("mechanical, nominal", CALIBRATED, LINEAR)
 _SAVED_OF_DATA = (_DATA_LINEAR, ELM, AUTO)  # of a robot without segments
 _N_HIDDEN = 100
 _INNER_FOLDS = 4
@@ -149,11 +150,6 @@ class _Rows(NamedTuple):
 
     def of(self, rows: NDArray) -> _Rows:
         return self._replace(q=self.q[rows], x=self.x[rows], groups=self.groups[rows])
-
-    @property
-    def hybrid_choices(self) -> tuple[_Choice, ...]:
-        """The ELMs of hybrids to choose from."""
-        return _GUARDED_CHOICES if self.robot.chain is None else _HYBRID_CHOICES
 
     def calibrated(
         self, chain: Chain, parameters: Sequence[str] | None = None
@@ -365,7 +361,7 @@ def _write_choice(report: Report, compared: Comparison, data: MeasuredLog) -> No
 
 def _fit_saved(saved: str, rows: _Rows, mechanical: ForwardModel) -> tuple[HybridForwardModel, str]:
     """Return the model to save, fitted to all rows, and what was chosen for it."""
-    choice = _choose(rows, rows.hybrid_choices) if saved == ELM else _Choice()
+    choice = _choose(rows, hybrid=True) if saved == ELM else _Choice()
     model, chosen = choice.model(mechanical), str(choice)
     if saved == LINEAR:
         model, chosen = HybridForwardModel(mechanical, linear()), "linear"
@@ -404,28 +400,22 @@ def _add_model(
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors on test rows of every model fitted to training rows, and the choices."""
     seeds, chain = range(train.settings.n_seeds), train.robot.chain
-    data_choice, hybrid_choice = _choose(train, _DATA_CHOICES), _choose(train, train.hybrid_choices)
-    mechanical, first, more = train.mechanical(), {}, {}
-    if chain is not None:
-        nominal = (
-            train.calibrated(chain, ("base",))[0].chain
-            if "base" in train.robot.calibrate
-            else chain
-        )
-        first = {
-            "mechanical, nominal": [HybridForwardModel(nominal, "drop")],
-            CALIBRATED: [HybridForwardModel(mechanical, "drop")],
-        }
-        more = {LINEAR: [HybridForwardModel(mechanical, linear())]}
+    data_choice, hybrid_choice = _choose(train, hybrid=False), _choose(train, hybrid=True)
+    nominal, mechanical = chain, train.mechanical()
+    if chain is not None and "base" in train.robot.calibrate:
+        nominal = train.calibrated(chain, ("base",))[0].chain
     models = {
-        **first,
+        "mechanical, nominal": [HybridForwardModel(nominal, "drop")],
+        CALIBRATED: [HybridForwardModel(mechanical, "drop")],
         _DATA_LINEAR: [HybridForwardModel(None, linear())],
         "data-driven, quadratic": [HybridForwardModel(None, quadratic())],
         "data-driven, ELM": [data_choice.model(None, seed) for seed in seeds],
-        **more,
+        LINEAR: [HybridForwardModel(mechanical, linear())],
         "hybrid, quadratic": [HybridForwardModel(mechanical, quadratic())],
         ELM: [hybrid_choice.model(mechanical, seed) for seed in seeds],
     }
+    if chain is None:
+        models = {name: models[name] for name in models if name not in _OF_CHAINS}
     chosen = {"data-driven, ELM": str(data_choice), ELM: str(hybrid_choice)}
     if train.settings.auto:
         models[AUTO] = [train.auto_model(mechanical)]
@@ -446,12 +436,15 @@ def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
         return distance(model.module_(torch.tensor(q, dtype=torch.float64)).numpy(), test.x)
 
 
-def _choose(rows: _Rows, candidates: Sequence[_Choice]) -> _Choice:
-    """Return the candidate with the least mean error on held-out groups, calibrated anew."""
+def _choose(rows: _Rows, *, hybrid: bool) -> _Choice:
+    """Return the ELM with the least mean error on held-out groups, calibrated anew."""
+    candidates = _DATA_CHOICES
+    if hybrid:
+        candidates = _GUARDED_CHOICES if rows.robot.chain is None else _HYBRID_CHOICES
     errors = np.zeros(len(candidates))
     folds = GroupKFold(min(_INNER_FOLDS, len(np.unique(rows.groups))))
     for train, test in folds.split(rows.q, groups=rows.groups):
         known, new = rows.of(train), rows.of(test)
-        mechanical = None if candidates is _DATA_CHOICES else known.mechanical()
+        mechanical = known.mechanical() if hybrid else None
         errors += [_held_out(choice.model(mechanical), known, new).sum() for choice in candidates]
     return candidates[int(errors.argmin())]
