@@ -134,7 +134,7 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
     Domain and limits are in unit and sign of the logs, where these are known.
     """
     record, description = report.record, loaded.description
-    log_format = LogFormat((), (), "1" if loaded.chain is None else "mm")
+    log_format = LogFormat((), (), "mm" if isinstance(loaded.chain, ArcChain) else "1")
     if description is not None and description.log is not None:
         log_format = description.log
     if record["error_model"] is not None:
@@ -154,9 +154,9 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
         shown = Limits() if limits is None else limits.scaled(1 / log_format.q_factor)
         for name, value in vars(shown).items():
             if value is not None:
-                unit = log_format.q_unit + ("/s" if name == "dq_max" else "")
-                numbers = ", ".join(f"{v:.4g}" for v in value)
-                report.text(f"{what} {name} = {numbers} {unit}.")
+                unit = "" if log_format.q_unit == "1" else f" {log_format.q_unit}"
+                unit += "/s" if name == "dq_max" else ""
+                report.text(f"{what} {name} = {', '.join(f'{v:.4g}' for v in value)}{unit}.")
     if record["log_format"] is not None:
         q, x, q_unit, x_unit, q_sign, *_ = record["log_format"].values()
         columns = f"q in {q_unit}, q_sign {q_sign} ({', '.join(q)}), x in {x_unit} ({', '.join(x)})"

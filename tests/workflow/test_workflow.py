@@ -342,26 +342,24 @@ def test_motor_angles_from_the_log_to_the_commands(tmp_path, capsys):
     robot.write_text(MOTORS)
     loaded = workflow.open_model(robot)
     turn = np.radians([0.006, 0.006, 0.012])
-    limits = workflow.path_limits(loaded)
-    np.testing.assert_allclose(limits.q_min, -60 * turn)
-    path = trajectories.line([0.03, 0.0, 0.09], [0.03, 0.01, 0.09], duration=1.0, dt=0.5)
-    out = tmp_path / "track"
-    workflow.track_path(loaded, path, out, tol=0.1)
-    log = workflow.read_log(out / "track.csv", replace(loaded.log_format(), x_unit="m"))
-    angles = datasets.load_log(out / "track.csv", ["a", "b", "c"], ["x", "y", "z"], q_unit="1").q
-    np.testing.assert_allclose(log.q, -turn * angles, rtol=1e-12)
-    assert np.abs(angles).max() <= 60.0
-    np.testing.assert_allclose(loaded.predict(log.q), log.x, atol=1e-8)
+    np.testing.assert_allclose(workflow.path_limits(loaded).q_min, -60 * turn)
     assert main(["describe", str(robot)]) == 0
     printed = capsys.readouterr().out
     assert "Limits: q_min = -60, -60, -60 deg." in printed
     assert "Limits: dq_max = 90, 90, 90 deg/s." in printed
-    options = ["--shape", "line", "--size", "0,0.01,0", "--unit", "m", "--q-min=-10", "--dt", "5"]
-    arguments = ["track", str(robot), *options, "--q-max", "20,20,30", "--out", str(out), "--json"]
-    main(arguments)
-    record = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(record["limits"]["q_min"], [-20, -20, -30] * turn)
-    np.testing.assert_allclose(record["limits"]["q_max"], 10 * turn)
+    points, out = tmp_path / "points.csv", tmp_path / "track"
+    angles = np.array([[0.0, 10.0, -5.0], [0.0, 9.0, -5.0]])
+    np.savetxt(points, loaded.predict(-turn * angles), delimiter=",")
+    options = ["--unit", "m", "--dt", "1", "--q-min=-10", "--q-max", "20,20,30", "--json"]
+    assert main(["track", str(robot), str(points), "--out", str(out), *options]) == 0
+    limits = json.loads(capsys.readouterr().out)["limits"]
+    np.testing.assert_allclose(limits["q_min"], [-20, -20, -30] * turn)
+    np.testing.assert_allclose(limits["q_max"], 10 * turn)
+    log = workflow.read_log(out / "track.csv", replace(loaded.log_format(), x_unit="m"))
+    angles = datasets.load_log(out / "track.csv", ["a", "b", "c"], ["x", "y", "z"], q_unit="1").q
+    np.testing.assert_allclose(log.q, -turn * angles, rtol=1e-12)
+    assert (np.abs(angles - [5, 5, 10]) <= [15.001, 15.001, 20.001]).all()
+    np.testing.assert_allclose(loaded.predict(log.q), log.x, atol=1e-8)
 
 
 DATA_ROBOT = """
@@ -400,7 +398,8 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path, ca
     assert not loaded.hybrid.in_domain(measured.q + 300).any()
     text = workflow.describe(loaded).plain()
     assert "No mechanical model." in text
-    assert "mm" not in text[text.index("Fitted for") : text.index("Logs:")]
+    fitted_for = text[text.index("Fitted for") : text.index("Logs:")]
+    assert re.search(r"q_min = 2\d\d(\.\d)?(, 2\d\d(\.\d)?){5}\.\n", fitted_for)
     x = loaded.predict(measured.q[:1])[0]
     way = trajectories.line(x, (x[0] + 0.005, x[1], x[2]), duration=1.0, dt=0.5)
     tracked, _ = workflow.track_path(loaded, way, tmp_path / "t", tol=1e-3)
