@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from numpy.typing import NDArray
+from sklearn.base import BaseEstimator
+from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.autograd import grad
 
@@ -91,6 +94,27 @@ class ForwardModel(PortableModule):
 
     n_actuators: int = 0
     n_outputs: int = 0
+
+    @property
+    def least_actuator(self) -> float:
+        """What no entry of q can be below: 0 for absolute lengths, else -inf."""
+        return -math.inf
+
+    @property
+    def robot(self) -> ForwardModel:
+        """The model that knows the geometry: of a hybrid its mechanical model, else itself."""
+        return self
+
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return warnings where q (N, n) holds values too large to be metres or radians.
+
+        `factor` multiplies what counts as too large.
+        """
+        return []
+
+    def far_messages(self, x: Tensor, name: str) -> list[str]:
+        """Return warnings where tips (..., 3) lie too far from the base to be metres."""
+        return []
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., n_outputs) for q of shape (..., n_actuators)."""
@@ -243,9 +267,13 @@ def as_forward_model(model: Any) -> ForwardModel:
     if fitted is not None:
         return as_forward_model(fitted)
     if not callable(model):
+        if isinstance(model, BaseEstimator):
+            check_is_fitted(model)
         raise TypeError(
-            f"`model` must be a torch module or callable q -> x, got {type(model).__name__}; "
-            "an estimator must be fitted first, and of a robot description hand over its `chain`."
+            "`model` must be a torch module, a callable q -> x or a fitted regressor with a "
+            f"`module_`, got {type(model).__name__}; fit another regressor or a pipeline by "
+            "HybridForwardModel(None, error_model=regressor).fit(q, x) and hand that over; "
+            "of a search hand over its `best_estimator_`, of a robot description its `chain`."
         )
     return FunctionModel(model)
 

@@ -15,14 +15,17 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 UNITS = {**METRES, "rad": 1.0, "deg": math.pi / 180, "1": 1.0}
 """Metres or radians in each unit of actuators; "1" is left as it is."""
 
+LONGEST_PULL = 4.0
+"""Backbone lengths that no tendon moves by."""
+
 _TURNS = 4.0 * math.pi  # [rad]; a joint or an angle that goes further is more likely in degrees
 _SPANS = 10.0  # a tip moves within two lengths of its robot; millimetres look like 2000
 
 
-def span_message(name: str, tips: Tensor, reach: float) -> str | None:
+def span_message(name: str, tips: Tensor, reach: float, spans: float = _SPANS) -> str | None:
     """Return a warning where tips (N, 3) lie further apart than a robot of that size reaches."""
     span = float((tips.amax(dim=0) - tips.amin(dim=0)).max())
-    if span <= _SPANS * reach:
+    if span <= spans * reach:
         return None
     return (
         f"`{name}` spans {span:.4g} m, but the robot is only {reach:.3g} m long; hybridkin "
@@ -32,7 +35,7 @@ def span_message(name: str, tips: Tensor, reach: float) -> str | None:
 
 def millimetres_message(name: str, value: Tensor, limit: float) -> str | None:
     """Return a warning where values are too large to be metres."""
-    what = ", which looks like millimetres; hybridkin works in metres."
+    what = ", which looks like millimetres; hybridkin works in metres: divide by 1000."
     return _too_large(name, value, limit, what)
 
 
@@ -43,10 +46,10 @@ def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
         warnings.warn(message, stacklevel=3)
 
 
-def degrees_message(name: str, turns: Tensor) -> str | None:
+def degrees_message(name: str, turns: Tensor, factor: float = 1.0) -> str | None:
     """Return a warning where joint angles are too large to be radians."""
     what = " on a revolute joint, which looks like degrees; hybridkin works in radians."
-    return _too_large(name, turns, _TURNS, what)
+    return _too_large(name, turns, factor * _TURNS, what)
 
 
 def _too_large(name: str, value: Tensor, limit: float, what: str) -> str | None:

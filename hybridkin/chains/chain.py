@@ -10,11 +10,14 @@ from torch import Tensor, nn
 
 from hybridkin._core.blocks import check_vectors
 from hybridkin._core.model import PoseModel
+from hybridkin._core.units import span_message
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 __all__ = ["Chain"]
+
+_FAR = 50.0  # times the robot's size; some extensible robots are long and thin
 
 
 class Chain(PoseModel):
@@ -135,15 +138,22 @@ class Chain(PoseModel):
                 f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of {len(rows)} "
                 f"rows (first: row {int(bad.nonzero()[0])}); drop those rows."
             )
-        return [message for message in self._check_rows(rows, name) if message is not None]
+        self._check_rows(rows, name)
+        return self.unit_messages(rows, name)
 
     def _why_shape(self) -> str:
         """Return the reason why q needs its shape, for messages."""
         return f"this robot has {self.n_actuators} actuators"
 
-    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
-        """Return warnings about the units of finite rows (N, n); raise where they are no log."""
-        return []
+    def _check_rows(self, rows: Tensor, name: str) -> None:
+        """Raise where finite rows (N, n) are no log of this robot."""
+
+    def far_messages(self, x: Tensor, name: str) -> list[str]:
+        """Return a warning where tips lie farther away than 50 times the robot's size."""
+        points = torch.cat([self.base[:3, 3].detach().to(x)[None], x.reshape(-1, 3)])
+        points = points[torch.isfinite(points).all(-1)]
+        message = span_message(name, points, float(self.reach.detach()), _FAR)
+        return [] if message is None else [message]
 
     def contradiction(self, q: Tensor, name: str = "q") -> str | None:
         """Return a warning where the actuators of q (..., n) contradict each other, else None.

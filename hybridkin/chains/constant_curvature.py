@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.stored import Layout
-from hybridkin._core.units import millimetres_message
+from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
@@ -214,15 +215,24 @@ class ConstantCurvatureChain(ArcChain):
             "ElasticTendonChain models tendons that can only pull."
         )
 
-    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
+    @property
+    def least_actuator(self) -> float:
+        """0.0 for extensible segments, whose actuators have lengths; -inf for tendons."""
+        return 0.0 if self.lengths is None else -math.inf
+
+    def _check_rows(self, rows: Tensor, name: str) -> None:
         if self.lengths is None and (rows <= 0).any():
             row = int((rows <= 0).any(dim=1).nonzero()[0])
             raise ValueError(
                 f"`{name}` must hold positive actuator lengths [m], got {rows[row].min():.6g} in "
                 f"row {row}; for tendon length changes build the chain with `lengths=`."
             )
-        largest = 10.0 if self.lengths is None else 10.0 * float(self.lengths.detach().sum())
-        return [millimetres_message(name, rows.abs(), largest)]
+
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return a warning where lengths exceed 10 m, or length changes the backbone's 4-fold."""
+        limit = 10.0 if self.lengths is None else LONGEST_PULL * float(self.lengths.detach().sum())
+        message = millimetres_message(name, q.abs(), factor * limit)
+        return [] if message is None else [message]
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""

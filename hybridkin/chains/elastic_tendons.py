@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.stored import Layout
-from hybridkin._core.units import millimetres_message
+from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains import _slack
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled
@@ -212,8 +212,11 @@ class ElasticTendonChain(ArcChain):
         """Return which tendons hang slack, a bool tensor of the shape of q."""
         return ~self._balance(self._rows(q)).taut.reshape(q.shape)
 
-    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
-        return [millimetres_message(name, rows.abs(), 10.0 * float(self.lengths.detach().sum()))]
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return a warning where length changes exceed the backbone's length 4-fold."""
+        limit = LONGEST_PULL * float(self.lengths.detach().sum())
+        message = millimetres_message(name, q.abs(), factor * limit)
+        return [] if message is None else [message]
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""

@@ -349,11 +349,11 @@ class RigidChain(Chain):
         t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
         return torch.cat([corners[..., :1, :], torch.lerp(start, end, t).flatten(-3, -2)], dim=-2)
 
-    def _check_rows(self, rows: Tensor, name: str) -> list[str | None]:
-        return [
-            degrees_message(name, rows[:, ~self.slides].abs()),
-            millimetres_message(name, rows[:, self.slides].abs(), _FAR),
-        ]
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return warnings where joints turn by more than two turns, or slide far."""
+        turned = degrees_message(name, q[:, ~self.slides].abs(), factor)
+        slid = millimetres_message(name, q[:, self.slides].abs(), factor * _FAR)
+        return [message for message in (turned, slid) if message is not None]
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""

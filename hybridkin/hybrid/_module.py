@@ -187,6 +187,11 @@ class HybridModule(ForwardModel):
         if mechanical is not None:
             self.n_actuators, self.n_outputs = mechanical.n_actuators, mechanical.n_outputs
 
+    @property
+    def robot(self) -> ForwardModel:
+        """The mechanical model, or the module itself without one."""
+        return self if self.mechanical is None else self.mechanical
+
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this one stays as it is."""
         return type(self)(self.mechanical, [c for _, c in self._parts()], self.weights, drift)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
 from hybridkin.ik._settings import StepSettings
+from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
 
@@ -22,6 +23,9 @@ _NULL_STEPS = 30  # iterations of a null-space descent
 _NULL_SLIP = 0.3  # error per tip-sized motion that a null-space step may leave to the next
 _NULL_GAIN = 1e-8  # of the square of what is left to go; the descent ends where it gains less
 _INSIDE = 0.98  # domain distance to go to from outside the domain
+_OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
+_FIRST = 4  # further starts before all the others
+_ROWS = 256  # that start elsewhere at once
 
 RowsT = TypeVar("RowsT", bound="Point")
 
@@ -67,6 +71,7 @@ class Found(Point):
     stationary: Tensor
     held: Tensor
     n_iter: Tensor
+    n_starts: Tensor
 
     def points(self, rows: Tensor) -> Point:
         """Return the points of some rows."""
@@ -100,7 +105,7 @@ class Search:
     tol: Tolerance
     max_iter: int
 
-    def solve(self, q: Tensor, target: Tensor, cold: bool, starts: list[Tensor]) -> Found:
+    def solve(self, q: Tensor, target: Tensor, cold: bool, restarts: int) -> Found:
         """Return the best points from starts q (N, n), and from further ones where they fail."""
         settings = self.settings
         q = settings.inside(q)
@@ -112,9 +117,11 @@ class Search:
         found = self._attempt(q, target)
         lost = ~found.reached
         lost[lost.clone()] = row_gram(found.J[lost]).is_singular
-        self._try_again(found, lost, self._nudged(found))
-        for start in starts:
-            self._try_again(found, self._rank(found) > 0, start.expand_as(q))
+        rows = lost.nonzero()[:, 0]
+        self._try_again(found, rows, self._nudged(found)[rows, None])
+        rows = ((self._cost(found) > _DONE) & torch.isfinite(found.error)).nonzero()[:, 0]
+        for some in rows.split(_ROWS):
+            self._start_elsewhere(found, some, q[some], restarts)
         if settings.has_posture:
             self._descend(found, lambda p: settings.preferred(p) - p)
         return found
@@ -125,22 +132,36 @@ class Search:
         self._enter_domain(found)
         return found
 
-    def _try_again(self, found: Found, rows: Tensor, q: Tensor) -> None:
-        """Search some rows from another start, and keep what is better."""
-        rows = rows.nonzero()[:, 0]
-        if rows.numel() == 0:
+    def _start_elsewhere(self, found: Found, rows: Tensor, q: Tensor, restarts: int) -> None:
+        """Search rows that started at q from further starts: a few, then the others."""
+        if restarts == 0 or rows.numel() == 0:
             return
-        again = self._attempt(self.settings.inside(q[rows]), found.target[rows])
-        again.n_iter += found.n_iter[rows]
-        found.n_iter[rows] = again.n_iter
-        old, new = self._rank(found)[rows], self._rank(again)
-        better = (new < old) | ((new == old) & (new == 2) & (again.error < found.error[rows]))
-        found.put(rows[better], again.take(better))
+        size = _per_tip(found.J, found.error)
+        starts = nearest_starts(self.settings, q, size[rows], found.target[rows], restarts)
+        for part in starts.split([min(_FIRST, restarts), max(restarts - _FIRST, 0)], dim=1):
+            open_rows = self._cost(found)[rows] > _DONE
+            self._try_again(found, rows[open_rows], part[open_rows])
 
-    def _rank(self, found: Found) -> Tensor:
-        """Return 0 for rows that are done, 1 for those outside the domain, 2 for the others."""
+    def _try_again(self, found: Found, rows: Tensor, starts: Tensor) -> None:
+        """Search rows (k,) from further starts (k, s, n) at once, and keep what is best."""
+        n_starts = starts.shape[1]
+        if rows.numel() == 0 or n_starts == 0:
+            return
+        q, target = starts.flatten(0, 1), found.target[rows].repeat_interleave(n_starts, 0)
+        again = self._attempt(self.settings.inside(q), target)
+        n_iter = found.n_iter[rows] + again.n_iter.view(-1, n_starts).sum(1)
+        n_tried = found.n_starts[rows] + n_starts
+        cost = self._cost(again).nan_to_num(torch.inf).view(-1, n_starts)
+        best = cost.argmin(1)
+        again = again.take(best + n_starts * torch.arange(len(rows), device=best.device))
+        better = self._cost(again) < self._cost(found)[rows]
+        found.put(rows[better], again.take(better))
+        found.n_iter[rows], found.n_starts[rows] = n_iter, n_tried
+
+    def _cost(self, found: Found) -> Tensor:
+        """Return the error, -1 for rows that are reached outside the domain, -2 inside."""
         inside = self.settings.task.in_domain(found.q)
-        return torch.where(found.reached, torch.where(inside, 0, 1), 2)
+        return torch.where(found.reached, torch.where(inside, _DONE, _OUTSIDE), found.error)
 
     def _point(self, q: Tensor, target: Tensor) -> Point:
         x, J = self.settings.evaluate(q)
@@ -149,7 +170,7 @@ class Search:
     def _start(self, q: Tensor, target: Tensor) -> Found:
         point = self._point(q, target)
         no = torch.zeros(len(q), dtype=torch.bool, device=q.device)
-        parts = (*vars(point).values(), self._within(point.e), no, no, no.long())
+        parts = (*vars(point).values(), self._within(point.e), no, no, no.long(), (~no).long())
         return Found(*(part.clone() for part in parts))
 
     def _lower(self, q: Tensor, target: Tensor) -> Found:
@@ -196,7 +217,7 @@ class Search:
 
     def _enter_domain(self, found: Found) -> None:
         """Slide rows that are reached outside the models' domain towards it."""
-        rows = (self._rank(found) == 1).nonzero()[:, 0]
+        rows = (self._cost(found) == _OUTSIDE).nonzero()[:, 0]
         if rows.numel() > 0:
             part = found.take(rows)
             self._descend(part, self._inward)
@@ -298,9 +319,14 @@ class Search:
         5 % of the limits, or what moves a healthy tip by a tenth of the error.
         """
         n, settings = found.q.shape[-1], self.settings
-        size = found.J.flatten(1).norm(dim=-1, keepdim=True)
-        size = torch.where(size > 0.0, 0.1 * found.error[:, None] / size, 0.0).expand_as(found.q)
+        size = 0.1 * _per_tip(found.J, found.error)[:, None].expand_as(found.q)
         span = 0.05 * (settings.q_max - settings.q_min).to(found.q)
         size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)
         # Unequal shares, because equal ones may cancel in a symmetric robot.
         return found.q + size * torch.cos(torch.arange(1.0, n + 1.0).to(found.q))
+
+
+def _per_tip(J: Tensor, error: Tensor) -> Tensor:
+    """Return the motion (N,) of an actuator that moves a healthy tip by the error."""
+    size = J.flatten(1).norm(dim=-1)
+    return torch.where(size > 0.0, error / size, error)

@@ -42,6 +42,9 @@ def require(good: bool | Tensor, message: str) -> None:
         raise ValueError(message)
 
 
+_FAST = 5.0  # times the largest plausible q in a second is too fast
+
+
 @dataclass(frozen=True)
 class StepSettings:
     """What a step depends on besides q and the target; see `InverseKinematics`.
@@ -79,6 +82,28 @@ class StepSettings:
         share = 0.0 if self.damping == "adaptive" else self.damping
         good, text = not isinstance(share, str) and 0.0 <= share < math.inf, '"adaptive" or'
         require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
+
+    @property
+    def given(self) -> dict[str, object]:
+        """The settings by name, without a posture that is only the middle of the limits."""
+        q_pref, middle = self.q_pref, self.middle
+        derived = isinstance(q_pref, Tensor) and middle is not None and q_pref.equal(middle)
+        return {k: v for k, v in vars(self).items() if k != "q_pref" or not derived}
+
+    def unit_messages(self) -> list[str]:
+        """Return warnings where limits or a posture look like another unit than the model's."""
+        found, n = [], self.n_actuators
+        for name, value in self.given.items():
+            if isinstance(value, Tensor) and name != "weights" and n is not None:
+                q = torch.where(torch.isfinite(value), value, 0.0).expand(1, n)
+                factor = _FAST if name == "dq_max" else 1.0
+                found += self.task.models[0].robot.unit_messages(q, name, factor)
+        return found
+
+    def far_messages(self, x: Tensor, name: str) -> list[str]:
+        """Return warnings where targets lie too far from the robot to be metres."""
+        points = x[..., :3, 3] if self.task.shape == (4, 4) else x
+        return self.task.models[0].robot.far_messages(points, name) if points.shape[-1] == 3 else []
 
     def _sizes(self) -> dict[str, int]:
         """Return the numbers of actuators that the settings and the model know, by name."""

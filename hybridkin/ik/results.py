@@ -26,9 +26,11 @@ class IKStatus(IntEnum):
     CONVERGED = 0
     """The error is within `tol`."""
     AT_LIMITS = 1
-    """Not converged; limits held the last step back and the search was not finished."""
+    """Not converged; limits held the last step of the best start, which was not finished."""
     UNREACHABLE = 2
-    """No motion within the limits brings the tip nearer: the nearest point is returned."""
+    """No motion within the limits brings the tip nearer, from any start: the nearest point found.
+
+    `IKSolution.n_starts` says how many starts were tried."""
     SINGULAR = 3
     """Not converged; the Jacobian has (nearly) lost a direction."""
     MAX_ITER = 4
@@ -115,6 +117,8 @@ class IKSolution(Generic[ArrayT]):
         `IKStatus` of every target.
     n_iter : int array of shape (...,)
         Iterations spent, restarts included.
+    n_starts : int array of shape (...,)
+        Configurations that the search started from: 1 where the first one led to the target.
     sigma_min : array of shape (...,)
         Smallest singular value of the Jacobian at `q`.
     limit_margin : array of shape (...,)
@@ -126,6 +130,7 @@ class IKSolution(Generic[ArrayT]):
     error: ArrayT
     status: ArrayT
     n_iter: ArrayT
+    n_starts: ArrayT
     sigma_min: ArrayT
     limit_margin: ArrayT
 
@@ -136,7 +141,9 @@ class IKSolution(Generic[ArrayT]):
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
-        return f"IKSolution({_tally(self.status)}; {_errors(self.error)})"
+        most = as_array(self.n_starts).max(initial=1)
+        starts = f"up to {most} starts; " if most > 1 else ""
+        return f"IKSolution({_tally(self.status)}; {starts}{_errors(self.error)})"
 
 
 @dataclass(frozen=True, repr=False)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
+from inspect import signature
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,7 +39,8 @@ class InverseKinematics:
         and OUT_OF_DOMAIN. Poses, several points and NumPy functions are tasks, see
         `hybridkin.tasks`; then x has the shape of their targets.
     q_min, q_max : float or array-like of shape (n,), optional
-        Limits of q, in the unit of q.
+        Limits of q, in the unit of q. Default: none, and 0 as `q_min` of absolute lengths, those of
+        extensible segments.
     dq_max : float or array-like of shape (n,), optional
         Largest speed of every actuator [unit of q per second]: a step is at most ``dq_max dt``.
     q_pref : float, array-like of shape (n,) or callable, optional
@@ -114,10 +116,10 @@ class InverseKinematics:
         dt: float = 0.01,
         weights: Array | None = None,
     ) -> None:
-        self.model = model
+        self.model, task = model, as_task(model)
         self.settings = StepSettings(
-            as_task(model),
-            bound(-math.inf if q_min is None else q_min, "q_min"),
+            task,
+            bound(task.models[0].robot.least_actuator if q_min is None else q_min, "q_min"),
             bound(math.inf if q_max is None else q_max, "q_max"),
             bound(math.inf if dq_max is None else dq_max, "dq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
@@ -128,13 +130,20 @@ class InverseKinematics:
             float(dt),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
         )
+        for message in self.settings.unit_messages():
+            warnings.warn(message, stacklevel=2)
 
     def __repr__(self) -> str:
-        """Return the model's name and the settings."""
-        name = type(self.model).__name__
-        settings = {k: v for k, v in vars(self.settings).items() if k != "task" and v is not None}
-        shown = {k: v.tolist() if isinstance(v, Tensor) else v for k, v in settings.items()}
-        return f"InverseKinematics({', '.join([name, *(f'{k}={v!r}' for k, v in shown.items())])})"
+        """Return the model's name, the limits, and the settings that are not the default ones."""
+        parts, given = [type(self.model).__name__], self.settings.given
+        for name, default in signature(type(self)).parameters.items():
+            value = given.get(name)
+            if isinstance(value, Tensor):
+                ends = dict.fromkeys(f"{float(end):.4g}" for end in (value.min(), value.max()))
+                parts += [f"{name}={' to '.join(ends)}"] if torch.isfinite(value).any() else []
+            elif value not in (None, default.default):
+                parts.append(f"{name}={value!r}")
+        return f"InverseKinematics({', '.join(parts)})"
 
     @torch.no_grad()
     def step(
@@ -183,16 +192,17 @@ class InverseKinematics:
         *,
         tol: float | Sequence[float] = 1e-4,
         max_iter: int = 50,
-        restarts: int = 0,
-        random_state: int | np.random.Generator | None = None,
+        restarts: int = 32,
         differentiable: bool = False,
     ) -> IKSolution:
         """Return configurations that reach the targets, or come as near as the limits allow.
 
         Levenberg-Marquardt on the tip error with the box-limited step; a step is taken only
-        where it lowers the error. Rows that have converged leave the work, and then slide
-        along their null space towards `q_pref`. `dq_max` plays no part here: this
-        is where to go, not how fast.
+        where it lowers the error. One start can end in a local minimum. Targets that it missed
+        are searched again from up to `restarts` further starts, first from four, then from the
+        others, before a status is given. Rows that have converged leave the work, and then slide
+        along their null space towards `q_pref`. `dq_max` plays no part here: this is where to go,
+        not how fast.
 
         Parameters
         ----------
@@ -205,11 +215,11 @@ class InverseKinematics:
             for a pose.
         max_iter : int, default=50
             Iterations per start.
-        restarts : int, default=0
-            Further starts for rows that failed: `q_pref` first where `q0` was given, then drawn
-            in the limits, the same for every row.
-        random_state : int, Generator or None, default=None
-            Seed of the restarts.
+        restarts : int, default=32
+            Further starts for targets that the first one missed, or reached only outside the
+            model's domain: of an even sample of the limits, the same in every call, those whose
+            tips lie nearest to the target. Without limits the sample lies around the start. 0:
+            none.
         differentiable : bool, default=False
             Keep the graph from q to `x_target`, and to parameters of the model that require
             gradients, by the implicit function theorem at the solution.
@@ -235,13 +245,13 @@ class InverseKinematics:
         good = isinstance(x_target, Tensor) or not differentiable
         require(good, "`x_target` must be a torch tensor for differentiable=True.")
         target = settings.points(x_target, "x_target")
+        for message in settings.far_messages(target, "x_target"):
+            warnings.warn(message, stacklevel=3)
         q = settings.start(target) if q0 is None else settings.configurations(q0, "q0", target)
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q, target = rows_of(q, lead), rows_of(target, lead, axes)
-        rng = np.random.default_rng(random_state)
-        starts = self._restarts(q, restarts, rng, q0 is not None)
-        found = Search(settings, tolerance, max_iter).solve(q, target, q0 is None, starts)
+        found = Search(settings, tolerance, max_iter).solve(q, target, q0 is None, restarts)
         q = found.q
         if differentiable:
             with torch.enable_grad():
@@ -255,7 +265,7 @@ class InverseKinematics:
         status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
         status[found.stationary & ~reached & torch.isfinite(error)] = IKStatus.UNREACHABLE
         margin = settings.margin(q.detach())
-        results = (q, x, error, status, found.n_iter, gram.sigma_min, margin)
+        results = (q, x, error, status, found.n_iter, found.n_starts, gram.sigma_min, margin)
         with torch.set_grad_enabled(differentiable):
             return IKSolution(*give_back(results, lead, as_numpy))
 
@@ -320,6 +330,8 @@ class InverseKinematics:
         as_numpy, tolerance = is_numpy(points), settings.tolerance(tol)
         target = settings.points(points, "path", lead="T")
         require(len(target) > 0, f"`path` must hold at least one point, got {tuple(target.shape)}.")
+        for message in [] if q0 is None else settings.far_messages(target, "path"):
+            warnings.warn(message, stacklevel=3)
         times, periods = self._times(t, target)
         start = self.solve(target[0], tol=tol).q if q0 is None else q0
         q = settings.configurations(start, "q0", target)
@@ -359,21 +371,6 @@ class InverseKinematics:
             command.
         """
         return Tracker(self.settings, q0, self.settings.tolerance(tol), memory)
-
-    def _restarts(
-        self, q: Tensor, restarts: int, rng: np.random.Generator, from_preferred: bool
-    ) -> list[Tensor]:
-        """Return further starts (n,): the preferred configuration, then draws in the limits."""
-        n, settings = q.shape[-1], self.settings
-        preferred = from_preferred and restarts > 0 and settings.q_pref is not None
-        points = [settings.start(q)] if preferred else []
-        if restarts <= len(points):
-            return points
-        low, span = settings.q_min.expand(n), (settings.q_max - settings.q_min).expand(n)
-        if not torch.isfinite(span).all():
-            raise ValueError("`restarts` draws starts in the limits: give finite `q_min`, `q_max`.")
-        shares = rng.random((restarts - len(points), n))
-        return points + list((low + span * torch.as_tensor(shares)).to(q))
 
     def _times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
         """Return the times of a path's points, and the period that follows each."""

@@ -164,7 +164,7 @@ def _initial_guesses(
         rows = np.flatnonzero(found.status[1:] == wanted) + 1
         if len(rows):
             return [found.q[0], found.q[rows[found.sigma_min[rows].argmax()]]]
-    free = ik.solve(target, tol=tol, max_iter=200, restarts=_GUESSES, random_state=0)
+    free = ik.solve(target, tol=tol, max_iter=200, restarts=_GUESSES)
     return [found.q[0], free.q]
 
 

@@ -398,7 +398,7 @@ def test_inverse_kinematics_reaches_what_can_be_reached(rng):
     high = torch.where(chain.slides, 0.4, -low)
     targets = chain(low + (high - low) * torch.rand(50, 8, generator=rng, dtype=torch.float64))
     ik = InverseKinematics(chain, q_min=low, q_max=high)
-    found = ik.solve(targets, tol=1e-6, max_iter=100, restarts=5, random_state=0)
+    found = ik.solve(targets, tol=1e-6, max_iter=100, restarts=5)
     assert_close(chain(found.q), targets, rtol=0, atol=1e-4)
     assert ((found.q >= low) & (found.q <= high)).all()
 
@@ -423,7 +423,7 @@ def test_a_hybrid_learns_the_sag_of_an_arm_and_is_inverted(rng):
     assert_close(model.jacobian(unseen.numpy()), J.numpy(), rtol=0, atol=1e-12)
     targets = torch.as_tensor(model.predict(unseen.numpy()))
     ik = InverseKinematics(model, q_min=-1.0, q_max=1.0)
-    found = ik.solve(targets, max_iter=100, restarts=5, random_state=0)
+    found = ik.solve(targets, max_iter=100, restarts=5)
     assert_close(model.module_(found.q), targets, rtol=0, atol=1e-4)
 
 

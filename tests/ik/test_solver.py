@@ -255,7 +255,7 @@ def test_solver_evaluates_the_model_inside_the_limits_only(rng):
 
     witness = Witness()
     ik = InverseKinematics(witness, q_min=[0.1] * 9, q_max=0.4)
-    ik.solve(randn(rng, 200, 3), restarts=2, random_state=0)
+    ik.solve(randn(rng, 200, 3), restarts=2)
     assert (witness.lowest, witness.highest) == (0.1, 0.4)
 
 
@@ -371,14 +371,14 @@ def test_posture_after_convergence_is_the_nearest_solution(rng, A):
 
 
 @pytest.mark.slow
-def test_warm_start_restarts_and_the_seed(rng):
+def test_further_starts_reach_what_a_warm_start_misses(rng):
     target = CHAIN(uniform(rng, 0.1, 0.4, 300, 9))
     starts = uniform(rng, 0.1, 0.4, 300, 9)
-    once = bha().solve(target, starts)
-    again = bha().solve(target, starts, restarts=3, random_state=1)
+    once = bha().solve(target, starts, restarts=0)
+    again = bha().solve(target, starts)
     assert again.converged.all()
     assert not once.converged.all()
-    same = bha().solve(target, starts, restarts=3, random_state=1)
+    same = bha().solve(target, starts)
     assert_close(again.q, same.q, rtol=0.0, atol=0.0)
     assert (again.n_iter >= once.n_iter).all()
 
@@ -394,10 +394,10 @@ def test_max_iter_is_honest(rng):
 
 
 def solve_whole_and_in_parts(ik, target):
-    whole = ik.solve(target, restarts=2, random_state=0)
-    single = [ik.solve(row, restarts=2, random_state=0) for row in target]
+    whole = ik.solve(target, restarts=2)
+    single = [ik.solve(row, restarts=2) for row in target]
     cut = len(target) // 3
-    parts = [ik.solve(part, restarts=2, random_state=0) for part in target.split([cut, 2 * cut])]
+    parts = [ik.solve(part, restarts=2) for part in target.split([cut, 2 * cut])]
     return whole, single, [torch.stack([s.q for s in single]), torch.cat([s.q for s in parts])]
 
 
@@ -434,8 +434,8 @@ def test_a_nan_target_marks_only_its_row(rng):
     target = CHAIN(uniform(rng, 0.2, 0.3, 4, 9))
     spoilt = target.clone()
     spoilt[1, 2], spoilt[2, 0] = torch.nan, torch.inf
-    solution = bha().solve(spoilt, restarts=1, random_state=0)
-    clean = bha().solve(target, restarts=1, random_state=0)
+    solution = bha().solve(spoilt, restarts=1)
+    clean = bha().solve(target, restarts=1)
     assert solution.status.tolist() == [0, IKStatus.INVALID_INPUT, IKStatus.INVALID_INPUT, 0]
     assert_close(solution.q[1], torch.full((9,), 0.25).double())
     assert_close(solution.q[[0, 3]], clean.q[[0, 3]], rtol=0.0, atol=1e-12)
@@ -670,6 +670,7 @@ def test_float32_solves_to_a_tenth_of_a_millimetre(rng):
 def test_hostile_targets_never_raise(values):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "`x_target` spans")
         solution = bha().solve(np.array(values), max_iter=8)
     assert ((solution.q >= 0.1) & (solution.q <= 0.4)).all()
     if not np.isfinite(values).all():
@@ -726,13 +727,11 @@ def test_bad_calls_say_what_was_needed(call, message):
 
 
 def test_what_cannot_be_known_is_asked_for(A):
-    with pytest.raises(TypeError, match="must be fitted first"):
+    with pytest.raises(TypeError, match="fitted regressor"):
         InverseKinematics(object())
     with pytest.raises(ValueError, match="give `q0`"):
         InverseKinematics(CHAIN).solve(np.zeros(3))
     with pytest.raises(ValueError, match="number of actuators is not known"):
         InverseKinematics(Linear(A), q_min=0.0, q_max=1.0).solve(np.zeros(3))
-    with pytest.raises(ValueError, match="finite `q_min`"):
-        InverseKinematics(CHAIN, q_pref=0.2).solve(np.ones(3), restarts=1)
     with pytest.raises(ValueError, match="`model` must map q"):
         InverseKinematics(lambda q: q).step(np.zeros(9), np.zeros(3))

@@ -189,7 +189,7 @@ def test_poses_need_a_model_that_knows_them(rng):
 def test_a_rigid_arm_reaches_poses_within_its_limits(rng, rigid):
     q = uniform(rng, -2.5, 2.5, 300, 7)
     ik = InverseKinematics(PoseTask(rigid), q_min=-2.6, q_max=2.6)
-    solution = ik.solve(pose(rigid, q), restarts=10, random_state=0)
+    solution = ik.solve(pose(rigid, q), restarts=10)
     assert solution.converged.double().mean() >= 0.99
     assert ((solution.q >= -2.6) & (solution.q <= 2.6)).all()
 
@@ -340,11 +340,10 @@ def test_the_solver_stays_in_the_domain_of_a_hybrid_where_it_can(rng):
     assert_close(solution.converged, inside & (solution.error <= 1e-4))
     # Without the way in most of them leave it, and say so.
     bare = InverseKinematics(Unguided(model.module_), q_pref=0.35, **LIMITS)
-    blind = bare.solve(target, anywhere)
+    blind = bare.solve(target, anywhere, restarts=0)
     assert (blind.status == IKStatus.OUT_OF_DOMAIN).double().mean() > 0.5
-    # Restarts look for others.
-    again = bare.solve(target, anywhere, restarts=2, random_state=0)
-    assert again.converged.sum() > blind.converged.sum()
+    # Further starts are taken inside.
+    assert bare.solve(target, anywhere).converged.all()
 
 
 class Unguided(torch.nn.Module):

@@ -1,0 +1,77 @@
+"""Where a search starts again: configurations of an even sample whose tips lie near the target."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hybridkin.ik._settings import StepSettings
+
+_SHARED = 2048  # configurations in the limits, the same for every row
+_OWN = 64  # around a row's start, where an actuator has no limits
+_WIDE = 4.0  # times the motion for the error, where an actuator has no limits
+_OUTSIDE = 4.0  # factor on the distance from starts outside the domain of the models
+
+
+def nearest_starts(
+    settings: StepSettings, q: Tensor, size: Tensor, target: Tensor, count: int
+) -> Tensor:
+    """Return the `count` configurations of a sample whose tips are nearest to each target.
+
+    The sample is the same in every call and for every batch. It fills the limits, their faces and
+    their corners; where an actuator has no limits, a range around its start.
+
+    Parameters
+    ----------
+    settings : StepSettings
+        Task and limits.
+    q : Tensor of shape (N, n)
+        Where the rows started.
+    size : Tensor of shape (N,)
+        Motion of an actuator that moves the tip by about the error.
+    target : Tensor of shape (N, ...)
+        Targets.
+    count : int
+        Number of starts per row.
+
+    Returns
+    -------
+    Tensor of shape (N, count, n)
+        Starts, the nearest one first.
+    """
+    task, n = settings.task, q.shape[-1]
+    low, high = (a.to(q).expand(1, n) for a in (settings.q_min, settings.q_max))
+    if not torch.isfinite(high - low).all():
+        size = _WIDE * size[:, None]
+        low, high = (
+            torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size),
+            torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size),
+        )
+    k = max(count, _SHARED if len(low) == 1 else _OWN)
+    low, high = low[:, None], high[:, None]
+    sample = torch.lerp(low, high, _even_shares(n, k, q.device).to(q)).clamp(low, high)
+    x, _ = settings.evaluate(sample.flatten(0, 1))
+    x = x.unflatten(0, (-1, k)).expand(len(q), k, *task.shape).flatten(0, 1)
+    away = task.difference(x, target.repeat_interleave(k, 0)).norm(dim=-1).view(-1, k)
+    away = away * torch.where(task.in_domain(sample.flatten(0, 1)), 1.0, _OUTSIDE).view(-1, k)
+    near = away.nan_to_num(torch.inf).topk(count, largest=False).indices
+    return sample.expand(len(q), k, n).gather(1, near[..., None].expand(-1, -1, n))
+
+
+def _even_shares(n: int, count: int, device: torch.device) -> Tensor:
+    """Return `count` points that fill the unit cube of n axes evenly, and its faces.
+
+    A Kronecker sequence of the generalised golden ratio in n + 1 axes, from the middle. The last
+    axis stretches a point away from the middle; what leaves the cube is clipped to its faces.
+
+    References
+    ----------
+    Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018).
+    """
+    ratio = 2.0
+    for _ in range(64):  # the root of ratio^(n + 2) = ratio + 1
+        ratio = (1.0 + ratio) ** (1.0 / (n + 2))
+    index = torch.arange(max(count, n + 1), dtype=torch.float64, device=device)
+    steps = ratio ** -(index[: n + 1] + 1.0)
+    points = (0.5 + index[:count, None] * steps) % 1.0
+    return (0.5 + (points[:, :n] - 0.5) / (1.0 - points[:, n:])).clamp(0.0, 1.0)
