@@ -9,7 +9,6 @@ from hybridkin.ik._settings import StepSettings
 
 _SHARED = 2048  # configurations in the limits, the same for every row
 _OWN = 64  # around a row's start, where an actuator has no limits
-_WIDE = 4.0  # times the motion for the error, where an actuator has no limits
 _OUTSIDE = 4.0  # factor on the distance from starts outside the domain of the models
 
 
@@ -42,7 +41,7 @@ def nearest_starts(
     task, n = settings.task, q.shape[-1]
     low, high = (a.to(q).expand(1, n) for a in (settings.q_min, settings.q_max))
     if not torch.isfinite(high - low).all():
-        size = _WIDE * size[:, None]
+        size = size[:, None]
         low, high = (
             torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size),
             torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size),

@@ -38,9 +38,10 @@ def corners(rng, chain, low, high, n):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_targets_of_corners_are_reached_from_further_starts(rng, name):
     chain, low, high = ROBOTS[name]
-    target = chain(corners(rng, chain, low, high, 60))
+    target = chain(corners(rng, chain, low, high, 40))
+    start = low + (high - low) * torch.rand(40, chain.n_actuators, generator=rng).double()
     ik = InverseKinematics(chain, q_min=low, q_max=high)
-    once, solution = ik.solve(target, restarts=0), ik.solve(target)
+    once, solution = ik.solve(target, start, restarts=0), ik.solve(target, start)
     assert (once.status == IKStatus.UNREACHABLE).any()  # although each one can be reached
     assert solution.converged.all()
     assert ((solution.q >= low) & (solution.q <= high)).all()
@@ -101,9 +102,9 @@ def test_further_starts_lie_around_the_first_one_where_there_are_no_limits(rng):
     start = 0.02 * (2.0 * torch.rand(40, 6, generator=rng).double() - 1.0)
     ik = InverseKinematics(ELASTIC, q_min=-0.02)
     once, solution = ik.solve(target, start, restarts=0), ik.solve(target, start)
-    assert solution.converged.double().mean() > 0.9 > 0.8 > once.converged.double().mean()
+    assert solution.converged.double().mean() > 0.85 > 0.75 > once.converged.double().mean()
     assert solution.q.min() >= -0.02
-    assert solution.q.max() < 0.1
+    assert solution.q.max() < 0.2
 
 
 @pytest.mark.parametrize("n", [1, 3, 9, 24])
