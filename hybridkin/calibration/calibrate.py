@@ -15,9 +15,10 @@ from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor
+from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.units import span_message
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
-from hybridkin.calibration._least_squares import Fit, Rows, solve
+from hybridkin.calibration._least_squares import LOSSES, Fit, Rows, solve
 from hybridkin.calibration._parameters import ALIASES, Problem, parameter_names
 from hybridkin.calibration._unidentified import sentences
 from hybridkin.chains.chain import Chain
@@ -137,7 +138,8 @@ def calibrate(
         "turns", of each segment's ring of actuators as a whole, and instead of all offsets "tool",
         the last one.
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
-        All but "linear" bound the influence of outliers.
+        All but "linear" bound the influence of outliers: rho(|e|^2 / 3) of SciPy's
+        ``least_squares``, with the distance |e| of a row over the noise, times its weight.
     bounds : dict of str to (low, high), optional
         Limits of all entries of a name, in its own unit. Default: a factor of 5 on radii and
         lengths and of 10 000 on stiffnesses, half a turn on rest bends, and offsets that are no
@@ -150,7 +152,8 @@ def calibrate(
     groups : array-like of shape (N,), optional
         Motion of every row; asks for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional
-        How many times each row counts; rows of weight zero are left out.
+        How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
+        Equal rows are held out together.
 
     Returns
     -------
@@ -210,6 +213,8 @@ def fit_geometry(
             f"another Chain, got {type(chain).__name__}."
         )
     names = _check_parameters(chain, parameters, bounds, prior)
+    if loss not in LOSSES:
+        raise ValueError(f"`loss` must be one of {[*LOSSES]}, got {loss!r}.")
     torch_given = isinstance(q, Tensor)
     q, x, messages = _check_data(chain, q, x)
     if groups is not None:
@@ -220,8 +225,9 @@ def fit_geometry(
                 f"{groups.shape}."
             )
     weights = _check_weights(sample_weight, q)
-    kept = weights > 0
-    rows = Rows(q[kept], x[kept], weights[kept])
+    first, counts, _ = distinct_rows(q, x, weights, groups)
+    weights = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
+    rows = Rows(q[first], x[first], weights)
     stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
     stds = {name: min(float(stds.get(name, 0.5)), _WIDEST) for name in names}
     with torch.no_grad():
@@ -229,15 +235,15 @@ def fit_geometry(
     fits = []
     for guess in guesses:
         problem = Problem.of(guess.chain, names, bounds or {}, stds)
-        first = problem.start(guess.scale)
-        fits.append(solve(problem, rows, first, loss, roughly=len(guesses) > 1))
+        start = problem.start(guess.scale)
+        fits.append(solve(problem, rows, start, loss, roughly=len(guesses) > 1))
     best, message = _best(fits, guesses, bool({"angles", "turns"} & {*names}))
     if len(guesses) > 1:
         best = solve(best.problem, rows, best.theta, loss)
     messages += [message, _unphysical(best), best.chain().contradiction(q)]
     cv_rmse = None
     if groups is not None:
-        cv_rmse = _cross_validate(best, rows, groups[kept.numpy()], loss)
+        cv_rmse = _cross_validate(best, rows, groups[first], loss)
     result = _result(best, rows, cv_rmse, torch_given)
     return result, [message for message in messages if message is not None]
 

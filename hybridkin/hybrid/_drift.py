@@ -44,11 +44,13 @@ class Drift(NamedTuple):
     def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.
 
-        Each row multiplies the weight of all before it by `decay`.
+        Each row multiplies the weight of all before it by `decay`, once for each repetition.
         """
         phi = np.column_stack([np.ones(len(q)), (q - self.center) / self.scale])
-        weighed = (weights * decay ** np.arange(len(q) - 1, -1, -1))[:, None] * phi
-        kept = decay ** len(q)
+        later = weights[::-1].cumsum()[::-1] - weights
+        own = weights if decay == 1.0 else (1.0 - decay**weights) / (1.0 - decay)
+        weighed = (own * decay**later)[:, None] * phi
+        kept = decay ** weights.sum()
         gram, moment = kept * self.gram + weighed.T @ phi, kept * self.moment + weighed.T @ residual
         return self._replace(gram=gram, moment=moment)
 

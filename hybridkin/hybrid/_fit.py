@@ -13,6 +13,7 @@ from sklearn.base import BaseEstimator, clone
 from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 
+from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
 from hybridkin.chains.arc_chain import ArcChain
@@ -55,6 +56,11 @@ class Rows(NamedTuple):
     def take(self, rows: NDArray) -> Rows:
         """Return some of the rows."""
         return Rows(*(None if part is None else part[rows] for part in self))  # pyright: ignore
+
+    def distinct(self, runs: bool = False) -> tuple[Rows, NDArray]:
+        """Return the different rows, and the place of every row, see `distinct_rows`."""
+        first, weights, place = distinct_rows(self.X, self.y, self.weights, self.groups, runs)
+        return self.take(first)._replace(weights=weights), place
 
 
 class NamedFeatures(NamedTuple):
@@ -115,8 +121,10 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     A pure function: it changes none of its arguments and issues no warning.
     """
     spec = calibrated(spec, rows, rows.groups)
-    error = residuals(spec.mechanical, rows.q, rows.y, spec.output)
-    fits = [_fit_part(part, spec, rows, error) for part in spec.parts]
+    distinct, place = rows.distinct()
+    error = residuals(spec.mechanical, distinct.q, distinct.y, spec.output)
+    errors = distinct._replace(y=error)
+    fits = [_fit_part(part, spec, rows, errors, place) for part in spec.parts]
     weights = tuple(part.weight for part in spec.parts)
     error_model = fits[0][0] if len(fits) == 1 else Blend(weights, tuple(one for one, _ in fits))
     shares = [w for w, (_, found) in zip(weights, fits, strict=True) if found is not None]
@@ -124,6 +132,28 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     kind = PoseHybridModule if spec.output == "pose" else HybridModule
     module = kind(spec.mechanical, corrections, torch.tensor(shares, dtype=torch.float64))
     return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
+
+
+def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
+    """Return a warning where the different rows are few to learn from; raise where they are none.
+
+    From 20 held-out errors on, their rms is known to a sixth.
+    """
+    n_rows, n = rows.X.shape
+    learned = not spec.parts or spec.parts[0].error_model != "drop"
+    least = 1 + bool(learned or spec.calibrate) + (coverage is not None)
+    if n_rows < least:
+        raise ValueError(
+            f"`X` must hold at least {least} different rows of positive weight, got "
+            f"n_samples={n_rows}; record at least {10 * (n + 1)}."
+        )
+    if not learned or n_rows >= max(20, 2 * (n + 1)):
+        return []
+    return [
+        f"`X` holds {n_rows} different rows of {n} actuators, few to learn from: an affine "
+        f"function alone has {n + 1} coefficients for each output, and held-out errors of so few "
+        f"rows say little about new ones. Record at least {10 * (n + 1)}, in several motions."
+    ]
 
 
 def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
@@ -156,39 +186,48 @@ def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: st
     return y - tips.reshape(y.shape)
 
 
-def _fit_part(part: Part, spec: Spec, rows: Rows, error: NDArray) -> tuple[Any, Correction | None]:
+def _fit_part(
+    part: Part, spec: Spec, rows: Rows, errors: Rows, place: NDArray
+) -> tuple[Any, Correction | None]:
     """Return the fitted error model and its guarded correction."""
-    model, mechanical, q = part.error_model, spec.mechanical, rows.q
+    model, mechanical, q = part.error_model, spec.mechanical, errors.q
     if isinstance(model, str) and model == "drop":
         return None, None
-    counted, serial = q[torch.from_numpy(rows.counts > 0)], part.coupling == "serial"
+    serial = part.coupling == "serial"
     if mechanical is not None and (serial or isinstance(model, NamedFeatures)):
-        fitted = _fit_features(part, mechanical, rows, counted)
+        fitted = _fit_features(part, mechanical, rows, q)
         readout = fitted.readout
         correction = InnerCorrection(mechanical, readout) if serial else TipCorrection(readout)
     else:
-        fitted = _fit_regressor(model, rows, error)
+        fitted = _fit_regressor(model, rows, errors, place)
         correction = TipCorrection(error_module(fitted, q))
     if mechanical is None:
         return fitted, correction  # without a mechanical model there is nothing to fall back on
     alone = HybridModule(mechanical, [correction], torch.ones(1, dtype=torch.float64))
     with torch.no_grad():
         own = correction.module if isinstance(correction, TipCorrection) else None
-        correction.guard = fit_guard(spec.guard, alone.error_part(counted), own, counted)
+        correction.guard = fit_guard(spec.guard, alone.error_part(q), own, q, errors.counts)
     return fitted, correction
 
 
-def _fit_regressor(model: Any, rows: Rows, error: NDArray) -> Any:
+def _fit_regressor(model: Any, given_rows: Rows, rows: Rows, place: NDArray) -> Any:
+    """Return the regressor fitted to the errors of the different rows."""
     if isinstance(model, str):  # "kernel"
-        model = tuned_kernel(rows.X, error, rows.counts, rows.groups)
+        model = tuned_kernel(rows.X, rows.y, rows.counts, rows.groups)
+    elif not isinstance(model, (ELMRegressor, ELMRegressorCV)):  # gets the rows as they were given
+        kept = np.flatnonzero(given_rows.counts)
+        rows = rows.take(place[kept])._replace(weights=given_rows.take(kept).weights)
     given = {} if rows.weights is None else {"sample_weight": rows.weights}
     if rows.groups is not None and has_fit_parameter(model, "groups"):
         given["groups"] = rows.groups
     regressor: Any = clone(model)
-    return regressor.fit(rows.X, error, **given)
+    fitted = regressor.fit(rows.X, rows.y, **given)
+    if isinstance(fitted, ELMRegressorCV):
+        fitted.left_out_errors_ = at_place(fitted.left_out_errors_, place)
+    return fitted
 
 
-def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, counted: Tensor) -> ReadoutFit:
+def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, q: Tensor) -> ReadoutFit:
     """Return the readout of named features, or of the hidden layer of an ELM.
 
     An ELMRegressor brings its `alpha` as the penalty; of an ELMRegressorCV the penalties are
@@ -196,9 +235,9 @@ def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, counted: Ten
     """
     model = part.error_model
     if isinstance(model, NamedFeatures):
-        features, alphas, noise_ratio = _named(model.kind, mechanical, counted), *model[1:]
+        features, alphas, noise_ratio = _named(model.kind, mechanical, q), *model[1:]
     else:
-        features, alphas = _hidden(cast("ELMRegressor | ELMRegressorCV", model), counted)
+        features, alphas = _hidden(cast("ELMRegressor | ELMRegressorCV", model), q)
         noise_ratio = inf
     x = torch.from_numpy(rows.tips)
     weight = None if rows.weights is None else torch.from_numpy(rows.weights)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.model import PortableModule, reverse_jacobian
@@ -115,13 +116,15 @@ class LeverageGuard(Guard):
         self.register_buffer("limit", limit)
 
     @classmethod
-    def fit(cls, model: LeverageModule, q: Tensor, largest: Tensor) -> LeverageGuard:
+    def fit(
+        cls, model: LeverageModule, q: Tensor, largest: Tensor, counts: Tensor
+    ) -> LeverageGuard:
         """Return the guard whose limit is the largest leave-one-out leverage of the rows q (N, n).
 
-        That is h / (1 - h), with h the leverage of a row that took part in the fit.
+        That is h / (1 - c h), with h the leverage of a row that took part in the fit c times.
         """
         h = model.leverage(q)
-        return cls(model, (h / (1.0 - h).clamp(min=1e-9)).max(), largest)
+        return cls(model, (h / (1.0 - counts * h).clamp(min=1e-9)).max(), largest)
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the leverage of q over the limit, shape (...)."""
@@ -207,7 +210,7 @@ class QuadraticLeverage(LeverageModule):
 
 
 def fit_guard(
-    kind: str | None, corrections: Tensor, model: nn.Module | None, q: Tensor
+    kind: str | None, corrections: Tensor, model: nn.Module | None, q: Tensor, counts: NDArray
 ) -> Guard | None:
     """Return the guard of an error model trained on rows q (N, n).
 
@@ -221,17 +224,20 @@ def fit_guard(
         The error model, which may have a leverage of its own.
     q : Tensor of shape (N, n)
         The training rows.
+    counts : ndarray of shape (N,)
+        How many times each counts.
     """
     if kind is None:
         return None
     largest = corrections.norm(dim=-1).max()
     if kind == "box":
         return BoxGuard(q.amin(0), q.amax(0), largest)
+    times = torch.from_numpy(counts)
     with torch.no_grad():
         if not isinstance(model, LeverageModule) or _unexcited(q).numel():
             # Every configuration counts once, however often the log returns to it.
-            model = QuadraticLeverage.fit(torch.unique(q, dim=0))
-        return LeverageGuard.fit(model, q, largest)
+            model, times = QuadraticLeverage.fit(torch.unique(q, dim=0)), torch.ones_like(times)
+        return LeverageGuard.fit(model, q, largest, times)
 
 
 def _unexcited(q: Tensor) -> Tensor:

@@ -39,8 +39,8 @@ class Linearised:
         self.gram = phi.new_empty(C, K, C, K)  # sum_n (J' J)_ab phi phi'
         for a in range(C):
             row = (inner[:, a, : a + 1, None] * phi[:, None]).reshape(n, -1).mT @ phi
-            self.gram[: a + 1, :, a] = row.unflatten(0, (a + 1, K))
-            self.gram[a, :, : a + 1] = self.gram[: a + 1, :, a].transpose(0, 1)
+            block = row.unflatten(0, (a + 1, K))
+            self.gram[: a + 1, :, a], self.gram[a, :, : a + 1] = block, block.transpose(0, 1)
         self.moment = moment(J, y, phi)
 
     def factor(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,8 +93,8 @@ class Linearised:
         spread = phi.new_empty(len(phi), C, C)
         for a in range(C):
             part = phi @ inverse[a * K : (a + 1) * K, : (a + 1) * K]
-            spread[:, a, : a + 1] = (part.unflatten(1, (a + 1, K)) @ phi[..., None])[..., 0]
-            spread[:, : a + 1, a] = spread[:, a, : a + 1]
+            row = (part.unflatten(1, (a + 1, K)) @ phi[..., None])[..., 0]
+            spread[:, a, : a + 1] = spread[:, : a + 1, a] = row
         return spread
 
 

@@ -76,7 +76,8 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
         network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
         held_out = network.fit(effective, error, weights, parts).left_out_errors_
         distance = np.linalg.norm(held_out.reshape(len(y), -1), axis=1)
-        return np.array([distance[counted & (parts == a)].mean() for a in names])
+        kept = [counted & (parts == a) for a in names]
+        return np.array([np.average(distance[k], weights=rows.counts[k]) for k in kept])
 
     def mean_error(width: float) -> float:
         return float(error_by_motion(width).mean())

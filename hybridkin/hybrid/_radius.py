@@ -41,6 +41,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> Radius:
     Papadopoulos et al., ECML (2002), normalised inductive conformal prediction; Vovk, Annals of
     Mathematics and AI 74 (2015), its pooling over folds.
     """
+    given, (rows, place) = rows, rows.distinct()
     X, y, groups, weights = rows.X, rows.tips, rows.groups, rows.counts
     n_folds = min(_FOLDS, len(y) if groups is None else len(np.unique(groups)))
     if n_folds < 2:
@@ -51,7 +52,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> Radius:
     splitter = KFold(n_folds, shuffle=True, random_state=0) if groups is None else None
     trust, errors, mechanical = (np.full(len(y), np.nan) for _ in range(3))
     for train, test in (splitter or GroupKFold(n_folds)).split(X, y, groups):
-        part = rows.take(train)
+        part = given.take(np.isin(place, train))
         chosen = spec if spec.parts else select(choose_mechanics(spec, part), part)[0]
         module = fit_hybrid(chosen, part).module
         q = torch.from_numpy(X[test].astype(np.float64))

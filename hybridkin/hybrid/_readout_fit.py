@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Restore, Stored
 from hybridkin.hybrid import _linearised
@@ -33,6 +34,7 @@ class ReadoutFit(NamedTuple):
     scores: dict[Pair, float]  # mean squared leave-out distance [m^2], by alphas
     gradient: float  # of the objective at the optimum, relative to that without a correction
     noise_ratio: float = inf  # variance of tips over that of actuators; infinity: of tips alone
+    rmse: float = nan  # root mean square length of `residual`, by weight [m]
 
     def stored(self) -> Stored:
         """Return how the fit describes itself; JSON has no infinity, so penalties are strings."""
@@ -44,6 +46,7 @@ class ReadoutFit(NamedTuple):
             scores=[[*map(str, alphas), score] for alphas, score in self.scores.items()],
             gradient=self.gradient,
             noise_ratio=str(self.noise_ratio),
+            rmse=self.rmse,
         )
 
     @classmethod
@@ -57,6 +60,7 @@ class ReadoutFit(NamedTuple):
             {(float(a), float(b)): float(c) for a, b, c in stored.list_of(list, "scores")},
             stored.value("gradient", float),
             float(stored.value("noise_ratio", str)),
+            stored.value("rmse", float) if "rmse" in stored.settings else nan,
         )
 
 
@@ -111,7 +115,8 @@ def fit_readout(
     coupling : {"serial", "parallel"}, default="serial"
         Whether W phi(q) is added to the inner coordinates, or to the tip.
     sample_weight : Tensor of shape (N,), optional
-        How many times each row counts; residuals of rows that do not count are NaN.
+        How many times each row counts; equal rows are left out together. The residual of a row of
+        weight 0 is NaN.
     groups : array-like of shape (N,), optional
         Motion of every row, which is left out as a whole. Default: single rows.
     alphas : tuple of two floats, optional
@@ -127,13 +132,12 @@ def fit_readout(
         The readout, and how it was found.
     """
     q, x = q.detach().double(), x.detach().double()
-    weight = torch.ones_like(q[:, 0]) if sample_weight is None else sample_weight.to(q)
-    kept = weight > 0
-    counted = kept.numpy(force=True)
-    members = None if groups is None else _linearised.members_of(np.asarray(groups)[counted])
+    first, counts, place = distinct_rows(q, x, sample_weight, groups)
+    weight = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
+    members = None if groups is None else _linearised.members_of(np.asarray(groups)[first])
     model = mechanical if coupling == "serial" else _AtTip(mechanical)
     with torch.no_grad():
-        problem = _Problem(model, features, q[kept], x[kept], weight[kept])
+        problem = _Problem(model, features, q[first], x[first], weight)
         if alphas is not None:
             found = _fitted(problem.in_noise(noise_ratio), members, alphas)
         else:
@@ -143,9 +147,8 @@ def fit_readout(
                 other = _chosen(problem.in_noise(noise_ratio), members, found.alphas)
                 if problem.mean_distance(other.residual) < problem.mean_distance(found.residual):
                     found = other
-    residual = np.full(x.shape, nan)
-    residual[counted] = found.residual
-    return found._replace(residual=residual)
+    rmse = problem.mean_distance(found.residual, 2) ** 0.5
+    return found._replace(residual=at_place(found.residual, place), rmse=rmse)
 
 
 def _chosen(

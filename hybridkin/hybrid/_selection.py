@@ -120,8 +120,7 @@ def _results(
         own = _shares(held_out[:, ~test], y[~test], counts[~test])
         blend[test] = np.tensordot(own, held_out[:, test], 1)
     distances = np.array([distance(x, y) for x in (*held_out, blend)])
-    kept = [test for test in tests if counts[test].any()]
-    by_fold = np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in kept]).T
+    by_fold = np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in tests]).T
     means = np.average(distances, axis=1, weights=counts)
     return {
         "candidate": [*names, "blend"],

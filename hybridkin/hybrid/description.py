@@ -132,9 +132,8 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
     error = model.error_model_
     error = error.error_models[0] if isinstance(error, Blend) else error
     if isinstance(error, ReadoutFit):
-        squares = np.square(error.residual).sum(axis=1)
-        known["rows"] = int(np.isfinite(squares).sum())
-        known["left_out_rmse"] = float(np.sqrt(np.nanmean(squares)))
+        known["rows"] = int(np.isfinite(error.residual).all(axis=1).sum())
+        known["left_out_rmse"] = error.rmse
     elif isinstance(error, (ELMRegressor, ELMRegressorCV)):
         network = error.best_estimator_ if isinstance(error, ELMRegressorCV) else error
         known["rows"] = network.n_samples_seen_

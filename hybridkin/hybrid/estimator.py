@@ -18,8 +18,9 @@ from hybridkin._core.model import as_forward_model
 from hybridkin._core.units import span_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
+from hybridkin.hybrid import _fit
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import FittedHybrid, Part, Rows, Spec, fit_hybrid, residuals
+from hybridkin.hybrid._fit import Part, Rows, Spec, calibrated, few_rows, fit_hybrid, residuals
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -175,7 +176,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         y : array-like of shape (N, m) or (N,)
             Measured tip positions x [m]; of poses (N, 6), see `output`.
         sample_weight : array-like of shape (N,), optional
-            How many times each row counts.
+            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
+            Equal rows are held out together. With `play` a row of weight 0 still moves the
+            actuators.
         groups : array-like of shape (N,), optional
             Motion of every row, which is held out as a whole: by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
@@ -188,15 +191,16 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            For parameters out of their set, shapes that do not fit the mechanical model, and
-            data that are not finite.
+            For parameters out of their set, shapes that do not fit the mechanical model, data that
+            are not finite, and fewer than two different rows to learn from, three with `coverage`.
 
         Warns
         -----
         UserWarning
-            Where tendons of a ConstantCurvatureChain contradict each other, as slack does (so do
-            `predict` and the Jacobians), where numbers look like millimetres, and the warnings of
-            `calibrate`.
+            Where the different rows are fewer than 20, or than twice the coefficients of an affine
+            function of q. Where tendons of a ConstantCurvatureChain contradict each other, as slack
+            does (so do `predict` and the Jacobians), where numbers look like millimetres, and the
+            warnings of `calibrate`.
         """
         for message in self.fit_with_messages(X, y, sample_weight, groups):
             warnings.warn(message, stacklevel=2)
@@ -211,29 +215,33 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> list[str]:
         """Fit as `fit` does and return the messages of its warnings; none is issued."""
         check_settings(self)
-        rows = self._checked_rows(X, y, sample_weight, groups)
-        spec = self._spec(rows)
-        asked, mechanics, self.cv_results_ = spec, None, None
+        given = self._checked_rows(X, y, sample_weight, groups)
+        asked = spec = self._spec(given)
+        rows = given.distinct()[0]
+        few = few_rows(rows, spec, self.coverage)
+        mechanics, self.cv_results_ = None, None
         if not asked.parts:
             mechanics = choose_mechanics(spec, rows)
             spec = mechanics.spec
-        self.play_, said = play_of(self.play, spec, rows)
+        self.play_, said = play_of(self.play, spec, given.distinct(runs=True)[0])
         self._play_state: PlayState | None = None
         if self.play_ is not None:
-            rows = rows._replace(X=self._effective(rows.X, rows.groups))
+            given = given._replace(X=self._effective(given.X, given.groups))
+            rows = given.distinct()[0]
             if mechanics is not None:  # the scores stay those of all models, without play
                 mechanics = mechanics.of(spec, rows)._replace(scores=mechanics.scores)
         if mechanics is not None:
-            spec, self.cv_results_ = select(mechanics, rows)
-        fitted = fit_hybrid(spec, rows)
+            spec = calibrated(mechanics.spec, given)  # its warnings count the rows given
+            spec, self.cv_results_ = select(mechanics._replace(spec=spec), rows)
+        fitted = fit_hybrid(spec, given)
         self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
         self.error_model_, self.module_ = fitted.error_model, fitted.module
         self._single_output = rows.y.ndim == 1
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
         self.radius_: Radius | None = None
         if self.coverage is not None:
-            self.radius_ = conformal_radius(asked, rows, self.coverage)
-        return [*said, *_messages(fitted, rows)]
+            self.radius_ = conformal_radius(asked, given if asked.parts else rows, self.coverage)
+        return [*few, *said, *_messages(fitted, given)]
 
     def partial_fit(
         self,
@@ -256,7 +264,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         y : array-like of shape (N, m) or (N,)
             Measured tips [m].
         sample_weight : array-like of shape (N,), optional
-            How many times each row counts.
+            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
         decay : float, default=0.98
             Factor in (0, 1] on the weight of all earlier rows with every row: 0.98 forgets within
             about fifty measurements.
@@ -404,7 +412,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
-def _messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
+def _messages(fitted: _fit.FittedHybrid, rows: Rows) -> tuple[str, ...]:
     """Return the warnings of a fit: of its calibration, or of the rows of an uncalibrated chain."""
     chain = fitted.mechanical
     if fitted.calibration is not None or not isinstance(chain, Chain):

@@ -66,16 +66,11 @@ class LeftOut:
         return max(1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1]))
 
     def each(self, rows, alphas):
-        """Return the errors (n_alphas, n_rows, n_outputs) on rows each held out alone.
-
-        Of a row of weight above 1, a repeated one, a weight of 1 is held out.
-        """
+        """Return the errors (n_alphas, n_rows, n_outputs) on rows each held out alone."""
         Z, D, root = self._z(rows), self._d(alphas), self._root[rows]
         p = D @ (Z * Z).T
         if not self._wide:
             p += 1.0 - (root**2 / self._n if self._intercept else 0.0)
-        out = 1.0 / np.maximum(root**2, 1.0)
-        p = (1.0 - out) + out * p
         return self._residuals(Z, D, rows) / p[:, :, None] / root[:, None]
 
     def together(self, out, asked, alphas):

@@ -240,7 +240,7 @@ class ELMRegressor(FittedNetwork):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets.
         sample_weight : array-like of shape (n_samples,), default=None
-            How often each row counts; a row of weight 0 is absent, from the range of `X` too.
+            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
 
         Returns
         -------
@@ -308,7 +308,9 @@ class ELMRegressor(FittedNetwork):
         return self._solve(merge(self._stats, other._stats), self.module_)
 
     def _learn(self, X, y, sample_weight, first, decay=1.0):
-        X, y, sample_weight, _ = check_rows(self, X, y, sample_weight, reset=first)
+        X, y, sample_weight = check_rows(self, X, y, sample_weight, reset=first)
+        if sample_weight is not None and not sample_weight.all():
+            X, y, sample_weight = (part[sample_weight > 0] for part in (X, y, sample_weight))
         y_ndim, y = y.ndim, y.reshape(len(y), -1)
         if first:
             elm, stats = draw_layer(self, X, sample_weight), None

@@ -1,16 +1,18 @@
 """Extreme learning machine whose complexity is chosen by cross-validation."""
 
+from collections.abc import Iterable
 from itertools import product
 from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
 from sklearn.base import _fit_context
-from sklearn.model_selection import GroupKFold, LeaveOneGroupOut, check_cv
+from sklearn.model_selection import GroupKFold, LeaveOneGroupOut, PredefinedSplit, check_cv
 from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted
 
+from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.stored import plain
 from hybridkin.learning._left_out import LeftOut
 from hybridkin.learning._ridge import gather
@@ -152,8 +154,8 @@ class ELMRegressorCV(FittedNetwork):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets.
         sample_weight : array-like of shape (n_samples,), default=None
-            How often each row counts. One repetition is held out at a time, or what there is of
-            it; with groups all of them.
+            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
+            Equal rows are held out together.
         groups : array-like of shape (n_samples,), default=None
             Rows that belong together, such as those of one motion; they are held out together.
 
@@ -162,14 +164,23 @@ class ELMRegressorCV(FittedNetwork):
         self : ELMRegressorCV
             The fitted estimator.
         """
-        X, y, sample_weight, kept = check_rows(self, X, y, sample_weight)
+        X, y, sample_weight = check_rows(self, X, y, sample_weight)
+        if groups is not None:
+            groups = np.asarray(groups)
+            if groups.shape != (len(X),):
+                raise ValueError(
+                    f"`groups` must have shape {(len(X),)}, one entry for each row of `X`, got "
+                    f"{groups.shape}."
+                )
+        first, sample_weight, place = distinct_rows(X, y, sample_weight, groups)
+        X, y, groups = X[first], y[first], None if groups is None else groups[first]
         if len(y) < 2:
             raise ValueError(
-                f"`X` must have at least 2 rows of positive weight, so that one can be held out, "
-                f"got n_samples={len(y)}; ELMRegressor needs no choice."
+                f"`X` must have at least 2 different rows of positive weight, so that one can be "
+                f"held out, got n_samples={len(y)}; ELMRegressor needs no choice."
             )
         weights = np.ones(len(X)) if sample_weight is None else sample_weight
-        splits = _splits(self.cv, groups, kept)
+        splits = _splits(self.cv, groups, len(X), place)
         task = _Task(X, y.reshape(len(y), -1), sample_weight, weights, splits, self.alphas)
         seed = self.random_state
         if not isinstance(seed, Integral):
@@ -203,8 +214,7 @@ class ELMRegressorCV(FittedNetwork):
         chosen = ELMRegressor(**best.params).fit(X, y, sample_weight)
         self.best_estimator_, self.module_ = chosen, chosen.module_
         self.noise_variance_, self._y_ndim = chosen.noise_variance_, y.ndim
-        self.left_out_errors_ = np.full((len(kept), *y.shape[1:]), np.nan)
-        self.left_out_errors_[kept] = _left_out_errors(best, task).reshape(y.shape)
+        self.left_out_errors_ = at_place(_left_out_errors(best, task).reshape(y.shape), place)
         names = ("n_hidden", "weight_scale", "relevance", "alphas", "mean_squared_error")
         rows = [{**candidate.params, **candidate._asdict()} for candidate in tried]
         self.cv_results_ = {name: np.array([row[name] for row in rows]) for name in names}
@@ -219,7 +229,7 @@ class ELMRegressorCV(FittedNetwork):
 
 
 class _Task(NamedTuple):
-    """Rows of positive weight, and which of them are held out together (None: each alone)."""
+    """Different rows, and which of them are held out together (None: each alone)."""
 
     X: np.ndarray
     targets: np.ndarray  # with two dimensions
@@ -299,32 +309,31 @@ def _relevance(best, task):
     return relevance, np.array([center - half, center + half])
 
 
-def _splits(cv, groups, kept):
-    """Return (rows out, rows asked) of every split, counted among the rows kept."""
+def _splits(cv, groups, n_rows, place):
+    """Return (rows out, rows asked) of every split of the different rows.
+
+    Splits that the user lists are of all rows; `place` has that of each among the different ones.
+    An integer or a splitter sees the different ones alone.
+    """
     if groups is None and cv is None:
         return None
-    if groups is not None:
-        groups = np.asarray(groups)
-        if groups.shape != kept.shape:
-            raise ValueError(
-                f"`groups` must have shape {kept.shape}, one entry for each row of `X`, got "
-                f"{groups.shape}."
-            )
-        if cv is None:
-            cv = LeaveOneGroupOut()
-        elif isinstance(cv, Integral):
-            cv = GroupKFold(int(cv))
-    splits, rows = [], np.zeros(len(kept))
+    if groups is not None and cv is None:
+        cv = LeaveOneGroupOut()
+    elif groups is not None and isinstance(cv, Integral):
+        cv = GroupKFold(int(cv))
+    if not isinstance(cv, (Iterable, PredefinedSplit)):
+        place = np.arange(n_rows)
+    splits, rows = [], np.arange(len(place))
     splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
     for train, test in splitter.split(rows, rows, groups):
-        out, asked = np.ones(len(kept), dtype=bool), np.zeros(len(kept), dtype=bool)
-        out[train], asked[test] = False, True
-        if (asked & ~out).any():
+        if np.isin(rows[test], rows[train]).any():
             raise ValueError(
                 "`cv` must not test on rows that it trains on, but a split of its own does; use a "
                 "splitter of sklearn.model_selection."
             )
-        splits.append((np.flatnonzero(out[kept]), np.flatnonzero(asked[kept])))
+        out, asked = np.ones(n_rows + 1, dtype=bool), np.zeros(n_rows + 1, dtype=bool)
+        out[place[train]], asked[place[test]] = False, True  # the last: rows of weight 0
+        splits.append((np.flatnonzero((out | asked)[:-1]), np.flatnonzero(asked[:-1])))
     return [split for split in splits if len(split[1])]
 
 

@@ -40,18 +40,14 @@ def _scaling(X, sample_weight, input_scaling):
 
 
 def check_rows(estimator, X, y, sample_weight, reset=True):
-    """Return the rows of positive weight, float64 `y`, with their weights; and which they are."""
+    """Return the rows, `y` in float64, and their weights."""
     checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
     X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
-    y, kept = y.astype(np.float64, copy=False), np.ones(len(X), dtype=bool)
     if sample_weight is not None:
         sample_weight = _check_sample_weight(
             sample_weight, X, dtype=np.float64, ensure_non_negative=True
         )
-        kept = sample_weight > 0
-        if not kept.all():
-            X, y, sample_weight = X[kept], y[kept], sample_weight[kept]
-    return X, y, sample_weight, kept
+    return X, y.astype(np.float64, copy=False), sample_weight
 
 
 def draw_layer(params, X, sample_weight):

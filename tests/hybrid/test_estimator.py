@@ -48,6 +48,7 @@ def expected_failures(estimator):
     return failures
 
 
+@pytest.mark.filterwarnings("ignore:`X` holds .* different rows")  # its logs are small
 @parametrize_with_checks(
     [
         HybridForwardModel(),

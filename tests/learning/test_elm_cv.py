@@ -366,7 +366,7 @@ def test_integers_with_groups_split_whole_groups():
         ({}, {"groups": ["a"] * 60}, "contains fewer than 2 unique groups"),
         ({"cv": 2}, {"groups": ["a"] * 60}, "greater than the number of groups: 1"),
         ({"cv": [(np.arange(60), np.arange(5))]}, {}, "must not test on rows that it trains on"),
-        ({}, {"sample_weight": np.eye(60)[0]}, "at least 2 rows of positive weight"),
+        ({}, {"sample_weight": np.eye(60)[0]}, "at least 2 different rows of positive weight"),
     ],
 )
 def test_clear_errors(params, fit, message):

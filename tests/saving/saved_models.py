@@ -79,7 +79,7 @@ def trunk():
     return ConstantCurvatureChain([0.05], offsets=[0.03])
 
 
-def trunk_log(n_rows=16):
+def trunk_log(n_rows=24):
     """Rows of q [m], tips x [m] of a simulated trunk that is not quite circular, and motions."""
     rng = np.random.default_rng(0)
     q = 0.25 + 0.05 * rng.uniform(-1, 1, (n_rows, 3))
@@ -98,14 +98,14 @@ def _hybrid(error_model: Any = None, chain: Any = None, **settings: Any) -> Any:
 
 def _rigid_hybrid():
     rng = np.random.default_rng(0)
-    q = rng.uniform(-1, 1, (16, 3))
+    q = rng.uniform(-1, 1, (24, 3))
     x = arm()(torch.from_numpy(q)).numpy() + 0.01 * np.cos(q)
     return HybridForwardModel(arm(), ELMRegressor(4, random_state=0)).fit(q, x), q
 
 
 def _elastic_hybrid():
     rng = np.random.default_rng(0)
-    q = 0.003 * rng.uniform(-1, 1, (16, 7))
+    q = 0.003 * rng.uniform(-1, 1, (24, 7))
     x = elastic_chain()(torch.from_numpy(q)).numpy() + 0.001 * np.sin(300 * q[:, :3])
     return HybridForwardModel(elastic_chain(), LinearRegression()).fit(q, x), q
 

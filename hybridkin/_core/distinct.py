@@ -1,0 +1,62 @@
+"""Rows of a log that are equal, merged into one: a weight counts repetitions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridkin._core.arrays import Numbers, as_array
+
+
+def distinct_rows(
+    X: Numbers,
+    y: Numbers,
+    weights: Numbers | None = None,
+    groups: ArrayLike | None = None,
+    runs: bool = False,
+) -> tuple[NDArray, NDArray | None, NDArray]:
+    """Return which rows differ, in order of first occurrence, and how many times each counts.
+
+    A fit to these rows cannot tell a weight from a repetition, and equal rows are held out
+    together.
+
+    Parameters
+    ----------
+    X, y : array or Tensor of shape (N, n) and (N, m)
+        Measured rows.
+    weights : array or Tensor of shape (N,), optional
+        Weights. Default: ones.
+    groups : array-like of shape (N,), optional
+        Labels; equal rows of different groups stay apart.
+    runs : bool, default=False
+        Whether equal rows that do not follow each other stay apart, and rows of weight 0 remain.
+
+    Returns
+    -------
+    first : ndarray of int of shape (K,)
+        The first of each set of equal rows, ascending.
+    weights : ndarray of shape (K,) or None
+        Sums of the weights of equal rows; None where all are one.
+    place : ndarray of int of shape (N,)
+        Which entry of `first` stands for each row; -1 for rows of weight 0.
+    """
+    labels = np.zeros(len(X)) if groups is None else np.unique(groups, return_inverse=True)[1]
+    rows = np.column_stack([as_array(X), as_array(y), labels]).astype(np.float64)
+    rows += 0.0  # -0.0 equals 0.0
+    times = np.ones(len(rows)) if weights is None else as_array(weights)
+    if runs:
+        kept = np.arange(len(rows))
+        keys = np.cumsum(np.append(True, (rows[1:] != rows[:-1]).any(axis=1)))
+    else:
+        kept = np.flatnonzero(times)
+        keys = rows[kept].view(np.dtype((np.void, rows.itemsize * rows.shape[1])))[:, 0]
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    order, place = np.argsort(first), np.full(len(rows), -1)
+    place[kept] = np.argsort(order)[inverse]
+    counts = np.bincount(place[kept], weights=times[kept])
+    return kept[first[order]], None if (counts == 1.0).all() else counts, place
+
+
+def at_place(values: NDArray, place: NDArray) -> NDArray:
+    """Return values (K, ...) of the different rows for all rows (N, ...), NaN for weight 0."""
+    return np.append(values, np.full_like(values[:1], np.nan), axis=0)[place]
