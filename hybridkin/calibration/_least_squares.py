@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,17 +18,20 @@ from hybridkin.chains.chain import Chain
 
 _MAX_ROUNDS = 12
 _MEDIAN = 2.3660  # of the squared length of a normal vector with three coordinates
-_TINY = np.finfo(np.float64).tiny
 
 
-# rho(s) and rho'(s) of a squared distance s over its noise.
-LOSSES: dict[str, Callable[[NDArray], tuple[NDArray, NDArray]]] = {
-    "linear": lambda s: (s, np.ones_like(s)),
-    "soft_l1": lambda s: (2.0 * s / (1.0 + np.sqrt(1.0 + s)), (1.0 + s) ** -0.5),
-    "huber": lambda s: (np.where(s > 1.0, 2.0 * np.sqrt(s) - 1.0, s), np.maximum(s, 1.0) ** -0.5),
-    "cauchy": lambda s: (np.log1p(s), 1.0 / (1.0 + s)),
-    "arctan": lambda s: (np.arctan(s), 1.0 / (1.0 + s * s)),
+# rho(s), rho'(s) and rho''(s), of the squared distance s of a row over its noise.
+LOSSES: dict[str, Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]] = {
+    "linear": lambda s: (s, np.ones_like(s), np.zeros_like(s)),
+    "soft_l1": lambda s: (2 * s / (1 + np.sqrt(1 + s)), (1 + s) ** -0.5, -0.5 * (1 + s) ** -1.5),
+    "huber": lambda s: _huber(s, np.maximum(s, 1.0)),
+    "cauchy": lambda s: (np.log1p(s), 1 / (1 + s), -((1 + s) ** -2.0)),
+    "arctan": lambda s: (np.arctan(s), 1 / (1 + s * s), -2 * s / (1 + s * s) ** 2),
 }
+
+
+def _huber(s: NDArray, far: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    return np.where(s > 1, 2 * np.sqrt(far) - 1, s), far**-0.5, -0.5 * (s > 1) * far**-1.5
 
 
 class Rows(NamedTuple):
@@ -66,15 +70,20 @@ def _squares(residual: NDArray) -> NDArray:
     return (residual**2).sum(axis=1)
 
 
-def _bounded(residual: NDArray, sigma: float, loss: str) -> tuple[NDArray, NDArray]:
-    """Return the factors k that make |k e|^2 the loss 3 rho(|e|^2 / 3), and t = s rho'(s) / rho(s).
+def row_loss(z: NDArray, weight: NDArray, loss: str) -> NDArray:
+    """Return the loss that SciPy's `least_squares` minimises, and its derivatives, (3, M).
 
-    `residual` holds the errors e (N, 3), in units of `sigma`. The loss sees their length alone:
-    it stays when the frame turns. Its 3 keeps the noise of three coordinates near s = 1.
+    `z` holds the squares of 3 N weighted coordinates, over their noise, then those of the prior.
+    Of a row it is 3 w rho(s) with s = |e|^2 / 3, so it stays when the frame turns; the 3 keeps the
+    noise of three coordinates near s = 1. The second derivative gives all coordinates of a row the
+    mean curvature rho' + 2/3 s rho'', so that the search does not depend on the frame either.
     """
-    s = np.maximum(_squares(residual) / (3.0 * sigma**2), _TINY)
-    rho, slope = LOSSES[loss](s)
-    return np.sqrt(rho / s), s * slope / rho
+    rows, prior = np.split(z, [3 * len(weight)])
+    s = rows.reshape(-1, 3).sum(axis=1) / (3.0 * weight)
+    rho, slope, bend = LOSSES[loss](s)
+    own = np.repeat([weight * rho, slope, bend * s / 3.0], 3, axis=1)
+    own[2] /= np.maximum(rows, np.finfo(np.float64).tiny)
+    return np.hstack([own, [prior, np.ones_like(prior), np.zeros_like(prior)]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,27 +109,21 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
 
     With `roughly` the search stops as soon as good and bad initial guesses differ.
     """
-    root = rows.weight.sqrt().numpy()[:, None]
+    weight = rows.weight.numpy()
+    root = np.sqrt(weight)[:, None]
 
     def residual(theta: NDArray) -> NDArray:
         return rows.residual(problem.moved(torch.as_tensor(theta).to(rows.q)))
 
     def jacobian(theta: NDArray) -> NDArray:
-        return rows.jacobian(problem, torch.as_tensor(theta).to(rows.q))
+        J = rows.jacobian(problem, torch.as_tensor(theta).to(rows.q))
+        return (root[..., None] * J).reshape(-1, theta.size)
 
     def whitened(theta: NDArray, sigma: float) -> NDArray:
-        errors = residual(theta)
-        scale = root / sigma * _bounded(errors, sigma, loss)[0][:, None]
-        return np.concatenate([(scale * errors).ravel(), theta / problem.prior_std])
+        return np.concatenate([(root * residual(theta)).ravel() / sigma, theta / problem.prior_std])
 
     def whitened_jacobian(theta: NDArray, sigma: float) -> NDArray:
-        errors, J = residual(theta), jacobian(theta)
-        factor, share = _bounded(errors, sigma, loss)
-        # d(k e) = k (1 - (1 - t) u u') de, with u = e / |e|.
-        along = (errors[:, None] @ J) / np.maximum(_squares(errors), _TINY)[:, None, None]
-        J = J - (1.0 - share)[:, None, None] * errors[..., None] * along
-        J = (root / sigma * factor[:, None])[..., None] * J
-        return np.vstack([J.reshape(-1, theta.size), np.diag(1.0 / problem.prior_std)])
+        return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
 
     floor = 1e-12 * float(problem.chain.reach)
     robust = loss != "linear"
@@ -128,16 +131,15 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
     converged, tol = False, 1e-5 if roughly else 1e-12
     options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol)
     options |= {"jac": whitened_jacobian, "bounds": (problem.low, problem.high), "max_nfev": 100}
+    options |= {"loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"}
     for _ in range(2 if roughly else _MAX_ROUNDS):
         solution = least_squares(whitened, theta, args=(sigma,), **options)
         theta, converged = solution.x, solution.status > 0
         previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    square, count = (
-        float((_squares(residual(theta)) * root[:, 0] ** 2).sum()),
-        float(rows.weight.sum()),
-    )
-    noise = max(sigma if robust else (square / max(3.0 * count - theta.size, 1.0)) ** 0.5, floor)
-    J = (root[..., None] * jacobian(theta)).reshape(-1, theta.size)
-    return Fit(problem, theta, J, noise, (square / count) ** 0.5, bool(converged))
+    found = float(rows.rmse(problem.moved(torch.as_tensor(theta).to(rows.q))))
+    count = float(weight.sum())
+    free = max(3.0 * count - theta.size, 1.0)
+    noise = max(sigma if robust else found * (count / free) ** 0.5, floor)
+    return Fit(problem, theta, jacobian(theta), noise, found, bool(converged))

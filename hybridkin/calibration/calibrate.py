@@ -168,10 +168,10 @@ def calibrate(
     Warns
     -----
     UserWarning
-        Where q or x look like millimetres. Where a value ran into a bound or is no longer
-        physical. Where the mirror image of the given robot explains the data far better; it is
-        then returned. Where tendons of a ConstantCurvatureChain contradict each other, as slack
-        tendons do.
+        Where q or x look like millimetres. Where the different rows are fewer than the free
+        parameters. Where a value ran into a bound or is no longer physical. Where the mirror image
+        of the given robot explains the data far better; it is then returned. Where tendons of a
+        ConstantCurvatureChain contradict each other, as slack tendons do.
 
     References
     ----------
@@ -240,7 +240,7 @@ def fit_geometry(
     best, message = _best(fits, guesses, bool({"angles", "turns"} & {*names}))
     if len(guesses) > 1:
         best = solve(best.problem, rows, best.theta, loss)
-    messages += [message, _unphysical(best), best.chain().contradiction(q)]
+    messages += [message, _few(best, rows), _unphysical(best), best.chain().contradiction(q)]
     cv_rmse = None
     if groups is not None:
         cv_rmse = _cross_validate(best, rows, groups[first], loss)
@@ -267,6 +267,17 @@ def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit
         f"the actuators run the other way round than in `chain`: its mirror image leaves "
         f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
         "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`."
+    )
+
+
+def _few(fit: Fit, rows: Rows) -> str | None:
+    """Return a warning where the rmse is too good to be true: by a fifth, and more with less."""
+    n_rows, n_free = len(rows.q), fit.theta.size
+    if n_rows >= n_free:
+        return None
+    return (
+        f"`q` holds {n_rows} different rows for {n_free} free parameters: `rmse` is far below the "
+        f"error on new rows. Record at least {4 * n_free}, or list fewer `parameters`."
     )
 
 

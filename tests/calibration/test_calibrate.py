@@ -5,10 +5,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, RigidChain, calibrate, datasets
+from hybridkin._core.rotations import rotation
+from hybridkin.calibration._least_squares import LOSSES, row_loss
 from hybridkin.calibration._parameters import Problem, parameter_names
 from hybridkin.calibration.calibrate import fit_geometry
 
@@ -391,17 +394,74 @@ def test_robust_loss_forgets_outliers(rng):
     assert robust < 0.001 < plain
 
 
-def test_weights_are_repetitions(rng):
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weights_are_repetitions(loss, rng):
     q = chambers(rng, 40)
     x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(40, 3, generator=rng).double()
-    weights = torch.arange(40) % 3
+    x[1:4] += 0.2
+    weights, motions = torch.arange(40) % 3, np.arange(40) // 20
     repeated = torch.arange(40).repeat_interleave(weights)
+    nominal, names = ConstantCurvatureChain([0.09, 0.09, 0.09]), ("radii",)
+    own = {"loss": loss, "groups": motions, "sample_weight": weights}
+    weighted = calibrate(nominal, q, x, names, **own)
+    own = {"loss": loss, "groups": motions[repeated]}
+    expanded = calibrate(nominal, q[repeated], x[repeated], names, **own)
+    assert_close(weighted.chain.radii, expanded.chain.radii, rtol=1e-9, atol=0)
+    assert_close(weighted.std_errors["radii"], expanded.std_errors["radii"], rtol=1e-9, atol=0)
+    assert weighted.rmse == pytest.approx(expanded.rmse, rel=1e-9)
+    assert weighted.cv_rmse == pytest.approx(expanded.cv_rmse, rel=1e-9)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_turning_the_frame_leaves_the_fit_as_it_is(loss, rng):
+    q = chambers(rng, 40)
+    x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(40, 3, generator=rng).double()
+    x[:4] += 0.2
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = rotation(torch.tensor([0.5, -1.0, 0.7]).double())[0]
     nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
-    weighted = calibrate(nominal, q, x, sample_weight=weights)
-    expanded = calibrate(nominal, q[repeated], x[repeated])
-    assert_close(weighted.chain.radii, expanded.chain.radii, rtol=1e-7, atol=0)
-    assert_close(weighted.std_errors["base"], expanded.std_errors["base"], rtol=1e-4, atol=0)
-    assert weighted.rmse == pytest.approx(expanded.rmse, rel=1e-8)
+    turned = ConstantCurvatureChain([0.09, 0.09, 0.09], base=turn)
+    plain, other = (
+        calibrate(chain, q, y, loss=loss)
+        for chain, y in ((nominal, x), (turned, x @ turn[:3, :3].mT))
+    )
+    assert_close(other.chain.radii, plain.chain.radii, rtol=1e-8, atol=0)
+    assert_close(other.chain.base, turn @ plain.chain.base, rtol=0, atol=1e-8)
+    assert_close(other.std_errors["radii"], plain.std_errors["radii"], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_loss_is_that_of_the_distance(loss):
+    rng = np.random.default_rng(0)
+    e = rng.normal(size=(20, 3)) * np.geomspace(1e-4, 1e2, 20)[:, None]
+    weight, prior = rng.uniform(0.5, 3.0, 20), np.array([0.3, 4.0])
+    z = np.append((weight[:, None] * e**2).ravel(), prior)
+    total, slope, _ = row_loss(z, weight, loss)
+    turn = Rotation.from_rotvec([0.4, 1.0, -2.0]).as_matrix()
+    turned = np.append((weight[:, None] * (e @ turn.T) ** 2).ravel(), prior)
+    bounded = 3.0 * weight @ LOSSES[loss]((e**2).sum(1) / 3.0)[0] + prior.sum()
+    for found in (total.sum(), row_loss(turned, weight, loss)[0].sum()):
+        assert found == pytest.approx(bounded, rel=1e-12)
+    for i in (0, 28, 57, 60):
+        step = 1e-6 * z[i] * (np.arange(62) == i)
+        pair = [
+            row_loss(at, weight, loss)[0][3 * (i // 3) : 3 * (i // 3) + 3].sum()
+            for at in (z + step, z - step)
+        ]
+        assert slope[i] == pytest.approx((pair[0] - pair[1]) / (2.0 * step[i]), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", [name for name in LOSSES if name != "linear"])
+def test_losses_are_those_of_scipy(name):
+    z = np.array([1e-3, 0.5, 1.0, 3.0, 1e4])
+    for at, value, rate, bend in zip(z, *LOSSES[name](z), strict=True):
+        found = least_squares(lambda t, a=at: np.sqrt([a]) + 0.0 * t, [0.0], loss=name, max_nfev=1)
+        assert 2.0 * found.cost == pytest.approx(value, rel=1e-3)
+        step = 1e-4 * at
+        ahead, behind = LOSSES[name](at + step), LOSSES[name](at - step)
+        if at != 1.0:  # where huber bends
+            assert rate == pytest.approx((ahead[0] - behind[0]) / (2 * step), rel=1e-6)
+            assert bend == pytest.approx((ahead[1] - behind[1]) / (2 * step), rel=1e-3, abs=1e-3)
 
 
 def test_bounds_hold(rng):
@@ -568,6 +628,7 @@ def test_numpy_in_numpy_out_and_groups(rng):
         ({"groups": [1, 2]}, r"`groups` must have shape \(10,\)"),
         ({"groups": [1] * 10}, "at least 2 motions"),
         ({"sample_weight": [0] * 10}, "`sample_weight` must hold 10 non-negative"),
+        ({"loss": "squared"}, r"`loss` must be one of \['linear', .* got 'squared'"),
     ],
 )
 def test_bad_input_says_what_is_needed(change, message):

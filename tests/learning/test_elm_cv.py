@@ -13,6 +13,7 @@ from sklearn.datasets import make_friedman1
 from sklearn.model_selection import (
     GroupKFold,
     KFold,
+    PredefinedSplit,
     ShuffleSplit,
     TimeSeriesSplit,
     cross_val_score,
@@ -137,19 +138,51 @@ def test_any_splitter_equals_refits(cv, n):
 
 
 @pytest.mark.parametrize("n", [10, 60])
-def test_weights_are_repetitions_of_which_one_is_left_out(n):
+def test_weights_are_repetitions_that_are_left_out_together(n):
     X, y = data(n)
     weights = np.random.default_rng(0).integers(0, 4, n)
     repeated = np.repeat(np.arange(n), weights)
     weighed = quick().fit(X, y, sample_weight=weights)
     longhand = quick().fit(X[repeated], y[repeated])
-    assert_allclose(
-        weighed.cv_results_["mean_squared_error"],
-        longhand.cv_results_["mean_squared_error"],
-        rtol=1e-10,
-    )
-    assert_allclose(weighed.predict(X), longhand.predict(X), rtol=0, atol=1e-9)
+    by_row = quick().fit(X[repeated], y[repeated], groups=repeated)
+    for other in (longhand, by_row):
+        assert_allclose(
+            weighed.cv_results_["mean_squared_error"],
+            other.cv_results_["mean_squared_error"],
+            rtol=1e-9,
+        )
+        assert_allclose(weighed.predict(X), other.predict(X), rtol=0, atol=1e-9)
+        left_out = np.repeat(weighed.left_out_errors_, weights, axis=0)
+        assert_allclose(other.left_out_errors_, left_out, rtol=0, atol=1e-9)
     assert_array_equal(np.isnan(weighed.left_out_errors_).any(axis=1), weights == 0)
+
+
+@pytest.mark.parametrize(
+    ("cv", "with_groups"), [(3, False), (3, True), (KFold(4), False), (GroupKFold(3), True)]
+)
+def test_folds_keep_equal_rows_together(cv, with_groups):
+    X, y = data(30)
+    groups = np.arange(30) // 5 if with_groups else None
+    weights = np.random.default_rng(0).integers(0, 4, 30)
+    repeated = np.repeat(np.arange(30), weights)
+    own = None if groups is None else groups[repeated]
+    weighed = quick(cv=cv).fit(X, y, sample_weight=weights, groups=groups)
+    longhand = quick(cv=cv).fit(X[repeated], y[repeated], groups=own)
+    left_out = np.repeat(weighed.left_out_errors_, weights, axis=0)
+    assert_array_equal(longhand.left_out_errors_, left_out)
+
+
+def test_listed_splits_count_all_rows():
+    X, y = data(20)
+    rows = np.append(np.arange(20), [4, 4, 9])  # two rows are given again
+    fold = np.append(np.arange(20) % 2, [1, 0, 0])
+    model = quick(cv=PredefinedSplit(fold)).fit(X[rows], y[rows], np.append(np.ones(22), 0.0))
+    listed = [(np.flatnonzero(fold != k), np.flatnonzero(fold == k)) for k in (0, 1)]
+    again = quick(cv=listed).fit(X[rows], y[rows], np.append(np.ones(22), 0.0))
+    assert_array_equal(model.left_out_errors_, again.left_out_errors_)
+    assert np.isnan(model.left_out_errors_[-1]).all()
+    assert np.isfinite(model.left_out_errors_[:-1]).all()
+    assert_array_equal(model.left_out_errors_[4], model.left_out_errors_[20])
 
 
 def test_hopeless_penalties_are_never_chosen():

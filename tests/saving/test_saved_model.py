@@ -335,14 +335,14 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     assert_allclose(header["domain"]["q_high"], q.max(0))
     residual = model.error_model_.residual
     assert header["training"] == {
-        "rows": 16,
+        "rows": 24,
         "left_out_rmse": pytest.approx(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
         "log": "log.csv",
         "motions": 4,
     }
     save_model(fitted["parallel_elm"][0], path)
     found = model_header(path)["training"]
-    assert found["rows"] == 16
+    assert found["rows"] == 24
     assert found["calibration"]["rmse"] == fitted["parallel_elm"][0].calibration_.rmse
     save_model(fitted["blend"][0], path)
     chosen = model_header(path)["training"]["cv_results"]["chosen"]
