@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_array
 
 
 def distinct_rows(
-    X: Numbers,
-    y: Numbers,
+    X: NDArray | Tensor,
+    y: NDArray | Tensor,
     weights: Numbers | None = None,
     groups: ArrayLike | None = None,
     runs: bool = False,
