@@ -135,7 +135,7 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
 
 
 def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
-    """Return a warning where the different rows are few to learn from; raise where they are none.
+    """Return a warning where the different rows are few to learn from; raise below one or two.
 
     From 20 held-out errors on, their rms is known to a sixth.
     """
