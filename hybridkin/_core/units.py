@@ -33,6 +33,12 @@ def span_message(name: str, tips: Tensor, reach: float, spans: float = _SPANS) -
     )
 
 
+def motion_message(name: str, tips: Tensor, predicted: Tensor, reach: float) -> str | None:
+    """Return a warning where tips (N, 3) lie further apart than a model's: 20 times, and a size."""
+    moved = float((predicted.amax(dim=0) - predicted.amin(dim=0)).detach().max())
+    return span_message(name, tips, reach, min(_SPANS, max(2.0, 20.0 * moved / reach)))
+
+
 def millimetres_message(name: str, value: Tensor, limit: float) -> str | None:
     """Return a warning where values are too large to be metres."""
     what = ", which looks like millimetres; hybridkin works in metres: divide by 1000."

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor
 from hybridkin._core.distinct import distinct_rows
-from hybridkin._core.units import span_message
+from hybridkin._core.units import motion_message
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import LOSSES, Fit, Rows, solve
 from hybridkin.calibration._parameters import ALIASES, Problem, parameter_names
@@ -32,6 +32,7 @@ _IDENTIFIED = 0.1
 _EQUAL = 1.0 - 1e-4  # of guesses that explain the tips alike the given chain counts
 _BETTER = 0.8  # another handedness than the given one must lower the error to this share,
 _FAR_BETTER = 0.5  # and to this share where the user has not asked for it
+_FEW, _LEFT = 10, 0.5  # a quarter of the variance
 _MEASURED = ("radii", "lengths")  # sizes that a ruler measures:
 _UNPHYSICAL = 1.75  # a change by this factor is a warning
 
@@ -169,7 +170,8 @@ def calibrate(
     -----
     UserWarning
         Where q or x look like millimetres. Where the different rows are fewer than the free
-        parameters. Where a value ran into a bound or is no longer physical. Where the mirror image
+        parameters. Where a quarter of the variance of the tips stays, as with columns of q in a
+        wrong order. Where a value ran into a bound or is no longer physical. Where the mirror image
         of the given robot explains the data far better; it is then returned. Where tendons of a
         ConstantCurvatureChain contradict each other, as slack tendons do.
 
@@ -241,6 +243,8 @@ def fit_geometry(
     if len(guesses) > 1:
         best = solve(best.problem, rows, best.theta, loss)
     messages += [message, _few(best, rows), _unphysical(best), best.chain().contradiction(q)]
+    if not any(messages[:-4]):  # of the units
+        messages.append(_unexplained(best, rows))
     cv_rmse = None
     if groups is not None:
         cv_rmse = _cross_validate(best, rows, groups[first], loss)
@@ -278,6 +282,20 @@ def _few(fit: Fit, rows: Rows) -> str | None:
     return (
         f"`q` holds {n_rows} different rows for {n_free} free parameters: `rmse` is far below the "
         f"error on new rows. Record at least {4 * n_free}, or list fewer `parameters`."
+    )
+
+
+def _unexplained(fit: Fit, rows: Rows) -> str | None:
+    """Return a warning where half of the rows are not explained well: not by outliers alone."""
+    with torch.no_grad():
+        left = (fit.chain()(rows.q) - rows.x).norm(dim=1).median()
+    spread = (rows.x - rows.x.median(dim=0).values).norm(dim=1).median()
+    if len(rows.x) < _FEW or not 0 < _LEFT * spread < left:
+        return None
+    return (
+        f"the calibrated model leaves {1e3 * left:.3g} mm (median) where the tip moves by "
+        f"{1e3 * spread:.3g} mm. The columns of `q` may have another order or sign, or the robot "
+        "is described wrongly: datasets.check_log(Log(q, x), chain=chain) looks for better ones."
     )
 
 
@@ -416,8 +434,10 @@ def _check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, l
     messages = chain.check_actuators(q)
     if not torch.isfinite(x).all():
         rows = int((~torch.isfinite(x).all(dim=1)).sum())
-        raise ValueError(f"`x` must be finite, got NaN or infinity in {rows} rows; drop them.")
-    return q, x, [*messages, span_message("x", x, float(chain.reach.detach()))]
+        raise ValueError(
+            f"`x` must be finite, got NaN or infinity in {rows} of {len(x)} rows; leave them out."
+        )
+    return q, x, [*messages, motion_message("x", x, chain(q), float(chain.reach.detach()))]
 
 
 def _check_weights(sample_weight: Numbers | None, q: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -9,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin.datasets._log_geometry import geometry_findings
-from hybridkin.datasets._log_report import SEVERITIES, LogFinding, LogReport, named_rows
+from hybridkin.datasets._log_report import MISREAD, SEVERITIES, LogFinding, LogReport, named_rows
+from hybridkin.datasets._log_residual import residual_findings
 from hybridkin.datasets._logs import Log
 
 _FROZEN_ROWS = 3  # fewer may be chance
@@ -31,19 +33,23 @@ def check_log(
 
     The check looks for NaN and infinite rows, a tip or an actuator sensor that is frozen while the
     rest moves, columns that never change, rows that occur twice, jumps of the tip, gaps in time and
-    times that run backwards, and too few motions to hold some out. With the nominal chain it also
-    looks for wrong units, a wrong sign of q and actuators numbered the other way round. Rows must
-    be in order of time.
+    times that run backwards, columns that hold the same, a tip that comes late or drifts, and too
+    few motions to hold some out. With a chain it also looks for wrong units, columns of q in
+    another order or of another sign, actuators numbered the other way round, axes of the tip that
+    are turned or left-handed, radii that are far off, and an offset or a drift of one actuator.
+    Rows must be in order of time.
 
     Parameters
     ----------
     log : Log
         As from `load_log`; of arrays ``Log(q, x, groups)``.
     chain : ConstantCurvatureChain or ElasticTendonChain, optional
-        Nominal kinematics. None: units, sign and numbering are not checked.
+        Nominal kinematics, or a calibrated chain (``calibrate(...).chain``), which tells orders of
+        the columns apart more sharply. None: units, order, signs and axes are not checked.
     base_is_free : bool, default=True
         Whether the pose of the base will be fitted. With tendons on a backbone that does not
-        stretch, a wrong sign of q then is a half turn of the base and cannot be seen.
+        stretch, a wrong sign of q then is a half turn of the base, which is named where the base
+        is turned by more than 120 degrees about its axis.
     drop_invalid : bool, default=True
         Whether the reader was asked to leave out invalid rows (a warning) or not (an error).
 
@@ -73,10 +79,12 @@ def check_log(
     findings = [*_invalid(log, valid, drop_invalid)]
     if valid.any():
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))
-        for check in (_frozen, _constant, _duplicates, _jumps, _times, _motions):
+        for check in (_frozen, _constant, _same, _duplicates, _jumps, _times, _motions):
             findings += check(rows)
-        if chain is not None:
-            findings += geometry_findings(rows.log, chain, base_is_free)
+        found = [] if chain is None else geometry_findings(rows.log, chain, base_is_free)
+        findings += found
+        if not any(f.kind in MISREAD for f in found):
+            findings += residual_findings(rows.log, chain, rows.same_motion())
         q, x = q[valid], x[valid]
     else:
         q, x = 0.0 * q[:1], 0.0 * x[:1]
@@ -222,6 +230,15 @@ def _constant(rows: _Rows) -> Iterator[LogFinding]:
             severity = "error" if len(flat) == len(columns) else "warning"
             message = f"{what}: {', '.join(flat)}."
             yield rows.finding("constant", severity, message, _CONSTANT_ADVICE[which])
+
+
+def _same(rows: _Rows) -> Iterator[LogFinding]:
+    columns = [*rows.columns("q"), *rows.columns("x")]
+    for (one, a), (other, b) in itertools.combinations(columns, 2):
+        if np.ptp(a) > 0 and (a == b).all():
+            message = f"columns {one!r} and {other!r} hold the same values in all rows."
+            advice = "check the names of the columns; two actuators that always agree are one."
+            yield rows.finding("same column", "warning", message, advice)
 
 
 def _duplicates(rows: _Rows) -> Iterator[LogFinding]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,11 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin._core.units import METRES
+from hybridkin.datasets._log_order import Way, base_turn, better_way, changes, misses
 from hybridkin.datasets._log_report import LogFinding
 from hybridkin.datasets._logs import Log
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
-_ROWS = 500  # enough to tell one robot from its mirror image
+_ROWS, _FEW = 500, 150  # enough to tell one robot from its mirror image; of many changes
 _CONVERT = (
     "set `spool_radius` (of motors) or `q_scale` (of pressures or steps: metres per unit) in [log] "
     "of the robot description"
@@ -26,7 +29,29 @@ _REACH, _USUAL_REACH = 5.0, 0.7
 _SMALL_SHARE = 0.04  # of the way that the model predicts
 _BEND, _USUAL_BEND, _SMALL_BEND = 15.0, 1.0, 0.02
 _LONG, _USUAL_LONG, _SHORT = 100.0, 3.0, 0.05
-_EXPLAINED, _FAR_BETTER = 0.7, 0.6
+_FAR_BETTER, _GOOD = 0.6, 0.55  # of the motion missed: another reading's over the declared one's
+_SEARCHED = 0.1  # of the tip's motion missed: other orders are tried
+_ENOUGH = 0.75  # of the variance explained
+_TWIST, _TILT = 120.0, 45.0  # [deg] of a base that is turned about its axis, and upright
+_BENDS = (0.25, 0.4, 0.5, 0.65, 1.5, 2.0, 2.5, 4.0)  # factors on all bends that are tried
+_SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # offsets, in standard deviations
+_SHIFTED = 0.87  # of the motion missed; clean logs of robots, simulated and real, stayed above 0.89
+_SIMPLE = 1.1  # an earlier change in the list is taken where it is about as good
+_ADVICE = {
+    "axes": "check order and signs of the columns of x, which must be right-handed, and [base] of "
+    'the description; or list "base" in `calibrate`.',
+    "size": "check `radius` of every [[segment]], half the diameter of the circle on which the "
+    'actuators lie, and the unit of q; or list "radii" in `calibrate`.',
+    "offset": "correct its zero, or list the zeros (`actuator_zeros` or `tendon_zeros`) in "
+    "`calibrate`.",
+    "drift": "look for a slipping spool or sensor; fit the parts of the log apart.",
+    "geometry": "check which columns are q and x, their order, the zero of each actuator, the "
+    "angles, the routing, the lengths and, where it is not fitted, [base].",
+    "whole": "subtract from each column its value at the straight robot; or, for chambers that "
+    "stretch, leave `length` out of every [[segment]].",
+    "changes": "if the log holds changes of length, add the length at rest to each, or, for a "
+    "robot with tendons on a backbone of fixed length, give `length` in every [[segment]].",
+}
 
 
 class _Robot:
@@ -45,10 +70,29 @@ class _Robot:
         with torch.no_grad():
             return self.chain(torch.from_numpy(np.ascontiguousarray(q, dtype=float))).cpu().numpy()
 
-    def renumbered(self, q: NDArray) -> NDArray:
-        """Return q of actuators counted the other way round, from the same first one."""
-        parts = np.split(q, self.ends, axis=1)
-        return np.hstack([np.hstack([part[:, :1], part[:, :0:-1]]) for part in parts])
+    def changed(self, q: NDArray) -> dict[tuple[str, float, float], NDArray]:
+        """Return rows q after each change of their values that is tried.
+
+        All bends by a factor, as radii that are off make them; an offset or a drift of one
+        actuator, in standard deviations.
+        """
+        found, rest, t = {}, np.zeros_like(q), np.linspace(0.0, 1.0, len(q))
+        if self.extensible:
+            parts = np.split(q, self.ends, axis=1)
+            rest = np.hstack([0.0 * part + part.mean(axis=1, keepdims=True) for part in parts])
+        for by in _BENDS:
+            found["size", by, 0.0] = rest + by * (q - rest)
+        for kind, way in (("offset", np.ones(len(q))), ("drift", t)):
+            for i, by in itertools.product(range(q.shape[1]), _SHIFTS):
+                shift = by * q[:, i].std() * way[:, None] * np.eye(q.shape[1])[i]
+                found[kind, i, by] = q + shift
+        return found
+
+    @property
+    def clockwise(self) -> bool:
+        """Whether the actuators of the first segment run clockwise."""
+        first = self.chain.angles[: self.chain.actuators_per_segment[0]].detach()
+        return bool(torch.sin(first[1] - first[0]) < 0)
 
 
 def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFinding]:
@@ -63,8 +107,9 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         message = f"the actuators of the robot are lengths, but q is in {log.file_units['q']}."
         yield LogFinding("units", "error", message, f"{_CONVERT}.")
         return
-    if robot.extensible and (q <= 0).any():
-        yield _not_lengths(q)
+    wrong = _kind_finding(log, robot)
+    if wrong is not None:
+        yield wrong
         return
     if robot.extensible:
         stroke = float(np.median(q)) / radii.mean()
@@ -114,86 +159,103 @@ def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
     )
 
 
-def _not_lengths(q: NDArray) -> LogFinding:
-    if (q < 0).all():
-        advice = "all are negative: set q_sign = 1."
-    else:
-        advice = (
-            "if the log holds changes of length, add the length at rest to each, or, for a robot "
-            "with tendons on a backbone of fixed length, give `length` in every [[segment]]."
-        )
-    message = (
-        "the robot is described with chambers, whose q are positive actuator lengths, but q goes "
-        f"down to {1e3 * q.min():.4g} mm."
-    )
-    return LogFinding("geometry", "error", message, advice)
+def _kind_finding(log: Log, robot: _Robot) -> LogFinding | None:
+    """Return a finding where q holds whole lengths for changes of length, or the reverse."""
+    low, high = log.q.min(axis=0), log.q.max(axis=0)
+    what, kind, advice = "tendons, whose q are changes of length", "geometry", _ADVICE["whole"]
+    if robot.extensible:
+        what, advice = "chambers, whose q are positive lengths", _ADVICE["changes"]
+        if ((low > 0) | (high < 0)).all():
+            kind, advice = "sign", _sign_advice(log, np.where(high < 0, -1, 1), _names(log))
+    if (low > 0).all() if robot.extensible else not (low > 0.1 * high).all():
+        return None
+    span = f"lies between {1e3 * low.min():.4g} and {1e3 * high.max():.4g} mm"
+    return LogFinding(kind, "error", f"the robot is described with {what}, but q {span}.", advice)
+
+
+def _names(log: Log) -> list[str]:
+    return [*(log.q_names or (f"q[{i}]" for i in range(log.q.shape[1])))]
+
+
+def _sign_advice(log: Log, sign: NDArray, names: list[str]) -> str:
+    """Return how to write a change of signs of the columns of those names."""
+    new = sign * np.asarray(log.q_sign)
+    if np.ptp(new) == 0:
+        return f"set q_sign = {new[0]} in [log] of the robot description, or --q-sign={new[0]}."
+    changed = ", ".join(repr(name) for name, s in zip(names, sign, strict=True) if s < 0)
+    return f"negate {changed} in the log, or read it by load_log with q_sign = {new.tolist()}."
 
 
 def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterator[LogFinding]:
-    q, flipped = log.q, (-np.asarray(log.q_sign)).tolist()
-    sign_advice = (
-        f"set q_sign = {flipped} in [log] of the robot description, or --q-sign={flipped}."
-    )
-    released = not robot.extensible and q.max() > 20 * max(-q.min(), 0.0) and q.max() > 0
-    if released:
+    chain, flipped = robot.chain, np.full(log.q.shape[1], -1)
+    flip = _sign_advice(log, flipped, _names(log))
+    if not robot.extensible and log.q.max() > 20 * max(-log.q.min(), 0.0):
         message = "the tendons are only ever lengthened; shortening must be negative."
-        yield LogFinding("sign", "warning", message, sign_advice)
-    rows = np.linspace(0, len(q) - 1, min(len(q), _ROWS)).astype(int)
-    spread = np.sqrt(((log.x[rows] - log.x[rows].mean(axis=0)) ** 2).sum(axis=1).mean())
-    if spread == 0 or len(rows) < 10:
+        yield LogFinding("sign", "warning", message, flip)
         return
-    ways = {"as declared": q[rows], "numbering": robot.renumbered(q[rows])}
-    if not robot.extensible:
-        ways |= {"sign": -q[rows], "sign and numbering": -ways["numbering"]}
-    missed = {
-        name: _missed(robot.tips(way), log.x[rows], base_is_free) / spread
-        for name, way in ways.items()
-    }
-    as_declared, best = missed["as declared"], min(missed, key=lambda name: missed[name])
-    # The simplest of those that are about as good.
-    best = next(name for name in missed if missed[name] < 1.1 * missed[best])
-    if missed[best] < _FAR_BETTER * as_declared and 1 - missed[best] ** 2 > _EXPLAINED:
-        compared = (
-            f"the nominal model explains {_share(as_declared)} of the tip's motion as declared, "
-            f"but {_share(missed[best])} "
-        )
-        if "sign" in best and not released:
-            other = " and the numbering" if "numbering" in best else ""
-            message = f"{compared}with the sign of q{other} flipped."
-            yield LogFinding("sign", "warning", message, sign_advice)
-        if "numbering" in best:
-            message = f"{compared}with the actuators numbered the other way round."
-            advice = (
-                "set clockwise = true in every [[segment]] (or negate angles_deg); check that the "
-                "axes of the tip are right-handed."
-            )
-            yield LogFinding("numbering", "warning", message, advice)
-    elif 1 - as_declared**2 < 0.3:
-        of_q, more = ("", "") if base_is_free else (" of q", " and [base]")
+    rows = np.linspace(0, len(log.q) - 1, min(len(log.q), _ROWS)).astype(int)
+    q, x = log.q[rows], log.x[rows]
+    if len(rows) < 10 or not np.ptp(x, axis=0).any():
+        return
+    missed = least = float(misses(chain, q[None], x, base_is_free)[0])
+    free, image = (float(misses(chain, q[None], x * [s, 1, 1], True)[0]) for s in (1.0, -1.0))
+    compared = f"the nominal model explains {_share(missed)} of the tip's motion as declared, but "
+    good, turned, way = min(_FAR_BETTER * missed, _GOOD), min(free, image), None
+    if missed > _SEARCHED:
+        way, least = better_way(chain, q, x, base_is_free)
+        reread = float(misses(chain, way.of(q)[None], x, True)[0])
+        if not base_is_free and turned < min(good, _FAR_BETTER * reread):
+            how = "turned, and one of them mirrored" if image < free else "turned"
+            message = f"{compared}{_share(turned)} with the axes of the tip {how}."
+            yield LogFinding("axes", "warning", message, _ADVICE["axes"])
+            return
+    few = slice(None, None, -(-len(q) // _FEW))
+    changed = robot.changed(q[few])
+    scores = misses(chain, np.stack([*changed.values()]), x[few], True)
+    kind, i, by = [*changed][int(np.argmax(scores < _SIMPLE * scores.min()))]
+    share = float(scores.min() / misses(chain, q[few][None], x[few], True)[0])
+    twist, tilt = base_turn(chain, q, x)
+    if way is not None and least < good and least < share * missed:
+        yield _way_finding(log, robot, way, f"{compared}{_share(least)} with ")
+    elif base_is_free and not robot.extensible and abs(twist) > _TWIST and tilt < _TILT:
         message = (
-            f"the nominal model explains only {_share(as_declared)} of the tip's motion, whatever "
-            f"the sign and the numbering{of_q}."
+            f"the base must be turned by {twist:.0f} degrees about its axis to fit the tips, but "
+            f"by {twist - np.copysign(180, twist):.0f} degrees with the sign of q flipped."
         )
-        advice = (
-            "check the order of the columns of q (segment by segment from the base), the angles, "
-            f"the routing, the lengths{more}."
+        mounted = "Or, if the robot is mounted so, give the turn in [base] (`base` of a chain)."
+        yield LogFinding("sign", "warning", message, f"{flip} {mounted}")
+    elif share < (_FAR_BETTER if kind == "size" else _SHIFTED):
+        name, far = _names(log)[int(i)], 1e3 * abs(by) * q.std(axis=0)[int(i)]
+        what = (
+            f"actuator {name!r} {'is off' if kind == 'offset' else 'drifts'} by about {far:.1g} mm"
         )
-        yield LogFinding("geometry", "warning", message, advice)
+        what = f"its bends are {i:g} times as large" if kind == "size" else what
+        message = f"the nominal model misses {100 * share:.0f} % as much of the motion if {what}."
+        yield LogFinding(kind, "warning", message, _ADVICE[kind])
+    elif 1 - missed**2 < _ENOUGH:
+        message = f"the nominal model explains only {_share(missed)} of the tip's motion, in any"
+        finding = f"{message} order and sign of q."
+        yield LogFinding("geometry", "warning", finding, _ADVICE["geometry"])
 
 
-def _missed(predicted: NDArray, x: NDArray, base_is_free: bool) -> float:
-    """Return the rms distance after the best shift and, of a free base, turn and scale.
-
-    References
-    ----------
-    Umeyama, IEEE PAMI 13 (1991): least squares over turns that are none of mirror images.
-    """
-    a, b = predicted - predicted.mean(axis=0), x - x.mean(axis=0)
-    if base_is_free:
-        u, s, vt = np.linalg.svd(b.T @ a)
-        flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-        a = a @ (u * flip @ vt).T * ((s * flip).sum() / max((a**2).sum(), np.finfo(float).tiny))
-    return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean()))
+def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding:
+    """Return a finding that names a better way to read the columns of q."""
+    names = [_names(log)[i] for i in way.order]
+    clockwise = next(changes(robot.chain.actuators_per_segment, False)).order
+    kind, what, advice = "sign", [], []
+    if names != _names(log) and way.order == clockwise:
+        kind, what = "numbering", ["the actuators numbered the other way round"]
+        counted = f"set clockwise = {str(not robot.clockwise).lower()} in every [[segment]]"
+        advice = [f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."]
+    elif names != _names(log):
+        kind, what = "order", [f"the columns of q in the order {', '.join(names)}"]
+        listed = f"set q = {json.dumps(names)} in [log] of the robot description."
+        advice = [listed if log.q_names else f"use q[:, {[*way.order]}]."]
+    if min(way.sign) < 0:
+        one = ", ".join(repr(n) for n, s in zip(names, way.sign, strict=True) if s < 0)
+        what.append(f"the sign of {'q' if max(way.sign) < 0 else one} flipped")
+        advice.append(_sign_advice(log, np.array(way.sign), names))
+    return LogFinding(kind, "warning", f"{compared}{' and '.join(what)}.", " ".join(advice))
 
 
 def _factor(ratio: float, usual: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SEVERITIES = ("error", "warning", "note")
+MISREAD = ("units", "order", "sign", "numbering", "axes", "size")
 _WIDTH, _ARROW = 96, " " * 11 + "-> "
 
 
@@ -21,7 +22,8 @@ class LogFinding:
     ----------
     kind : str
         "invalid", "frozen tip", "frozen actuator", "constant", "duplicates", "same command",
-        "jumps", "time", "motions", "rows", "units", "sign", "numbering" or "geometry".
+        "jumps", "time", "motions", "rows", "same column", "drift", "lag", "offset", "units",
+        "order", "sign", "numbering", "axes", "size" or "geometry".
     severity : {"error", "warning", "note"}
         "error": a fit would be worthless; "warning": look at it; "note": good to know.
     message : str
@@ -82,6 +84,11 @@ class LogReport:
     def warnings(self) -> tuple[LogFinding, ...]:
         """The findings to look at."""
         return tuple(f for f in self.findings if f.severity == "warning")
+
+    @property
+    def misread(self) -> tuple[LogFinding, ...]:
+        """The findings on how columns should be read: units, order, signs, axes, radii."""
+        return tuple(f for f in self.findings if f.kind in MISREAD)
 
     @property
     def ok(self) -> bool:

@@ -15,12 +15,13 @@ from sklearn.utils.validation import _check_sample_weight, check_is_fitted, vali
 from torch import Tensor, nn
 
 from hybridkin._core.model import as_forward_model
-from hybridkin._core.units import span_message
+from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
 from hybridkin.hybrid import _fit
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Part, Rows, Spec, calibrated, few_rows, fit_hybrid, residuals
+from hybridkin.hybrid._measured import check_finite, check_unscaled
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -192,7 +193,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ------
         ValueError
             For parameters out of their set, shapes that do not fit the mechanical model, data that
-            are not finite, and fewer than two different rows to learn from, three with `coverage`.
+            are not finite, or that a scaler has turned into numbers without a unit, and fewer than
+            two different rows to learn from, three with `coverage`.
 
         Warns
         -----
@@ -281,6 +283,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
             if not 0.0 < value <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
+        check_finite(X=X, y=y)
         X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES, reset=False)
         if self.play_ is not None:
             X, self._play_state = self.play_.apply(X, self._play_state)
@@ -289,6 +292,13 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         with torch.no_grad():
             error = residuals(self.mechanical_model_, q, y, self.output).reshape(len(y), -1)
             residual = error - self.module_.with_drift(None).error_part(q).numpy()
+        chain = self.mechanical_model_
+        if isinstance(chain, Chain):
+            tips = chain(q).detach()
+            both = torch.cat([tips, torch.from_numpy(y[:, :3])])
+            message = motion_message("y", both, tips, float(chain.reach))
+            if message is not None:
+                warnings.warn(message, stacklevel=2)
         self._drift = self._drift.learned(q.numpy(), residual, weights, decay)
         # What was handed out before stays as it was.
         self.module_ = self.module_.with_drift(self._drift.correction(alpha))
@@ -357,6 +367,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _checked_rows(self, X: Any, y: Any, weights: ArrayLike | None, groups: Any) -> Rows:
         """Return the measured rows, checked."""
+        check_finite(X=X, y=y)
         X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES)
         X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
         if groups is not None:
@@ -376,6 +387,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if mechanical is not None:
             mechanical = as_forward_model(mechanical)
         if isinstance(mechanical, Chain):
+            check_unscaled("X", rows.X, "actuator vectors [m or rad]")
+            check_unscaled("y", rows.tips, "tip positions [m]")
             mechanical.check_actuators(rows.q, "X")
             names = self.calibrate
             names = mechanical.default_parameters if isinstance(names, str) else tuple(names)
@@ -403,9 +416,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X = validate_data(self, X, dtype=_DTYPES, reset=False)
         q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
         chain = self.mechanical_model_
-        message = chain.contradiction(q, "X") if warn and isinstance(chain, Chain) else None
-        if message is not None:
-            warnings.warn(message, stacklevel=3)
+        if warn and isinstance(chain, Chain):
+            # Of the unit alone: lengths below zero are extrapolation.
+            units = chain.check_actuators(q.abs().clamp(min=1e-9), "X")
+            for message in (*units, chain.contradiction(q, "X")):
+                if message is not None:
+                    warnings.warn(message, stacklevel=3)
         with torch.no_grad():
             arrays = [part.numpy() for part in function(self.module_.rows(), q)]
         arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
@@ -419,5 +435,6 @@ def _messages(fitted: _fit.FittedHybrid, rows: Rows) -> tuple[str, ...]:
         return fitted.messages
     found = [*chain.check_actuators(rows.q, "X"), chain.contradiction(rows.q, "X")]
     if rows.y.ndim == 2:
-        found.append(span_message("y", torch.from_numpy(rows.y[:, :3]), float(chain.reach)))
+        tips = torch.from_numpy(rows.y[:, :3])
+        found.append(motion_message("y", tips, chain(rows.q), float(chain.reach)))
     return tuple(message for message in found if message is not None)

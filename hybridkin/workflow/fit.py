@@ -284,15 +284,16 @@ def fit_log(
     whole = checked(log, robot.chain, "base" in robot.calibrate)
     _check(whole, settings, force)
     data = whole.thinned(settings.max_rows)
+    rows = _Rows(data.q, data.x, data.motions, robot, settings)
+    result, messages = (None, []) if robot.chain is None else rows.calibrated(robot.chain)
+    messages += [] if result is None else whole.misread(result.chain)
+    for message in messages:
+        warnings.warn(message, stacklevel=2)
     compared = compare_by_group(data, robot, settings, n_jobs=n_jobs, progress=progress)
     savable = _SAVED_OF_DATA if robot.chain is None else _SAVED
     errors = {name: values.mean() for name, values in compared.errors.items() if name in savable}
     saved = min(errors, key=lambda name: (errors[name], name))
     progress(f"fitting {saved} to all motions", 0, 1)
-    rows = _Rows(data.q, data.x, data.motions, robot, settings)
-    result, messages = (None, []) if robot.chain is None else rows.calibrated(robot.chain)
-    for message in messages:
-        warnings.warn(message, stacklevel=2)
     mechanical = rows.mechanical() if result is None else result.chain
     model, chosen = _fit_saved(saved, rows, mechanical)
     progress(f"fitting {saved} to all motions", 1, 1)

@@ -81,6 +81,12 @@ class MeasuredLog(Log):
         if self.report.errors and not force:
             raise LogError(self.report)
 
+    def misread(self, calibrated: Chain) -> list[str]:
+        """Return what the calibrated chain says of the order and the signs of q, if it is new."""
+        known = {f.kind for f in self.report.misread}
+        found = check_log(self, chain=calibrated).misread
+        return [f"{f.message} {f.advice}" for f in found if f.kind not in known]
+
     def thinned(self, max_rows: int | None) -> MeasuredLog:
         """Return every k-th row, so that at most `max_rows` are left; None: all."""
         if max_rows is None or len(self.q) <= max_rows:

@@ -711,3 +711,16 @@ def test_only_chains_can_be_calibrated(rng):
     q = chambers(rng, 5)
     with pytest.raises(TypeError, match="another Chain, got Linear"):
         calibrate(torch.nn.Linear(9, 3), q, torch.zeros(5, 3))
+
+
+def test_columns_in_a_wrong_order_are_noticed_but_not_outliers(rng):
+    chain, q = nominal_tendon_robot(), tendons(rng)
+    with torch.no_grad():
+        x = chain(q)
+    shuffled = q[:, torch.randperm(q.shape[1], generator=rng)]
+    with pytest.warns(UserWarning, match=r"another order or sign.* datasets\.check_log") as issued:
+        calibrate(chain, shuffled, x, ("base",))
+    assert issued
+    spoiled = x.clone()
+    spoiled[: len(x) // 5] += 0.1
+    calibrate(chain, q, spoiled, ("base",), loss="cauchy")

@@ -637,7 +637,11 @@ def test_a_wrong_sign_is_told():
     finding = found(flipped, chain=CHAIN, base_is_free=False)["sign", "warning"]
     assert "set q_sign = -1" in finding.advice
     # A half turn of a free base makes up for it where all tendons are taut.
-    assert check_log(Log(**flipped), chain=CHAIN).findings == ()
+    turned = found(flipped, chain=CHAIN)["sign", "warning"]
+    assert "turned by" in turned.message
+    assert "set q_sign = -1" in turned.advice
+    mounted = CHAIN.with_geometry(base=torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]).double()))
+    assert check_log(Log(**flipped), chain=mounted).findings == ()
     released = {**log, "q": np.abs(log["q"])}
     assert "only ever lengthened" in found(released, chain=CHAIN)["sign", "warning"].message
 

@@ -432,3 +432,16 @@ def test_a_log_that_does_not_pass_its_check_stops_the_fit(log, tmp_path):
     with pytest.raises(ValueError, match="`play` requires `auto=True`"):
         workflow.fit_log(measured, description, tmp_path / "m", settings)
     assert not (tmp_path / "m").exists()
+
+
+def test_columns_in_a_wrong_order_are_named_by_the_calibrated_chain(log, tmp_path):
+    path, toml = log
+    robot = robots.read_description(toml)
+    q = ("l1", "l4", "l3", "l2", "l5", "l6")
+    log_format = replace(robot.log, q=q)
+    unchecked = workflow.read_log(path, log_format)
+    (message,) = unchecked.misread(robot.chain)
+    assert 'set q = ["l1", "l2", "l3", "l4", "l5", "l6"] in [log]' in message
+    checked = workflow.read_log(path, log_format, chain=robot.chain)
+    assert [f.kind for f in checked.report.misread] == ["order"]
+    assert checked.misread(robot.chain) == []

@@ -1,0 +1,35 @@
+"""Checks of measured rows before a fit: missing values, and values that were scaled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def check_finite(**arrays: ArrayLike) -> None:
+    """Raise where rows of numbers hold NaN or infinity."""
+    for name, values in arrays.items():
+        rows = np.asarray(values)
+        if rows.ndim not in (1, 2) or rows.dtype.kind != "f" or np.isfinite(rows).all():
+            continue
+        bad = ~np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+        raise ValueError(
+            f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(rows)} rows "
+            f"(first: row {bad.argmax()}); leave these rows out of `X` and `y` (np.isfinite finds "
+            "them), or read the log by datasets.load_log(..., drop_invalid=True)."
+        )
+
+
+def check_unscaled(name: str, values: NDArray, meant: str) -> None:
+    """Raise where a scaler has turned all columns (N, k) into numbers without a unit."""
+    if len(values) < 3:
+        return
+    low, high, mean, std = (f(values, axis=0) for f in (np.min, np.max, np.mean, np.std))
+    standard = np.abs([mean, std - 1.0]).max() < 1e-3
+    if standard or (np.isin(low, (0.0, -1.0)).all() and np.abs(high - 1.0).max() < 1e-6):
+        scaler = "StandardScaler" if standard else "MinMaxScaler"
+        raise ValueError(
+            f"`{name}` must hold {meant} for this mechanical model, but looks like the output of "
+            f"{scaler}; take it out of the pipeline. Error models scale their inputs themselves; "
+            "one that needs more can bring it: error_model=make_pipeline(StandardScaler(), ...)."
+        )
