@@ -94,7 +94,7 @@ def random_case(seed: int) -> Case:
     def build(radii: NDArray, lengths: NDArray, base: NDArray) -> Chain:
         given: dict[str, Any] = {"angles": angles, "routing": routing, "base": base}
         if kind == "elastic":
-            return ElasticTendonChain(radii, lengths, n_tendons=counts, **given)
+            return ElasticTendonChain(radii, lengths, n_actuators=counts, **given)
         given["n_actuators"] = counts
         return ConstantCurvatureChain(
             radii, lengths=None if kind == "extensible" else lengths, **given
@@ -303,8 +303,7 @@ def _rebuilt(case: Case, **changes: Any) -> Case:
         "base": chain.base,
         "lengths": chain.lengths,
     }
-    name = "n_tendons" if isinstance(chain, ElasticTendonChain) else "n_actuators"
-    given[name] = chain.actuators_per_segment
+    given["n_actuators"] = chain.actuators_per_segment
     return replace(case, chain=type(chain)(**{**given, **changes}))
 
 
@@ -312,14 +311,13 @@ def _segment_count(case: Case, rng: np.random.Generator) -> Case:
     more = [*range(len(case.chain.radii)), len(case.chain.radii) - 1]
     counts = [case.chain.actuators_per_segment[i] for i in more]
     angles = case.chain.angles.split(case.chain.actuators_per_segment)
-    name = "n_tendons" if isinstance(case.chain, ElasticTendonChain) else "n_actuators"
     lengths = case.chain.lengths
     return _rebuilt(
         case,
         radii=case.chain.radii[more],
         lengths=None if lengths is None else lengths[more],
         angles=[angles[i] for i in more],
-        **{name: counts},
+        n_actuators=counts,
     )
 
 

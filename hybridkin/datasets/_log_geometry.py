@@ -166,7 +166,7 @@ def _kind_finding(log: Log, robot: _Robot) -> LogFinding | None:
     if robot.extensible:
         what, advice = "chambers, whose q are positive lengths", _ADVICE["changes"]
         if ((low > 0) | (high < 0)).all():
-            kind, advice = "sign", _sign_advice(log, np.where(high < 0, -1, 1), _names(log))
+            kind, advice = "sign", _sign_advice(log, _signs(np.where(high < 0, -1, 1)))
     if (low > 0).all() if robot.extensible else not (low > 0.1 * high).all():
         return None
     span = f"lies between {1e3 * low.min():.4g} and {1e3 * high.max():.4g} mm"
@@ -177,18 +177,21 @@ def _names(log: Log) -> list[str]:
     return [*(log.q_names or (f"q[{i}]" for i in range(log.q.shape[1])))]
 
 
-def _sign_advice(log: Log, sign: NDArray, names: list[str]) -> str:
-    """Return how to write a change of signs of the columns of those names."""
-    new = sign * np.asarray(log.q_sign)
-    if np.ptp(new) == 0:
-        return f"set q_sign = {new[0]} in [log] of the robot description, or --q-sign={new[0]}."
-    changed = ", ".join(repr(name) for name, s in zip(names, sign, strict=True) if s < 0)
-    return f"negate {changed} in the log, or read it by load_log with q_sign = {new.tolist()}."
+def _signs(sign: NDArray) -> Way:
+    return Way((*range(len(sign)),), tuple(sign.tolist()))
+
+
+def _sign_advice(log: Log, way: Way) -> str:
+    """Return how to write the signs of a way of reading the columns."""
+    sign = np.array(way.sign) * np.broadcast_to(log.q_sign, len(way.sign))[list(way.order)]
+    value, option = (
+        (sign[0], f", or --q-sign={sign[0]}") if np.ptp(sign) == 0 else (sign.tolist(), "")
+    )
+    return f"set q_sign = {value} in [log] of the robot description{option}."
 
 
 def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterator[LogFinding]:
-    chain, flipped = robot.chain, np.full(log.q.shape[1], -1)
-    flip = _sign_advice(log, flipped, _names(log))
+    chain, flip = robot.chain, _sign_advice(log, _signs(np.full(log.q.shape[1], -1)))
     if not robot.extensible and log.q.max() > 20 * max(-log.q.min(), 0.0):
         message = "the tendons are only ever lengthened; shortening must be negative."
         yield LogFinding("sign", "warning", message, flip)
@@ -254,7 +257,7 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
     if min(way.sign) < 0:
         one = ", ".join(repr(n) for n, s in zip(names, way.sign, strict=True) if s < 0)
         what.append(f"the sign of {'q' if max(way.sign) < 0 else one} flipped")
-        advice.append(_sign_advice(log, np.array(way.sign), names))
+        advice.append(_sign_advice(log, way))
     return LogFinding(kind, "warning", f"{compared}{' and '.join(what)}.", " ".join(advice))
 
 

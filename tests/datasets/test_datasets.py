@@ -659,7 +659,7 @@ def test_a_model_that_explains_nothing_is_told():
     log = tendon_log()
     log["q"] = np.random.default_rng(1).permutation(log["q"])
     finding = found(log, chain=CHAIN)["geometry", "warning"]
-    assert "order of the columns" in finding.advice
+    assert "columns are q and x, their order" in finding.advice
 
 
 def test_check_says_what_it_needs():
