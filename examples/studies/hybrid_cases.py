@@ -89,7 +89,9 @@ def _errors(
     found = {"mean": float(errors.mean()), "max": float(errors.max()), "n_test": len(errors)}
     if model.coverage is not None:
         radius = model.predict(q, return_radius=True, groups=groups)[1]
-        found |= {"within": float((errors <= radius).mean()), "radius": float(radius.mean())}
+        known = np.isfinite(radius)  # elsewhere, outside the domain, no radius holds
+        found |= {"known": float(known.mean()), "radius": float(radius.min())}
+        found["within"] = float((errors <= radius)[known].mean()) if known.any() else np.nan
     return found
 
 

@@ -149,8 +149,8 @@ def held_out_motions(
     Parameters
     ----------
     coverage : float or None, default=0.9
-        Share of tips within the estimated error radius of "auto"; the result has the share found,
-        and the mean radius [m].
+        Share of tips within the estimated error radius of "auto"; the result has the share found
+        among the rows that have one.
     thin : int, default=2
         Step between training rows: the motions are slow.
     models, data_home, n_jobs, progress
@@ -159,8 +159,9 @@ def held_out_motions(
     Returns
     -------
     list of dict
-        One entry per case and model, as in `learning_curves`, its "errors" with "within", the share
-        of tips inside the radius, and "radius", its mean [m], where the model estimates one.
+        One entry per case and model, as in `learning_curves`. Where the model estimates a radius,
+        its "errors" have "radius" [m], "known", the share of rows with a radius, which lie in the
+        domain, and "within", the share of these whose tips are inside it.
     """
     return examine(motion_cases(data_home, coverage, thin), models, n_jobs, progress)
 
@@ -229,7 +230,7 @@ def hybrids_report(
 
 _CHOICES = (
     *("case", "draw", "model", "chosen", "cross-validated", "test"),
-    *("within the radius", "radius"),
+    *("in the domain", "of these within the radius", "radius"),
 )
 
 
@@ -237,14 +238,15 @@ def _choice(entry: dict[str, Any]) -> list[str]:
     errors = next(iter(entry["errors"].values()))
     numbers = [f"{1e3 * e:.2f}" for e in (entry["scores"][entry["chosen"]], errors["mean"])]
     if "within" in errors:
-        numbers += [f"{100 * errors['within']:.1f} %", f"{1e3 * errors['radius']:.1f}"]
+        numbers += [f"{100 * errors[key]:.1f} %" for key in ("known", "within")]
+        numbers.append(f"{1e3 * errors['radius']:.1f}")
     return [
         entry["case"],
         str(entry["draw"]),
         entry["model"],
         entry["chosen"],
         *numbers,
-        *["-"] * (4 - len(numbers)),
+        *["-"] * (5 - len(numbers)),
     ]
 
 

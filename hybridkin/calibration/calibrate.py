@@ -65,6 +65,9 @@ class CalibrationResult:
         Below 10 the prior decides.
     unidentified : tuple of str
         A sentence for each direction that the data do not identify, with advice.
+    unphysical : tuple of str
+        Parameters, as "lengths", of which a value ran into a bound or left what is physical. They
+        compensate for what the model does not describe, however well the data identify them.
     rmse : float
         Root mean square tip distance on the given data [m].
     cv_rmse : float or None
@@ -82,6 +85,7 @@ class CalibrationResult:
     identifiable: dict[str, NDArray]
     singular_values: NDArray
     unidentified: tuple[str, ...]
+    unphysical: tuple[str, ...]
     rmse: float
     cv_rmse: float | None
     converged: bool
@@ -242,13 +246,14 @@ def fit_geometry(
     best, message = _best(fits, guesses, bool({"angles", "turns"} & {*names}))
     if len(guesses) > 1:
         best = solve(best.problem, rows, best.theta, loss)
-    messages += [message, _few(best, rows), _unphysical(best), best.chain().contradiction(q)]
+    unphysical, left = _unphysical(best)
+    messages += [message, _few(best, rows), left, best.chain().contradiction(q)]
     if not any(messages[:-4]):  # of the units
         messages.append(_unexplained(best, rows))
     cv_rmse = None
     if groups is not None:
         cv_rmse = _cross_validate(best, rows, groups[first], loss)
-    result = _result(best, rows, cv_rmse, torch_given)
+    result = _result(best, rows, cv_rmse, unphysical, torch_given)
     return result, [message for message in messages if message is not None]
 
 
@@ -299,36 +304,37 @@ def _unexplained(fit: Fit, rows: Rows) -> str | None:
     )
 
 
-def _unphysical(fit: Fit) -> str | None:
-    """Return a warning where values ran into a bound or left what is physical."""
-    problem, theta = fit.problem, fit.theta
-    words = []
-    for label, at, low, high in zip(problem.labels, theta, problem.low, problem.high, strict=True):
-        if min(at - low, high - at) < 1e-6:
-            side = "lower" if at - low < high - at else "upper"
-            words.append(f"{label} ran into its {side} bound")
-    before = problem.chain.geometry()
-    for part, at in zip(problem.parameters, problem.parts(theta), strict=True):
-        for label, moved in zip(part.labels, at, strict=True):
-            if part.name in _MEASURED and abs(moved) > np.log(_UNPHYSICAL):
-                words.append(f"{label} went to {np.exp(moved):.2g} times its start")
+def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
+    """Return the parameters that ran into a bound or left what is physical, and a warning."""
+    problem, names, words = fit.problem, {}, []
+    pieces = map(problem.parts, (fit.theta, problem.low, problem.high))
+    for part, *values in zip(problem.parameters, *pieces, strict=True):
+        n = len(words)
+        for label, at, low, high in zip(part.labels, *values, strict=True):
+            if min(at - low, high - at) < 1e-6:
+                side = "lower" if at - low < high - at else "upper"
+                words.append(f"{label} ran into its {side} bound")
+            if part.name in _MEASURED and abs(at) > np.log(_UNPHYSICAL):
+                words.append(f"{label} went to {np.exp(at):.2g} times its start")
         if part.entry == "offsets":
-            offsets = fit.chain().geometry()["offsets"]
-            further = before["offsets"] - offsets > 1e-3 * part.units[0]
-            worse = further & (offsets < -0.02 * part.units[0])
+            before, after = (c.geometry()["offsets"] for c in (problem.chain, fit.chain()))
+            worse = (before - after > 1e-3 * part.units[0]) & (after < -0.02 * part.units[0])
             for k in worse.nonzero().flatten().tolist():
                 label = "tool" if part.name == "tool" else part.labels[k]
-                words.append(f"{label} became {1e3 * float(offsets[k]):.3g} mm")
+                words.append(f"{label} became {1e3 * float(after[k]):.3g} mm")
+        names[part.name] = len(words) > n
     if not words:
-        return None
-    return (
+        return (), None
+    return tuple(name for name, left in names.items() if left), (
         f"calibration left what is physical: {'; '.join(words)}. Check the units and the start, "
         "narrow the `prior`, or fit less; the robot may do what this model does not know (slack "
         "tendons, gravity, twist)."
     )
 
 
-def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> CalibrationResult:
+def _result(
+    fit: Fit, rows: Rows, cv_rmse: float | None, unphysical: tuple[str, ...], torch_given: bool
+) -> CalibrationResult:
     problem, chain = fit.problem, fit.chain()
     prior_std = problem.prior_std
     # By singular values in units of the prior: squares would lose the small ones to rounding.
@@ -359,6 +365,7 @@ def _result(fit: Fit, rows: Rows, cv_rmse: float | None, torch_given: bool) -> C
         identifiable=identifiable,
         singular_values=narrowed,
         unidentified=sentences(fit, unidentified, float(rows.weight.sum())),
+        unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
         converged=fit.converged,

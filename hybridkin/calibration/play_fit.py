@@ -27,7 +27,7 @@ class PlayFit:
     width : float
         Chosen play [m]; zero where none was kept.
     widths : ndarray of shape (W,)
-        Widths tried [m], ascending, the first zero.
+        Widths tried [m], ascending, the first zero; doubled ones where the largest was the best.
     cv_rmse : ndarray of shape (W,)
         Root mean square tip distance on held-out motions, with each width [m].
     gain : float
@@ -81,7 +81,8 @@ def fit_play(
     groups : array-like of shape (N,)
         Motion of every row; the play of each starts afresh.
     widths : sequence of float, default=(0, 0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3)
-        Total play to try, the same for all tendons [m]. Zero is always tried.
+        Total play to try, the same for all tendons [m]. Zero is always tried. While the largest
+        width is the best, twice that width is tried as well, up to the largest range of q.
     parameters : sequence of str, optional
         What to calibrate, see `calibrate`. Default: the chain's own list.
     **calibrate_options
@@ -115,12 +116,13 @@ def fit_play(
     >>> fit.kept, fit.width
     (True, 0.0004)
     """
-    tried = np.unique(np.concatenate([[0.0], np.asarray(widths, dtype=float).ravel()]))
+    tried = np.unique(np.concatenate([[0.0], np.asarray(widths, dtype=float).ravel()])).tolist()
     groups = np.asarray(groups)
     splits = motion_folds(groups)
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q, x = as_array(q), as_array(x)
-    effective = [PlayOperator(width).apply_by_group(q, groups) for width in tried]
+    sizes = [len(test) for _, test in splits]
+    effective, mean_squares = {}, {}  # by width
 
     def mean_square(y: NDArray, train: NDArray, test: NDArray) -> float:
         """Return the mean squared tip distance on the held-out motions."""
@@ -129,13 +131,20 @@ def fit_play(
             tips = result.chain(torch.as_tensor(y[test]).to(result.chain.base)).numpy()
         return float(((tips - x[test]) ** 2).sum(axis=1).mean())
 
-    mean_squares = np.array([[mean_square(y, *split) for split in splits] for y in effective])
-    sizes = [len(test) for _, test in splits]
-    cv_rmse = np.sqrt(np.average(mean_squares, axis=1, weights=sizes))
-    best = int(np.argmin(cv_rmse))
-    gains = np.sqrt(mean_squares[0]) - np.sqrt(mean_squares[best])
+    def error(width: float) -> float:
+        """Return the root mean square tip distance on held-out motions."""
+        if width not in mean_squares:
+            y = effective[width] = PlayOperator(width).apply_by_group(q, groups)
+            mean_squares[width] = np.array([mean_square(y, *split) for split in splits])
+        return float(np.sqrt(np.average(mean_squares[width], weights=sizes)))
+
+    widest = float(np.ptp(q, axis=0).max())
+    while 0.0 < (best := min(tried, key=error)) == tried[-1] < widest:
+        tried.append(min(2.0 * best, widest))
+    gains = np.sqrt(mean_squares[0.0]) - np.sqrt(mean_squares[best])
     gain, std_error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(splits)))
-    kept = best > 0 and gain > std_error
-    chosen = best if kept else 0
-    result = calibrate(chain, effective[chosen], x, names, **calibrate_options)
-    return PlayFit(float(tried[chosen]), tried, cv_rmse, gain, std_error, kept, result)
+    kept = best > 0.0 and gain > std_error
+    width = best if kept else 0.0
+    result = calibrate(chain, effective[width], x, names, **calibrate_options)
+    cv_rmse = np.array([error(width) for width in tried])
+    return PlayFit(width, np.array(tried), cv_rmse, gain, std_error, kept, result)

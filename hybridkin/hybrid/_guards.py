@@ -101,7 +101,8 @@ class LeverageGuard(Guard):
     Parameters
     ----------
     model : LeverageModule
-        Gives the leverage: the error model itself, or a `QuadraticLeverage`.
+        Gives the leverage: the error model itself where it is a network at the tip, else a
+        `QuadraticLeverage`, which does not know the features of the error model.
     limit : Tensor of shape ()
         The leverage at distance 1.
     largest : Tensor of shape ()

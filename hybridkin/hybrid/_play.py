@@ -14,7 +14,7 @@ from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._fit import Rows, Spec, calibrated, residuals
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
-_WIDTHS = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # over the stroke of an actuator
+_LEAST = 0.0025  # of the stroke: the first width tried
 _CLOSE = 0.02  # to the best width
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
 
@@ -35,9 +35,16 @@ def play_of(
     """
     if play is None:
         return None, []
+    ranges = np.ptp(rows.X, axis=0)
     if isinstance(play, str):
-        return choose_play(calibrated(spec, rows), rows), []
-    operator, ranges = PlayOperator(play), np.ptp(rows.X, axis=0)
+        found = choose_play(calibrated(spec, rows), rows)
+        if found is None or found.width < 0.95 * ranges.max():
+            return found, []
+        return found, [
+            f"`play`='auto' found backlash of {found.width:.3g}, as wide as the range of `X`: the "
+            "log gives no upper limit. Record larger motions, or give the width as `play`."
+        ]
+    operator = PlayOperator(play)
     if not np.any(operator.width >= ranges):
         return operator, []
     return operator, [
@@ -49,8 +56,8 @@ def play_of(
 def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     """Return the play with the least held-out error of an ELM; None where none helps.
 
-    As in `fit_play`, it is kept only where it lowers the error of a motion by more than the
-    standard error of that over the motions.
+    Widths up to the range of the actuators are tried. As in `fit_play`, the best is kept only where
+    it lowers the error of a motion by more than the standard error of that over the motions.
 
     Parameters
     ----------
@@ -62,9 +69,12 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     X, y, weights, groups = rows
     motions = np.zeros(len(X)) if groups is None else groups
     strokes = np.subtract(*np.percentile(X, (95, 5), axis=0))
-    widths = [0.0, *(share * float(np.median(strokes)) for share in _WIDTHS)]
-    # A motion is one sample: its rows err alike. Without motions stretches of the log serve.
-    parts = np.arange(len(X)) * 10 // len(X) if groups is None else motions
+    least = _LEAST * float(np.median(strokes[strokes > 0.0])) if strokes.any() else 0.0
+    # The error may have several minima over the width, so widths of all sizes are tried.
+    doubled, widest = least * 2.0 ** np.arange(20), float(np.ptp(X, axis=0).max())
+    widths = [0.0, *doubled[(doubled > 0.0) & (doubled < widest)].tolist(), widest]
+    # A motion is one sample: its rows err alike. Where there is one only, stretches of it serve.
+    parts = motions if len(np.unique(motions)) > 1 else np.arange(len(X)) * 10 // len(X)
     counted = rows.counts > 0
     names = np.unique(parts[counted])
 
@@ -84,7 +94,11 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
 
     best = min(widths, key=mean_error)
     if best > 0.0:
-        found = minimize_scalar(mean_error, (best / 2.0, best, best * 2.0), tol=_CLOSE)
+        at = widths.index(best)
+        bounds = widths[at - 1], widths[min(at + 1, len(widths) - 1)]
+        found = minimize_scalar(
+            mean_error, bounds=bounds, method="bounded", options={"xatol": _CLOSE * best}
+        )
         best = min(best, float(found.x), key=mean_error)
     gains = error_by_motion(0.0) - error_by_motion(best)
     kept = best > 0.0 and gains.mean() > gains.std(ddof=1) / np.sqrt(len(names))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil, floor, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -14,67 +15,80 @@ from hybridkin.hybrid._kernel import distance
 from hybridkin.hybrid._selection import choose_mechanics, select
 
 _FOLDS = 5
+_ROUNDING = 1e-9  # of shares
 
 
 class Radius(NamedTuple):
-    """Radii about a predicted tip [m]: where the error model is trusted, and where it is not."""
+    """Radius about a predicted tip [m]; infinite where no radius holds."""
 
-    inside: float
-    outside: float
-    coverage: float  # the share of held-out tips within
+    inside: float  # the domain of the error model; infinite: too few groups for the coverage
+    outside: float  # infinite: the log says nothing of errors outside the domain
+    coverage: float  # share of held-out tips within the radius
     n_rows: int
 
-    def at(self, weight: NDArray) -> NDArray:
-        """Return the radius (N,) at weights (N,) of the error model."""
-        return weight * self.inside + (1.0 - weight) * self.outside
+    def at(self, in_domain: NDArray) -> NDArray:
+        """Return the radius (N,) of rows inside or outside the domain (N,)."""
+        return np.where(in_domain, self.inside, self.outside)
+
+    @property
+    def least_groups(self) -> int:
+        """The least number of groups with which the radius is finite."""
+        return ceil(self.coverage / (1.0 - self.coverage) - _ROUNDING)
 
 
-def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> Radius:
-    """Return the radius that covers a share `coverage` of held-out tips.
+def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, str | None]:
+    """Return the radius that covers a share `coverage` of held-out tips, and a warning about it.
 
-    Whole groups are held out, five times, and everything is fitted anew without them, calibration
-    included. The errors, over the rms of errors of their kind (of the hybrid where its error model
-    is trusted, of the mechanical model outside), give the quantile.
+    Whole groups are held out, in five folds, and everything is fitted anew without them,
+    calibration included. Without groups every row is one. The errors inside the domain of these
+    fits give the radius.
 
     References
     ----------
-    Papadopoulos et al., ECML (2002), normalised inductive conformal prediction; Vovk, Annals of
-    Mathematics and AI 74 (2015), its pooling over folds.
+    Lee, Barber & Willett, Distribution-free inference with hierarchical data (2023), the rank by
+    groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
-    given, (rows, place) = rows, rows.distinct()
-    X, y, groups, weights = rows.X, rows.tips, rows.groups, rows.counts
-    n_folds = min(_FOLDS, len(y) if groups is None else len(np.unique(groups)))
+    given = rows.take(rows.counts > 0)
+    rows, place = given.distinct()
+    X, y = rows.X, rows.tips
+    groups = np.arange(len(y)) if rows.groups is None else rows.groups
+    n_folds = min(_FOLDS, len(np.unique(groups)))
     if n_folds < 2:
         raise ValueError(
             "`coverage` needs at least two groups, so that one can be held out, got one; leave "
             "`groups` out to hold out single rows, or fit with coverage=None."
         )
-    splitter = KFold(n_folds, shuffle=True, random_state=0) if groups is None else None
-    trust, errors, mechanical = (np.full(len(y), np.nan) for _ in range(3))
-    for train, test in (splitter or GroupKFold(n_folds)).split(X, y, groups):
+    splitter = KFold(n_folds, shuffle=True, random_state=0) if rows.groups is None else None
+    inside, errors = np.zeros(len(y), dtype=bool), np.full(len(y), np.nan)
+    for train, test in (splitter or GroupKFold(n_folds)).split(X, y, rows.groups):
         part = given.take(np.isin(place, train))
         chosen = spec if spec.parts else select(choose_mechanics(spec, part), part)[0]
         module = fit_hybrid(chosen, part).module
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():
-            trust[test] = module.error_weight(q).numpy()
+            inside[test] = module.in_domain(q).numpy()
             errors[test] = distance(module(q).numpy(), y[test])
-            mechanical[test] = distance(module.mechanical_part(q).numpy(), y[test])
-    trusted = weights * (trust >= 0.5)
-    inside = _rms(errors, trusted if trusted.any() else weights)
-    outside = inside if spec.mechanical is None else max(inside, _rms(mechanical, weights))
-    relative = errors / (trust * inside + (1.0 - trust) * outside)
-    factor = _quantile(relative, weights, coverage)
-    return Radius(factor * inside, factor * outside, coverage, len(y))
+    names, of = np.unique(groups[inside], return_inverse=True)
+    radius = _quantile(errors[inside], of, rows.counts[inside], coverage)
+    found, n = Radius(radius, inf, coverage, len(y)), len(names)
+    if found.inside < inf:
+        return found, None
+    return found, (
+        f"`coverage` {coverage:g} needs at least {found.least_groups} "
+        f"{'rows' if rows.groups is None else 'groups'} inside the domain of the error model when "
+        f"they are held out, got {n}: the radius is infinite. Record more motions, or ask for a "
+        f"`coverage` of at most {floor(1000 * n / (n + 1) + _ROUNDING) / 1000:g}."
+    )
 
 
-def _rms(values: NDArray, weights: NDArray) -> float:
-    return float(np.sqrt(np.average(values**2, weights=weights)))
+def _quantile(values: NDArray, groups: NDArray, weights: NDArray, coverage: float) -> float:
+    """Return the smallest value that covers the share; infinity where no value does.
 
-
-def _quantile(values: NDArray, weights: NDArray, coverage: float) -> float:
-    """Return the smallest value that covers the share, with one more row counted as not covered."""
+    Each of the K groups (N,), numbered from 0, has the mass 1 / (K + 1), divided among its values
+    (N,) by their weights (N,). The rest belongs to a new group, whose errors are not known.
+    """
+    totals = np.bincount(groups, weights)
     order = np.argsort(values)
-    reached = np.cumsum(weights[order])
-    wanted = coverage * (reached[-1] + 1.0)
-    return float(values[order][min(np.searchsorted(reached, wanted), len(values) - 1)])
+    reached = np.cumsum((weights / totals[groups])[order]) / (len(totals) + 1)
+    first = int(np.searchsorted(reached, coverage - _ROUNDING))
+    return float(values[order][first]) if first < len(values) else inf

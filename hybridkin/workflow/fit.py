@@ -33,6 +33,7 @@ from hybridkin.workflow._fit_report import (
     write_calibration,
     write_check,
     write_comparison,
+    write_model,
 )
 from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.report import (
@@ -301,9 +302,7 @@ def fit_log(
     report.record.update(n=len(data.q), saved=saved, chosen=chosen)
     _write_log(report, whole, robot, settings)
     _write_choice(report, compared, data)
-    if saved == AUTO:
-        report.record["auto"] = auto_entry(model)
-        report.text(" ".join(report.record["auto"]["words"]))
+    write_model(report, model)
     if robot.chain is not None and result is not None:
         write_calibration(report, robot.chain, result, messages)
         _write_elastic_calibration(report, robot.chain, model)

@@ -41,12 +41,14 @@ _COLUMNS = {  # of tables of errors: heading, factor, format
     "p95": ("95 %", 1e3, ".2f"),
     "max": ("max", 1e3, ".2f"),
     "std_folds": ("std over folds", 1e3, ".2f"),
+    "std_error": ("std error (motions)", 1e3, ".2f"),
     "share_in_domain": ("in domain [%]", 100, ".0f"),
     "share_in_radius": ("in radius [%]", 100, ".0f"),
 }
 
 IDENTIFIED = 10.0
-"""The data identify a parameter whose prior they narrow at least so many times."""
+"""The data identify a parameter whose prior they narrow at least so many times, and that stays
+physical with the others of its kind."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
@@ -67,9 +69,20 @@ def distance(a: NDArray, b: NDArray) -> NDArray:
     return np.linalg.norm(a - b, axis=-1)
 
 
-def statistics(errors: NDArray) -> dict[str, Any]:
-    """Return mean, standard deviation, median, 95 % quantile and maximum of errors (N,)."""
+def statistics(errors: NDArray, motions: NDArray | None = None) -> dict[str, Any]:
+    """Return mean, standard deviation, median, 95 % quantile and maximum of errors (N,).
+
+    With the motion of every row (N,) also "std_error", the standard error of the mean over
+    motions: the rows of a motion err alike.
+
+    References
+    ----------
+    Cochran, Sampling Techniques (1977), chapter 9A: clusters of unequal sizes.
+    """
     spread = {"mean": errors.mean(), "std": errors.std(), "median": np.median(errors)}
+    if motions is not None:
+        sums = np.bincount(np.unique(motions, return_inverse=True)[1], errors - errors.mean())
+        spread["std_error"] = np.sqrt(len(sums) * (sums @ sums) / (len(sums) - 1)) / len(errors)
     return {**spread, "p95": np.percentile(errors, 95), "max": errors.max()}
 
 
@@ -85,7 +98,8 @@ def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, 
     -------
     list of dict
         "name"; "unit", "mm", "deg", "mm²/rad²" or "-"; "start", "value" and "std_error" in that
-        unit, of the base its turn from the start and its position; "narrowing" and "identified".
+        unit, of the base its turn from the start and its position; "narrowing", "physical" and
+        "identified".
     """
     entries = []
     labels, narrowing = iter(result.names), iter(result.narrowing.tolist())
@@ -101,7 +115,8 @@ def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, 
             entry: dict[str, Any] = {"name": next(labels), "unit": unit}
             entry["start"], entry["value"], entry["std_error"] = np.multiply(scale, numbers)
             entry["narrowing"] = next(narrowing)
-            entry["identified"] = entry["narrowing"] >= IDENTIFIED
+            entry["physical"] = name not in result.unphysical
+            entry["identified"] = entry["physical"] and entry["narrowing"] >= IDENTIFIED
             entries.append(entry)
     return entries
 
@@ -153,7 +168,7 @@ class Report:
         rows = []
         for name, entry in record.items():
             values = [factor * entry[key] for key, factor in zip(columns, factors, strict=True)]
-            rows.append([name, *map(format, values, formats)])
+            rows.append([name, *(c.replace("nan", "-") for c in map(format, values, formats))])
         self.table(["tip error [mm]", *titles], rows)
 
     def geometry(self, entries: Sequence[dict[str, Any]]) -> None:
@@ -162,7 +177,7 @@ class Report:
         rows = []
         for entry in entries:
             numbers = (f"{entry[key]:.2f}" for key in ("start", "value", "std_error"))
-            answer = "yes" if entry["identified"] else "no"
+            answer = "yes" if entry["identified"] else "no" if entry["physical"] else "not physical"
             label, narrowing = f"{entry['name']} [{entry['unit']}]", f"{entry['narrowing']:.3g}"
             rows.append([label, *numbers, narrowing, answer])
         self.table([*header, "identified"], rows)

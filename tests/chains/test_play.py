@@ -193,6 +193,25 @@ def test_play_in_a_log_is_found():
 
 
 @pytest.mark.slow
+def test_widths_are_doubled_while_the_largest_is_the_best():
+    truth, q, x, groups = log_of(1.6e-3, 1e-4)
+    fit = fit_play(truth, q, x, groups, parameters=("radii",))
+    assert fit.kept
+    assert fit.width == 1.6e-3
+    close(fit.widths[-4:], np.array([0.4e-3, 0.8e-3, 1.6e-3, 3.2e-3]))
+    assert fit.cv_rmse.shape == fit.widths.shape
+
+
+@pytest.mark.slow
+def test_no_width_is_wider_than_the_range():
+    truth, q, x, groups = log_of(0.01, 1e-4)
+    with pytest.warns(UserWarning, match="calibration left what is physical"):
+        fit = fit_play(truth, q, x, groups, (3e-3,), ("radii",))
+    close(fit.widths, np.array([0.0, 3e-3, 6e-3, np.ptp(q, axis=0).max()]))
+    assert fit.width == fit.widths[-1]
+
+
+@pytest.mark.slow
 def test_no_play_is_kept_where_there_is_none():
     truth, q, x, groups = log_of(0.0, 1e-3)
     fit = fit_play(truth, q, x, groups, (0.1e-3, 0.4e-3), ("radii",), loss="soft_l1")

@@ -155,7 +155,7 @@ def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
     assert "hybrid, auto" not in record["held_out"]
     assert record["saved"] == "hybrid, ELM"
     _, record = document(capsys, "evaluate", out, log)
-    assert record["coverage_asked"] == 0.9
+    assert record["radius"]["coverage"] == 0.9
     assert 0.85 < record["all"]["share_in_radius"] <= 1
     code, printed, _ = run(capsys, "describe", out)
     assert "radius for 90 % of the tips" in printed

@@ -74,6 +74,46 @@ def test_no_play_is_found_where_there_is_none(log):
     assert model.play_ is None
 
 
+def log_with(share, motions=8, rows=20):
+    """Return a log of the trunk whose play is a share of the stroke, its groups and the width."""
+    rng = np.random.default_rng(1)
+    time = np.linspace(0.0, 2.0 * np.pi, rows)
+    swing = rng.uniform(-0.05, 0.05, (motions, 9, 2))
+    waves = np.stack([np.sin(time), np.sin(2.0 * time)])
+    q = 0.25 + (swing @ waves).transpose(0, 2, 1).reshape(-1, 9)
+    groups = np.repeat(np.arange(motions), rows)
+    width = share * np.median(np.subtract(*np.percentile(q, (95, 5), axis=0)))
+    y = PlayOperator(width).apply_by_group(q, groups)
+    return q, tips(y) + 2e-4 * rng.standard_normal((len(q), 3)), groups, width
+
+
+def play_found(q, x, groups):
+    model = HybridForwardModel(CHAIN, "drop", play="auto").fit(q, x, groups=groups)
+    return 0.0 if model.play_ is None else model.play_.width
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.28, 0.37, 0.56, 1.3])
+def test_any_width_up_to_the_range_is_found(share):
+    q, x, groups, width = log_with(share)
+    assert play_found(q, x, groups) == pytest.approx(width, rel=0.05, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_play_of_the_whole_range_warns():
+    q, x, groups, _ = log_with(2.0)  # only the first row of each motion has an effect
+    with pytest.warns(UserWarning, match="`play`='auto' found backlash of .* no upper limit"):
+        assert play_found(q, x, groups) > 0.95 * np.ptp(q, axis=0).max()
+
+
+@pytest.mark.slow
+def test_play_of_a_log_without_several_motions():
+    q, x, _, _ = log_with(0.3, 1, 160)
+    width = 0.3 * np.median(np.subtract(*np.percentile(q, (95, 5), axis=0)))
+    for groups in (None, np.zeros(len(q))):
+        assert play_found(q, x, groups) == pytest.approx(width, rel=0.05)
+
+
 @pytest.mark.slow
 def test_commands_for_a_path(log):
     q, x, groups = log

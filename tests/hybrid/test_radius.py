@@ -1,14 +1,24 @@
-"""The radius about a predicted tip: it covers new motions as promised, and widens outside."""
+"""The radius about a predicted tip: it covers new motions like the known ones, or is infinite."""
+
+import json
 
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.linear_model import Ridge
 from sklearn.model_selection import GroupShuffleSplit
 
-from hybridkin import HybridForwardModel, load_model, robots, save_model
+from hybridkin import (
+    ConstantCurvatureChain,
+    HybridForwardModel,
+    load_model,
+    robots,
+    save_model,
+    workflow,
+)
 from hybridkin.hybrid._radius import _quantile
+from hybridkin.workflow.report import json_text
 
 
 def motions(seed, n_motions=240, n=6, noise=2e-3):
@@ -48,7 +58,7 @@ def test_unseen_motions_are_covered(coverage, error_model):
     assert abs(np.mean(covered) - coverage) < 0.05
 
 
-def test_wider_outside_the_domain_and_monotone_in_coverage():
+def test_infinite_outside_the_domain_and_monotone_in_coverage():
     q, x, motion = motions(0)
     narrow, wide = (
         HybridForwardModel(
@@ -56,21 +66,72 @@ def test_wider_outside_the_domain_and_monotone_in_coverage():
         ).fit(q, x, groups=motion)
         for coverage in (0.5, 0.95)
     )
-    assert narrow.radius_.inside < wide.radius_.inside
-    far = q + 0.2
-    _, inside = wide.predict(q, return_radius=True)
-    _, outside = wide.predict(far, return_radius=True)
-    assert_allclose(inside, wide.radius_.inside)
-    assert outside.min() > 1.5 * inside.max()
-    assert outside.max() <= wide.radius_.outside
+    assert narrow.radius_.inside < wide.radius_.inside < np.inf
+    rows = np.concatenate([q, q + 0.2])
+    _, radius = wide.predict(rows, return_radius=True)
+    inside = wide.in_domain(rows)
+    assert inside[: len(q)].all()
+    assert not inside[len(q) :].any()
+    assert_array_equal(radius, np.where(inside, wide.radius_.inside, np.inf))
+
+
+def few(n, coverage, groups=True, error_model="drop"):
+    """Return a fit to few motions, its warnings, and its rows."""
+    q, x, motion = motions(0, n, 4)
+    model = HybridForwardModel(robots.bionic_handling_assistant(), error_model, coverage=coverage)
+    return model, model.fit_with_messages(q, x, groups=motion if groups else None), q
+
+
+@pytest.mark.parametrize(("n", "finite"), [(8, False), (9, True)])
+def test_as_many_groups_as_the_coverage_needs(n, finite):
+    model, messages, q = few(n, 0.9)
+    assert np.isfinite(model.radius_.inside) == finite
+    assert np.isfinite(model.predict(q, return_radius=True)[1]).all() == finite
+    found = [message for message in messages if "`coverage` 0.9 needs at least 9 groups" in message]
+    assert len(found) == (not finite)
+    if not finite:
+        assert "got 8: the radius is infinite." in found[0]
+        assert found[0].endswith("or ask for a `coverage` of at most 0.888.")
+
+
+def test_rows_without_groups_count_one_by_one():
+    model, messages, _ = few(3, 0.99, groups=False)
+    assert model.radius_.inside == np.inf
+    assert "needs at least 99 rows inside the domain" in messages[-1]
+    assert "got 12: " in messages[-1]
+    model, messages, _ = few(3, 12 / 13, groups=False)
+    assert np.isfinite(model.radius_.inside)
+    assert not messages
+
+
+def test_the_scale_of_the_weights_has_no_influence():
+    q, x, motion = motions(0, 20)
+    weights = np.random.default_rng(0).integers(0, 4, len(q)).astype(float)
+    radii = []
+    for scale in (0.01, 1.0, 100.0):
+        model = HybridForwardModel(robots.bionic_handling_assistant(), "drop", coverage=0.8)
+        radii.append(model.fit(q, x, scale * weights, groups=motion).radius_.inside)
+    assert_allclose(radii, radii[1], rtol=1e-12)
+
+
+def test_every_group_has_the_same_mass():
+    values, groups = np.array([1.0, 2.0, 3.0, 5.0, 4.0, 6.0]), np.array([0, 0, 0, 0, 1, 2])
+    ones = np.ones(6)
+    # Masses: 1/16 for each value of the first group, 1/4 for 4 and for 6.
+    assert _quantile(values, groups, ones, 3 / 16) == 3.0
+    assert _quantile(values, groups, ones, 7 / 16) == 4.0
+    assert _quantile(values, groups, ones, 0.5) == 5.0
+    assert _quantile(values, groups, ones, 0.75) == 6.0
+    assert _quantile(values, groups, ones, 0.76) == np.inf
 
 
 def test_weights_are_repetitions():
     values = np.array([3.0, 1.0, 2.0, 5.0, 4.0])
-    counts = np.array([2, 1, 3, 1, 4])
-    for coverage in (0.1, 0.5, 0.8, 0.99):
-        repeated = _quantile(np.repeat(values, counts), np.ones(counts.sum()), coverage)
-        assert _quantile(values, counts.astype(float), coverage) == repeated
+    groups, counts = np.array([0, 1, 0, 1, 1]), np.array([2, 1, 3, 1, 4])
+    for coverage in (0.1, 0.3, 0.5, 0.6, 0.9):
+        repeated = [np.repeat(part, counts) for part in (values, groups)]
+        one_by_one = _quantile(*repeated, np.ones(counts.sum()), coverage)
+        assert _quantile(values, groups, counts.astype(float), coverage) == one_by_one
 
 
 def test_one_dimensional_targets_and_no_mechanical_model():
@@ -90,6 +151,45 @@ def test_it_is_saved(tmp_path):
     assert back.radius_ == model.radius_
     assert back.coverage == 0.8
     assert_allclose(back.predict(q, True)[1], model.predict(q, True)[1])
+
+
+def test_an_infinite_radius_is_saved_and_described(tmp_path):
+    model, _, _ = few(8, 0.9)
+    save_model(model, tmp_path / "model.safetensors")
+    assert load_model(tmp_path / "model.safetensors").radius_ == model.radius_
+    report = workflow.describe(workflow.open_model(tmp_path / "model.safetensors"))
+    assert "radius for 90 % of the tips: not known" in report.plain()
+    assert "at least 9" in " ".join(report.plain().split())
+    assert json.loads(json_text(report.record))["radius"]["inside"] is None
+
+
+def test_a_damaged_radius_is_refused(tmp_path):
+    model, _, _ = few(9, 0.9)
+    model.radius_ = model.radius_._replace(inside=np.nan)
+    save_model(model, tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match="`radius` must hold"):
+        load_model(tmp_path / "model.safetensors")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n_motions", "n"), [(40, 1), (12, 5)], ids=["rows", "few motions"])
+def test_coverage_over_many_logs(n_motions, n):
+    """The mean over logs is at least the coverage, but for the error of 30 of them."""
+    chain, covered = ConstantCurvatureChain([0.05]), []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        motion = np.repeat(np.arange(n_motions + 100), n)
+        q = 0.25 + 0.05 * rng.uniform(-1, 1, (len(motion), 3))
+        x = chain(torch.from_numpy(q)).numpy() + 0.02 * np.sin(15 * q)
+        x = x + 2e-3 * rng.standard_normal((motion[-1] + 1, 3))[motion]
+        old = motion < n_motions
+        model = HybridForwardModel(chain, Ridge(1e-3), coverage=0.9)
+        model.fit(q[old], x[old], groups=motion[old])
+        tips, radius = model.predict(q[~old], return_radius=True)
+        known = np.isfinite(radius)
+        covered.append(np.mean((np.linalg.norm(tips - x[~old], axis=1) <= radius)[known]))
+    assert np.mean(covered) > 0.9 - 2.0 * np.std(covered) / np.sqrt(30)
+    assert np.mean(covered) < 0.97
 
 
 def test_clear_errors():

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
+from sklearn.utils import Bunch
 
-from hybridkin import datasets, paper
+from hybridkin import HybridForwardModel, datasets, paper, robots
+from hybridkin.paper import tables, tracks
 from hybridkin.paper.identifiability import ASKED, IDENTIFIABLE, identifiability
 from hybridkin.paper.tables import summary
 
@@ -28,6 +30,30 @@ def test_table1_orders_the_models_as_the_paper_does():
     assert mechanical > 1.8 * test["hybrid on nominal", "ELM"]
     assert train["data-driven", "ELM"] < test["data-driven", "ELM"]
     assert test["hybrid on calibrated", "ELM"] < test["mechanical, calibrated", "-"]
+
+
+@pytest.mark.slow
+def test_the_hybrids_of_the_paper_have_no_guard(monkeypatch):
+    fitted, fit = [], HybridForwardModel.fit
+    monkeypatch.setattr(
+        HybridForwardModel, "fit", lambda model, q, x: fit(fitted.append(model) or model, q, x)
+    )
+    chain = robots.bionic_handling_assistant()
+    for module in (tables, tracks):
+        monkeypatch.setattr(
+            module, "chains_of", lambda q, x: {"nominal": chain, "calibrated": chain}
+        )
+    data = datasets.load_trunk()
+    rows = np.flatnonzero(data.part == 3)[::4]
+    few = Bunch(q=data.q[rows], x=data.x[rows], part=data.part[rows])
+    paper.table1(few, n_splits=1, n_seeds=1, n_jobs=1)
+    hybrids = [m for m in fitted if m.mechanical_model is not None and m.error_model != "drop"]
+    assert len(hybrids) == 6
+    assert {model.guard for model in hybrids} == {None}
+    models = tracks.tracked_models(few.q, few.x)
+    guards = {name: model.guard for name, model in models.items()}
+    assert guards["hybrid on nominal"] is guards["hybrid on calibrated"] is None
+    assert guards["serial on calibrated"] == "leverage"  # not of the paper
 
 
 @pytest.mark.slow

@@ -31,6 +31,8 @@ def said_of(path):
             for name in stored.files
             if name.split(".")[0] == path.stem
         }
+    if "radius" in said:  # outside the domain no radius holds, whatever earlier versions predicted
+        said["radius"] = np.where(said["in_domain"], said["radius"], np.inf)
     return said.pop("q"), said
 
 

@@ -16,13 +16,14 @@ from hybridkin import (
     datasets,
     load_model,
     robots,
+    save_model,
     trajectories,
     workflow,
 )
 from hybridkin.cli.main import main
 from hybridkin.saving.saved_model import model_header
 from hybridkin.workflow._domain import sample_domain
-from hybridkin.workflow.report import geometry_entries
+from hybridkin.workflow.report import geometry_entries, statistics
 
 ROBOT = """
 calibrate = ["radii", "base"]
@@ -137,9 +138,50 @@ def test_turns_of_rings_are_not_identified_apart_from_the_base(log, tmp_path):
 def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace("0.11", "0.05"))
-    with pytest.warns(UserWarning, match="left what is physical") as caught:
-        fit(path, robot, tmp_path / "m")
+    with pytest.warns(UserWarning, match="left what is physical: radii") as caught:
+        report, _ = fit(path, robot, tmp_path / "m")
     assert len(caught) == 1
+    # The same page does not call them identified, however far the data narrow the prior.
+    radii = [e for e in report.record["calibration"]["entries"] if e["name"].startswith("radii")]
+    assert max(entry["narrowing"] for entry in radii) > 10
+    assert not any(entry["identified"] or entry["physical"] for entry in radii)
+    text = (tmp_path / "m" / "report.md").read_text()
+    assert re.search(r"\| radii\[0\] \[mm\] \|.*\| not physical \|", text)
+
+
+def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
+    path, robot = log
+    form = robots.read_description(robot).log
+    data = workflow.read_log(path, replace(form, groups="motion"))
+    model = HybridForwardModel(robots.from_toml(robot), "linear", coverage=0.8, guard="box")
+    model.fit_with_messages(data.q, data.x, groups=data.groups)
+    save_model(model, tmp_path / "model.safetensors")
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[rows[:, 9] == 1, 0] += 160.0  # all of this motion, outside the training range
+    names = "l1,l2,l3,l4,l5,l6,x,y,z,motion"
+    np.savetxt(path, rows, "%.6f", ",", header=names, comments="")
+    new = workflow.read_log(path, replace(form, groups="motion"))
+    loaded = workflow.open_model(tmp_path / "model.safetensors", robot)
+    report, _ = workflow.evaluate_log(loaded, new, force=True)
+    motions = report.record["motions"]
+    shares = {float(name): entry["share_in_radius"] for name, entry in motions.items()}
+    assert np.isnan(shares.pop(1.0))
+    assert report.record["all"]["share_in_radius"] == pytest.approx(np.mean([*shares.values()]))
+    assert re.search(r"\| 1[.0]* \|.*\| 0 \| - \|", report.markdown())
+    text = " ".join(report.plain().split())
+    assert "radius for 80 % of the tips: " in text
+    assert "only in the domain and for motions like the log's. Rows without a radius" in text
+
+
+def test_standard_error_counts_motions_once():
+    rng = np.random.default_rng(0)
+    motions = np.repeat(np.arange(40), rng.integers(5, 30, 40))
+    logs = 1.0 + rng.standard_normal((400, 40))[:, motions]  # the rows of a motion are equal
+    found = [statistics(errors, motions)["std_error"] for errors in logs]
+    assert np.mean(found) == pytest.approx(logs.mean(axis=1).std(), rel=0.1)
+    by_row = statistics(logs[0], np.arange(len(motions)))["std_error"]
+    assert by_row == pytest.approx(logs[0].std(ddof=1) / np.sqrt(len(motions)))
+    assert "std_error" not in statistics(logs[0])
 
 
 @pytest.fixture
