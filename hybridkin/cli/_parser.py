@@ -149,19 +149,24 @@ def _fit(command: argparse.ArgumentParser) -> None:
 def _evaluate(command: argparse.ArgumentParser) -> None:
     """Show the errors of a model on a log.
 
-    Motion by motion, with figures of where it errs.
+    Motion by motion, with figures of where it errs. Take a log of other motions than those of the
+    fit: rows that were fitted are recognised, and their errors reported apart as training errors.
 
     Some examples:
-      hybridkin evaluate model log.csv --out evaluation
+      hybridkin evaluate model next_day.csv --out evaluation
       hybridkin evaluate robot.toml log.csv            # the mechanical model alone
-      hybridkin evaluate model log.csv --json --fail-above 3.5 > errors.json
+      hybridkin evaluate model next_day.csv --json --fail-above 3.5 > errors.json
     """
     command.add_argument("model", type=Path, metavar="MODEL")
     command.add_argument("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
     _add_robot(command)
     command.add_argument("--out", type=Path, help="folder for report and figures (none)")
     command.add_argument(
-        "--fail-above", type=float, metavar="MM", help="exit with 1 if the mean error is larger"
+        "--fail-above",
+        type=float,
+        metavar="MM",
+        help="exit with 1 if the mean error is larger: of the rows that were not fitted or, where "
+        "all were, on the held-out motions of the fit",
     )
     _add_log(command)
 

@@ -79,6 +79,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             **{f"drift_{name}": array for name, array in model._drift._asdict().items()},
             "play_width": None if model.play_ is None else model.play_.width,
             "radius": model.radius_,
+            "fitted_rows": model._fitted_rows,
         },
         {
             "module": model.module_.stored(),
@@ -125,6 +126,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
             raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
         # Earlier files hold a finite radius outside the domain, which no log supports.
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
+    known = "fitted_rows" in stored.arrays  # older files do not have it
+    model._fitted_rows = stored.array("fitted_rows", (None,)) if known else None
     results = training.get("cv_results") if isinstance(training, dict) else None
     model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
     return model

@@ -14,6 +14,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import Tensor, nn
 
+from hybridkin._core.digests import row_digests
 from hybridkin._core.model import as_forward_model
 from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
@@ -248,6 +249,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             used = given if asked.parts else rows
             self.radius_, message = conformal_radius(asked, used, self.coverage)
             said += [] if message is None else [message]
+        self._fitted_rows: NDArray | None = np.unique(row_digests(X, y))
         return [*few, *said, *_messages(fitted, given)]
 
     def partial_fit(

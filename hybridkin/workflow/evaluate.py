@@ -42,7 +42,10 @@ def evaluate_log(
     -------
     report : Report
         Its ``record`` holds "all" and "motions" with mean, median, p95 and max [m], and where the
-        model knows them "share_in_domain" and "share_in_radius".
+        model knows them "share_in_domain" and "share_in_radius". "fitted_rows" counts the rows that
+        the model was fitted to, None where it does not know; then "fitted" and "new" hold the
+        errors of those and of the others, and "held_out" those of the fit on held-out motions. A
+        row counts as fitted also where half of its motion was.
     paths : list of Path
         What was written.
 
@@ -82,6 +85,7 @@ def evaluate_log(
         split=measured.split,
     )
     write_check(report, measured)
+    _add_fitted(report, loaded, measured, columns)
     _write_errors(report)
     if out is None:
         return report, []
@@ -96,12 +100,45 @@ def _entry(columns: dict[str, NDArray], rows: NDArray | slice) -> dict[str, Any]
     return {"rows": len(error), **statistics(error), **shares}
 
 
+def _add_fitted(
+    report: Report, loaded: LoadedModel, log: MeasuredLog, columns: dict[str, NDArray]
+) -> None:
+    """Add which rows were fitted, and the errors of those and of the others apart."""
+    fitted, parts = loaded.was_fitted(log.q, log.x), {}
+    if fitted is not None:
+        _, motion = np.unique(log.motions, return_inverse=True)
+        fitted |= (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
+        parts = {"fitted": fitted, "new": ~fitted}
+    entries = {name: _entry(columns, rows) for name, rows in parts.items() if rows.any()}
+    held_out = loaded.held_out if "fitted" in entries else None
+    report.record.update({"fitted": None, "new": None, **entries, "held_out": held_out})
+    report.record["fitted_rows"] = None if fitted is None else int(fitted.sum())
+
+
 def _write_errors(report: Report) -> None:
-    everything = report.record["all"]
-    motions = sorted(report.record["motions"].items(), key=lambda item: -item[1]["mean"])
+    record = report.record
+    everything, n_fitted = record["all"], record["fitted_rows"]
+    motions = sorted(record["motions"].items(), key=lambda item: -item[1]["mean"])
     report.text("## Errors by motion, largest first")
+    if n_fitted is None:
+        report.text(
+            "The model does not say which rows it was fitted to; errors on those are training "
+            "errors."
+        )
+    elif n_fitted:
+        known = "The model has no errors on held-out motions."
+        if record["held_out"] is not None:
+            errors = (f"{1e3 * record['held_out'][key]:.2f}" for key in ("mean", "p95", "max"))
+            known = "On held-out motions the fit found mean {}, 95 % {}, max {} mm.".format(*errors)
+        report.text(
+            f"**{n_fitted} of {everything['rows']} rows were fitted: their errors are training "
+            f"errors, smaller than those on new motions.** {known} To test the model, evaluate a "
+            "log of other motions."
+        )
+    shown = ("new", "fitted") if n_fitted else ()
+    parts = {f"{name} rows": record[name] for name in shown if record[name] is not None}
     columns = ["rows", "mean", "median", "p95", "max", *(s for s in _SHARES if s in everything)]
-    report.errors({"all rows": everything, **dict(motions)}, columns)
+    report.errors({"all rows": everything, **parts, **dict(motions)}, columns)
     if "radius" in report.record:
         report.text(f"{report.record['radius']['words']} Rows without a radius are not counted.")
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
+from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
 from hybridkin.chains import robots
@@ -306,7 +307,7 @@ def fit_log(
     if robot.chain is not None and result is not None:
         write_calibration(report, robot.chain, result, messages)
         _write_elastic_calibration(report, robot.chain, model)
-    _add_model(report, model, robot, whole.split)
+    _add_model(report, model, robot, whole)
     return report, report.write(out)
 
 
@@ -382,12 +383,14 @@ def _write_elastic_calibration(report: Report, chain: Chain, model: HybridForwar
 
 
 def _add_model(
-    report: Report, model: HybridForwardModel, robot: robots.RobotDescription, split: str
+    report: Report, model: HybridForwardModel, robot: robots.RobotDescription, log: MeasuredLog
 ) -> None:
     """Add the model and the description of its robot to the files of the report."""
     kept = ("log", "robot", "n_whole", "n_motions", "excluded", "loss", "saved", "chosen")
     training = {key: report.record[key] for key in (*kept, "held_out")}
-    training |= {"rows": report.record["n"], "split": split}
+    training |= {"rows": report.record["n"], "split": log.split}
+    # The rows between those of a thinned log are no new ones.
+    model._fitted_rows = np.unique(row_digests(log.q, log.x))
     report.file("model.safetensors", lambda path: save_model(model, path, training=training))
     report.text("The model: `hybridkin.load_model('model.safetensors')`.")
     if robot.path is not None:

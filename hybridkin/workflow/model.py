@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
@@ -100,6 +101,22 @@ class LoadedModel:
             return self.hybrid.predict(q, groups=groups)
         with torch.no_grad():
             return self.module(torch.from_numpy(np.ascontiguousarray(q))).numpy()
+
+    def was_fitted(self, q: NDArray, x: NDArray) -> NDArray[np.bool_] | None:
+        """Return whether each row (q, x) was fitted (N,) [m]; None where the model does not know.
+
+        Rows are compared to a micrometre.
+        """
+        if self.header is None:  # a nominal chain
+            return np.zeros(len(q), dtype=bool)
+        known = None if self.hybrid is None else self.hybrid._fitted_rows
+        return None if known is None else np.isin(row_digests(q, x), known)
+
+    @property
+    def held_out(self) -> dict[str, float] | None:
+        """Errors [m] of the fit on held-out motions, where the file has them."""
+        training = (self.header or {}).get("training") or {}
+        return training.get("held_out", {}).get(training.get("saved"))
 
     def log_format(self) -> robots.LogFormat:
         """Return how the robot's logs are written, or plain names in SI units."""

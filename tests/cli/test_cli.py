@@ -355,6 +355,43 @@ def test_evaluate_tells_errors_by_motion(fitted, tmp_path, capsys):
     assert re.search(rf"all rows +240 +{1e3 * errors.mean():.2f} ", printed)
 
 
+def test_evaluate_says_which_rows_were_fitted(fitted, tmp_path, capsys):
+    held_out = json.loads((fitted / "model" / "report.json").read_text())["held_out"]
+    held_out = held_out["hybrid, auto"]
+    below = ["--fail-above", 1e3 * 0.9 * held_out["mean"]]  # and above the training error
+    np.savetxt(tmp_path / "log.csv", rows(), "%.6g", ",", header=HEADER, comments="")
+    code, record = document(capsys, "evaluate", fitted / "model", tmp_path / "log.csv", *below)
+    assert code == 1
+    assert record["fitted_rows"] == 240
+    assert record["fitted"] == record["all"]
+    assert record["new"] is None
+    assert record["held_out"] == held_out
+    assert 1e3 * record["all"]["mean"] < below[1]
+    _, printed, _ = run(capsys, "evaluate", fitted / "model", tmp_path / "log.csv")
+    printed = re.sub(r"\s+", " ", printed)
+    assert "240 of 240 rows were fitted: their errors are training errors" in printed
+    assert f"held-out motions the fit found mean {1e3 * held_out['mean']:.2f}, " in printed
+
+
+@pytest.mark.slow
+def test_evaluate_takes_new_and_fitted_rows_apart(fitted, tmp_path, capsys):
+    table = np.vstack([rows(), rows(14)[240:]])
+    table[10:24, 7] += 0.01  # mm: other tips; less than half of the motion is fitted
+    table[36:48, 7] += 0.01  # half of it is
+    log = write(tmp_path / "more.csv", table[:-12])
+    code, record = document(capsys, "evaluate", fitted / "model", log)
+    assert code == 0
+    assert record["fitted_rows"] == record["fitted"]["rows"] == 240 - 14
+    assert record["new"]["rows"] == 14 + 3 * 24 + 12
+    assert record["new"]["mean"] > record["all"]["mean"] > record["fitted"]["mean"]
+    _, printed, _ = run(capsys, "evaluate", fitted / "model", log)
+    assert re.search(rf"new rows +98 +{1e3 * record['new']['mean']:.2f}", printed)
+    new = write(tmp_path / "new.csv", table[240:])
+    _, record = document(capsys, "evaluate", fitted / "model", new)
+    assert (record["fitted_rows"], record["fitted"], record["held_out"]) == (0, None, None)
+    assert "training errors" not in run(capsys, "evaluate", fitted / "model", new)[1]
+
+
 def test_evaluate_of_a_description_is_the_mechanical_model(fitted, capsys):
     arguments = [fitted / "robot.toml", fitted / "log.csv"]
     code, record = document(capsys, "evaluate", *arguments)

@@ -12,6 +12,7 @@ from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from torch.testing import assert_close
 
 from hybridkin import ELMRegressor, HybridForwardModel, as_forward_model, load_model, save_model
+from hybridkin._core.digests import row_digests
 from hybridkin._core.stored import Stored
 from hybridkin.learning.regressor_modules import error_module
 
@@ -116,3 +117,15 @@ def test_entries_are_checked_when_they_are_read():
     for message, read in wrong:
         with pytest.raises(ValueError, match=message):
             read()
+
+
+def test_digests_of_rows_are_the_same_everywhere():
+    q, x = np.array([[0.0, 0.0123], [-1.5, 2e-6]]), np.array([[0.1, 0.0, 0.3], [1e9, 1.0, 0.2]])
+    digests = row_digests(q, x)
+    assert digests.tolist() == [3617025846877243, 5702618512221831]
+    assert_array_equal(row_digests(-0.0 * q + q, x + 1e-8), digests)
+    assert_array_equal(row_digests(q, np.hstack([x, x])), digests)  # of a pose the position
+    rows = np.random.default_rng(0).integers(-50, 50, (20000, 6)) * 1e-6
+    digests = row_digests(rows[:, :3], rows[:, 3:])
+    assert len(np.unique(digests)) == len(np.unique(rows, axis=0))
+    assert digests.max() < 2.0**53

@@ -331,6 +331,33 @@ def test_an_actuator_that_never_moved_is_held_where_it_was():
     assert model.module_.in_domain(torch.from_numpy(sample_domain(loaded, limits)[0])).all()
 
 
+@pytest.mark.slow
+def test_a_fit_to_a_thinned_log_knows_all_of_its_rows(log, tmp_path):
+    path, robot = log
+    description = robots.read_description(robot)
+    measured = workflow.read_log(path, description.log, chain=description.chain)
+    settings = workflow.FitSettings(n_folds=2, n_seeds=1, auto=False, max_rows=60)
+    workflow.fit_log(measured, description, tmp_path / "m", settings, n_jobs=1)
+    loaded = workflow.open_model(tmp_path / "m")
+    assert loaded.was_fitted(measured.q, measured.x).all()
+    assert not loaded.was_fitted(measured.q, measured.x + 1e-5).any()
+    assert loaded.held_out["mean"] > 0
+    nominal = workflow.open_model(robot)
+    assert not nominal.was_fitted(measured.q, measured.x).any()
+    report, _ = workflow.evaluate_log(nominal, measured)
+    assert report.record["fitted_rows"] == 0
+
+
+def test_a_model_that_does_not_know_its_rows_says_so(log, tmp_path):
+    path, robot = log
+    description = robots.read_description(robot)
+    save_model(description.chain, tmp_path / "chain.safetensors")
+    loaded = workflow.open_model(tmp_path / "chain.safetensors", robot)
+    report, _ = workflow.evaluate_log(loaded, workflow.read_log(path, description.log))
+    assert report.record["fitted_rows"] is None
+    assert "does not say which rows it was fitted to" in report.plain()
+
+
 def test_limits_intersect_where_both_are_known():
     one = robots.Limits(q_min=np.array([-1.0, 0.0]), q_max=np.array([2.0, 3.0]))
     other = robots.Limits(q_max=np.array([1.0, 4.0]), dq_max=np.array([0.5, 0.5]))
