@@ -17,8 +17,8 @@ from hybridkin._core.units import METRES, UNITS
 
 EXIT_CODES = """\
 exit codes: 0 success; 1 the result is not as asked for (points not reached, errors above
---fail-above, a log that does not pass its check in `describe`); 2 an error of input, a log among
-them that does not pass its check before a fit; 130 interrupted."""
+--fail-above, a log that does not pass its check in `describe`); 2 an error of input, among them a
+log that does not pass its check before a fit, and a path out of reach; 130 interrupted."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -151,6 +151,8 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
 
     Motion by motion, with figures of where it errs. Take a log of other motions than those of the
     fit: rows that were fitted are recognised, and their errors reported apart as training errors.
+    --fail-above looks at the other rows, or where all were fitted at the errors on held-out
+    motions.
 
     Some examples:
       hybridkin evaluate model next_day.csv --out evaluation
@@ -162,11 +164,7 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     _add_robot(command)
     command.add_argument("--out", type=Path, help="folder for report and figures (none)")
     command.add_argument(
-        "--fail-above",
-        type=float,
-        metavar="MM",
-        help="exit with 1 if the mean error is larger: of the rows that were not fitted or, where "
-        "all were, on the held-out motions of the fit",
+        "--fail-above", type=float, metavar="MM", help="exit with 1 if the mean error is larger"
     )
     _add_log(command)
 
@@ -186,8 +184,13 @@ def _track(command: argparse.ArgumentParser) -> None:
     A path file has columns t, x, y, z, or x, y, z together with --dt. --q-min and --q-max are in
     the unit and sign of the robot's logs (m without a description), one number or one for each
     actuator. By default the robot keeps to its limits and to the range that the model was fitted
-    on. Of a model with play, track.csv has what to send, and in the columns effective_... what the
-    actuators do.
+    on. A path that leaves the reach of the robot within them ends with exit code 2 and the largest
+    size that does not; --force goes as near as the tip can.
+
+    The first rows, with the status LEAD_IN, lead to the path from where the robot stands: --from
+    rest (no tendon pulled), --from=A,B,... with a value of every actuator in the unit and sign of
+    the log, or --from path (no lead-in). Of a model with play, track.csv has what to send, and in
+    the columns effective_... what the actuators do.
     """
     command.add_argument("model", type=Path, metavar="MODEL")
     command.add_argument("path", type=Path, nargs="?", metavar="PATH.csv", help="points to pass")
@@ -205,6 +208,7 @@ def _track(command: argparse.ArgumentParser) -> None:
         type=_numbers,
         help="W,H of a figure eight; radii R0,R1 of a spiral; X,Y,Z from end to end of a line",
     )
+    command.add_argument("--scale", type=_positive, default=1.0, help="about the path's centre (1)")
     command.add_argument("--normal", type=_numbers, metavar="X,Y,Z", help="of its plane (base z)")
     command.add_argument("--turns", type=float, default=3.0, help="of a spiral (3)")
     command.add_argument(
@@ -219,6 +223,9 @@ def _track(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--tol", type=_positive, default=0.1, help="error that is reached [mm] (0.1)"
     )
+    words = {"metavar": "rest|path|A,B,...", "help": "where the robot stands (rest)"}
+    command.add_argument("--from", type=_start, default="rest", dest="start", **words)
+    command.add_argument("--force", action="store_true", help="go as near as the tip can")
 
 
 def _animate(command: argparse.ArgumentParser) -> None:
@@ -301,6 +308,10 @@ def _count(text: str) -> int:
 
 def _numbers(text: str) -> Sequence[float]:
     return tuple(float(part) for part in text.split(","))
+
+
+def _start(text: str) -> Sequence[float] | str:
+    return text if text in ("rest", "path") else _numbers(text)
 
 
 def _names(text: str) -> Sequence[str]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from tqdm import tqdm
 
 import hybridkin  # its folders are opened when used: help comes at once
@@ -180,8 +181,16 @@ def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
             duration=arguments.duration,
             dt=arguments.dt or _DT,
         )
+    start = arguments.start
     report, paths = workflow.track_path(
-        loaded, path, arguments.out, limits=limits, tol=1e-3 * arguments.tol, progress=bars
+        loaded,
+        workflow.scaled_path(path, arguments.scale),
+        arguments.out,
+        limits=limits,
+        start=start if isinstance(start, str) else np.multiply(start, log_format.q_factor),
+        tol=1e-3 * arguments.tol,
+        force=arguments.force,
+        progress=bars,
     )
     code = 0 if report.record["reached"] == report.record["n"] else 1
     return _Outcome.of(report, paths, code)

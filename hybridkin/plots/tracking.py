@@ -13,6 +13,7 @@ from typing_extensions import Self
 
 from hybridkin.plots._arrays import distance, named, plain, shaped, times
 from hybridkin.plots._canvas import (
+    COLORS,
     LENGTHS,
     Display,
     axes_or_new,
@@ -174,6 +175,10 @@ class ActuatorDisplay:
         How the n actuators share out over the segments.
     t : array-like of shape (T,), optional
         Times [s]. Default: time steps.
+    names : sequence of n str, optional
+        Names of the actuators, which then differ in colour, the models in style.
+    limits : array-like of shape (2, n), optional
+        Least and largest value of every actuator [m], of revolute joints [rad].
 
     Attributes
     ----------
@@ -188,6 +193,9 @@ class ActuatorDisplay:
         paths: Mapping[str, ArrayLike],
         actuators_per_segment: Sequence[int],
         t: ArrayLike | None = None,
+        *,
+        names: Sequence[str] | None = None,
+        limits: ArrayLike | None = None,
     ) -> None:
         self.actuators_per_segment = tuple(actuators_per_segment)
         n = sum(self.actuators_per_segment)
@@ -199,7 +207,8 @@ class ActuatorDisplay:
                     f"`paths` must hold arrays of one shape (T, {n}), as `actuators_per_segment` "
                     f"says, got {q.shape} for {name!r}; the first has {rows} rows."
                 )
-        self.t = times(t, rows)
+        self.t, self.names = times(t, rows), names
+        self.limits = None if limits is None else plain(limits, "limits")
 
     @classmethod
     def from_tracks(cls, tracks: Mapping[str, Any], actuators_per_segment: Sequence[int]) -> Self:
@@ -220,7 +229,13 @@ class ActuatorDisplay:
         t = next(iter(named(tracks, "tracks").values())).t
         return cls({name: track.q for name, track in tracks.items()}, actuators_per_segment, t)
 
-    def plot(self, axes: Sequence[Axes] | NDArray | None = None, *, unit: str = "cm") -> Self:
+    def plot(
+        self,
+        axes: Sequence[Axes] | NDArray | None = None,
+        *,
+        unit: str = "cm",
+        per_unit: ArrayLike | None = None,
+    ) -> Self:
         """Draw one axes per segment, sharing time, and return self.
 
         Parameters
@@ -229,13 +244,17 @@ class ActuatorDisplay:
             Default: those of a new figure of pyplot.
         unit : {"m", "cm", "mm", "rad", "deg"}, default="cm"
             Of the actuators.
+        per_unit : float or array-like of shape (n,), optional
+            What to divide by in place of the size of `unit`, which is then a name only [m]: -0.001
+            for millimetres of pulled tendons.
 
         Returns
         -------
         ActuatorDisplay
             Itself, drawn.
         """
-        scale, n = scale_of(unit, _ACTUATOR_UNITS), len(self.actuators_per_segment)
+        n = len(self.actuators_per_segment)
+        scale = scale_of(unit, _ACTUATOR_UNITS) if per_unit is None else 1.0 / np.asarray(per_unit)
         if axes is None:
             size = (6.0, 1.0 + 1.6 * n)
             axes = plt.subplots(n, 1, figsize=size, sharex=True, layout="constrained")[1]
@@ -245,12 +264,25 @@ class ActuatorDisplay:
         steps, when = steps_of(self.t, len(next(iter(self.paths.values()))))
         ends = np.cumsum(self.actuators_per_segment)
         for k, ax in enumerate(axes):
+            part = slice(ends[k] - self.actuators_per_segment[k], ends[k])
             for i, (name, q) in enumerate(self.paths.items()):
-                part = scale * q[:, ends[k] - self.actuators_per_segment[k] : ends[k]]
-                lines = ax.plot(steps, part, **{**look_of(i), "linewidth": 1.2})
+                lines = ax.plot(steps, (scale * q)[:, part], **{**look_of(i), "linewidth": 1.2})
                 lines[0].set_label(name)
+                for j, line in enumerate(lines if self.names else ()):
+                    label = self.names[part][j] if i == 0 else line.get_label()
+                    line.set(color=COLORS[j % 8], linestyle="-:"[i % 2], label=label)
+            if self.limits is not None:
+                values = (scale * self.limits)[:, part]
+                colors = (
+                    [COLORS[j % 8] for j in range(values.shape[1])] if self.names else ["black"]
+                )
+                look = {"colors": 2 * colors, "linestyles": "dashed", "linewidth": 0.8}
+                ax.hlines(values.ravel(), steps[0], steps[-1], label="limits", **look)
             ax.set(ylabel=f"segment {k + 1} [{unit}]")
-        axes[0].legend(frameon=False, fontsize="small", ncols=len(self.paths))
+        beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+        look = beside if self.names else {"ncols": len(self.paths)}
+        for ax in axes if self.names else axes[:1]:
+            ax.legend(frameon=False, fontsize="small", **look)
         axes[-1].set(xlabel=when)
         self.axes_, self.figure_ = axes, axes[0].figure
         return self

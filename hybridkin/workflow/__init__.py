@@ -6,7 +6,7 @@ from hybridkin.workflow.evaluate import evaluate_log
 from hybridkin.workflow.fit import Comparison, FitSettings, compare_by_group, fit_log
 from hybridkin.workflow.log import LogError, MeasuredLog, read_log
 from hybridkin.workflow.model import LoadedModel, open_model
-from hybridkin.workflow.path import read_path, shape_path
+from hybridkin.workflow.path import read_path, scaled_path, shape_path
 from hybridkin.workflow.report import Report, json_text
 from hybridkin.workflow.track import animate_track, track_path
 
@@ -28,6 +28,7 @@ __all__ = [
     "path_limits",
     "read_log",
     "read_path",
+    "scaled_path",
     "shape_path",
     "track_path",
 ]

@@ -16,6 +16,7 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.workflow.model import LoadedModel
 
 _WALKERS, _STEPS, _STEP = 256, 60, 0.12  # length of a step, as a share of the range
+Domain = tuple[NDArray, NDArray]  # commands (K, n) in it and their tips (K, 3) [m]
 _EASE = 0.5  # domain distance from which the posture turns back; 1 is the edge of the domain
 
 
@@ -112,7 +113,7 @@ def preferred(loaded: LoadedModel, limits: PathLimits) -> NDArray:
     return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
 
 
-def sample_domain(loaded: LoadedModel, limits: PathLimits) -> tuple[NDArray, NDArray]:
+def sample_domain(loaded: LoadedModel, limits: PathLimits) -> Domain:
     """Return commands (K, n) from all over the domain, within the limits, and their tips (K, 3).
 
     The first is near the preferred one.

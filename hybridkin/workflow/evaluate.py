@@ -15,6 +15,7 @@ from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report, check_out, distance, statistics
 
+_PARTS = {"new rows": "new", "fitted rows": "fitted", "held out in the fit": "held_out"}
 _SHARES = ("share_in_domain", "share_in_radius")
 
 
@@ -77,15 +78,20 @@ def evaluate_log(
             columns["share_in_radius"] = np.where(np.isinf(radius), np.nan, errors <= radius)
             report.record["radius"] = radius_entry(loaded.hybrid)
     motions = {str(name): measured.motions == name for name in dict.fromkeys(measured.motions)}
+    fitted = loaded.was_fitted(log.q, log.x, measured.motions)
+    parts = {} if fitted is None else {"new": ~fitted, "fitted": fitted}
+    parts = {name: _entry(columns, rows) for name, rows in parts.items() if rows.any()}
     report.record.update(
         model=str(loaded.path),
         log=log.source,
         all=_entry(columns, slice(None)),
         motions={name: _entry(columns, rows) for name, rows in motions.items()},
+        fitted_rows=None if fitted is None else int(fitted.sum()),
+        **{name: parts.get(name) for name in ("new", "fitted")},
+        held_out=loaded.held_out if "fitted" in parts else None,
         split=measured.split,
     )
     write_check(report, measured)
-    _add_fitted(report, loaded, measured, columns)
     _write_errors(report)
     if out is None:
         return report, []
@@ -100,43 +106,19 @@ def _entry(columns: dict[str, NDArray], rows: NDArray | slice) -> dict[str, Any]
     return {"rows": len(error), **statistics(error), **shares}
 
 
-def _add_fitted(
-    report: Report, loaded: LoadedModel, log: MeasuredLog, columns: dict[str, NDArray]
-) -> None:
-    """Add which rows were fitted, and the errors of those and of the others apart."""
-    fitted, parts = loaded.was_fitted(log.q, log.x), {}
-    if fitted is not None:
-        _, motion = np.unique(log.motions, return_inverse=True)
-        fitted |= (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
-        parts = {"fitted": fitted, "new": ~fitted}
-    entries = {name: _entry(columns, rows) for name, rows in parts.items() if rows.any()}
-    held_out = loaded.held_out if "fitted" in entries else None
-    report.record.update({"fitted": None, "new": None, **entries, "held_out": held_out})
-    report.record["fitted_rows"] = None if fitted is None else int(fitted.sum())
-
-
 def _write_errors(report: Report) -> None:
-    record = report.record
-    everything, n_fitted = record["all"], record["fitted_rows"]
+    record, everything = report.record, report.record["all"]
     motions = sorted(record["motions"].items(), key=lambda item: -item[1]["mean"])
     report.text("## Errors by motion, largest first")
-    if n_fitted is None:
+    if record["fitted_rows"] is None:
+        report.text("The model does not say which rows it was fitted to; those err less here.")
+    if record["fitted_rows"]:
         report.text(
-            "The model does not say which rows it was fitted to; errors on those are training "
-            "errors."
+            f"**{record['fitted_rows']} of {everything['rows']} rows were fitted: their errors are "
+            "training errors.** To test the model, evaluate a log of other motions."
         )
-    elif n_fitted:
-        known = "The model has no errors on held-out motions."
-        if record["held_out"] is not None:
-            errors = (f"{1e3 * record['held_out'][key]:.2f}" for key in ("mean", "p95", "max"))
-            known = "On held-out motions the fit found mean {}, 95 % {}, max {} mm.".format(*errors)
-        report.text(
-            f"**{n_fitted} of {everything['rows']} rows were fitted: their errors are training "
-            f"errors, smaller than those on new motions.** {known} To test the model, evaluate a "
-            "log of other motions."
-        )
-    shown = ("new", "fitted") if n_fitted else ()
-    parts = {f"{name} rows": record[name] for name in shown if record[name] is not None}
+    parts = {title: record[name] for title, name in _PARTS.items() if record["fitted"]}
+    parts = {title: entry for title, entry in parts.items() if entry is not None}
     columns = ["rows", "mean", "median", "p95", "max", *(s for s in _SHARES if s in everything)]
     report.errors({"all rows": everything, **parts, **dict(motions)}, columns)
     if "radius" in report.record:

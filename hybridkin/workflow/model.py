@@ -102,15 +102,16 @@ class LoadedModel:
         with torch.no_grad():
             return self.module(torch.from_numpy(np.ascontiguousarray(q))).numpy()
 
-    def was_fitted(self, q: NDArray, x: NDArray) -> NDArray[np.bool_] | None:
-        """Return whether each row (q, x) was fitted (N,) [m]; None where the model does not know.
+    def was_fitted(self, q: NDArray, x: NDArray, motions: NDArray) -> NDArray[np.bool_] | None:
+        """Return whether rows were fitted (N,): themselves, to a micrometre, or half their motion.
 
-        Rows are compared to a micrometre.
+        None where the model does not know.
         """
-        if self.header is None:  # a nominal chain
-            return np.zeros(len(q), dtype=bool)
-        known = None if self.hybrid is None else self.hybrid._fitted_rows
-        return None if known is None else np.isin(row_digests(q, x), known)
+        if self.hybrid is None or self.hybrid._fitted_rows is None:
+            return None if self.header else np.zeros(len(q), dtype=bool)  # nominal: of no row
+        fitted = np.isin(row_digests(q, x), self.hybrid._fitted_rows)
+        _, motion = np.unique(motions, return_inverse=True)
+        return fitted | (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
 
     @property
     def held_out(self) -> dict[str, float] | None:

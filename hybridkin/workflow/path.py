@@ -55,6 +55,25 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     return Trajectory(t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1))
 
 
+def scaled_path(path: Trajectory, scale: float) -> Trajectory:
+    """Return a path scaled about its centre, at the same times.
+
+    Parameters
+    ----------
+    path : Trajectory
+        Points [m] and times [s].
+    scale : float
+        Its size over that of `path`.
+
+    Returns
+    -------
+    Trajectory
+        The centre, that of the box around the points, stays where it is.
+    """
+    center = 0.5 * (path.x.min(axis=0) + path.x.max(axis=0))
+    return Trajectory(path.t, center + scale * (path.x - center))
+
+
 def shape_path(
     loaded: LoadedModel,
     limits: PathLimits,

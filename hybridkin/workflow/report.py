@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
+from hybridkin._core.stored import plain
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -167,7 +167,7 @@ class Report:
         titles, factors, formats = zip(*(_COLUMNS[key] for key in columns), strict=True)
         rows = []
         for name, entry in record.items():
-            values = [factor * entry[key] for key, factor in zip(columns, factors, strict=True)]
+            values = [factor * entry.get(key, math.nan) for key, factor in zip(columns, factors, strict=True)]
             rows.append([name, *(c.replace("nan", "-") for c in map(format, values, formats))])
         self.table(["tip error [mm]", *titles], rows)
 
@@ -257,19 +257,7 @@ def json_text(record: Any) -> str:
     str
         JSON text.
     """
-    return json.dumps(_plain(record), indent=2, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
-    if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
+    return json.dumps(plain(record), indent=2, allow_nan=False, default=str)
 
 
 def versions() -> dict[str, str]:

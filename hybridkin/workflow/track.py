@@ -13,17 +13,26 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.units import METRES
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.datasets import load_log
+from hybridkin.ik import trajectories
 from hybridkin.ik.results import IKStatus, Track
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.plots import ActuatorDisplay, TrackAnimation, TrackingDisplay, new_figure
-from hybridkin.workflow._domain import PathLimits, path_limits, preferred_posture, sample_domain
+from hybridkin.workflow._domain import (
+    Domain,
+    PathLimits,
+    path_limits,
+    preferred,
+    preferred_posture,
+    sample_domain,
+)
+from hybridkin.workflow._reach import check_reach
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, millimetres, quiet
 
@@ -33,6 +42,8 @@ _COLUMNS = ("q", "q_unit", "q_sign", "q_scale", "x", "x_unit")  # of a log forma
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
 _GUESSES = 16
+_PEAK = 1.875  # of the speed of `min_jerk` over its mean
+_SLOW, _DT = 0.1, 0.02  # without known limits: share of the range per second; period [s]
 _PULLS = (0.2, 0.0, 0.0, 0.2)  # to the preferred configuration, one attempt at the path each
 
 
@@ -42,7 +53,9 @@ def track_path(
     out: str | Path,
     *,
     limits: PathLimits | None = None,
+    start: ArrayLike | str = "rest",
     tol: float = 1e-4,
+    force: bool = False,
     progress: Progress = quiet,
 ) -> tuple[Report, list[Path]]:
     """Compute the commands that lead the tip along a path, and write them.
@@ -51,8 +64,10 @@ def track_path(
     commands, the model's tip, the target, the error and its status. Figures and the report come
     with it. Points far apart are passed in several steps on a straight line; where points are
     missed, other starts and postures are tried, and the track that reaches most within the domain
-    is kept. Of a model with play the commands are those to send, which lead or trail what the
-    actuators do by half its width, and further columns ``effective_NAME`` hold the latter.
+    is kept. Rows with the status LEAD_IN lead from `start` to the path, within ``dq_max`` of the
+    limits or, where that is not known, a tenth of the largest range per second. Of a model with
+    play the commands are those to send, which lead or trail what the actuators do by half its
+    width, and further columns ``effective_NAME`` hold the latter.
 
     Parameters
     ----------
@@ -64,8 +79,14 @@ def track_path(
         Folder to write into.
     limits : PathLimits, optional
         As from `path_limits`, which is also the default.
+    start : array-like of shape (n,), "rest" or "path", default="rest"
+        Where the robot stands before [m]. "rest": no tendon pulled, of robots without tendons zero
+        or, where that lies outside the limits, the middle of the range. "path": at the first
+        command of the path, without a lead-in.
     tol : float, default=1e-4
         As for `InverseKinematics.track` [m].
+    force : bool, default=False
+        Go as near as possible where points of the path are out of reach.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -73,17 +94,27 @@ def track_path(
     -------
     report : Report
         Its ``record`` holds "errors" [m], "statuses", "reached", "in_domain" (share of the points,
-        None without a learned part), "limits" and "play" (width [m]).
+        None without a learned part), "limits", "lead_in" (rows, duration_s and start [m]) and
+        "play" (width [m]).
     paths : list of Path
         What was written.
+
+    Raises
+    ------
+    ValueError
+        If points of the path are out of reach, with the largest size that is not.
     """
     check_out(out)
     log_format = loaded.log_format()
     limits = path_limits(loaded) if limits is None else limits
-    track = _best_track(loaded, path, limits, tol, progress)
-    sent = track.q if loaded.play is None else loaded.play.command(track.q)[0]
+    start = _start(loaded, limits, start)
+    domain = sample_domain(loaded, limits)
+    check_reach(loaded, path, limits, domain, tol, force, progress)
+    track = _best_track(loaded, path, limits, domain, tol, progress)
     names = [IKStatus(int(code)).name for code in track.status]
-    speeds = np.abs(np.diff(track.q, axis=0) / np.diff(path.t)[:, None])
+    whole, n_lead = _with_lead_in(track, start, limits, loaded)
+    sent = whole.q if loaded.play is None else loaded.play.command(whole.q)[0]
+    speeds = np.abs(np.diff(whole.q, axis=0) / np.diff(whole.t)[:, None])
     inside = loaded.module.in_domain(torch.from_numpy(track.q)).double().mean()
     report = Report(f"{loaded.name}: a path of {len(path)} points")
     report.record.update(
@@ -96,23 +127,72 @@ def track_path(
         in_domain=None if loaded.hybrid is None else float(inside),
         play=loaded.play_width,
         statuses=dict(Counter(names)),
+        lead_in={"rows": n_lead, "duration_s": whole.t[n_lead] - whole.t[0], "start": start},
         limits=dict(vars(limits)),
         largest_speed=speeds.max(initial=0.0),
         columns={name: vars(log_format)[name] for name in _COLUMNS},
     )
     _write_summary(report)
-    _add_figures(report, loaded, track, sent)
-    effective = None if loaded.play is None else track.q
-    write = partial(_write_track, track, sent, effective, names, log_format)
+    _add_path(report, track)
+    shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
+    _add_commands(report, loaded, whole.t, shown, limits)
+    effective = None if loaded.play is None else whole.q
+    names = [*["LEAD_IN"] * n_lead, *names]
+    write = partial(_write_track, whole, sent, effective, names, log_format)
     report.file("track.csv", write)
     return report, report.write(out)
 
 
+def _start(loaded: LoadedModel, limits: PathLimits, start: ArrayLike | str) -> NDArray | None:
+    """Return where the actuators stand before the path (n,), None: at its first command."""
+    low, high, chain = limits.q_min, limits.q_max, loaded.chain
+    if isinstance(start, str):
+        if start not in ("rest", "path"):
+            raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
+        has_tendons = isinstance(chain, ArcChain) and chain.lengths is not None
+        zero = has_tendons or ((low <= 0) & (high >= 0)).all()
+        rest = np.zeros(len(low)) if zero else preferred(loaded, limits)
+        return rest if start == "rest" else None
+    q, span = np.array(start, dtype=float), high - low
+    if q.shape != low.shape or (np.abs(q - 0.5 * (low + high)) > 1.5 * span).any():
+        raise ValueError(
+            f"`start` must be {len(low)} values in or near the limits, {low.round(4)} to "
+            f"{high.round(4)} m, got {q} m; check its unit and sign."
+        )
+    return q
+
+
+def _with_lead_in(
+    track: Track, start: NDArray | None, limits: PathLimits, loaded: LoadedModel
+) -> tuple[Track, int]:
+    """Return a track that begins at `start`, and how many rows lead from there to the path.
+
+    They begin and end at rest; their targets are the tips of the model.
+    """
+    way = np.zeros_like(track.q[0]) if start is None else track.q[0] - start
+    dt = float(track.t[1] - track.t[0]) if len(track.t) > 1 else _DT
+    widest = max((limits.q_max - limits.q_min).max(), np.abs(way).max())
+    speed = _SLOW * widest if limits.dq_max is None else limits.dq_max
+    n = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
+    q = track.q[0] - (1.0 - trajectories.min_jerk(np.arange(n) / max(n, 1)))[:, None] * way
+    with torch.no_grad():
+        x = loaded.module(torch.from_numpy(q)).numpy()
+    before = {"q": q, "x": x, "target": x, "error": np.zeros(n)}
+    rows = {name: np.concatenate([rows, vars(track)[name]]) for name, rows in before.items()}
+    t = np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt])
+    return replace(track, t=t, **rows), n
+
+
 def _best_track(
-    loaded: LoadedModel, path: Trajectory, limits: PathLimits, tol: float, progress: Progress
+    loaded: LoadedModel,
+    path: Trajectory,
+    limits: PathLimits,
+    domain: Domain,
+    tol: float,
+    progress: Progress,
 ) -> Track:
     """Return of several attempts the track that reaches most points within the domain."""
-    commands, tips = sample_domain(loaded, limits)
+    commands, tips = domain
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     fine, every = _in_steps(path, max(1, math.ceil(way / (_STEP * extent))))
@@ -271,13 +351,13 @@ def _write_track(
     file: Path,
 ) -> None:
     """Write commands, and what the actuators do where that is something else, point by point."""
-    unit, scale = 1 / log_format.q_factor, 1 / METRES[log_format.x_unit]
-    columns = np.column_stack([track.t, unit * sent, scale * track.x, scale * track.target])
+    unit, scale = log_format.q_factor, 1 / METRES[log_format.x_unit]
+    columns = np.column_stack([track.t, sent / unit, scale * track.x, scale * track.target])
     head = [TIME, *log_format.q, *log_format.x, *TARGET, "error", "status"]
     cells = [*_text("%.9g", columns).T, _text("%.6g", scale * track.error), statuses]
     if effective is not None:
         head += [f"effective_{name}" for name in log_format.q]
-        cells += [*_text("%.9g", unit * effective).T]
+        cells += [*_text("%.9g", effective / unit).T]
     with open(file, "w", encoding="utf-8", newline="") as lines:
         writer = csv.writer(lines, lineterminator="\n")
         writer.writerows([head, *zip(*cells, strict=True)])
@@ -287,7 +367,7 @@ def _text(form: str, values: NDArray) -> NDArray:
     return np.char.mod(form, values + 0.0)  # no -0
 
 
-def _add_figures(report: Report, loaded: LoadedModel, track: Track, sent: NDArray) -> None:
+def _add_path(report: Report, track: Track) -> None:
     figure, axes = new_figure(11.0, 4.2, 1, 3)
     display = TrackingDisplay.from_tracks({"model": track})
     i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])  # the plane of the largest moves
@@ -296,17 +376,21 @@ def _add_figures(report: Report, loaded: LoadedModel, track: Track, sent: NDArra
     display.plot_error(axes[2], unit="mm")
     axes[2].get_legend().remove()
     report.figure("track", figure, "Path, tip by the model, and its error.")
-    chain = loaded.chain
+
+
+def _add_commands(
+    report: Report, loaded: LoadedModel, t: NDArray, shown: dict[str, NDArray], limits: PathLimits
+) -> None:
+    """Add the commands against the limits, in names, unit and sign of the robot's logs."""
+    chain, log_format = loaded.chain, loaded.log_format()
     shares = chain.actuators_per_segment if isinstance(chain, ArcChain) else (loaded.n_actuators,)
     n = len(shares)
     figure, axes = new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
-    shown = {"commands": replace(track, q=sent)}
-    if loaded.play is not None:
-        shown["what the actuators do"] = track
-    ActuatorDisplay.from_tracks(shown, shares).plot(axes[:, 0], unit="mm")
-    if len(shown) == 1:
-        axes[0, 0].get_legend().remove()
-    report.figure("commands", figure, "Commands as the model counts them.")
+    half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
+    ends = np.stack([limits.q_min - half_play, limits.q_max + half_play])
+    display = ActuatorDisplay(shown, shares, t, names=log_format.q, limits=ends)
+    display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
+    report.figure("commands", figure, "Commands as the robot's logs name and count them.")
 
 
 def _write_summary(report: Report) -> None:
@@ -320,6 +404,11 @@ def _write_summary(report: Report) -> None:
     report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
     if record["in_domain"] is not None:
         report.text(f"{100 * record['in_domain']:.0f} % of the points lie in the model's domain.")
+    if record["lead_in"]["rows"]:
+        report.text(
+            "Rows with the status LEAD_IN lead from where the robot stands to the path: {rows} in "
+            "{duration_s:.2f} s.".format(**record["lead_in"])
+        )
     sign = ", shortening positive" if np.all(np.less(columns["q_sign"], 0)) else ""
     units = f"q in {columns['q_unit']}{sign}; x, target and error in {columns['x_unit']}; t in s."
     report.text(f"track.csv: {units}")

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -370,7 +371,7 @@ def test_evaluate_says_which_rows_were_fitted(fitted, tmp_path, capsys):
     _, printed, _ = run(capsys, "evaluate", fitted / "model", tmp_path / "log.csv")
     printed = re.sub(r"\s+", " ", printed)
     assert "240 of 240 rows were fitted: their errors are training errors" in printed
-    assert f"held-out motions the fit found mean {1e3 * held_out['mean']:.2f}, " in printed
+    assert f" held out in the fit {1e3 * held_out['mean']:.2f} " in printed
 
 
 @pytest.mark.slow
@@ -431,8 +432,16 @@ def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
     model = load_model(fitted / "model" / "model.safetensors")
     assert np.linalg.norm(model.predict(data.q) - data.x, axis=1).max() < 1e-4
     assert np.abs(data.q).max() <= 0.006
-    np.testing.assert_allclose(data.time, 0.05 * np.arange(41), atol=1e-9)
-    np.testing.assert_allclose(np.ptp(data.x, axis=0)[:2], [0.02, 0.01], rtol=0.02)
+    rows = record["lead_in"]["rows"]
+    np.testing.assert_allclose(data.time, 0.05 * np.arange(rows + 41), atol=1e-9)
+    np.testing.assert_allclose(np.ptp(data.x[rows:], axis=0)[:2], [0.02, 0.01], rtol=0.02)
+    # The robot starts at rest, and the lead-in keeps to a tenth of the range per second.
+    assert not data.q[0].any()
+    low, high = (np.array(record["limits"][name]) for name in ("q_min", "q_max"))
+    speed = np.abs(np.diff(data.q[: rows + 1], axis=0)).max() / 0.05
+    assert 0.08 * (high - low).max() < speed <= 0.1 * (high - low).max() + 1e-9
+    statuses = np.genfromtxt(out / "track.csv", delimiter=",", dtype=str, skip_header=1)[:, -1]
+    assert statuses.tolist() == rows * ["LEAD_IN"] + 41 * ["CONVERGED"]
     assert (out / "track.png").stat().st_size > 500
 
 
@@ -449,14 +458,86 @@ def test_track_of_points_within_given_limits(fitted, tmp_path, capsys):
     assert "--dt" in errors
     # In the log's sign: at least -1 mm pulled, at most 0.2.
     limits = ["--dt", "1", "--q-min=-1", "--q-max", "0.2"]
-    code, record = document(capsys, *arguments, *limits)
-    assert code == 1  # the last point is out of reach
+    code, _, errors = run(capsys, *arguments, *limits)
+    assert code == 2  # the last point is out of reach
+    assert "2 of 3 points tried are out of reach" in errors
+    assert not out.exists()
+    code, record = document(capsys, *arguments, *limits, "--force")
+    assert code == 1
     assert record["reached"] < 3
     assert record["limits"]["q_min"] == pytest.approx([-0.0002] * 6)
     assert record["limits"]["q_max"] == pytest.approx([0.001] * 6)
     q = np.loadtxt(out / "track.csv", delimiter=",", skiprows=1, usecols=range(1, 7))
     assert q.min() >= -1 - 1e-9
     assert q.max() <= 0.2 + 1e-9
+
+
+SHAPE = ["--shape", "figure-eight", "--unit", "mm", "--dt", "0.1"]
+
+
+@pytest.mark.slow
+def test_track_says_how_much_of_a_path_is_within_reach(fitted, tmp_path, capsys):
+    arguments = ["track", fitted / "robot.toml", *SHAPE, "--out", tmp_path / "track"]
+    code, printed, errors = run(capsys, *arguments, "--size", "800,400")
+    assert code == 2
+    assert printed == ""
+    assert "leaves the reach of the robot within its limits (robot description)" in errors
+    scale = float(re.search(r"--scale ([\d.]+\d)", errors)[1])
+    assert document(capsys, *arguments, "--size", "800,400", "--scale", scale)[0] == 0
+    code, _, errors = run(capsys, *arguments, "--size", f"{960 * scale},{480 * scale}")
+    assert code == 2
+    assert float(re.search(r"--scale ([\d.]+\d)", errors)[1]) == pytest.approx(1 / 1.2, rel=0.05)
+    code, _, errors = run(capsys, *arguments, "--size", "8,4", "--center", "0,0,500")
+    assert code == 2
+    assert "its centre is out of reach too: tips go from (" in errors
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_track_names_the_unit_of_a_path_a_thousand_times_too_large(fitted, tmp_path, capsys, force):
+    (tmp_path / "path.csv").write_text("t,x,y,z\n0,0,0,190\n1,5,0,190\n2,0,0,190\n")
+    arguments = ["track", fitted / "robot.toml", tmp_path / "path.csv", "--out", tmp_path / "t"]
+    code, _, errors = run(capsys, *arguments, "--unit", "m", *force)
+    assert code == 2
+    assert re.search(r"goes 190.1 m from the origin, the tips of the robot 0.\d+ m", errors)
+    assert errors.endswith("this looks like millimetres read as metres: give --unit mm.\n")
+
+
+@pytest.mark.slow
+def test_track_leads_in_from_where_the_robot_stands(fitted, tmp_path, capsys):
+    out = tmp_path / "track"
+    arguments = ["track", fitted / "robot.toml", *SHAPE, "--size", "20,10", "--out", out]
+    arguments += ["--duration", "2", "--dq-max", "4"]  # mm/s
+    table = {}
+    for start in ("1,-2,1,0.5,0,-0.5", "rest", "path"):
+        code, record = document(capsys, *arguments, f"--from={start}")
+        assert code == 0
+        q = np.loadtxt(out / "track.csv", delimiter=",", skiprows=1, usecols=range(1, 7))
+        assert np.abs(np.diff(q, axis=0)).max() <= 0.4 + 1e-8
+        rows = record["lead_in"]["rows"]
+        assert record["lead_in"]["duration_s"] == pytest.approx(0.1 * rows)
+        assert len(q) == rows + 21
+        table[start] = q[0], q[rows:]
+    assert table["1,-2,1,0.5,0,-0.5"][0].tolist() == [1, -2, 1, 0.5, 0, -0.5]
+    assert not table["rest"][0].any()
+    assert rows == 0
+    for _, path in table.values():
+        np.testing.assert_array_equal(path, table["path"][1])
+    code, _, errors = run(capsys, *arguments, "--from=1000,0,0,0,0,0")
+    assert code == 2
+    assert "`start` must be 6 values in or near the limits" in errors
+    assert run(capsys, *arguments, "--from=1,2")[0] == 2
+
+
+@pytest.mark.slow
+def test_start_of_chambers_is_the_middle_of_their_range(tmp_path):
+    chain = hybridkin.robots.bionic_handling_assistant()
+    loaded = workflow.LoadedModel("trunk", Path("trunk.toml"), chain)
+    limits = workflow.path_limits(loaded, 0.1, 0.4)
+    path = hybridkin.trajectories.line([0.0, 0, 0.75], [0.05, 0, 0.75], duration=1.0, dt=0.25)
+    report, _ = workflow.track_path(loaded, path, tmp_path / "t", limits=limits)
+    np.testing.assert_allclose(report.record["lead_in"]["start"], 0.25)
+    with pytest.raises(ValueError, match='`start` must be "rest", "path" or numbers'):
+        workflow.track_path(loaded, path, "t", limits=limits, start="home")
 
 
 @pytest.mark.parametrize(

@@ -355,6 +355,25 @@ def test_actuators_share_out_over_segments(track, tmp_path):
     np.testing.assert_array_equal(display.t, track.t)
 
 
+@pytest.mark.slow
+def test_actuators_by_name_against_their_limits(tmp_path):
+    figure, axes = plots.new_figure(4, 4, 2, 1)
+    q, limits = np.arange(15.0).reshape(3, 5), np.array([5 * [-1.0], [16.0, 17, 18, 19, 20]])
+    shown, names = {"sent": q, "done": q + 0.5}, ("a", "b", "c", "d", "e")
+    display = plots.ActuatorDisplay(shown, (2, 3), names=names, limits=limits)
+    display.plot(axes, unit="turns", per_unit=-0.5)
+    assert [len(ax.lines) for ax in axes] == [4, 6]
+    np.testing.assert_allclose(axes[1].lines[0].get_ydata(), -2 * q[:, 2])
+    labels = [text.get_text() for text in axes[1].get_legend().get_texts()]
+    assert labels == ["c", "d", "e", "done", "limits"]
+    (lines,) = axes[0].collections
+    assert [segment[0, 1] for segment in lines.get_segments()] == [2.0, 2.0, -32.0, -34.0]
+    assert lines.get_colors()[0].tolist() == lines.get_colors()[2].tolist()
+    assert axes[0].lines[0].get_color() == axes[0].lines[2].get_color()
+    assert axes[1].get_ylabel() == "segment 2 [turns]"
+    assert drawn(figure, tmp_path)
+
+
 # Films and pages
 
 

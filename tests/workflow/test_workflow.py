@@ -339,11 +339,11 @@ def test_a_fit_to_a_thinned_log_knows_all_of_its_rows(log, tmp_path):
     settings = workflow.FitSettings(n_folds=2, n_seeds=1, auto=False, max_rows=60)
     workflow.fit_log(measured, description, tmp_path / "m", settings, n_jobs=1)
     loaded = workflow.open_model(tmp_path / "m")
-    assert loaded.was_fitted(measured.q, measured.x).all()
-    assert not loaded.was_fitted(measured.q, measured.x + 1e-5).any()
+    assert loaded.was_fitted(measured.q, measured.x, measured.motions).all()
+    assert not loaded.was_fitted(measured.q, measured.x + 1e-5, measured.motions).any()
     assert loaded.held_out["mean"] > 0
     nominal = workflow.open_model(robot)
-    assert not nominal.was_fitted(measured.q, measured.x).any()
+    assert not nominal.was_fitted(measured.q, measured.x, measured.motions).any()
     report, _ = workflow.evaluate_log(nominal, measured)
     assert report.record["fitted_rows"] == 0
 

@@ -1,0 +1,87 @@
+"""Whether a path lies within the reach of a robot, and how much smaller it would."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridkin.ik.solver import InverseKinematics
+from hybridkin.ik.trajectories import Trajectory
+from hybridkin.workflow._domain import Domain, PathLimits, preferred
+from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.path import scaled_path
+from hybridkin.workflow.report import Progress
+
+_POINTS = 13  # of the path, evenly in time; those furthest in every direction come in addition
+_STARTS = 12  # for every point, the commands whose tips are nearest to it
+_BOX = 2000  # commands within the limits
+_HALVINGS = 7
+_OTHER_UNIT = 100.0  # a path so many times larger than the workspace is in another unit
+
+
+def check_reach(
+    loaded: LoadedModel,
+    path: Trajectory,
+    limits: PathLimits,
+    domain: Domain,
+    tol: float,
+    force: bool,
+    progress: Progress,
+) -> None:
+    """Raise where a path is in another unit or, unless `force` is set, leaves the robot's reach."""
+    tips = domain[1]
+    far, reach = (float(np.linalg.norm(x, axis=1).max()) for x in (path.x, tips))
+    if far > _OTHER_UNIT * reach:
+        raise ValueError(
+            f"`path` goes {far:.4g} m from the origin, the tips of the robot {reach:.3g} m; this "
+            "looks like millimetres read as metres: give --unit mm."
+        )
+    if force:
+        return
+    # Starts from all of the box as well: many of its corners lie outside the domain.
+    shares = np.random.default_rng(0).uniform(size=(_BOX, len(limits.q_min)))
+    shares[::2] = shares[::2].round()
+    box = limits.q_min + shares * (limits.q_max - limits.q_min)
+    with torch.no_grad():
+        reached = loaded.module(torch.from_numpy(box)).numpy()
+    home = preferred(loaded, limits)
+    ik = InverseKinematics(loaded.module, q_min=limits.q_min, q_max=limits.q_max, q_pref=home)
+    ends = [f(column) for column in path.x.T for f in (np.argmin, np.argmax)]
+    rows = np.unique([*np.linspace(0, len(path) - 1, _POINTS).astype(int), *ends])
+
+    def missed_by(scale: float, rows: NDArray) -> NDArray:
+        progress("checking the reach", 0, 1)
+        x = scaled_path(path, scale).x[rows]
+        starts = np.concatenate([q[_nearest(x, p)] for q, p in (domain, (box, reached))], axis=1)
+        targets = np.repeat(x[:, None], starts.shape[1], axis=1)
+        error = ik.solve(targets, q0=starts, tol=tol, max_iter=100).error.min(axis=1)
+        return np.where(error <= tol, 0.0, error)
+
+    missed = missed_by(1.0, rows)
+    far_out = rows[missed > 0.0]
+    if len(far_out) == 0:
+        return
+    worst = path.x[rows[missed.argmax()]]
+    low, high, point = map(_words, (tips.min(axis=0), tips.max(axis=0), worst))
+    way_out = f"its centre is out of reach too: tips go from ({low}) to ({high}) mm, check --unit"
+    if not missed_by(0.0, far_out[:1]).any():
+        scale = 0.0
+        for step in 0.5 ** np.arange(1, _HALVINGS + 1):
+            scale += 0.0 if missed_by(scale + step, far_out).any() else step
+        scale *= 0.99  # for points between those tried
+        way_out = f"about its centre {scale:.2g} of its size can be reached: --scale {scale:.2g}"
+    raise ValueError(
+        f"`path` leaves the reach of the robot within its limits ({limits.source}): "
+        f"{len(far_out)} of {len(rows)} points tried are out of reach, ({point}) mm by "
+        f"{1e3 * missed.max():.3g} mm; {way_out}. To go as near as the tip can: --force."
+    )
+
+
+def _nearest(x: NDArray, tips: NDArray) -> NDArray:
+    """Return for each of the points x (N, 3) which of the tips are nearest (N, _STARTS)."""
+    return np.linalg.norm(tips - x[:, None], axis=2).argsort(axis=1)[:, :_STARTS]
+
+
+def _words(point: NDArray) -> str:
+    return ", ".join(f"{1e3 * v:.3g}" for v in point)
