@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import json
+import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -59,7 +62,10 @@ class _Parser(argparse.ArgumentParser):
     """Errors in the form of all others of the command line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"hybridkin: error: {message}; see `{self.prog} --help`\n")
+        message = f"{message}; see `{self.prog} --help`"
+        if "--json" in sys.argv:
+            print(json.dumps({"error": message, "exit_code": 2}, indent=2))
+        self.exit(2, f"hybridkin: error: {message}\n")
 
 
 def _paper(command: argparse.ArgumentParser) -> None:
@@ -124,7 +130,9 @@ def _fit(command: argparse.ArgumentParser) -> None:
         type=_share,
         help="estimate an error radius that covers this share of tips, such as 0.9; slow",
     )
-    command.add_argument("--folds", type=_count, default=5, help="parts to hold out in turn (5)")
+    command.add_argument(
+        "--folds", type=partial(_count, least=2), default=5, help="parts to hold out in turn (5)"
+    )
     command.add_argument(
         "--no-auto", action="store_true", help="leave out the hybrid that chooses for itself: fast"
     )
@@ -138,7 +146,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--max-rows",
-        type=int,
+        type=partial(_count, least=0),
         default=2000,
         metavar="N",
         help="of a longer log take every k-th row, N at most; 0: all (2000)",
@@ -282,8 +290,8 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     log.add_argument("--q-unit", choices=UNITS)
     log.add_argument("--x-unit", choices=METRES)
     log.add_argument("--q-sign", type=int, choices=(1, -1), help="-1: pulled counts as positive")
-    log.add_argument("--groups", metavar="COLUMN", help="column that names the motion of a row")
-    log.add_argument("--time", metavar="COLUMN", help="column of the time stamp [s]")
+    log.add_argument("--groups", metavar="COLUMN", help="column that names the motion; or none")
+    log.add_argument("--time", metavar="COLUMN", help="column of the time stamp [s]; or none")
     log.add_argument("--delimiter", help="separator of a text file (found out)")
     log.add_argument(
         "--exclude",
@@ -299,15 +307,18 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     log.add_argument("--force", action="store_true", help="go on in spite of errors in the log")
 
 
-def _count(text: str) -> int:
+def _count(text: str, least: int = 1) -> int:
     value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
+    if value < least:
+        raise argparse.ArgumentTypeError(f"must be at least {least}, got {value}")
     return value
 
 
 def _numbers(text: str) -> Sequence[float]:
-    return tuple(float(part) for part in text.split(","))
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be numbers, as in 1.5,2, got {text!r}") from None
 
 
 def _start(text: str) -> Sequence[float] | str:

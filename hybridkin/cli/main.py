@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
+import os
 import re
 import sys
+import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,8 +26,8 @@ if TYPE_CHECKING:
     from hybridkin.chains.robots import LogFormat, RobotDescription
     from hybridkin.workflow import MeasuredLog, Report
 
-_LOGS = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 _DT = 0.02
+_PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
 
 
 class _Outcome(NamedTuple):
@@ -47,21 +50,29 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.showwarning = bars.warn
             outcome = _RUN[arguments.command](arguments, bars)
     except KeyboardInterrupt:
-        print("hybridkin: interrupted; nothing was written", file=sys.stderr)
-        return 130
+        return _failed("interrupted; nothing was written", 130, arguments.json)
     except Exception as error:
         if not _is_of_input(error):
             raise
-        print(f"hybridkin: error: {error}", file=sys.stderr)
-        return 2
+        return _failed(f"error: {error}", 2, arguments.json)
+    written = "\n  ".join(["\n\nWrote", *map(str, outcome.paths)]) if outcome.paths else ""
+    text = outcome.text + written
     if arguments.json:
-        written = {"written": [str(path) for path in outcome.paths]} if outcome.paths else {}
-        print(hybridkin.workflow.json_text({**outcome.record, **written}))
-        return outcome.code
-    print(outcome.text)
-    if outcome.paths:
-        print("\nWrote", *outcome.paths, sep="\n  ")
+        more = {"written": [*map(str, outcome.paths)]} if outcome.paths else {}
+        text = hybridkin.workflow.json_text({**outcome.record, **more})
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:  # the reader, `head` for example, has what it wants
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
     return outcome.code
+
+
+def _failed(message: str, code: int, as_json: bool) -> int:
+    """Print why a command failed, with --json also as a document, and return the exit code."""
+    print(f"hybridkin: {message}", file=sys.stderr)
+    if as_json:
+        print(json.dumps({"error": message.removeprefix("error: "), "exit_code": code}, indent=2))
+    return code
 
 
 class _Bars:
@@ -71,6 +82,7 @@ class _Bars:
         self._bar: Any = None
         self._what: str | None = None
         self._seen: set[str] = set()
+        self._said = time.monotonic()
 
     def __call__(self, what: str, done: int, total: int) -> None:
         if self._what != what:
@@ -79,6 +91,9 @@ class _Bars:
             # None: no bars in files and pipes
             self._bar = tqdm(total=total, desc=what, file=sys.stderr, disable=None)
         self._bar.update(done - self._bar.n)
+        if self._bar.disable and time.monotonic() > self._said + _PATIENCE:
+            self._said = time.monotonic()
+            print(f"hybridkin: {what}: {done} of {total}", file=sys.stderr)
 
     def warn(self, message: Any, *_: Any) -> None:
         """Print a warning, of those that differ in numbers only the first."""
@@ -96,7 +111,7 @@ class _Bars:
 
 def _is_of_input(error: Exception) -> bool:
     """Return whether the user can correct it: such errors are printed without a traceback."""
-    if isinstance(error, (ValueError, TypeError, OSError, ImportError)):
+    if isinstance(error, (ValueError, TypeError, OSError, ImportError, MemoryError)):
         return True
     return isinstance(error, hybridkin.simulation.NotSettledError)
 
@@ -211,7 +226,7 @@ def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
 
 
 def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    if arguments.log.suffix.lower() not in _LOGS:
+    if arguments.log.suffix.lower() not in hybridkin.workflow.model.LOG_SUFFIXES:
         loaded = hybridkin.workflow.open_model(arguments.log, arguments.robot)
         return _Outcome.of(hybridkin.workflow.describe(loaded))
     if arguments.robot is None:
@@ -252,6 +267,7 @@ def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: 
     names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time")
     given = {name: vars(arguments)[name] for name in names}
     given = {name: value for name, value in given.items() if value is not None}
+    given |= {name: None for name in ("groups", "time") if given.get(name) == "none"}
     if known is not None:
         return replace(known, **given, **({"q_scale": None} if "q_unit" in given else {}))
     if "q" not in given or "x" not in given:

@@ -81,6 +81,9 @@ def path_limits(
             "robot description: this model does not know the range of its actuators."
         )
     n = loaded.n_actuators
+    for name, value in asked.items():
+        if value.shape not in ((), (1,), (n,)):
+            raise ValueError(f"`{name}` must be one number or {n}, got {value.size}.")
     low, high = (np.broadcast_to(v, n).astype(float) for v in (found.q_min, found.q_max))
     fast = None if found.dq_max is None else np.broadcast_to(found.dq_max, n).astype(float)
     if (low > high).any():

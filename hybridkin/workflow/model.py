@@ -19,6 +19,7 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.saving.saved_model import load_model, model_header
 
+LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 _MODEL, _ROBOT = "model.safetensors", "robot.toml"
 
 
@@ -160,6 +161,8 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
                 f"fit: hybridkin fit LOG --robot {path} --out MODEL."
             )
         return LoadedModel(description.name, path, description.chain, description)
+    if path.suffix.lower() in LOG_SUFFIXES:
+        raise ValueError(f"`model` must be a model or a robot description, got the log {path}.")
     if path.is_dir():
         if not (path / _MODEL).is_file():
             raise FileNotFoundError(f"`model` {path} is a folder without {_MODEL}; name the file.")

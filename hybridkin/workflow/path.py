@@ -42,8 +42,11 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {file}.")
-    with open(file, encoding="utf-8-sig") as lines:
-        rows = [line.split(",") for line in lines if line.strip() and line[0] != "#"]
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"`path` must be a CSV file of points, {file} is no text.") from error
+    rows = [line.split(",") for line in lines if line.strip() and line[0] != "#"]
     if max(map(len, rows), default=0) == 3:
         if dt is None:
             raise ValueError(f"{file} has no times: give the time between its points (--dt 0.02).")

@@ -14,7 +14,7 @@ from sklearn.kernel_ridge import KernelRidge
 
 import hybridkin
 from hybridkin import PlayOperator, datasets, load_model, robots, save_model, workflow
-from hybridkin.cli.main import main
+from hybridkin.cli.main import _Bars, main
 
 COLUMNS = ["t1", "t2", "t3", "t4", "t5", "t6"]
 ROBOT = """
@@ -783,6 +783,9 @@ def test_every_command_has_help_with_exit_codes(command, capsys):
         ["animate", "model", "track", "--out", "a.gif", "--frames", "0"],
         ["track", "model", "--shape", "line", "--tol", "-1", "--out", "out"],
         ["fit", "l", "--robot", "r", "--play", "-1", "--out", "out"],
+        ["fit", "l", "--robot", "r", "--folds", "1", "--out", "out"],
+        ["fit", "l", "--robot", "r", "--max-rows", "-3", "--out", "out"],
+        ["track", "model", "--shape", "line", "--size", "1,a,0", "--out", "out"],
     ],
 )
 def test_wrong_options_end_with_2(arguments, capsys):
@@ -790,6 +793,61 @@ def test_wrong_options_end_with_2(arguments, capsys):
         main(arguments)
     assert left.value.code == 2
     assert capsys.readouterr().err.startswith("hybridkin: error: ")
+
+
+def test_errors_are_json_where_asked(fitted, capsys, monkeypatch):
+    code, record = document(capsys, "describe", fitted / "none")
+    assert code == record["exit_code"] == 2
+    assert "no such file" in record["error"]
+    monkeypatch.setattr(sys, "argv", ["hybridkin", "fly", "--json"])
+    with pytest.raises(SystemExit):
+        main(["fly", "--json"])
+    assert "invalid choice: 'fly'" in json.loads(capsys.readouterr().out)["error"]
+
+
+@pytest.mark.slow
+def test_a_reader_that_stops_early_is_no_error(fitted):
+    command = [sys.executable, "-m", "hybridkin", "describe", fitted / "robot.toml"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
+
+
+def test_long_work_says_so_where_there_is_no_terminal(capsys, monkeypatch):
+    monkeypatch.setattr("hybridkin.cli.main._PATIENCE", -1.0)
+    with contextlib.closing(_Bars()) as bars:
+        bars("tracking", 3, 7)
+    assert capsys.readouterr().err == "hybridkin: tracking: 3 of 7\n"
+
+
+def test_groups_of_the_description_can_be_left_out(log, robot, capsys):
+    code, record = document(capsys, "describe", log, "--robot", robot, "--groups", "none")
+    assert code == 0
+    assert record["n_motions"] in (None, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evaluate", "log.csv", "model"], "must be a model or a robot description, got the log"),
+        (["track", "model", "noise.bin", "--out", "t"], "noise.bin is no text"),
+        (
+            ["track", "model", *SHAPE, "--size", "5,5", "--q-min", "1,2", "--out", "t"],
+            "number or 6",
+        ),
+        (
+            ["track", "model", *SHAPE, "--size", "5,5", "--duration", "1e9", "--out", "t"],
+            "allocate",
+        ),
+    ],
+)
+def test_a_slip_of_a_newcomer_has_an_answer(fitted, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(fitted)
+    (fitted / "noise.bin").write_bytes(bytes(range(256)))
+    code, _, errors = run(capsys, *arguments)
+    assert code == 2
+    assert message in errors
 
 
 @pytest.mark.slow
