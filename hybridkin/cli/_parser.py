@@ -231,8 +231,10 @@ def _track(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--tol", type=_positive, default=0.1, help="error that is reached [mm] (0.1)"
     )
-    words = {"metavar": "rest|path|A,B,...", "help": "where the robot stands (rest)"}
-    command.add_argument("--from", type=_start, default="rest", dest="start", **words)
+    where, values = "where the robot stands (rest)", "rest|path|A,B,..."
+    command.add_argument(
+        "--from", type=_start, default="rest", dest="start", metavar=values, help=where
+    )
     command.add_argument("--force", action="store_true", help="go as near as the tip can")
 
 

@@ -226,7 +226,7 @@ def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
 
 
 def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
-    if arguments.log.suffix.lower() not in hybridkin.workflow.model.LOG_SUFFIXES:
+    if arguments.log.suffix.lower() not in hybridkin.workflow.LOG_SUFFIXES:
         loaded = hybridkin.workflow.open_model(arguments.log, arguments.robot)
         return _Outcome.of(hybridkin.workflow.describe(loaded))
     if arguments.robot is None:

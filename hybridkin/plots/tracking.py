@@ -269,7 +269,7 @@ class ActuatorDisplay:
                 lines = ax.plot(steps, (scale * q)[:, part], **{**look_of(i), "linewidth": 1.2})
                 lines[0].set_label(name)
                 for j, line in enumerate(lines if self.names else ()):
-                    label = self.names[part][j] if i == 0 else line.get_label()
+                    label = (self.names or ())[part][j] if i == 0 else line.get_label()
                     line.set(color=COLORS[j % 8], linestyle="-:"[i % 2], label=label)
             if self.limits is not None:
                 values = (scale * self.limits)[:, part]

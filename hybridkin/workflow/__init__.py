@@ -5,12 +5,13 @@ from hybridkin.workflow._domain import PathLimits, path_limits
 from hybridkin.workflow.evaluate import evaluate_log
 from hybridkin.workflow.fit import Comparison, FitSettings, compare_by_group, fit_log
 from hybridkin.workflow.log import LogError, MeasuredLog, read_log
-from hybridkin.workflow.model import LoadedModel, open_model
+from hybridkin.workflow.model import LOG_SUFFIXES, LoadedModel, open_model
 from hybridkin.workflow.path import read_path, scaled_path, shape_path
 from hybridkin.workflow.report import Report, json_text
 from hybridkin.workflow.track import animate_track, track_path
 
 __all__ = [
+    "LOG_SUFFIXES",
     "Comparison",
     "FitSettings",
     "LoadedModel",

@@ -20,6 +20,8 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.saving.saved_model import load_model, model_header
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
+"""Endings of the files that are taken for logs."""
+
 _MODEL, _ROBOT = "model.safetensors", "robot.toml"
 
 

@@ -107,12 +107,12 @@ def track_path(
     check_out(out)
     log_format = loaded.log_format()
     limits = path_limits(loaded) if limits is None else limits
-    start = _start(loaded, limits, start)
+    stands = _start(loaded, limits, start)
     domain = sample_domain(loaded, limits)
     check_reach(loaded, path, limits, domain, tol, force, progress)
     track = _best_track(loaded, path, limits, domain, tol, progress)
     names = [IKStatus(int(code)).name for code in track.status]
-    whole, n_lead = _with_lead_in(track, start, limits, loaded)
+    whole, n_lead = _with_lead_in(track, stands, limits, loaded)
     sent = whole.q if loaded.play is None else loaded.play.command(whole.q)[0]
     speeds = np.abs(np.diff(whole.q, axis=0) / np.diff(whole.t)[:, None])
     inside = loaded.module.in_domain(torch.from_numpy(track.q)).double().mean()
@@ -127,7 +127,7 @@ def track_path(
         in_domain=None if loaded.hybrid is None else float(inside),
         play=loaded.play_width,
         statuses=dict(Counter(names)),
-        lead_in={"rows": n_lead, "duration_s": whole.t[n_lead] - whole.t[0], "start": start},
+        lead_in={"rows": n_lead, "duration_s": whole.t[n_lead] - whole.t[0], "start": stands},
         limits=dict(vars(limits)),
         largest_speed=speeds.max(initial=0.0),
         columns={name: vars(log_format)[name] for name in _COLUMNS},
