@@ -98,11 +98,6 @@ class LogFormat:
         """What the model counts per unit of the log, sign included, shape () or (n,)."""
         return np.multiply(self.q_sign, self.q_scale or UNITS[self.q_unit])
 
-    @property
-    def q_factor(self) -> np.ndarray:
-        """What the model counts per unit of the log, sign included, shape () or (n,)."""
-        return np.multiply(self.q_sign, METRES[self.q_unit])
-
 
 @dataclass(frozen=True, eq=False)
 class Limits:
