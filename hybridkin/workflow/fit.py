@@ -6,6 +6,7 @@ import shutil
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,8 +59,7 @@ _DATA_LINEAR = "data-driven, linear"
 _SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # what a file can hold
 _OF_CHAINS = ("mechanical, nominal", CALIBRATED, LINEAR)
 _SAVED_OF_DATA = (_DATA_LINEAR, ELM, AUTO)  # of a robot without segments
-_N_HIDDEN = 100
-_INNER_FOLDS = 4
+_N_HIDDEN, _INNER_FOLDS = 100, 4
 _ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto: fewer do not pay for a start
 
 
@@ -389,14 +389,11 @@ def _add_model(
     kept = ("log", "robot", "n_whole", "n_motions", "excluded", "loss", "saved", "chosen")
     training = {key: report.record[key] for key in (*kept, "held_out")}
     training |= {"rows": report.record["n"], "split": log.split}
-    # The rows between those of a thinned log are no new ones.
-    model._fitted_rows = np.unique(row_digests(log.q, log.x))
+    model._fitted_rows = np.unique(row_digests(log.q, log.x))  # with those between thinned ones
     report.file("model.safetensors", lambda path: save_model(model, path, training=training))
     report.text("The model: `hybridkin.load_model('model.safetensors')`.")
-    if robot.path is not None:
-        source = robot.path
-        report.file("robot.toml", lambda path: shutil.copyfile(source, path))
-        report.text("`robot.toml` is the description it was made from.")
+    if robot.path is not None:  # the description it was made from
+        report.file("robot.toml", partial(shutil.copyfile, robot.path))
 
 
 @threadpool_limits.wrap(limits=1)  # the processes share the cores already
