@@ -167,7 +167,10 @@ class Report:
         titles, factors, formats = zip(*(_COLUMNS[key] for key in columns), strict=True)
         rows = []
         for name, entry in record.items():
-            values = [factor * entry.get(key, math.nan) for key, factor in zip(columns, factors, strict=True)]
+            values = [
+                factor * entry.get(key, math.nan)
+                for key, factor in zip(columns, factors, strict=True)
+            ]
             rows.append([name, *(c.replace("nan", "-") for c in map(format, values, formats))])
         self.table(["tip error [mm]", *titles], rows)
 
