@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import issparse
 from torch import Tensor
 
 
@@ -27,21 +29,73 @@ Numbers = ArrayLike | Tensor  # what a caller may hand over as an array
 def as_tensor(
     value: Numbers | Transform, name: str, device: torch.device | str | None = None
 ) -> Tensor:
-    """Return a floating tensor that shares no memory with a caller's array."""
+    """Return a caller's real numbers as a tensor, without a graph; an array is copied.
+
+    float32 stays; all other types become float64.
+    """
     if isinstance(value, Transform):
-        return value.get_matrix().detach()
+        value = value.get_matrix()
     if not isinstance(value, Tensor):
-        try:
-            value = torch.tensor(np.asarray(value), device=device)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
-    value = value.detach()
-    return value if value.is_floating_point() else value.double()
+        return torch.tensor(real_array(value, name), device=device or "cpu")
+    if value.is_complex() or value.layout != torch.strided or value.is_meta:
+        got = f"{value.dtype} with layout {value.layout} on {value.device}"
+        raise ValueError(f"`{name}` must be a dense tensor that holds real numbers, got {got}.")
+    return value.detach() if value.dtype == torch.float32 else value.detach().double()
+
+
+def real_array(value: Numbers | Transform, name: str) -> NDArray:
+    """Return a caller's real numbers as an array; float32 stays, other types become float64."""
+    if isinstance(value, (Tensor, Transform)):
+        return as_tensor(value, name).numpy(force=True)
+    if np.ma.is_masked(value):
+        raise ValueError(f"`{name}` has masked entries; drop these rows, or fill them with NaN.")
+    if issparse(value):
+        raise TypeError(f"`{name}` must be dense, got a sparse matrix; convert it by `.toarray()`.")
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind in "biufO":
+            kind = np.float32 if array.dtype == np.float32 else np.float64
+            return np.require(array, kind, ["C", "W"])
+    except (TypeError, ValueError, RuntimeError) as error:
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"`{name}` must be numeric, got {value!r:.200} ({error}).") from error
+    hint = " Complex data not supported." if array.dtype.kind == "c" else ""
+    raise ValueError(f"`{name}` must be numeric, got {value!r:.200}.{hint}")
+
+
+def number(value: Any, name: str) -> float:
+    """Return a caller's real number."""
+    found = real_array(value, name)
+    if found.ndim:
+        raise ValueError(f"`{name}` must be one number, got {value!r:.200}.")
+    return float(found)
+
+
+def table(value: Any, name: str) -> Any:
+    """Return rows as scikit-learn takes them: a data frame of X as it is, else an array."""
+    if value is None or isinstance(value, Real):
+        return value
+    array = real_array(value, name)
+    return value if name == "X" and hasattr(value, "columns") else array
+
+
+def labels(groups: Any, n_rows: int) -> NDArray:
+    """Return the motion of every row, shape (N,)."""
+    found = groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
+    if found.shape != (n_rows,):
+        need = f"must have shape ({n_rows},), one entry for each row"
+        raise ValueError(f"`groups` {need} of the log, got {found.shape}.")
+    return found.astype(str) if found.dtype == object else found
 
 
 def as_array(a: Numbers) -> np.ndarray:
     """Return a tensor or array as a NumPy array."""
     return a.cpu().numpy() if isinstance(a, Tensor) else np.asarray(a)
+
+
+def identity(n: int, like: Tensor) -> Tensor:
+    """Return the identity (n, n) in the dtype and on the device of a tensor."""
+    return torch.eye(n, dtype=like.dtype, device=like.device)
 
 
 def is_numpy(value: object) -> bool:

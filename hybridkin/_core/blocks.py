@@ -16,7 +16,8 @@ def in_blocks(
     The temporaries of a block stay in the cache: a million rows cost as much each as a thousand.
     What the function gives may lie in memory with the batch last; the result is contiguous.
     """
-    if not isinstance(q, Tensor) or q.ndim == 0:
+    check_tensor(q, "q")
+    if q.ndim == 0:
         return function(q)  # which raises
     blocks = q.reshape(-1, q.shape[-1]).split(size)
     first = function(blocks[0])
@@ -32,19 +33,24 @@ def in_blocks(
     return tuple(result.reshape(*q.shape[:-1], *part.shape[1:]) for result, part in pairs)
 
 
-def check_vectors(value: Tensor, size: int, name: str, why: str) -> Tensor:
-    """Return `value` when it is a floating tensor of shape (..., size), else raise."""
+def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:
+    """Raise where `value` is not a dense tensor of float64 or float32."""
     if not isinstance(value, Tensor):
         raise TypeError(
             f"`{name}` must be a torch tensor of shape (..., {size}), got "
             f"{type(value).__name__}; wrap it in torch.as_tensor(...)."
         )
-    if not value.is_floating_point():
+    if value.dtype not in (torch.float64, torch.float32) or value.layout != torch.strided:
         raise TypeError(
-            f"`{name}` must be a floating tensor, got {value.dtype}; convert it with `.double()`."
+            f"`{name}` must be a dense floating tensor, float64 or float32, got {value.dtype} "
+            f"with layout {value.layout}; convert it with `.double()`, or `.to_dense()`."
         )
+
+
+def check_vectors(value: Tensor, size: int, name: str, why: str) -> None:
+    """Raise where `value` is not a dense floating tensor of shape (..., size)."""
+    check_tensor(value, name, size)
     if value.ndim == 0 or value.shape[-1] != size:
         raise ValueError(
             f"`{name}` must have shape (..., {size}), got {tuple(value.shape)}; {why}."
         )
-    return value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from hybridkin._core.blocks import check_tensor
 from hybridkin._core.stored import Layout, Restore, Stored
 
 if TYPE_CHECKING:
@@ -20,11 +21,47 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-class PortableModule(nn.Module):
+class _Closed(NamedTuple):
+    """A tensor in a pickle: torch's own names its storage by an address."""
+
+    array: NDArray
+    device: str
+
+
+class Portable:
+    """An object whose pickle and joblib hash are the same in every process.
+
+    Its tensors, those in its dicts too, are pickled as plain arrays. They come back on their
+    device, or on the CPU where that device does not exist.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        return _closed(vars(self))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(_opened(state))
+
+
+def _closed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return type(value)((key, _closed(entry)) for key, entry in value.items())
+    tensor = isinstance(value, Tensor)
+    return _Closed(value.numpy(force=True), str(value.device)) if tensor else value
+
+
+def _opened(value: Any) -> Any:
+    if isinstance(value, dict):
+        return type(value)((key, _opened(entry)) for key, entry in value.items())
+    if not isinstance(value, _Closed):
+        return value
+    device = value.device if torch.cuda.is_available() else "cpu"
+    return torch.tensor(value.array, device=device)
+
+
+class PortableModule(Portable, nn.Module):
     """A module of buffers whose pickle and joblib hash are the same in every process.
 
-    Buffers are stored as plain arrays and come back on their device, or on the CPU where that
-    device does not exist. A class with a `layout` describes itself, for files and compilers.
+    A class with a `layout` describes itself, for files and compilers.
     """
 
     layout: ClassVar[Layout] = Layout("", {})  # without a kind: it could only be stored as code
@@ -60,21 +97,6 @@ class PortableModule(nn.Module):
     if TYPE_CHECKING:  # attributes that no statement assigns are buffers
 
         def __getattr__(self, name: str) -> Tensor: ...
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = self.__dict__.copy()
-        state["_buffers"] = {
-            name: None if value is None else (value.detach().cpu().numpy(), str(value.device))
-            for name, value in self._buffers.items()
-        }
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        def opened(array: NDArray, device: str) -> Tensor:
-            return torch.tensor(array, device=device if torch.cuda.is_available() else "cpu")
-
-        buffers = {k: None if a is None else opened(*a) for k, a in state["_buffers"].items()}
-        super().__setstate__({**state, "_buffers": buffers})
 
 
 class ForwardModel(PortableModule):
@@ -136,6 +158,7 @@ class ForwardModel(PortableModule):
 
         At most 1 within the domain, larger outside; 0 where nothing was learned. Differentiable.
         """
+        check_tensor(q, "q")
         return q.new_zeros(q.shape[:-1])
 
     def in_domain(self, q: Tensor) -> Tensor:
@@ -303,6 +326,7 @@ def jacobian(model: Any, q: Tensor) -> Tensor:
     tensor([[2., 0.],
             [0., 6.]])
     """
+    check_tensor(q, "q")
     return as_forward_model(model).jacobian(q)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hybridkin._core.arrays import identity
 from hybridkin._core.stumpff import stumpff
 
 
@@ -22,7 +23,7 @@ def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
     See Barfoot, State Estimation for Robotics (2017), section 7.1.
     """
     K = cross_matrix(phi)
-    eye = torch.eye(3).to(phi)
+    eye = identity(3, phi)
     _, f, g, c3, _ = (part[..., None, None] for part in stumpff(phi.square().sum(-1)))
     return eye + f * K + g * K @ K, eye + g * K + c3 * K @ K
 

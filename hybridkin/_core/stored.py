@@ -158,7 +158,8 @@ class Stored:
         for name, letters in shapes.items():
             array = self.array(name, tuple(lengths.get(letter) for letter in letters))
             lengths |= dict(zip(letters, array.shape, strict=True))
-            found[name] = torch.tensor(array)
+            array = self.array(name, tuple(lengths[letter] for letter in letters))
+            found[name] = torch.tensor(array, device="cpu")
         return found
 
     def part(self, name: str) -> Stored:

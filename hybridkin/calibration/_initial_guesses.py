@@ -63,7 +63,7 @@ def aligned(chain: _Chain, rows: Rows) -> _Chain:
     sign = torch.ones_like(here)
     sign[2] = torch.sign(torch.linalg.det(u @ vh))
     rotation = vh.mT @ (sign[:, None] * u.mT)
-    move = torch.eye(4, dtype=here.dtype)
+    move = torch.eye(4, dtype=here.dtype, device=here.device)
     move[:3, :3], move[:3, 3] = rotation, there - rotation @ here
     return chain.with_geometry(base=move @ chain.geometry()["base"])
 

@@ -101,7 +101,7 @@ class Fit:
         """Return the chain at the end of the search."""
         base = self.problem.chain.geometry()["base"]
         with torch.no_grad():
-            return self.problem.moved(torch.as_tensor(self.theta).to(base))
+            return self.problem.moved(torch.from_numpy(self.theta).to(base))
 
 
 def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: bool = False) -> Fit:
@@ -113,10 +113,10 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
     root = np.sqrt(weight)[:, None]
 
     def residual(theta: NDArray) -> NDArray:
-        return rows.residual(problem.moved(torch.as_tensor(theta).to(rows.q)))
+        return rows.residual(problem.moved(torch.from_numpy(theta).to(rows.q)))
 
     def jacobian(theta: NDArray) -> NDArray:
-        J = rows.jacobian(problem, torch.as_tensor(theta).to(rows.q))
+        J = rows.jacobian(problem, torch.from_numpy(theta).to(rows.q))
         return (root[..., None] * J).reshape(-1, theta.size)
 
     def whitened(theta: NDArray, sigma: float) -> NDArray:
@@ -138,7 +138,7 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
         previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    found = float(rows.rmse(problem.moved(torch.as_tensor(theta).to(rows.q))))
+    found = float(rows.rmse(problem.moved(torch.from_numpy(theta).to(rows.q))))
     count = float(weight.sum())
     free = max(3.0 * count - theta.size, 1.0)
     noise = max(sigma if robust else found * (count / free) ** 0.5, floor)

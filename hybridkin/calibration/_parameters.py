@@ -123,11 +123,11 @@ class Shifted(Parameter):
         return self.start.numpy().ravel()[self.shown]
 
     def moved(self, part: Tensor) -> Tensor:
-        directions = torch.as_tensor(self.directions).to(part)
+        directions = torch.from_numpy(self.directions).to(part)
         return self.start + (directions @ part).reshape(self.start.shape)
 
     def tangents(self, part: Tensor) -> Tensor:
-        return torch.as_tensor(self.directions.T.copy()).to(part).reshape(-1, *self.start.shape)
+        return torch.from_numpy(self.directions.T.copy()).to(part).reshape(-1, *self.start.shape)
 
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
         low, high = self.physical if bound is None else bound
@@ -136,7 +136,7 @@ class Shifted(Parameter):
         return (low - self.origin) / self.units, (high - self.origin) / self.units
 
     def value(self, entry: Tensor) -> Tensor:
-        return entry.flatten()[torch.as_tensor(self.shown)].reshape(self.shape)
+        return entry.flatten()[torch.as_tensor(self.shown, device=entry.device)].reshape(self.shape)
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         return (np.abs(self.directions) @ std)[self.shown].reshape(self.shape)
@@ -151,7 +151,7 @@ class Posed(Parameter):
 
     def moved(self, part: Tensor) -> Tensor:
         turned = rotation(part[:3])[0] @ self.start[:3, :3]
-        position = self.start[:3, 3] + part[3:] * torch.as_tensor(self.units[3:]).to(part)
+        position = self.start[:3, 3] + part[3:] * torch.from_numpy(self.units[3:]).to(part)
         pose = torch.cat([turned, position[:, None]], dim=1)
         return torch.cat([pose, self.start[3:]], dim=0)
 
@@ -159,7 +159,7 @@ class Posed(Parameter):
         spins = cross_matrix(rotation(part[:3])[1].T)  # of the columns of the left Jacobian
         tangents = self.start.new_zeros(6, 4, 4)
         tangents[:3, :3, :3] = spins @ self.moved(part)[:3, :3]
-        tangents[3:, :3, 3] = torch.diag(torch.as_tensor(self.units[3:]).to(part))
+        tangents[3:, :3, 3] = torch.diag(torch.from_numpy(self.units[3:]).to(part))
         return tangents
 
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -14,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor
+from hybridkin._core.arrays import Numbers, as_tensor, labels
 from hybridkin._core.distinct import distinct_rows
+from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import LOSSES, Fit, Rows, solve
@@ -38,7 +40,7 @@ _UNPHYSICAL = 1.75  # a change by this factor is a warning
 
 
 @dataclass(frozen=True, repr=False)
-class CalibrationResult:
+class CalibrationResult(Portable):
     """Calibrated chain, and how far the data identify its geometry.
 
     Attributes
@@ -221,15 +223,11 @@ def fit_geometry(
     names = _check_parameters(chain, parameters, bounds, prior)
     if loss not in LOSSES:
         raise ValueError(f"`loss` must be one of {[*LOSSES]}, got {loss!r}.")
-    torch_given = isinstance(q, Tensor)
+    torch_given, device = isinstance(q, Tensor), chain.geometry()["base"].device
+    chain = copy.deepcopy(chain).cpu()  # where the solver works, without a graph
     q, x, messages = _check_data(chain, q, x)
     if groups is not None:
-        groups = np.asarray(groups)
-        if groups.shape != (len(q),):
-            raise ValueError(
-                f"`groups` must have shape ({len(q)},), one motion per row of `q`, got "
-                f"{groups.shape}."
-            )
+        groups = labels(groups, len(q))
     weights = _check_weights(sample_weight, q)
     first, counts, _ = distinct_rows(q, x, weights, groups)
     weights = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
@@ -254,6 +252,7 @@ def fit_geometry(
     if groups is not None:
         cv_rmse = _cross_validate(best, rows, groups[first], loss)
     result = _result(best, rows, cv_rmse, unphysical, torch_given)
+    result.chain.to(device)
     return result, [message for message in messages if message is not None]
 
 
@@ -352,7 +351,7 @@ def _result(
         value = part.value(geometry[part.entry])
         error = part.std_errors(error, value.numpy())
         values[part.name] = value if torch_given else value.numpy()
-        std_errors[part.name] = torch.as_tensor(error) if torch_given else np.asarray(error)
+        std_errors[part.name] = torch.from_numpy(error) if torch_given else np.asarray(error)
         identifiable[part.name] = np.asarray(part.flags(identified))
     unidentified = directions[narrowed * _IDENTIFIED < 1.0]
     return CalibrationResult(
@@ -428,7 +427,7 @@ def _check_parameters(
 def _check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str | None]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
-    q, x = as_tensor(q, "q").to(dtype), as_tensor(x, "x").to(dtype)
+    q, x = as_tensor(q, "q").to("cpu", dtype), as_tensor(x, "x").to("cpu", dtype)
     if q.ndim != 2:
         raise ValueError(f"`q` must have shape (N, n_actuators), got {tuple(q.shape)}.")
     if x.shape != (len(q), 3):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import Numbers, as_array
+from hybridkin._core.arrays import Numbers, labels, real_array
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry, motion_folds
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
@@ -116,11 +116,11 @@ def fit_play(
     >>> fit.kept, fit.width
     (True, 0.0004)
     """
-    tried = np.unique(np.concatenate([[0.0], np.asarray(widths, dtype=float).ravel()])).tolist()
-    groups = np.asarray(groups)
-    splits = motion_folds(groups)
+    tried = np.unique(np.concatenate([[0.0], real_array(widths, "widths").ravel()])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
-    q, x = as_array(q), as_array(x)
+    q, x = real_array(q, "q"), real_array(x, "x")
+    groups = labels(groups, len(q))
+    splits = motion_folds(groups)
     sizes = [len(test) for _, test in splits]
     effective, mean_squares = {}, {}  # by width
 
@@ -128,7 +128,7 @@ def fit_play(
         """Return the mean squared tip distance on the held-out motions."""
         result, _ = fit_geometry(chain, y[train], x[train], names, **calibrate_options)
         with torch.no_grad():
-            tips = result.chain(torch.as_tensor(y[test]).to(result.chain.base)).numpy()
+            tips = result.chain(torch.from_numpy(y[test]).to(result.chain.base)).numpy()
         return float(((tips - x[test]) ** 2).sum(axis=1).mean())
 
     def error(width: float) -> float:

@@ -5,14 +5,23 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.arrays import Numbers, Transform, real_array
 
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
+
+
+def float_dtype(dtype: Any) -> torch.dtype:
+    """Return the precision that torch, NumPy or a string names."""
+    name = str(np.dtype(dtype) if isinstance(dtype, type) else dtype).removeprefix("torch.")
+    if name not in ("float64", "float32"):
+        raise ValueError(f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}.")
+    return torch.float64 if name == "float64" else torch.float32
 
 
 def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
@@ -25,8 +34,8 @@ def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None =
 
 def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
     """Return one number for all, or an array of the shape (also a list of lists), as a tensor."""
-    if len(shape) == 1 and isinstance(value, (list, tuple)) and any(np.ndim(v) for v in value):
-        value = [number for part in value for number in np.ravel(part)]
+    if len(shape) == 1 and _is_nested(value):
+        value = torch.cat([numeric(part, name).flatten() for part in value])
     tensor = numeric(value, name, dtype)
     if tensor.ndim and tensor.shape != shape:
         raise ValueError(
@@ -36,17 +45,17 @@ def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]
 
 
 def numeric(
-    value: Numbers, name: str, dtype: torch.dtype = torch.float64, *, finite: bool = True
+    value: Numbers | Transform,
+    name: str,
+    dtype: torch.dtype = torch.float64,
+    *,
+    finite: bool = True,
 ) -> Tensor:
     """Return numbers as a tensor that shares no memory with them; NaN and infinity raise.
 
     With ``finite=False`` only NaN does.
     """
-    try:
-        array = value.detach() if isinstance(value, Tensor) else np.asarray(value)
-        tensor = torch.as_tensor(array).to(dtype).clone()
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
+    tensor = torch.tensor(real_array(value, name), dtype=dtype, device="cpu")
     if (not torch.isfinite(tensor).all() and finite) or torch.isnan(tensor).any():
         raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")
     return tensor
@@ -90,13 +99,20 @@ def actuator_counts(
     return counts
 
 
+def _is_nested(value: object) -> TypeGuard[Sequence[Numbers]]:
+    parts = value if isinstance(value, (list, tuple)) else ()
+    return any(isinstance(part, (list, tuple)) or np.ndim(part) > 0 for part in parts)
+
+
 def flat_angles(angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """Return the angles of all actuators, segment by segment, shape (n,)."""
     if angles is None:
         rows = [2.0 * math.pi * np.arange(n) / n for n in counts]
+    elif _is_nested(angles):
+        rows = angles
     else:
-        parts = list(angles)  # pyright: ignore[reportArgumentType]
-        rows = parts if np.ndim(parts[0]) else [angles] * len(counts)
+        given = numeric(angles, "angles", dtype)
+        rows = given if given.ndim == 2 else [given] * len(counts)
     rows = [numeric(row, "angles", dtype) for row in rows]
     if tuple(row.numel() for row in rows) != counts:
         raise ValueError(
@@ -117,11 +133,10 @@ def flat_angles(angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dt
 def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Tensor:
     """Return a pose given as a matrix, a Transform3d or None, shape (4, 4)."""
     if value is None:
-        return torch.eye(4, dtype=dtype)
-    if isinstance(value, Transform):
-        value = value.get_matrix().detach()
-        value = value[0] if value.shape[:1] == (1,) else value
+        return torch.eye(4, dtype=dtype, device="cpu")
     matrix = numeric(value, name, dtype)
+    if isinstance(value, Transform) and len(matrix) == 1:
+        matrix = matrix[0]
     if matrix.shape != (4, 4):
         raise ValueError(f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}.")
     rotation = matrix[:3, :3]

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import identity
+
 MOST = 62  # a set of tendons is the bits of one integer
 _MANY = 2000  # rows from which on steps in single precision save more than they cost
 _ROUGH_STEPS = 5
@@ -53,7 +55,7 @@ def responses_of(
     compliance = units[:, None] * torch.linalg.inv_ex(scaled).inverse * units
     force = torch.cat([pulling, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1)
     shape = compliance @ force
-    given = torch.cat([torch.eye(len(zeros)).to(zeros), -zeros[:, None]], dim=-1)
+    given = torch.cat([identity(len(zeros), zeros), -zeros[:, None]], dim=-1)
     return Responses(shape, readings @ shape - given, compliance)
 
 
@@ -113,7 +115,7 @@ def _pivoted_roughly(codes: Tensor, at: Tensor, x: Tensor, rough: Tensor, size: 
     # Stretches in units of a bound on their rounding errors: from one on the sign is certain.
     error = 4 * (n + 1) * torch.finfo(rough.dtype).eps * (x.abs() @ size)
     x = (x / error[:, None]).to(rough).nan_to_num()
-    bits, ones = 2.0 ** torch.arange(n).to(rough), rough.new_ones(n)
+    bits, ones = rough.new_tensor([2.0**k for k in range(n)]), rough.new_ones(n)
     for _ in range(_ROUGH_STEPS):
         terms = here[:, None] * (n + 1) + torch.arange(n + 1, device=at.device)
         stretch = nn.functional.embedding_bag(terms, rough, per_sample_weights=x, mode="sum")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.arrays import Numbers, Transform, identity, number
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
@@ -228,7 +228,7 @@ class ArcChain(Chain):
         # An arc of length l and bending b goes l c along c, the derivative by its length, and
         # turns the axes across it by -b c.
         along = moves[:, :S]
-        x, y = torch.eye(3).to(arcs)[:2, :, None, None] - (bending[:, None] * along).cumsum(2)
+        x, y = identity(3, arcs)[:2, :, None, None] - (bending[:, None] * along).cumsum(2)
         points = (length * along + offsets[:, None] * z).cumsum(1)
         moves, spins = (part.unflatten(1, (3, S)) for part in (moves, spins))
         return Frames(torch.stack([x, y, z]), points, moves, spins, slope)
@@ -284,7 +284,7 @@ class ArcChain(Chain):
         >>> chain(torch.zeros(6, dtype=torch.float64))
         tensor([0.0000, 0.0000, 0.1500], dtype=torch.float64)
         """
-        if not 0.0 < at <= self.n_segments:
+        if not 0.0 < number(at, "at") <= self.n_segments:
             raise ValueError(
                 f"`at` must lie in (0, {self.n_segments}], in segments from the base, got {at}."
             )

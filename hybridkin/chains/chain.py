@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.blocks import check_vectors
+from hybridkin._core.blocks import check_tensor, check_vectors
 from hybridkin._core.model import PoseModel
 from hybridkin._core.units import span_message
 
@@ -70,6 +70,7 @@ class Chain(PoseModel):
                 raise ValueError(
                     f"`{name}` is not part of this chain's geometry; it has {sorted(current)}."
                 )
+            check_tensor(value, name)
             shape = tuple(current[name].shape)
             if value.shape != shape:
                 raise ValueError(f"`{name}` must have shape {shape}, got {tuple(value.shape)}.")

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.arrays import Numbers, Transform, identity
 from hybridkin._core.stored import Layout
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
-from hybridkin.chains._checks import filled
+from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
 
 __all__ = ["ConstantCurvatureChain"]
@@ -92,6 +92,7 @@ class ConstantCurvatureChain(ArcChain):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
+        dtype = float_dtype(dtype)
         geometry = self._checked(
             radii, lengths, n_actuators, 3, angles, routing, offsets, rest_bends, base, dtype
         )
@@ -248,7 +249,7 @@ class ConstantCurvatureChain(ArcChain):
         scaled = readings * units[-readings.shape[1] :]
         inverse = torch.linalg.solve(scaled.mT @ scaled, scaled.mT)
         # One step of refinement: the normal equations lose some digits.
-        inverse = inverse + (torch.eye(len(inverse)).to(inverse) - inverse @ scaled) @ inverse
+        inverse = inverse + (identity(len(inverse), inverse) - inverse @ scaled) @ inverse
         matrix = nn.functional.pad(inverse, (0, 0, len(units) - len(inverse), 0)) * units[:, None]
         straight = torch.zeros_like(radii) if lengths is None else lengths
         offset = torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
@@ -276,7 +277,7 @@ class ConstantCurvatureChain(ArcChain):
         by_reading = nn.functional.pad(by_reading, (readings.shape[1] - 2 * S, 0))
         # The derivative of a least-squares inverse M of B, with M M' = (B' B)^-1.
         M = self.arc_matrix.to(rows)[-readings.shape[1] :]
-        contradicted = torch.eye(len(readings)).to(rows) - readings @ M
+        contradicted = identity(len(readings), rows) - readings @ M
         by_matrix = M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
         by_matrix = nn.functional.pad(by_matrix, (0, 0, 3 * S - len(M), 0))
         straight = change.get("lengths", torch.zeros_like(change["radii"]))

@@ -14,7 +14,7 @@ from hybridkin._core.stored import Layout
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains import _slack
 from hybridkin.chains._arcs import levers, reading_matrix
-from hybridkin.chains._checks import filled
+from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
@@ -122,6 +122,7 @@ class ElasticTendonChain(ArcChain):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
+        dtype = float_dtype(dtype)
         if lengths is None:
             raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
         geometry = self._checked(

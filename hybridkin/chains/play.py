@@ -10,6 +10,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from hybridkin._core.arrays import as_tensor, labels, real_array
+
 __all__ = ["PlayOperator", "PlayState"]
 
 
@@ -62,7 +64,7 @@ class PlayOperator:
     """
 
     def __init__(self, width: ArrayLike) -> None:
-        self.width = np.array(width, dtype=float)
+        self.width = real_array(width, "width").astype(float)
         valid = np.isfinite(self.width) & (self.width >= 0)
         if self.width.ndim > 1 or not valid.all():
             raise ValueError(
@@ -150,9 +152,9 @@ class PlayOperator:
         ValueError
             For wrong shapes or entries that are not finite.
         """
-        groups = np.asarray(groups)
-        if groups.shape != tuple(q.shape)[:1]:
-            raise ValueError(f"`groups` must have shape ({len(q)},), got {groups.shape}.")
+        rows = real_array(q, "q")
+        q = q if isinstance(q, Tensor) else rows
+        groups = labels(groups, len(q))
         order = np.argsort(groups, kind="stable")  # a motion's rows keep their order
         starts = np.flatnonzero(groups[order][1:] != groups[order][:-1]) + 1
         parts = [self.apply(q[at])[0] for at in np.split(order, starts)]
@@ -166,8 +168,8 @@ class PlayOperator:
         self, given: Any, state: PlayState | None, name: str, step: _Step, wanted: int
     ) -> tuple[Any, PlayState]:
         """Return the entry `wanted` of the state after every row given, and the last state."""
-        rows = given if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given))
-        rows = rows if rows.is_floating_point() else rows.to(torch.float64)
+        rows = as_tensor(given, name)
+        rows = given.to(rows.dtype) if isinstance(given, Tensor) else rows  # with its graph
         if rows.ndim != 2 or self.width.shape not in ((), rows.shape[1:]):
             needed = self.width.size if self.width.ndim else "n"
             raise ValueError(f"`{name}` must have shape (T, {needed}), got {tuple(rows.shape)}.")
@@ -176,13 +178,13 @@ class PlayOperator:
         if state is None and not len(rows):
             raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
         start = (rows[0], rows[0]) if state is None else state
-        at = PlayState(*(torch.as_tensor(part).to(rows) for part in start))
+        at = PlayState(*(torch.as_tensor(part, device=rows.device).to(rows) for part in start))
         shapes = [tuple(part.shape) for part in at]
         if shapes != [tuple(rows.shape[1:])] * 2:
             raise ValueError(
                 f"`state` must hold vectors of shape ({rows.shape[1]},), got {shapes}."
             )
-        found, half = [], torch.as_tensor(self.width / 2).to(rows)
+        found, half = [], as_tensor(self.width / 2, "width").to(rows)
         for row in rows:
             at = step(row, at, half)
             found.append(at[wanted])

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.arrays import Numbers, Transform, identity
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
 from hybridkin.chains import _joint_motions
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints, urdf_path
-from hybridkin.chains._checks import pose, rigid_pose, shaped
+from hybridkin.chains._checks import float_dtype, pose, rigid_pose, shaped
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -95,6 +95,7 @@ class RigidChain(Chain):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
+        dtype = float_dtype(dtype)
         axes = shaped(axes, "axes", (None, 3))
         n = len(axes)
         lengths = axes.norm(dim=1, keepdim=True)
@@ -126,7 +127,7 @@ class RigidChain(Chain):
             "axes": axes,
             "q_min": low,
             "q_max": high,
-            "tip": rigid_pose(torch.eye(4) if tip is None else tip, "tip"),
+            "tip": rigid_pose(np.eye(4) if tip is None else tip, "tip"),
             "tool": shaped(tool, "tool", (3,)),
             "base": pose(base, "base", dtype),
             "motions": motions,
@@ -295,7 +296,7 @@ class RigidChain(Chain):
         columns = [self._in_measuring_frame(part, q) for part in (linear, angular)]
         turned = (self.tip.to(q)[:, :3].T @ frame.flatten(1)).unflatten(1, (3, -1))
         local = torch.cat([turned, tip[None]]).permute(2, 1, 0)  # (N, 3, 4): axes and tip
-        last = torch.eye(4).to(q)[3].expand(len(local), 1, 4)
+        last = identity(4, q)[3].expand(len(local), 1, 4)
         pose = (self.base.to(q) @ torch.cat([local, last], 1)).reshape(*q.shape[:-1], 4, 4)
         return pose, torch.cat(columns, dim=-2)
 
@@ -313,8 +314,8 @@ class RigidChain(Chain):
             Homogeneous transforms into the measuring frame; the last one is the tip: the end link
             moved to its tool.
         """
-        base = self.base.to(q)
-        frames = base @ self._frames(q)
+        frames, base = self._frames(q), self.base.to(q)
+        frames = base @ frames
         end = torch.cat([self.tip.to(q)[:, :3], self._end(q)[:, None]], dim=1)
         first = base.expand(*q.shape[:-1], 1, 4, 4)
         last = frames[..., -1:, :, :] @ end
@@ -341,8 +342,8 @@ class RigidChain(Chain):
         """
         if n_points < 1:
             raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
-        base = self.base.to(q)[:3]
-        joints = (base @ self._frames(q)[..., 3:])[..., 0]
+        frames, base = self._frames(q), self.base.to(q)[:3]
+        joints = (base @ frames[..., 3:])[..., 0]
         first = base[:, 3].expand(*q.shape[:-1], 1, 3)
         corners = torch.cat([first, joints, self(q)[..., None, :]], dim=-2)
         start, end = corners[..., :-1, None, :], corners[..., 1:, None, :]

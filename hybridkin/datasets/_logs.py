@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
+from hybridkin._core.arrays import real_array
 from hybridkin._core.units import METRES, UNITS
 
 _PARQUET = (".parquet", ".pq")
@@ -65,6 +66,9 @@ class Log:
     source: str = "in memory"
 
     def __post_init__(self) -> None:
+        for name in ("q", "x", "time"):
+            if vars(self)[name] is not None:
+                vars(self)[name] = real_array(vars(self)[name], name)
         if np.ndim(self.q) != 2 or np.shape(self.x) != (len(self.q), 3) or len(self.q) == 0:
             raise ValueError(
                 f"A log needs q of shape (N, n) and x of shape (N, 3), got {np.shape(self.q)} and "

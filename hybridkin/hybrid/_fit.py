@@ -130,7 +130,7 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     shares = [w for w, (_, found) in zip(weights, fits, strict=True) if found is not None]
     corrections = [found for _, found in fits if found is not None]
     kind = PoseHybridModule if spec.output == "pose" else HybridModule
-    module = kind(spec.mechanical, corrections, torch.tensor(shares, dtype=torch.float64))
+    module = kind(spec.mechanical, corrections, rows.q.new_tensor(shares))
     return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
 
 
@@ -203,7 +203,7 @@ def _fit_part(
         correction = TipCorrection(error_module(fitted, q))
     if mechanical is None:
         return fitted, correction  # without a mechanical model there is nothing to fall back on
-    alone = HybridModule(mechanical, [correction], torch.ones(1, dtype=torch.float64))
+    alone = HybridModule(mechanical, [correction], q.new_ones(1))
     with torch.no_grad():
         own = correction.module if isinstance(correction, TipCorrection) else None
         correction.guard = fit_guard(spec.guard, alone.error_part(q), own, q, errors.counts)

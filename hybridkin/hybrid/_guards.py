@@ -6,6 +6,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import identity
 from hybridkin._core.model import PortableModule, reverse_jacobian
 from hybridkin._core.stored import Layout
 from hybridkin.learning.network import LeverageModule
@@ -190,7 +191,7 @@ class QuadraticLeverage(LeverageModule):
         half_width = 0.5 * (high - low)
         half_width = torch.where(half_width > 0, half_width, torch.ones_like(half_width))
         n = q.shape[1]
-        found = cls(0.5 * (low + high), half_width, torch.eye(2 * n + 1).to(q))
+        found = cls(0.5 * (low + high), half_width, identity(2 * n + 1, q))
         features = found.forward(q)
         gram = features.mT @ features
         gram.diagonal().add_(alpha)

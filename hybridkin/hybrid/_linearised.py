@@ -10,6 +10,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from hybridkin._core.arrays import identity
+
 Pair = tuple[float, float]
 _GRID = (inf, 4.0, 0.0, -4.0)  # penalties to start with, in half decades
 _LOW, _HIGH = (-6.0, -12.0), 8.0
@@ -73,12 +75,12 @@ class Linearised:
         inverse = torch.cholesky_inverse(L)
         if members is None:
             share = self.J @ self._spread(phi, inverse) @ self.J.mT
-            return torch.linalg.solve(torch.eye(share.shape[1]).to(share) - share, own)
+            return torch.linalg.solve(identity(share.shape[1], share) - share, own)
         result = torch.empty_like(own)
         for rows in members:
             A, y = design(self.J[rows], phi[rows]).flatten(0, 1), self.y[rows].flatten()
             if len(A) <= len(L):
-                share = torch.eye(len(A)).to(A) - A @ inverse @ A.mT
+                share = identity(len(A), A) - A @ inverse @ A.mT
                 left = torch.linalg.solve(share, own[rows].flatten())
             else:
                 rest = torch.linalg.cholesky(L @ L.mT - A.mT @ A)
@@ -135,7 +137,7 @@ def basis(phi: Tensor, n_linear: int, most: int) -> Tensor:
     rest = bent - linear @ explained
     sizes, axes = torch.linalg.eigh(rest.mT @ rest)
     axes = axes[:, sizes > _RANK * bent.square().sum()].flip(1)[:, :most]
-    top = torch.cat([torch.eye(n_linear).to(phi), -explained @ axes], dim=1)
+    top = torch.cat([identity(n_linear, phi), -explained @ axes], dim=1)
     return torch.cat([top, torch.nn.functional.pad(axes, (n_linear, 0))])
 
 

@@ -22,7 +22,7 @@ from hybridkin.hybrid._linearised import Linearised, Pair
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
 _SETTLED = 1e-9  # of the gradient without a correction
-_RATIOS = torch.logspace(-2, 4, 25, dtype=torch.float64)  # of noise, over the mean of dx/dq squared
+_RATIOS = torch.from_numpy(np.logspace(-2, 4, 25))  # of noise, over the mean of dx/dq squared
 
 
 class ReadoutFit(NamedTuple):
@@ -252,7 +252,7 @@ class _Problem:
     def penalty(self, alphas: Pair) -> Tensor:
         """Return the penalty of every feature (K,)."""
         n = self.features.n_linear
-        return torch.tensor([alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n)).to(self.phi)
+        return self.phi.new_tensor([alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n))
 
     def linearised(self, readout: Tensor) -> Linearised:
         """Return the ridge problem about a readout (C, K)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -90,21 +89,19 @@ def select(mechanics: Mechanics, rows: Rows) -> tuple[Spec, dict[str, Any]]:
     candidates = _candidates(spec)
     if len(y) > _MOST:
         del candidates["parallel kernel"]
-    settled, seconds = [], np.zeros(len(candidates) + 1)
+    settled: list[Part] = []
     held_out = np.empty((len(candidates), *y.shape))
     for i, (coupling, error_model) in enumerate(candidates.values()):
-        start = time.process_time()
         fitted = fit_hybrid(replace(spec, parts=(Part(1.0, coupling, error_model),)), by_fold)
         part = Part(1.0, coupling, _settled(error_model, fitted.error_model))
         settled.append(part)
         for (train, test), chain in zip(folds, mechanics.chains, strict=True):
             alone = replace(spec, mechanical=chain, parts=(part,))
             held_out[i, test] = fit_hybrid(alone, weighed.take(train)).predict(rows.X[test])
-        seconds[i] = time.process_time() - start
     shares = _shares(held_out, y, counts)
     parts = [part._replace(weight=float(w)) for w, part in zip(shares, settled, strict=True)]
     results = _results([*candidates], held_out, shares, fold_of, rows)
-    results |= {"seconds": seconds, "mechanical_model": mechanics.scores}
+    results["mechanical_model"] = mechanics.scores
     return replace(spec, parts=tuple(part for part in parts if part.weight > 0.0)), results
 
 

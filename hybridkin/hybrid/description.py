@@ -110,9 +110,12 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
     restore_columns(model, stored, n)
     model._single_output = stored.value("single_output", bool)
-    center = torch.tensor(stored.array("drift_center", (n,)))
-    with torch.no_grad():  # arrays that do not fit together fail here, not in use
-        x, _ = model.module_.rows().forward_and_jacobian(center[None])
+    center = torch.tensor(stored.array("drift_center", (n,)), device="cpu")
+    try:  # arrays that do not fit together fail here, not in use
+        with torch.no_grad():
+            x, _ = model.module_.rows().forward_and_jacobian(center[None])
+    except RuntimeError as error:
+        raise ValueError("the arrays do not fit together") from error
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]))
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))

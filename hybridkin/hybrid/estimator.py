@@ -14,6 +14,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import as_forward_model
 from hybridkin._core.units import motion_message
@@ -103,10 +104,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         a fit without it or its group [m].
     cv_results_ : dict or None
         Of error_model="auto": by candidate, the last of which is the blend, the mean distance on
-        held-out rows, its spread over the folds [m] and the CPU time [s]; the ``weights`` of the
-        blend, what is ``chosen`` ("blend", or the only candidate with a weight), and the scores of
-        the mechanical models, without play (``mechanical_model``). The blend is judged by weights
-        chosen without the fold. New motions unlike all in the log are harder than held-out ones.
+        held-out rows and its spread over the folds [m]; the ``weights`` of the blend, what is
+        ``chosen`` ("blend", or the only candidate with a weight), and the scores of the mechanical
+        models, without play (``mechanical_model``). The blend is judged by weights chosen without
+        the fold. New motions unlike all in the log are harder than held-out ones.
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator or None
@@ -288,8 +289,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
         for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
-            if not 0.0 < value <= high:
+            if not 0.0 < number(value, name) <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
+        X, y, sample_weight = map(table, (X, y, sample_weight), ("X", "y", "sample_weight"))
         check_finite(X=X, y=y)
         X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES, reset=False)
         if self.play_ is not None:
@@ -375,16 +377,11 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _checked_rows(self, X: Any, y: Any, weights: ArrayLike | None, groups: Any) -> Rows:
         """Return the measured rows, checked."""
+        X, y, weights = map(table, (X, y, weights), ("X", "y", "sample_weight"))
         check_finite(X=X, y=y)
         X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES)
         X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
-        if groups is not None:
-            groups = np.asarray(groups)
-            if groups.shape != (len(X),):
-                raise ValueError(
-                    f"`groups` must have shape ({len(X)},), one entry for each row of `X`, got "
-                    f"{groups.shape}."
-                )
+        groups = None if groups is None else labels(groups, len(X))
         if weights is not None:
             weights = _check_sample_weight(weights, X, dtype=np.float64, ensure_non_negative=True)
         return Rows(X, np.asarray(y, dtype=np.float64), cast("NDArray | None", weights), groups)
@@ -421,7 +418,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> list[NDArray]:
         """Return what a function of the module gives for the rows of X, in the dtype of X."""
         check_is_fitted(self)
-        X = validate_data(self, X, dtype=_DTYPES, reset=False)
+        X = validate_data(self, table(X, "X"), dtype=_DTYPES, reset=False)
         q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
         chain = self.mechanical_model_
         if warn and isinstance(chain, Chain):

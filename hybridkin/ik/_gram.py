@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hybridkin._core.arrays import identity
+
 HEALTHY = 0.02  # sigma_min / sigma_max above which the pseudo-inverse needs no damping
 
 
@@ -103,7 +105,7 @@ def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> 
     if len(gram.parts) == 6:
         return _solve_3x3(gram.parts, v, damping_sq)
     if len(gram.parts) == 1:
-        damping_sq = torch.as_tensor(damping_sq).to(v).expand_as(v[..., 0])
+        damping_sq = torch.as_tensor(damping_sq, device=v.device).to(v).expand_as(v[..., 0])
         factor = _factor(gram.parts[0], damping_sq)
         return torch.cholesky_solve(v[..., None], factor)[..., 0]
     squares, vectors = gram.parts
@@ -178,7 +180,7 @@ def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
     """Return mu with (J J^T + lambda^2 1) mu = v, for lambda^2 > 0."""
     if J.shape[-2] == 3:
         return _solve_3x3(_entries_3x3(J), v, damping_sq)
-    damping = damping_sq[..., None, None] * torch.eye(J.shape[-2]).to(J)
+    damping = damping_sq[..., None, None] * identity(J.shape[-2], J)
     factor = torch.linalg.cholesky_ex(J @ J.mT + damping)[0]
     return torch.cholesky_solve(v[..., None], factor)[..., 0]
 
@@ -187,7 +189,7 @@ def _factor(G: Tensor, damping_sq: Tensor) -> Tensor:
     """Return the Cholesky factor of G + lambda^2, kept positive definite against rounding."""
     trace = torch.diagonal(G, dim1=-2, dim2=-1).sum(-1)
     tiny = 16.0 * torch.finfo(G.dtype).eps * trace + torch.finfo(G.dtype).tiny
-    damped = G + (damping_sq + tiny)[..., None, None] * torch.eye(G.shape[-1]).to(G)
+    damped = G + (damping_sq + tiny)[..., None, None] * identity(G.shape[-1], G)
     return torch.linalg.cholesky_ex(damped)[0]
 
 

@@ -323,7 +323,7 @@ class Search:
         span = 0.05 * (settings.q_max - settings.q_min).to(found.q)
         size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)
         # Unequal shares, because equal ones may cancel in a symmetric robot.
-        return found.q + size * torch.cos(torch.arange(1.0, n + 1.0).to(found.q))
+        return found.q + size * torch.cos(found.q.new_ones(n).cumsum(0))
 
 
 def _per_tip(J: Tensor, error: Tensor) -> Tensor:

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from hybridkin._core.arrays import as_tensor
+from hybridkin._core.arrays import as_tensor, real_array
+from hybridkin._core.model import Portable
 from hybridkin.ik.tasks import Task, Tolerance
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ _FAST = 5.0  # times the largest plausible q in a second is too fast
 
 
 @dataclass(frozen=True)
-class StepSettings:
+class StepSettings(Portable):
     """What a step depends on besides q and the target; see `InverseKinematics`.
 
     Limits, weights and a fixed posture are float64 tensors of shape () or (n,).
@@ -206,7 +207,7 @@ class StepSettings:
         n = self.n_actuators
         good, need = q.ndim > 0 and n in (None, q.shape[-1]), f"(..., {n or 'n'}), n actuators"
         require(good, f"`{name}` must have shape {need}, got {tuple(q.shape)}.")
-        return q if like is None else q.to(torch.promote_types(q.dtype, like.dtype))
+        return q if like is None else q.to(like.device, torch.promote_types(q.dtype, like.dtype))
 
     def points(
         self,
@@ -234,7 +235,7 @@ class StepSettings:
 
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
         """Return one tolerance [m], or one for every part of the task."""
-        given = np.atleast_1d(np.asarray(tol, dtype=float))
+        given = np.atleast_1d(real_array(tol, "tol").astype(float))
         require(bool((given > 0.0).all()), f"`tol` must be positive [m], got {tol!r}.")
         if np.ndim(tol) == 0:
             return float(given[0])

@@ -10,7 +10,15 @@ from inspect import signature
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import as_array, as_tensor, give_back, is_numpy, leading, rows_of
+from hybridkin._core.arrays import (
+    as_array,
+    as_tensor,
+    give_back,
+    is_numpy,
+    leading,
+    number,
+    rows_of,
+)
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
@@ -123,11 +131,11 @@ class InverseKinematics:
             bound(math.inf if q_max is None else q_max, "q_max"),
             bound(math.inf if dq_max is None else dq_max, "dq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
-            float(beta),
-            None if gain is None else float(gain),
+            number(beta, "beta"),
+            None if gain is None else number(gain, "gain"),
             damping,
             limits,
-            float(dt),
+            number(dt, "dt"),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
         )
         for message in self.settings.unit_messages():
@@ -255,7 +263,7 @@ class InverseKinematics:
         q = found.q
         if differentiable:
             with torch.enable_grad():
-                goal = rows_of(torch.as_tensor(x_target).to(q), lead, axes)
+                goal = rows_of(torch.as_tensor(x_target, device=q.device).to(q), lead, axes)
                 q = with_derivatives(settings, q, goal, found.reached)
         # The error and the status are those of the q that is returned.
         x, J = settings.evaluate(q.detach())

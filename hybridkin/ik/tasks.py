@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol, TypeAlias, runtime_checkable
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from hybridkin._core.arrays import as_tensor, identity, number
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
@@ -190,7 +190,7 @@ class PoseTask(Task):
     """
 
     def __init__(self, model: object, radian: float = 0.1) -> None:
-        if not (radian > 0.0 and math.isfinite(radian)):
+        if not 0.0 < number(radian, "radian") < math.inf:
             raise ValueError(f"`radian` must be positive metres, got {radian!r}.")
         model = as_forward_model(model)
         if not isinstance(model, PoseModel):
@@ -215,7 +215,7 @@ class PoseTask(Task):
         """Raise where a finite target does not hold a rotation."""
         R = x_target[..., :3, :3]
         R = R[torch.isfinite(R).all(-1).all(-1)]
-        off = (R.mT @ R - torch.eye(3).to(R)).abs().amax((-2, -1))
+        off = (R.mT @ R - identity(3, R)).abs().amax((-2, -1))
         if ((off > 1e-3) | (torch.linalg.det(R) < 0.0)).any():
             raise ValueError(
                 f"`{name}` must hold rotations in its upper left 3 x 3 blocks (orthonormal, "
@@ -263,7 +263,7 @@ class PointsTask(Task):
             raise TypeError(
                 f"`chain` must have with_tip(at), as chains of arcs, got {type(chain).__name__}."
             )
-        self.models, n = tuple(chain.with_tip(float(a)) for a in at), len(at)
+        self.models, n = tuple(chain.with_tip(number(a, "at")) for a in at), len(at)
         self.units = (1.0,) * n if weights is None else tuple(float(w) for w in weights)
         if n == 0 or len(self.units) != n or not all(0.0 < w < math.inf for w in self.units):
             need = "positive, one for every point of `at`"
@@ -293,4 +293,4 @@ def _through_numpy(function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tenso
             "`model` must be twice differentiable by torch for derivatives of the solution, got "
             "functions for NumPy."
         )
-    return torch.tensor(np.asarray(function(q.detach().cpu().numpy())), device=q.device)
+    return as_tensor(function(q.numpy(force=True)), "model", q.device)

@@ -232,4 +232,4 @@ class Tracker:
             warnings.warn(
                 f"`plant` failed at point {i}: {error!r}; it counts as NaN.", stacklevel=6
             )
-            return torch.full((1, *self._settings.task.shape), math.nan).to(self._q)
+            return self._q.new_full((1, *self._settings.task.shape), math.nan)

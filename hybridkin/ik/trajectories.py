@@ -11,6 +11,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hybridkin._core.arrays import real_array
 from hybridkin._core.units import METRES
 
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
@@ -37,7 +38,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
-        t, x = np.array(self.t, dtype=float), np.array(self.x, dtype=float)
+        t, x = (np.array(real_array(vars(self)[name], name), dtype=float) for name in "tx")
         if x.ndim != 2 or x.shape[1] != 3 or len(x) == 0:
             raise ValueError(f"`x` must have shape (T, 3) with T >= 1, got {x.shape}.")
         if t.shape != (len(x),):
@@ -93,7 +94,7 @@ def min_jerk(s: ArrayLike) -> np.ndarray:
     ----------
     Flash & Hogan, J. Neurosci. 5 (1985).
     """
-    s = np.clip(np.asarray(s, dtype=float), 0.0, 1.0)
+    s = np.clip(real_array(s, "s").astype(float), 0.0, 1.0)
     return s * s * s * (10.0 + s * (6.0 * s - 15.0))
 
 
@@ -310,7 +311,7 @@ def _checked(
     value: ArrayLike, name: str, need: str, shape: tuple[int, ...], least: float = -math.inf
 ) -> np.ndarray:
     """Return finite numbers of this shape, each at least `least`."""
-    numbers = np.array(value, dtype=float)
+    numbers = np.array(real_array(value, name), dtype=float)
     finite = numbers.shape == shape and np.isfinite(numbers).all()
     if not finite or (numbers < least).any():
         raise ValueError(f"`{name}` must be {need}, got {value!r}.")

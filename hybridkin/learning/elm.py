@@ -11,6 +11,7 @@ from sklearn.utils import gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from hybridkin._core.arrays import real_array, table
 from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
 from hybridkin.learning._ridge import BLOCK_ELEMENTS, Statistics, fit_readout, gather, merge
 from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer
@@ -99,6 +100,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _map(self, X, function):
         """Return the arrays that `function(module, q)` gives, computed block by block."""
         check_is_fitted(self, "module_")
+        X = table(X, "X")
         X = np.asarray(validate_data(self, X, reset=False, dtype=DTYPES, order="C"))
         elm, outputs = self.module_, ()
         width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
@@ -332,7 +334,7 @@ class ELMRegressor(FittedNetwork):
         n_features = len(elm.output_weights)
         n_outputs = len(stats.mean) - n_features
         if np.ndim(self.alpha):
-            alpha = np.asarray(self.alpha, dtype=np.float64)
+            alpha = real_array(self.alpha, "alpha").astype(np.float64)
             if alpha.shape != (n_outputs,) or not (np.isfinite(alpha) & (alpha >= 0)).all():
                 raise ValueError(
                     f"`alpha` must be a number >= 0, or {n_outputs} of them, one for each column "

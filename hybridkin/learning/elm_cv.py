@@ -12,6 +12,7 @@ from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted
 
+from hybridkin._core.arrays import labels
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.stored import plain
 from hybridkin.learning._left_out import LeftOut
@@ -168,12 +169,7 @@ class ELMRegressorCV(FittedNetwork):
         """
         X, y, sample_weight = check_rows(self, X, y, sample_weight)
         if groups is not None:
-            groups = np.asarray(groups)
-            if groups.shape != (len(X),):
-                raise ValueError(
-                    f"`groups` must have shape {(len(X),)}, one entry for each row of `X`, got "
-                    f"{groups.shape}."
-                )
+            groups = labels(groups, len(X))
         first, sample_weight, place = distinct_rows(X, y, sample_weight, groups)
         X, y, groups = X[first], y[first], None if groups is None else groups[first]
         if len(y) < 2:

@@ -5,6 +5,7 @@ import torch
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, validate_data
 
+from hybridkin._core.arrays import real_array, table
 from hybridkin.learning.network import ELM, LAYER, READOUT
 
 DTYPES = (np.float64, np.float32)
@@ -18,7 +19,7 @@ def _scaling(X, sample_weight, input_scaling):
     if isinstance(input_scaling, str):
         bounds = np.array([X.min(axis=0), X.max(axis=0)], dtype=np.float64)
     else:
-        bounds = np.asarray(input_scaling, dtype=np.float64)
+        bounds = real_array(input_scaling, "input_scaling").astype(np.float64)
     shaped = bounds.shape == (2, n_inputs) and np.isfinite(bounds).all()
     if not shaped or (bounds[0] > bounds[1]).any():
         raise ValueError(
@@ -42,6 +43,7 @@ def _scaling(X, sample_weight, input_scaling):
 def check_rows(estimator, X, y, sample_weight, reset=True):
     """Return the rows, `y` in float64, and their weights."""
     checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
+    X, y, sample_weight = map(table, (X, y, sample_weight), ("X", "y", "sample_weight"))
     X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
     if sample_weight is not None:
         sample_weight = _check_sample_weight(

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from hybridkin._core.blocks import in_blocks
+from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel, reverse_jacobian
 from hybridkin._core.stored import Layout
 
@@ -73,7 +73,8 @@ class ELM(LeverageModule):
         super().__init__()
         self.activation = activation
         for name in LAYER + READOUT:
-            self.register_buffer(name, torch.tensor(np.asarray(arrays[name], order="C")))
+            array = np.asarray(arrays[name], order="C")
+            self.register_buffer(name, torch.tensor(array, device="cpu"))
         n_hidden, self.n_actuators = self.input_weights.shape
         n_features, self.n_outputs = self.output_weights.shape
         if n_features not in (n_hidden, n_hidden + self.n_actuators):
@@ -89,11 +90,7 @@ class ELM(LeverageModule):
 
     def _hidden(self, q, out=None):
         n_inputs = len(self.input_center)
-        if q.ndim == 0 or q.shape[-1] != n_inputs or not q.is_floating_point():
-            raise ValueError(
-                f"`q` must be a floating-point tensor of shape (..., {n_inputs}), got {q.dtype} of "
-                f"shape {tuple(q.shape)}; this ELM was fitted on {n_inputs} inputs."
-            )
+        check_vectors(q, n_inputs, "q", f"this ELM was fitted on {n_inputs} inputs")
         # Folding the scaling into W and b would cancel digits where the range is narrow.
         u = (q - self.input_center.to(q)) / self.input_scale.to(q)
         W, b = self.input_weights.to(q), self.input_bias.to(q)

@@ -62,7 +62,7 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
 def _register(module: nn.Module, **arrays: ArrayLike) -> None:
     for name, array in arrays.items():
         rows = np.asarray(array, dtype=np.float64, order="C")
-        module.register_buffer(name, torch.tensor(rows))
+        module.register_buffer(name, torch.tensor(rows, device="cpu"))
 
 
 class AffineModule(ForwardModel):

@@ -6,19 +6,16 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
+
+from hybridkin._core.arrays import real_array
 
 T = TypeVar("T")
 
 
 def plain(value: Any, name: str = "array") -> NDArray:
     """Return numbers of any kind, torch tensors too, as a float array of their own."""
-    value = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
-    try:
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` must be numeric, got {value!r}.") from error
+    return np.array(real_array(value, name), dtype=float)
 
 
 def shaped(value: ArrayLike, name: str, letters: str, n_rows: int | None = None) -> NDArray:

@@ -17,22 +17,27 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
+import re
+import secrets
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from hybridkin._core.stored import Stored
+
+if sys.platform != "win32":
+    import fcntl
 
 FORMAT = "hybridkin-model"
 VERSION = 3
 _HEADER, _CHECKSUM = "hybridkin", "sha256"
-_UNREADABLE = (SafetensorError, AttributeError, LookupError, OSError, RecursionError, TypeError)
-_UNREADABLE += (ValueError,)
+_UNREADABLE = (SafetensorError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 Header = dict[str, Any]
 Arrays = dict[str, NDArray]
@@ -83,22 +88,57 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
 
 
 def write(path: Path, header: Header, arrays: Arrays) -> None:
-    """Write header and arrays to a file, which is replaced only once all is written."""
+    """Write header and arrays to a file, which is replaced only once all is on the disk.
+
+    Equal content gives equal bytes. Of a symbolic link the target is replaced. A file that is
+    replaced keeps its permissions.
+    """
+    path = Path(os.path.realpath(path))
     if not path.parent.is_dir():
         raise FileNotFoundError(f"`path` must lie in a folder that exists, got {path}.")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"`path` must name a file, got {path}, which is none; add a file name.")
     text = json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False)
     whole = {name: np.array(array, order="C", ndmin=0) for name, array in arrays.items()}
-    handle, staging = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    os.close(handle)
+    content = save(whole, metadata={_HEADER: text, _CHECKSUM: _checksum(text, whole)})
+    # safetensors orders its metadata by chance.
+    end = 8 + int.from_bytes(content[:8], "little")
+    head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 8)
+    staging = path.with_name(f".{path.name}-{secrets.token_hex(8)}.part")
+    folder = _folder_of_saves(path)
     try:
-        save_file(whole, staging, metadata={_HEADER: text, _CHECKSUM: _checksum(text, whole)})
-        # A temporary file is its owner's alone; a saved model is as readable as any other file.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(staging, 0o666 & ~mask)
+        with open(staging, "xb") as file:
+            file.writelines([len(head).to_bytes(8, "little"), head, content[end:]])
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            os.chmod(staging, path.stat().st_mode)
         os.replace(staging, path)
+        with suppress(OSError):  # some file systems cannot
+            os.fsync(folder)
     finally:
-        Path(staging).unlink(missing_ok=True)
+        staging.unlink(missing_ok=True)
+        os.close(folder)
+
+
+def _folder_of_saves(path: Path) -> int:
+    """Return the folder of a file, open and locked, and remove what killed saves have left there.
+
+    Every save holds a shared lock on the folder, which ends with its process: whoever gets the
+    folder alone finds no other save at work.
+    """
+    if sys.platform == "win32":  # it opens no folders
+        return os.open(os.devnull, os.O_RDONLY)
+    folder = os.open(path.parent, os.O_RDONLY)
+    with suppress(OSError):  # others are at work, or the file system has no locks
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        ours = re.compile(rf"\.{re.escape(path.name)}-[0-9a-f]{{16}}\.part")
+        for left in filter(ours.fullmatch, os.listdir(folder)):
+            os.unlink(left, dir_fd=folder)
+    with suppress(OSError):
+        fcntl.flock(folder, fcntl.LOCK_SH)
+    return folder
 
 
 def read(path: Path) -> tuple[Header, Arrays]:

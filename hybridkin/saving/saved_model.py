@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
+import time
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
@@ -25,8 +27,7 @@ from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.hidden_layer import device_named
 from hybridkin.saving._file import packed, read, unpacked, write
 
-_DAMAGE = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError)
-_DAMAGE += (AssertionError, TypeError, ValueError)
+_DAMAGE = (AttributeError, LookupError, TypeError, ValueError)
 Model = ForwardModel | ELMRegressor | ELMRegressorCV | HybridForwardModel
 
 
@@ -43,7 +44,8 @@ def save_model(
         KernelRidge with the kernel "rbf", or a name. Of an ELMRegressorCV the chosen ELMRegressor
         is stored.
     path : str or Path
-        File to write, usually ``*.safetensors``. It is replaced only once all is written.
+        File to write, usually ``*.safetensors``. It is replaced, with its permissions kept, only
+        once all is on the disk.
     training : mapping of str to numbers, strings or lists, optional
         What people should read about the training besides what the model knows of it, for example
         ``{"log": "log.csv", "motions": 24, "held_out_rmse": 0.0031}``; see `model_header`.
@@ -58,6 +60,10 @@ def save_model(
     A reader ignores entries of the header that it does not know. For another format version,
     `load_model` refuses the file and names the hybridkin that wrote it.
 
+    Equal models give equal files: by the same versions, on the same day, or on the one that the
+    environment variable ``SOURCE_DATE_EPOCH`` names in seconds since 1970. A save that is killed
+    leaves the earlier file as it was. Of a symbolic link the target is replaced.
+
     Examples
     --------
     >>> import tempfile, pathlib
@@ -70,7 +76,8 @@ def save_model(
     versions = {"hybridkin": __version__, "python": platform.python_version()}
     versions |= {"torch": str(torch.__version__), "numpy": np.__version__}
     versions["scikit-learn"] = sklearn.__version__
-    created = datetime.now(timezone.utc).date().isoformat()
+    now = float(os.environ.get("SOURCE_DATE_EPOCH", time.time()))
+    created = datetime.fromtimestamp(now, timezone.utc).date().isoformat()
     header: dict[str, Any] = {"versions": versions, "created": created}
     known: dict[str, Any] = {}
     if isinstance(model, HybridForwardModel):

@@ -154,7 +154,7 @@ def _bending_projector(loaded: LoadedModel) -> NDArray:
     chain = loaded.chain
     if not isinstance(chain, ConstantCurvatureChain) or chain.lengths is None:
         return np.eye(loaded.n_actuators)
-    zero = torch.zeros(chain.n_actuators, dtype=torch.float64)
+    zero = torch.from_numpy(np.zeros(chain.n_actuators))
     slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
     return (torch.linalg.pinv(slopes) @ slopes).numpy()
 

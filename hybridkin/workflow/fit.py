@@ -433,7 +433,7 @@ def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
     model.fit_with_messages(train.q, train.x, groups=train.groups)
     q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
     with torch.no_grad():
-        return distance(model.module_(torch.tensor(q, dtype=torch.float64)).numpy(), test.x)
+        return distance(model.module_(torch.from_numpy(np.array(q, dtype=float))).numpy(), test.x)
 
 
 def _choose(rows: _Rows, *, hybrid: bool) -> _Choice:

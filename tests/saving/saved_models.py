@@ -74,9 +74,9 @@ def arm(**options):
     return RigidChain(origins, [[0, 0, 1], [1, 0, 2], [0, 1, 0]], **options)
 
 
-def trunk():
+def trunk(**options):
     """One segment of three chambers, so that files stay small."""
-    return ConstantCurvatureChain([0.05], offsets=[0.03])
+    return ConstantCurvatureChain([0.05], offsets=[0.03], **options)
 
 
 def trunk_log(n_rows=24):

@@ -1,0 +1,218 @@
+"""What a save does to the folder: one whole file, equal for equal models, and nothing else."""
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+import torch
+from saved_models import arm, bent_chain, elastic_chain, tendon_chain, trunk, trunk_log
+
+from hybridkin import HybridForwardModel, InverseKinematics, calibrate, load_model, save_model
+
+HERE = Path(__file__).parent
+LEFT = ".model-0123456789abcdef.part"
+posix = pytest.mark.skipif(sys.platform == "win32", reason="needs links, modes and locks of POSIX")
+# What a fit of every kind saves, and its hash, one line each.
+FITS = """
+import hashlib, sys
+sys.path.insert(0, sys.argv[1])
+import joblib, numpy as np, torch
+from pathlib import Path
+from saved_models import bent_chain, trunk, trunk_log
+from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics, calibrate, save_model
+q, x, groups = trunk_log(24)
+result = calibrate(trunk(), torch.from_numpy(q), torch.from_numpy(x), ("radii", "base"))
+models = {"arc": bent_chain(), "calibrated": result.chain, "elm": ELMRegressor(4, random_state=0)}
+models["elm"].fit(q, x)
+for name in ("linear", "auto"):
+    model = HybridForwardModel(trunk(), name, calibrate=("radii",), random_state=0)
+    models[name] = model.fit(q, x, groups=groups)
+for name, model in models.items():
+    path = Path(sys.argv[2]) / name
+    save_model(model, path)
+    print(name, joblib.hash(model), hashlib.sha256(path.read_bytes()).hexdigest())
+print(joblib.hash(result), joblib.hash(InverseKinematics(result.chain, q_min=0.1, q_max=0.4)))
+"""
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[1])
+from saved_models import trunk
+from hybridkin import save_model
+if sys.argv[3] == "kill":
+    os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)
+for _ in range(40):
+    save_model(trunk(), sys.argv[2])
+"""
+
+
+def started(code, *arguments, seed="0"):
+    command = [sys.executable, "-c", code, str(HERE), *map(str, arguments)]
+    settings = {**os.environ, "PYTHONHASHSEED": seed, "SOURCE_DATE_EPOCH": "86400"}
+    return subprocess.Popen(command, env=settings, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+def test_fits_in_two_processes_are_equal_in_hash_and_bytes(tmp_path):
+    runs = [started(FITS, tmp_path, seed=seed) for seed in ("1", "2")]
+    first, second = (run.communicate()[0].splitlines() for run in runs)
+    assert len(first) == 6
+    assert first == second
+
+
+def test_equal_results_have_equal_hashes():
+    q, x, _ = trunk_log()
+    rows = torch.from_numpy(q), torch.from_numpy(x)
+    results = [calibrate(trunk(), *rows, ("radii",)) for _ in range(2)]
+    assert joblib.hash(results[0]) == joblib.hash(results[1])
+    assert joblib.hash(results[0].chain) != joblib.hash(trunk())
+    models = [HybridForwardModel(trunk(), "drop", calibrate=("radii",)) for _ in range(2)]
+    hashes = {joblib.hash(model.fit(q, x)) for model in models}
+    models[0].predict(q)
+    assert {joblib.hash(models[0])} == hashes
+    limits = {"q_min": torch.zeros(3), "q_max": torch.ones(3)}
+    solvers = [InverseKinematics(trunk(), **limits) for _ in range(2)]
+    assert joblib.hash(solvers[0]) == joblib.hash(solvers[1])
+
+
+@pytest.mark.parametrize("build", [tendon_chain, bent_chain, elastic_chain, arm])
+def test_equal_models_give_equal_bytes(tmp_path, build):
+    for k in range(8):
+        save_model(build(), tmp_path / f"{k}", training={"b": 1, "a": 2})
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+
+
+def test_the_date_can_be_fixed(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    save_model(trunk(), tmp_path / "model")
+    assert b"1970-01-02" in (tmp_path / "model").read_bytes()
+
+
+@posix
+@pytest.mark.parametrize("there", [True, False])
+def test_links_stay_and_their_targets_are_written(tmp_path, there):
+    (tmp_path / "folder").mkdir()
+    target, link = tmp_path / "folder" / "model", tmp_path / "link"
+    if there:
+        save_model(arm(), target)
+    link.symlink_to(Path("folder") / "model")
+    save_model(trunk(), link)
+    assert link.is_symlink()
+    assert os.readlink(link) == "folder/model"
+    assert not target.is_symlink()
+    assert load_model(target).n_actuators == load_model(link).n_actuators == 3
+    assert [path.name for path in (tmp_path / "folder").iterdir()] == ["model"]
+
+
+@posix
+def test_permissions_are_kept_or_follow_the_mask(tmp_path):
+    path, mask = tmp_path / "model", os.umask(0o027)
+    try:
+        save_model(trunk(), path)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o640
+        path.chmod(0o604)
+        save_model(trunk(), path)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o604
+    finally:
+        assert os.umask(mask) == 0o027
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    with pytest.raises(ValueError, match="`path` must name a file, got"):
+        save_model(trunk(), tmp_path)
+    assert tmp_path.is_dir()
+
+
+def test_content_is_on_the_disk_before_the_name_and_the_name_after(tmp_path, monkeypatch):
+    steps, replace, fsync = [], os.replace, os.fsync
+
+    def flushed(handle):
+        steps.append("folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", flushed)
+    monkeypatch.setattr(os, "replace", lambda *paths: (steps.append("name"), replace(*paths)))
+    save_model(trunk(), tmp_path / "model")
+    assert steps == ["file", "name", "folder"][: 3 if sys.platform != "win32" else 2]
+
+
+def test_a_save_that_fails_leaves_the_earlier_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "model"
+    save_model(arm(), path)
+    before = path.read_bytes()
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_model(trunk(), path)
+    assert path.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+@posix
+def test_the_next_save_removes_what_a_killed_one_left(tmp_path):
+    names = [LEFT, ".model-notes", ".model-0123.part", ".other-0123456789abcdef.part"]
+    for name in names:
+        (tmp_path / name).touch()
+    save_model(trunk(), tmp_path / "model")
+    assert {path.name for path in tmp_path.iterdir()} == {"model", *names[1:]}
+
+
+@posix
+def test_files_of_a_save_at_work_stay(tmp_path):
+    import fcntl
+
+    (tmp_path / LEFT).touch()
+    folder = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(folder, fcntl.LOCK_SH)
+    save_model(trunk(), tmp_path / "model")
+    assert (tmp_path / LEFT).exists()
+    os.close(folder)
+    save_model(trunk(), tmp_path / "model")
+    assert not (tmp_path / LEFT).exists()
+
+
+@posix
+@pytest.mark.slow
+def test_killed_and_concurrent_saves(tmp_path):
+    path = tmp_path / "model"
+    killed = started(KILLED, path, "kill")
+    killed.communicate()
+    assert killed.returncode < 0
+    assert [left.name[:7] for left in tmp_path.iterdir()] == [".model-"]
+    runs = [started(KILLED, path, "live") for _ in range(2)]
+    whole = 0
+    while any(run.poll() is None for run in runs):
+        if path.exists():
+            assert load_model(path).n_actuators == 3
+            whole += 1
+    assert whole > 0
+    assert [run.communicate() and run.returncode for run in runs] == [0, 0]
+    assert [left.name for left in tmp_path.iterdir()] == ["model"]
+
+
+def test_a_file_out_of_reach_is_not_called_damaged(tmp_path, monkeypatch):
+    path = tmp_path / "model"
+    save_model(trunk(), path)
+
+    def missing(*_):
+        raise NotImplementedError("no such operation on this device")
+
+    monkeypatch.setattr(np.linalg, "norm", missing)
+    monkeypatch.setattr(torch.linalg, "solve", missing)
+    with pytest.raises(NotImplementedError, match="no such operation"):
+        load_model(path)
+
+
+def test_matrices_of_a_file_are_square_where_they_must_be():
+    from hybridkin._core.stored import Stored
+
+    stored = Stored.of("thing", {"a": np.zeros((2, 3))})
+    with pytest.raises(ValueError, match=r"'a' must have shape \(3, 3\), got \(2, 3\)"):
+        stored.tensors(a="nn")
