@@ -90,9 +90,10 @@ def base_turn(chain: Any, q: NDArray, x: NDArray) -> tuple[float, float]:
 
 def _clouds(chain: Any, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
     """Return the tips (K, N, 3) of the chain and those measured, each about their mean."""
-    rows = torch.from_numpy(np.ascontiguousarray(qs))
+    rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
-        a, b = chain(rows.flatten(0, 1)).reshape(*rows.shape[:2], 3), torch.from_numpy(x)
+        a = chain(rows.flatten(0, 1)).double().reshape(*rows.shape[:2], 3)
+    b = torch.from_numpy(np.asarray(x, dtype=np.float64))
     return a - a.mean(dim=1, keepdim=True), b - b.mean(dim=0)
 
 

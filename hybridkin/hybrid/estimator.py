@@ -226,6 +226,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         asked = spec = self._spec(given)
         rows = given.distinct()[0]
         few = few_rows(rows, spec, self.coverage)
+        self._fitted_rows: NDArray | None = np.unique(row_digests(rows.X, rows.tips))
         mechanics, self.cv_results_ = None, None
         if not asked.parts:
             mechanics = choose_mechanics(spec, rows)
@@ -250,7 +251,6 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             used = given if asked.parts else rows
             self.radius_, message = conformal_radius(asked, used, self.coverage)
             said += [] if message is None else [message]
-        self._fitted_rows: NDArray | None = np.unique(row_digests(X, y))
         return [*few, *said, *_messages(fitted, given)]
 
     def partial_fit(

@@ -274,7 +274,7 @@ def test_spoilt_rows_can_be_left_out(robot, tmp_path, capsys, spoil, option, lef
         ({"text": HEADER + "\n0,1,2,3,4,5,6,7,8,nan,1\n"}, "NaN"),
         ({"text": HEADER + "\n0,1,2,3,4,5,6,7,8,a,1\n"}, "'a'"),
         ({"text": HEADER + "\n0,1,2,3,4,5,6,7,8,9,1\n1,2,1,3,4,5,6,7,7,9,1\n"}, "at least 2 mot"),
-        ({"toml": ROBOT.replace("length = 0.1\n", "")}, "positive actuator lengths"),
+        ({"toml": ROBOT.replace("length = 0.1\n", "")}, "positive lengths"),
         ({"toml": "[[segment]]\nradius = 0.1\n"}, r"\[log\]"),
         ({"toml": "[[segment]]\nradius = 0.1\nactuators = 2\n"}, "at least 3"),
         ({"out": "robot.toml"}, "must be a folder"),
@@ -371,7 +371,7 @@ def test_evaluate_says_which_rows_were_fitted(fitted, tmp_path, capsys):
     _, printed, _ = run(capsys, "evaluate", fitted / "model", tmp_path / "log.csv")
     printed = re.sub(r"\s+", " ", printed)
     assert "240 of 240 rows were fitted: their errors are training errors" in printed
-    assert f" held out in the fit {1e3 * held_out['mean']:.2f} " in printed
+    assert f" held out in the fit - {1e3 * held_out['mean']:.2f} " in printed
 
 
 @pytest.mark.slow
