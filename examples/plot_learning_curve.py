@@ -44,7 +44,7 @@ models = {
 
 split = ShuffleSplit(3, test_size=250, random_state=0)
 display = plots.LearningCurveDisplay.from_estimator(
-    models, data.q[rows], data.x[rows], sizes=(16, 30, 60, 120, 250), cv=split, random_state=0
+    models, data.q[rows], data.x[rows], sizes=(20, 30, 60, 120, 250), cv=split, random_state=0
 )
 for name, errors in display.errors.items():
     with_60, with_250 = 1e3 * errors.mean(axis=1)[[2, 4]]

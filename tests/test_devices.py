@@ -72,7 +72,7 @@ def inverse(build, q):
     pose = InverseKinematics(tasks.PoseTask(chain), **box)
     measured = ik.track(path, plant=lambda q: q[:3] * np.nan, feedback="measured", memory=0.1)
     return [
-        ik.solve(x, restarts=2, random_state=0, max_iter=5).q,
+        ik.solve(x, restarts=2, max_iter=5).q,
         ik.solve(x[:1] + 10.0, max_iter=5).status,
         ik.solve(target, differentiable=True, max_iter=5).q.detach().numpy(),
         ik.step(q, x + 1e-3, dx=0 * x, x_measured=x).dq,

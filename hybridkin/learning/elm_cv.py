@@ -50,7 +50,7 @@ class ELMRegressorCV(FittedNetwork):
         Ranges of the random weights to try.
     cv : int, splitter or iterable of (train, test), default=None
         Which rows are held out together. None: each group where `fit` is given groups, else each
-        row alone.
+        row alone. Equal rows of a group are held out together, unless the splits are listed.
     relevance_rounds : int, default=5
         How often at most the inputs are rescaled by their relevance.
     max_hidden : int, default=2000
@@ -170,7 +170,9 @@ class ELMRegressorCV(FittedNetwork):
         X, y, sample_weight = check_rows(self, X, y, sample_weight)
         if groups is not None:
             groups = labels(groups, len(X))
-        first, sample_weight, place = distinct_rows(X, y, sample_weight, groups)
+        # Splits that are listed hold out what they name, equal rows of other splits or not.
+        apart = np.arange(len(X)) if isinstance(self.cv, (Iterable, PredefinedSplit)) else groups
+        first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
         X, y, groups = X[first], y[first], None if groups is None else groups[first]
         if len(y) < 2:
             raise ValueError(
@@ -310,8 +312,8 @@ def _relevance(best, task):
 def _splits(cv, groups, n_rows, place):
     """Return (rows out, rows asked) of every split of the different rows.
 
-    Splits that the user lists are of all rows; `place` has that of each among the different ones.
-    An integer or a splitter sees the different ones alone.
+    Splits that the user lists are of all rows; `place` has that of each among those that count.
+    An integer or a splitter sees these alone.
     """
     if groups is None and cv is None:
         return None

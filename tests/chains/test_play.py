@@ -203,6 +203,7 @@ def test_widths_are_doubled_while_the_largest_is_the_best():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the calibrated model leaves")  # what such play hides
 def test_no_width_is_wider_than_the_range():
     truth, q, x, groups = log_of(0.01, 1e-4)
     with pytest.warns(UserWarning, match="calibration left what is physical"):

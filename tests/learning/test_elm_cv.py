@@ -172,7 +172,7 @@ def test_folds_keep_equal_rows_together(cv, with_groups):
     assert_array_equal(longhand.left_out_errors_, left_out)
 
 
-def test_listed_splits_count_all_rows():
+def test_listed_splits_count_all_rows_and_hold_out_what_they_name():
     X, y = data(20)
     rows = np.append(np.arange(20), [4, 4, 9])  # two rows are given again
     fold = np.append(np.arange(20) % 2, [1, 0, 0])
@@ -182,7 +182,8 @@ def test_listed_splits_count_all_rows():
     assert_array_equal(model.left_out_errors_, again.left_out_errors_)
     assert np.isnan(model.left_out_errors_[-1]).all()
     assert np.isfinite(model.left_out_errors_[:-1]).all()
-    assert_array_equal(model.left_out_errors_[4], model.left_out_errors_[20])
+    assert_allclose(model.left_out_errors_[4], model.left_out_errors_[21], rtol=0, atol=1e-12)
+    assert np.abs(model.left_out_errors_[4] - model.left_out_errors_[20]).max() > 1e-6
 
 
 def test_hopeless_penalties_are_never_chosen():

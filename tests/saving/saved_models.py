@@ -116,7 +116,7 @@ def _drifting():
 
 
 def _network(network):
-    q, x, groups = trunk_log()
+    q, x, groups = trunk_log(16)
     given = {"groups": groups} if isinstance(network, ELMRegressorCV) else {}
     return network.fit(q, x, **given), q
 
