@@ -206,8 +206,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         UserWarning
             Where the different rows are fewer than 20, or than twice the coefficients of an affine
             function of q. Where tendons of a ConstantCurvatureChain contradict each other, as slack
-            tendons do (so do `predict` and the Jacobians), where numbers look like millimetres, where the
-            groups are too few for `coverage`, and the warnings of `calibrate`.
+            tendons do (so do `predict` and the Jacobians), where numbers look like millimetres,
+            where the groups are too few for `coverage`, and the warnings of `calibrate`.
         """
         for message in self.fit_with_messages(X, y, sample_weight, groups):
             warnings.warn(message, stacklevel=2)
