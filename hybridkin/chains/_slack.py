@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from hybridkin._core.arrays import identity
 
 MOST = 62  # a set of tendons is the bits of one integer
-_MANY = 2000  # rows from which on steps in single precision save more than they cost
-_ROUGH_STEPS = 5
 _WHOLE_STEPS = 8  # then one tendon at a time, which ends for certain
 _MOST_TURNS = 12  # two to this power, should rounding keep it from an end
 
@@ -72,69 +70,32 @@ def as_mask(codes: Tensor, n: int) -> Tensor:
     return ((codes[:, None] >> torch.arange(n, device=codes.device)) & 1) > 0
 
 
-def find_in_table(rows: Tensor, table: Tensor, rough: Tensor, size: Tensor) -> Tensor:
-    """Return which tendons are taut (N,), from the stretches of all sets; see `rough_of`."""
-    x, at = extended(rows), torch.arange(len(rows), device=rows.device)
-    codes = _pulling_if_taut(table[-1], x)
-    if len(rows) >= _MANY:
-        at = _pivoted_roughly(codes, at, x, rough, size)
-    return _pivoted(partial(table.index_select, 0), codes, at, x)
+def find_in_table(rows: Tensor, table: Tensor) -> Tensor:
+    """Return which tendons are taut (N,), from the stretches of all sets."""
+    return _pivoted(partial(table.index_select, 0), table[-1], extended(rows))
 
 
 def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
     """Return which tendons are taut (N,), from the elasticity."""
-    n, x = rows.shape[1], extended(rows)
+    n = rows.shape[1]
 
     def maps_of(codes: Tensor) -> Tensor:
         return responses_of(as_mask(codes, n), *elasticity).stretch
 
-    at = torch.arange(len(rows), device=rows.device)
-    codes = _pulling_if_taut(maps_of(at.new_tensor([2**n - 1]))[0], x)
-    return _pivoted(maps_of, codes, at, x)
+    full = maps_of(torch.tensor([2**n - 1], device=rows.device))[0]
+    return _pivoted(maps_of, full, extended(rows))
 
 
-def rough_of(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the columns of maps (M, n, n + 1) in single precision, (M (n + 1), n), and a bound.
+def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Tensor:
+    """Return the codes (N,) of the taut tendons by block principal pivoting.
 
-    No entry of a map is larger than the bound (n + 1,) of its column.
-    """
-    return table.mT.float().flatten(0, 1), table.abs().amax((0, 1))
-
-
-def _pulling_if_taut(full: Tensor, x: Tensor) -> Tensor:
-    bits = 2 ** torch.arange(len(full), device=x.device)
-    return ((full @ x.T >= 0) * bits[:, None]).sum(0)
-
-
-def _pivoted_roughly(codes: Tensor, at: Tensor, x: Tensor, rough: Tensor, size: Tensor) -> Tensor:
-    """Change codes (N,) by block principal pivoting in single precision.
-
-    Returns the rows where that did not settle them: it never errs, it leaves what is too close.
-    """
-    here, n = codes, x.shape[1] - 1
-    # Stretches in units of a bound on their rounding errors: from one on the sign is certain.
-    error = 4 * (n + 1) * torch.finfo(rough.dtype).eps * (x.abs() @ size)
-    x = (x / error[:, None]).to(rough).nan_to_num()
-    bits, ones = rough.new_tensor([2.0**k for k in range(n)]), rough.new_ones(n)
-    for _ in range(_ROUGH_STEPS):
-        terms = here[:, None] * (n + 1) + torch.arange(n + 1, device=at.device)
-        stretch = nn.functional.embedding_bag(terms, rough, per_sample_weights=x, mode="sum")
-        signs = stretch.clamp(-1.0, 1.0)
-        found = (0.5 * (signs @ bits + (2**n - 1))).long()
-        left = ((found != here) | (signs.abs() @ ones < n)).nonzero()[:, 0]
-        at, x, here = (part.index_select(0, left) for part in (at, x, found))
-        codes[at] = here
-    return at
-
-
-def _pivoted(maps_of: Callable[[Tensor], Tensor], codes: Tensor, at: Tensor, x: Tensor) -> Tensor:
-    """Return the codes (N,) of the taut tendons by block principal pivoting in the rows `at`.
-
-    The stretches of sets of taut tendons come as maps (N, n, n + 1) from `maps_of`.
+    The stretches of sets of taut tendons come as maps (N, n, n + 1) from `maps_of`; `full` is the
+    map (n, n + 1) of the set of all, which gives the first guess.
     """
     n = x.shape[1] - 1
     bits = 2 ** torch.arange(n, device=x.device)
-    x, here = (part.index_select(0, at) for part in (x, codes))
+    at, here = torch.arange(len(x), device=x.device), ((full @ x.T >= 0) * bits[:, None]).sum(0)
+    codes = here.clone()
     for step in range(_WHOLE_STEPS + 2 ** min(n, _MOST_TURNS)):
         maps = maps_of(here)
         stretch = applied(maps, x)

@@ -22,7 +22,6 @@ __all__ = ["ElasticTendonChain"]
 
 _SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros".split()
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are stored
-_Rough = tuple[Tensor, Tensor]
 
 
 class ElasticTendonChain(ArcChain):
@@ -139,7 +138,7 @@ class ElasticTendonChain(ArcChain):
             if not (geometry[name] > 0).all():
                 raise ValueError(f"`{name}` must be positive, got {geometry[name].tolist()}.")
         zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
-        self._table: tuple[list[Tensor], object, _slack.Responses, _Rough] | None = None
+        self._table: tuple[list[Tensor], object, _slack.Responses] | None = None
         self._set_geometry({**geometry, "tendon_zeros": zeros})
 
     @classmethod
@@ -238,7 +237,7 @@ class ElasticTendonChain(ArcChain):
             self.tendon_zeros,
         )
 
-    def _all_responses(self, rows: Tensor) -> tuple[_slack.Responses, _Rough]:
+    def _all_responses(self, rows: Tensor) -> _slack.Responses:
         """Return the responses of all sets of taut tendons, stored while the geometry stays."""
         geometry = self.geometry()
         shaping = [geometry[name] for name in _SHAPING]
@@ -246,9 +245,9 @@ class ElasticTendonChain(ArcChain):
         passing = learning or any(value.is_inference() for value in shaping)
         key = None if passing else (rows.dtype, rows.device, *(v._version for v in shaping))
         if key is not None and self._table is not None:
-            kept, kept_key, responses, rough = self._table
+            kept, kept_key, responses = self._table
             if key == kept_key and all(a is b for a, b in zip(kept, shaping, strict=True)):
-                return responses, rough
+                return responses
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
         # Outside inference mode, or derivatives could not use what is stored.
         guard = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
@@ -256,28 +255,23 @@ class ElasticTendonChain(ArcChain):
             elasticity = _slack.Elasticity(*(part.double() for part in self._elasticity()))
             responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), *elasticity)
             responses = _slack.Responses(*(part.to(rows) for part in responses))
-            rough = _slack.rough_of(responses.stretch.detach())
         if not passing:
-            self._table = (shaping, key, responses, rough)
-        return responses, rough
+            self._table = (shaping, key, responses)
+        return responses
 
     def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, _slack.Responses]:
         """Return the sets of taut tendons (N,) as bits, and where among responses they stand."""
         if self.n_actuators <= _TABLE:
-            table, rough = self._all_responses(rows)
-            stretch = table.stretch.detach()
-            codes = _slack.FindTaut.apply(_slack.find_in_table, rows.detach(), stretch, *rough)
+            table = self._all_responses(rows)
+            codes = _slack.FindTaut.apply(
+                _slack.find_in_table, rows.detach(), table.stretch.detach()
+            )
             return codes, codes, table
         elasticity = [part.to(rows) for part in self._elasticity()]
-        codes = _slack.FindTaut.apply(
-            _slack.find_by_solving, rows.detach(), *(part.detach() for part in elasticity)
-        )
-        each = torch.arange(len(rows), device=rows.device)
-        return (
-            codes,
-            each,
-            _slack.responses_of(_slack.as_mask(codes, self.n_actuators), *elasticity),
-        )
+        given = (part.detach() for part in (rows, *elasticity))
+        codes = _slack.FindTaut.apply(_slack.find_by_solving, *given)
+        responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), *elasticity)
+        return codes, torch.arange(len(rows), device=rows.device), responses
 
     def _balance(self, rows: Tensor) -> _slack.Balance:
         codes, at, responses = self._find(rows)

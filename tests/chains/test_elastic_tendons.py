@@ -116,7 +116,7 @@ def test_forces_balance_where_it_rests(chain, rng):
     assert_close(moments / scale, 0 * moments, rtol=0, atol=1e-14)
 
 
-WAYS = [(_slack, "_WHOLE_STEPS"), (_slack, "_MANY"), (tendons, "_TABLE")]
+WAYS = [(_slack, "_WHOLE_STEPS"), (tendons, "_TABLE")]
 
 
 @pytest.mark.parametrize(("module", "limit"), WAYS)
@@ -132,38 +132,15 @@ def test_every_way_to_find_the_taut_tendons_agrees(module, limit, monkeypatch, r
     assert_close(J, chain.jacobian(q), rtol=0, atol=1e-12 * float(J.abs().max()))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["through", "soft", "pre-tensioned", "uneven"])
-@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 3e-6)])
-def test_single_precision_leaves_what_is_too_close(name, dtype, rounding, monkeypatch, rng):
+def test_rows_that_are_not_finite_spoil_no_others(name, rng):
     chain, n = ROBOTS[name], ROBOTS[name].n_actuators
-    monkeypatch.setattr(_slack, "_MANY", math.inf)
-    q = torch.cat([random_q(rng, 100, n, width) for width in (0.0, 1e-9, 1e-5, 5e-3, 5.0)])
-
-    def stretches(q):
-        shape = change_of_shape(chain, q.double())
-        return shape @ chain._elasticity().readings.T - q + chain.tendon_zeros
-
-    # Onto the kinks and a hair beside them: a tendon at the length where it starts to pull.
-    stretch, kink = stretches(q), q.clone()
-    first = stretch.where(stretch < 0, -torch.inf).argmax(-1, keepdim=True)
-    kink.scatter_add_(1, first, stretch.gather(1, first).clamp(max=0.0))
-    q = torch.cat([q, *(kink + hair for hair in (0.0, 1e-9, -1e-9, 1e-12, -1e-12))]).to(dtype)
-    size = q.abs().amax(-1, keepdim=True) + chain.tendon_zeros.abs().amax()
-    clear = stretches(q).abs() > rounding * size
-    clear[:100] = True  # q = 0: even a tendon just about to pull
-    assert clear[:500].float().mean() > 0.9
-    expected, pull = chain.slack(q), chain.tensions(q)
+    q = random_q(rng, 100, n)
     spoilt = q.clone()
     spoilt[::7, 0], spoilt[1::7, 1] = torch.nan, torch.inf
-    monkeypatch.setattr(_slack, "_MANY", 0)
-    for steps in (5, 50):
-        monkeypatch.setattr(_slack, "_ROUGH_STEPS", steps)
-        assert torch.equal(chain.slack(q)[clear], expected[clear])
-        assert ((chain.tensions(q) - pull).abs() <= rounding * size).all()
-        sound = spoilt.isfinite().all(-1)
-        assert torch.equal(chain.tensions(spoilt)[sound], chain.tensions(q)[sound])
-        assert torch.isnan(chain(spoilt)[::7]).all()
+    sound = spoilt.isfinite().all(-1)
+    assert torch.equal(chain.tensions(spoilt)[sound], chain.tensions(q)[sound])
+    assert torch.isnan(chain(spoilt)[::7]).all()
 
 
 def test_one_tendon_pulled_by_hand():
