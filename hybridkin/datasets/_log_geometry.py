@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hybridkin._core.units import METRES
 from hybridkin.datasets._log_order import Way, base_turn, better_way, changes, misses
 from hybridkin.datasets._log_report import LogFinding
-from hybridkin.datasets._logs import Log
+from hybridkin.datasets._logs import Log, column_names
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS, _FEW = 500, 150  # enough to tell one robot from its mirror image; of many changes
@@ -173,10 +173,6 @@ def _kind_finding(log: Log, robot: _Robot) -> LogFinding | None:
     return LogFinding(kind, "error", f"the robot is described with {what}, but q {span}.", advice)
 
 
-def _names(log: Log) -> list[str]:
-    return [*(log.q_names or (f"q[{i}]" for i in range(log.q.shape[1])))]
-
-
 def _signs(sign: NDArray) -> Way:
     return Way((*range(len(sign)),), tuple(sign.tolist()))
 
@@ -228,7 +224,7 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
         mounted = "Or, if the robot is mounted so, give the turn in [base] (`base` of a chain)."
         yield LogFinding("sign", "warning", message, f"{flip} {mounted}")
     elif share < (_FAR_BETTER if kind == "size" else _SHIFTED):
-        name, far = _names(log)[int(i)], 1e3 * abs(by) * q.std(axis=0)[int(i)]
+        name, far = column_names(log, "q")[int(i)], 1e3 * abs(by) * q.std(axis=0)[int(i)]
         what = (
             f"actuator {name!r} {'is off' if kind == 'offset' else 'drifts'} by about {far:.1g} mm"
         )
@@ -243,14 +239,15 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
 
 def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding:
     """Return a finding that names a better way to read the columns of q."""
-    names = [_names(log)[i] for i in way.order]
+    declared = column_names(log, "q")
+    names = [declared[i] for i in way.order]
     clockwise = next(changes(robot.chain.actuators_per_segment, False)).order
     kind, what, advice = "sign", [], []
-    if names != _names(log) and way.order == clockwise:
+    if names != declared and way.order == clockwise:
         kind, what = "numbering", ["the actuators numbered the other way round"]
         counted = f"set clockwise = {str(not robot.clockwise).lower()} in every [[segment]]"
         advice = [f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."]
-    elif names != _names(log):
+    elif names != declared:
         kind, what = "order", [f"the columns of q in the order {', '.join(names)}"]
         listed = f"set q = {json.dumps(names)} in [log] of the robot description."
         advice = [listed if log.q_names else f"use q[:, {[*way.order]}]."]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 SEVERITIES = ("error", "warning", "note")
 MISREAD = ("units", "order", "sign", "numbering", "axes", "size")
@@ -153,12 +153,11 @@ def _filled(head: str, text: str) -> str:
     return lines.fill(text)
 
 
-def named_rows(rows: ArrayLike, places: NDArray, kind: str = "line") -> str:
-    """Return rows in words, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
-    found = np.sort(places[np.asarray(rows)])
+def named_rows(places: NDArray, kind: str) -> str:
+    """Return places in words, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
+    found = np.sort(places)
     runs = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
     words = [f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:4]]
-    left = sum(len(run) for run in runs[4:])
-    return f"{kind}{'s' if len(found) > 1 else ''} {', '.join(words)}" + (
-        f" and {left} more" if left else ""
-    )
+    left = sum(map(len, runs[4:]))
+    more = f" and {left} more" if left else ""
+    return f"{kind}{'s' if len(found) > 1 else ''} {', '.join(words)}{more}"

@@ -81,6 +81,12 @@ class Log:
         return replace(self, **{k: v[kept] for k, v in columns.items() if v is not None})
 
 
+def column_names(log: Log, which: str) -> list[str]:
+    """Return the names of the columns of "q" or "x", by their numbers where they have none."""
+    n = vars(log)[which].shape[1]
+    return [*(vars(log)[f"{which}_names"] or (f"{which}[{i}]" for i in range(n)))]
+
+
 def load_log(
     path: str | os.PathLike[str],
     q: Sequence[str],
