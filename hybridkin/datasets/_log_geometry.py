@@ -22,13 +22,11 @@ _CONVERT = (
     "set `spool_radius` (of motors) or `q_scale` (of pressures or steps: metres per unit) in [log] "
     "of the robot description"
 )
-_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
-# Of the tip's spread over the robot's reach, of strokes over radii (a bend, in rad) and of
-# chamber lengths over radii: what cannot be, what is usual.
+# Of the tip's spread over the robot's reach: what cannot be, what is usual. Of strokes over radii
+# (a bend, in rad) and of chamber lengths over radii: what is too small, usual and too large.
 _REACH, _USUAL_REACH = 5.0, 0.7
+_BEND, _LONG = (0.02, 1.0, 15.0), (0.05, 3.0, 100.0)
 _SMALL_SHARE = 0.04  # of the way that the model predicts
-_BEND, _USUAL_BEND, _SMALL_BEND = 15.0, 1.0, 0.02
-_LONG, _USUAL_LONG, _SHORT = 100.0, 3.0, 0.05
 _FAR_BETTER, _GOOD = 0.6, 0.55  # of the motion missed: another reading's over the declared one's
 _SEARCHED = 0.1  # of the tip's motion missed: other orders are tried
 _ENOUGH = 0.75  # of the variance explained
@@ -88,45 +86,42 @@ class _Robot:
                 found[kind, i, by] = q + shift
         return found
 
-    @property
-    def clockwise(self) -> bool:
-        """Whether the actuators of the first segment run clockwise."""
-        first = self.chain.angles[: self.chain.actuators_per_segment[0]].detach()
-        return bool(torch.sin(first[1] - first[0]) < 0)
-
 
 def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFinding]:
     """Return what contradicts the chain; units first, since all else rests on them."""
     robot = _Robot(chain)
-    return [*_unit_findings(log, robot)] or [*_orientation_findings(log, robot, base_is_free)]
+    found = [*_kind_findings(log, robot)] or [*_unit_findings(log, robot)]
+    return found or [*_orientation_findings(log, robot, base_is_free)]
 
 
-def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
-    q, radii = log.q, robot.radii
+def _kind_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
+    """Yield a finding where q holds no lengths, or whole ones for changes or the reverse."""
+    low, high = log.q.min(axis=0), log.q.max(axis=0)
     if log.units["q"] != "m":
         message = f"the actuators of the robot are lengths, but q is in {log.file_units['q']}."
         yield LogFinding("units", "error", message, f"{_CONVERT}.")
         return
-    wrong = _kind_finding(log, robot)
-    if wrong is not None:
-        yield wrong
-        return
+    what, kind, advice = "tendons, whose q are changes of length", "geometry", _ADVICE["whole"]
     if robot.extensible:
-        stroke = float(np.median(q)) / radii.mean()
-        low, high, usual = _SHORT, _LONG, _USUAL_LONG
+        what, advice = "chambers, whose q are positive lengths", _ADVICE["changes"]
+        if ((low > 0) | (high < 0)).all():
+            kind, advice = "sign", _sign_advice(log, _signs(np.where(high < 0, -1, 1)))
+    if not (low > 0).all() if robot.extensible else (low > 0.1 * high).all():
+        span = f"lies between {1e3 * low.min():.4g} and {1e3 * high.max():.4g} mm"
+        message = f"the robot is described with {what}, but q {span}."
+        yield LogFinding(kind, "error", message, advice)
+
+
+def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
+    q, radii, length = log.q, robot.radii, robot.length
+    if robot.extensible:
+        size, radius, (low, usual, high) = float(np.median(q)), radii.mean(), _LONG
         # As long as q says; in which unit is asked next.
         length = sum(part.mean() for part in np.split(q, robot.ends, axis=1))
-        off = stroke > high or stroke < low
-        length /= _factor(stroke, usual) if off else 1.0
-        what = f"the chambers are {1e3 * np.median(q):.4g} mm long, {stroke:.3g} times the radius"
+        length /= 1.0 if low <= size / radius <= high else _factor(size / radius, usual)
     else:
-        stroke, length = float(np.abs(q).max()) / radii.sum(), robot.length
-        low, high, usual = _SMALL_BEND, _BEND, _USUAL_BEND
-        what = (
-            f"the longest stroke is {1e3 * np.abs(q).max():.4g} mm, for tendons at "
-            f"{1e3 * radii.mean():.4g} mm from the backbone a bend of {stroke:.3g} rad"
-        )
-    spread = float(np.linalg.norm(np.ptp(log.x, axis=0)))
+        size, radius, (low, usual, high) = float(np.abs(q).max()), radii.sum(), _BEND
+    stroke, spread = size / radius, float(np.linalg.norm(np.ptp(log.x, axis=0)))
     reach = spread / (length + robot.offsets)
     small = stroke < low and (robot.extensible or reach > 0.1 or stroke < low / 4)
     q_factor = _factor(stroke, usual) if stroke > high or small else None
@@ -136,6 +131,8 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         share = spread / max(float(np.linalg.norm(np.ptp(tips, axis=0))), np.finfo(float).tiny)
         x_factor = _factor(share, 1.0) if 0.0 < share < _SMALL_SHARE else None
     if q_factor is not None:
+        what = "the chambers are" if robot.extensible else "the longest stroke is"
+        what = f"{what} {1e3 * size:.4g} mm, {stroke:.3g} times the radii ({1e3 * radius:.4g} mm)"
         yield _unit_finding("q", what, log.file_units["q"], q_factor)
     if x_factor is not None:
         what = f"the tip moves within {1e3 * spread:.4g} mm, {reach:.3g} of the robot's reach"
@@ -143,34 +140,17 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
 
 
 def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
-    true = next((u for u in _NAMES if np.isclose(METRES[u] * factor, METRES.get(unit, 0.0))), None)
-    looks = f"these look like {_NAMES[true]}" if true else f"they are off by about {factor:g}"
+    sizes = {unit: METRES[unit] for unit in ("m", "cm", "mm")}
+    true = next((u for u in sizes if np.isclose(sizes[u] * factor, METRES.get(unit, 0.0))), None)
     where = f"in [log] of the robot description or --{name}-unit"
-    remedy = (
-        f'set {name}_unit = "{true}" {where} {true}' if true else f"check `{name}_unit` {where}"
-    )
-    if name == "q" and true is None:
-        remedy = f"where these are no lengths, {_CONVERT}"
-    return LogFinding(
-        "units",
-        "error",
-        f"columns of {name} are declared as {unit}, but {what}; {looks}.",
-        f"{remedy}; or correct the radii and lengths of the description, which are metres.",
-    )
-
-
-def _kind_finding(log: Log, robot: _Robot) -> LogFinding | None:
-    """Return a finding where q holds whole lengths for changes of length, or the reverse."""
-    low, high = log.q.min(axis=0), log.q.max(axis=0)
-    what, kind, advice = "tendons, whose q are changes of length", "geometry", _ADVICE["whole"]
-    if robot.extensible:
-        what, advice = "chambers, whose q are positive lengths", _ADVICE["changes"]
-        if ((low > 0) | (high < 0)).all():
-            kind, advice = "sign", _sign_advice(log, _signs(np.where(high < 0, -1, 1)))
-    if (low > 0).all() if robot.extensible else not (low > 0.1 * high).all():
-        return None
-    span = f"lies between {1e3 * low.min():.4g} and {1e3 * high.max():.4g} mm"
-    return LogFinding(kind, "error", f"the robot is described with {what}, but q {span}.", advice)
+    remedy = f'set {name}_unit = "{true}" {where} {true}'
+    if true is None:
+        q_remedy = f"where these are no lengths, {_CONVERT}"
+        remedy = q_remedy if name == "q" else f"check `{name}_unit` {where}"
+    looks = f"these look like {true}" if true else f"they are off by about {factor:g}"
+    message = f"columns of {name} are declared as {unit}, but {what}; {looks}."
+    advice = f"{remedy}; or correct the radii and lengths of the description, which are metres."
+    return LogFinding("units", "error", message, advice)
 
 
 def _signs(sign: NDArray) -> Way:
@@ -180,9 +160,8 @@ def _signs(sign: NDArray) -> Way:
 def _sign_advice(log: Log, way: Way) -> str:
     """Return how to write the signs of a way of reading the columns."""
     sign = np.array(way.sign) * np.broadcast_to(log.q_sign, len(way.sign))[list(way.order)]
-    value, option = (
-        (sign[0], f", or --q-sign={sign[0]}") if np.ptp(sign) == 0 else (sign.tolist(), "")
-    )
+    value = sign[0] if np.ptp(sign) == 0 else sign.tolist()
+    option = f", or --q-sign={value}" if np.ptp(sign) == 0 else ""
     return f"set q_sign = {value} in [log] of the robot description{option}."
 
 
@@ -224,17 +203,17 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
         mounted = "Or, if the robot is mounted so, give the turn in [base] (`base` of a chain)."
         yield LogFinding("sign", "warning", message, f"{flip} {mounted}")
     elif share < (_FAR_BETTER if kind == "size" else _SHIFTED):
-        name, far = column_names(log, "q")[int(i)], 1e3 * abs(by) * q.std(axis=0)[int(i)]
-        what = (
-            f"actuator {name!r} {'is off' if kind == 'offset' else 'drifts'} by about {far:.1g} mm"
-        )
-        what = f"its bends are {i:g} times as large" if kind == "size" else what
+        what = f"its bends are {i:g} times as large"
+        if kind != "size":
+            name, far = column_names(log, "q")[int(i)], 1e3 * abs(by) * q.std(axis=0)[int(i)]
+            does = "is off" if kind == "offset" else "drifts"
+            what = f"actuator {name!r} {does} by about {far:.1g} mm"
         message = f"the nominal model misses {100 * share:.0f} % as much of the motion if {what}."
         yield LogFinding(kind, "warning", message, _ADVICE[kind])
     elif 1 - missed**2 < _ENOUGH:
-        message = f"the nominal model explains only {_share(missed)} of the tip's motion, in any"
-        finding = f"{message} order and sign of q."
-        yield LogFinding("geometry", "warning", finding, _ADVICE["geometry"])
+        explained = f"{_share(missed)} of the tip's motion, in any order and sign of q"
+        message = f"the nominal model explains only {explained}."
+        yield LogFinding("geometry", "warning", message, _ADVICE["geometry"])
 
 
 def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding:
@@ -245,7 +224,8 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
     kind, what, advice = "sign", [], []
     if names != declared and way.order == clockwise:
         kind, what = "numbering", ["the actuators numbered the other way round"]
-        counted = f"set clockwise = {str(not robot.clockwise).lower()} in every [[segment]]"
+        first, second = robot.chain.angles[:2].tolist()
+        counted = f"set clockwise = {str(np.sin(second - first) > 0).lower()} in every [[segment]]"
         advice = [f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."]
     elif names != declared:
         kind, what = "order", [f"the columns of q in the order {', '.join(names)}"]
