@@ -23,7 +23,7 @@ else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
-_MODELS = ("constant-curvature", "elastic-tendon")
+_PLAIN, _ELASTIC = "constant-curvature", "elastic-tendon"
 _MOST = 64  # segments of a robot, actuators of a segment
 
 _LEAST, _LARGEST = 1e-18, 1e9  # of positive numbers, and of all: beyond lie only mistakes
@@ -62,7 +62,7 @@ _WHOLE = (f"be a whole number from 1 to {_MOST}", lambda v: type(v) is int and 0
 # Tables, their keys, and what the value of a key must do, in words and as a test.
 _ROWS: list[tuple[str, str, str, _Test]] = [
     ("file", "name", *_TEXT),
-    ("file", "model", *_among(*_MODELS)),
+    ("file", "model", *_among(_PLAIN, _ELASTIC)),
     ("file", "routing", *_among("segment", "base")),
     ("file", "calibrate", "be a list of names", lambda v: v == [] or _many(_is_text)(v)),
     ("file", "segment", "hold tables, each under the heading [[segment]]", _many(_TABLE[1])),
@@ -119,71 +119,64 @@ def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
 
 def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendonChain:
     """Return the chain of a description with segments."""
-    model = tables.get("model", _MODELS[0])
-    elastic = model == "elastic-tendon"
+    elastic = tables.get("model", _PLAIN) == _ELASTIC
     segments: list[dict[str, Any]] = []
     for i, table in enumerate(tables["segment"]):
         unused = [] if elastic else [key for key in _STIFFNESS if key in table]
         if unused:
             raise ValueError(
-                f"`{unused[0]}` in [[segment]] is not known to model 'constant-curvature'; leave "
-                'it out, or set model = "elastic-tendon".'
+                f"`{unused[0]}` in [[segment]] is not known to model {_PLAIN!r}; leave it out, or "
+                f'set model = "{_ELASTIC}".'
             )
-        segments += _segments(table, f"[[segment]] {i + 1}", 1 if elastic else 3)
+        segments += [_segment(table, f"[[segment]] {i + 1}", elastic)] * table.get("repeat", 1)
     if len(segments) > _MOST:
         raise ValueError(
             f"[[segment]] must describe at most {_MOST} segments in all, got "
             f"{len(segments)}; check `repeat`."
         )
     given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
-    for key in ("length", *_STIFFNESS):
+    for key in ("length", *_STIFFNESS) if elastic else ("length",):
         missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
-        if elastic and key == "length" and missing:
+        needed = elastic and key == "length"
+        if missing and (needed or len(missing) < len(segments)):
             raise ValueError(
-                f"`length` is missing for segment {missing[0]}; model 'elastic-tendon' needs the "
-                "backbone length [m] in every [[segment]]."
+                f"`{key}` must stand in every [[segment]]{'' if needed else ' or in none'}, but is "
+                f"missing for segment {missing[0]}."
             )
-        if 0 < len(missing) < len(segments):
-            kinds = " (tendons) or in none (chambers)" if key == "length" else " or in none"
-            raise ValueError(f"`{key}` must stand in every [[segment]]{kinds}.")
         given[key] = None if missing else given[key]
-    given["n_actuators"] = [len(angles) for angles in given["angles"]]
     given |= {"lengths": given.pop("length"), "base": _base(tables.get("base", {}))}
     given |= {"routing": tables["routing"]} if "routing" in tables else {}
-    zeros = given.pop("zeros")
-    if elastic:
-        return ElasticTendonChain(tendon_zeros=zeros, **given)
-    given = {key: value for key, value in given.items() if key not in _STIFFNESS}
-    return ConstantCurvatureChain(actuator_zeros=zeros, **given)
+    return ElasticTendonChain(**given) if elastic else ConstantCurvatureChain(**given)
 
 
-def _segments(table: Mapping[str, Any], where: str, fewest: int) -> list[dict[str, Any]]:
+def _segment(table: Mapping[str, Any], where: str, elastic: bool) -> dict[str, Any]:
+    """Return what a chain is made from for one segment; None for what may be left out."""
     if "radius" not in table:
         raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
-    key = "angles_deg" if "angles_deg" in table else "actuators"
-    if key == "angles_deg":
-        for other in ("angle_deg", "actuators", "clockwise"):
-            if other in table:
-                raise ValueError(f"`{other}` cannot stand beside `angles_deg` in {where}.")
-        angles = np.radians(np.array(table["angles_deg"], dtype=float))
+    if "angles_deg" in table:
+        key, angles = "angles_deg", np.radians(np.array(table["angles_deg"], dtype=float))
+        if beside := {"angle_deg", "actuators", "clockwise"} & {*table}:
+            raise ValueError(f"`{min(beside)}` cannot stand beside `angles_deg` in {where}.")
     else:
-        n = table.get("actuators", 3)
+        key, n = "actuators", table.get("actuators", 3)
         step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
         angles = math.radians(table.get("angle_deg", 0.0)) + step * np.arange(n)
+    fewest = 1 if elastic else 3
     if len(angles) < fewest:
         raise ValueError(
             f"`{key}` in {where} must describe at least {fewest} actuators, got {len(angles)}; two "
             "actuators do not determine which way a segment bends."
         )
-    segment = {
+    return {
         "radii": table["radius"],
+        "length": table.get("length"),
         "offsets": table.get("offset", 0.0),
+        "n_actuators": len(angles),
         "angles": angles,
         "rest_bends": np.radians(table.get("rest_bend_deg", [0.0, 0.0])),
-        "zeros": each(table, "zeros", where, len(angles)),
-        **{key: table.get(key) for key in ("length", *_STIFFNESS)},
+        "tendon_zeros" if elastic else "actuator_zeros": each(table, "zeros", where, len(angles)),
+        **{key: table.get(key) for key in _STIFFNESS if elastic},
     }
-    return [segment] * table.get("repeat", 1)
 
 
 def _base(table: Mapping[str, Any]) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains._robot_files import chain_of, each, read_tables
-from hybridkin.chains.arc_chain import ALIASES
+from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
@@ -295,14 +295,13 @@ def read_description(path: str | Path) -> RobotDescription:
 
 def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
     chain = chain_of(tables) if "segment" in tables else None
-    log = _log_format(tables["log"]) if "log" in tables else None
-    if chain is None and (log is None or {"model", "routing", "calibrate", "base"} & {*tables}):
+    of_chains = {"model", "routing", "calibrate", "base"} & {*tables}
+    if chain is None and ("log" not in tables or of_chains):
         raise ValueError(
             "`segment` is missing; describe each segment in a [[segment]] table. For a model of "
             "data alone give [log], and none of `model`, `routing`, `calibrate` and `base`."
         )
-    if chain is not None and log is not None:
-        _check_columns(log, chain.n_actuators)
+    log = _log_format(tables["log"], chain) if "log" in tables else None
     names = () if chain is None else tables.get("calibrate", chain.default_parameters)
     known = () if chain is None else (*chain.geometry(), *ALIASES)
     if not {*names} <= {*known} or len({*names}) < len(names):
@@ -311,23 +310,30 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
     return replace(robot, limits=_limits(tables.get("limits", {}), robot))
 
 
-def _log_format(table: Mapping[str, Any]) -> LogFormat:
+def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     if not {"q", "x"} <= {*table}:
         raise ValueError("`q` or `x` is missing in [log]; name the columns of actuators and tip.")
+    if chain is not None and len(table["q"]) != chain.n_actuators:
+        raise ValueError(
+            f"`q` in [log] must name {chain.n_actuators} columns, one for each actuator of the "
+            f"[[segment]] tables, got {len(table['q'])}: {table['q']}."
+        )
     columns = [*table["q"], *table["x"], *(table[key] for key in _COLUMNS if key in table)]
     if doubled := sorted({name for name in columns if columns.count(name) > 1}):
         raise ValueError(f"[log] must name every column once, got {doubled} more often.")
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
     unit = given.setdefault("q_unit", "1" if "q_scale" in given else "m")
-    known = [*UNITS]
+    known = [*UNITS] if chain is None else [*METRES]
+    fits = unit in known
     if "spool_radius" in given:
-        known = [] if "q_scale" in given else ["deg", "rad"]
+        fits = unit in ("deg", "rad") and "q_scale" not in given
     elif "q_scale" in given:
-        known = [unit] if unit not in METRES else []
-    if unit not in known:
+        fits = unit not in METRES
+    if not fits:
         raise ValueError(
-            f'`q_unit` in [log] must be one of {[*UNITS]}; with `spool_radius` "deg" or "rad"; '
-            f"with `q_scale` (instead of it) any name but a length; got {unit!r}."
+            f'`q_unit` in [log] must be one of {known}; of motors "deg" or "rad", with a '
+            "`spool_radius` [m]; of pressures or other units any name but a length, with `q_scale` "
+            f"[m per unit] instead; got {unit!r}."
         )
     for key in ("q_sign", "q_scale", "spool_radius"):
         values = each(table, key, "[log]", len(table["q"]))
@@ -335,20 +341,6 @@ def _log_format(table: Mapping[str, Any]) -> LogFormat:
             del given[key]
             given["q_scale"] = tuple((UNITS[unit] * values).tolist())
     return LogFormat(**given)
-
-
-def _check_columns(log: LogFormat, n_actuators: int) -> None:
-    if len(log.q) != n_actuators:
-        raise ValueError(
-            f"`q` in [log] must name {n_actuators} columns, one for each actuator of the "
-            f"[[segment]] tables, got {len(log.q)}: {list(log.q)}."
-        )
-    if log.q_scale is None and log.q_unit not in METRES:
-        raise ValueError(
-            f"`q_unit` in [log] must be a length, one of {[*METRES]}, since the actuators of "
-            f"[[segment]] tables are lengths, got {log.q_unit!r}; of motors give the "
-            "`spool_radius` [m], of pressures or other units `q_scale` [m per unit]."
-        )
 
 
 def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:

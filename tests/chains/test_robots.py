@@ -178,7 +178,7 @@ def test_elastic_tendons_by_default(write):
     ("change", "message"),
     [
         (('model = "elastic-tendon"', ""), "`bending_stiffness` in .* not known to model"),
-        (("length = 0.05\n", ""), "`length` is missing for segment 3"),
+        (("length = 0.05\n", ""), "`length` must stand in every .* missing for segment 3"),
         (("axial_stiffness = 4\n", ""), "`axial_stiffness` must stand in every"),
         (("bending_stiffness = 1e-6\n", ""), "`bending_stiffness` must stand in every"),
         (
@@ -312,9 +312,12 @@ LOG = "[log]\nq = ['a', 'b', 'c']\nx = ['x', 'y', 'z']\n"
         (SEGMENT + LOG + "q_sign = true", "`q_sign` in .log. must be 1 or -1"),
         (SEGMENT + LOG + "q_sign = [1, -1]", "`q_sign` in .log. must hold 3 numbers"),
         (SEGMENT + LOG + "q_unit = ['mm']", "`q_unit` in .log. must be text"),
-        (SEGMENT + LOG + "q_unit = 'deg'", "`q_unit` in .log. must be a length, .* `spool_radius`"),
-        (SEGMENT + LOG + "spool_radius = 0.01", '`spool_radius` "deg" or "rad"; .* got \'m\''),
-        (SEGMENT + LOG + "q_unit = 'mm'\nq_scale = 2", "any name but a length; got 'mm'"),
+        (SEGMENT + LOG + "q_unit = 'deg'", "`q_unit` in .log. must be one of .* `spool_radius`"),
+        (
+            SEGMENT + LOG + "spool_radius = 0.01",
+            '"deg" or "rad", with a `spool_radius` .* got \'m\'',
+        ),
+        (SEGMENT + LOG + "q_unit = 'mm'\nq_scale = 2", "any name but a length, .* got 'mm'"),
         (SEGMENT + LOG + "q_scale = 0.0", "`q_scale` in .log. must be positive"),
         (SEGMENT + LOG + "q_scale = [1, 2]", "`q_scale` in .log. must hold 3 numbers"),
         (SEGMENT + "[limits]\nq_min = nan", "`q_min` in .limits. must be a number"),
