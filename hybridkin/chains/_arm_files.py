@@ -116,10 +116,8 @@ def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         link = by_child[link].parent
     if root is not None and link != root:
         raise ValueError(f"`root_link` must lead to {end_link!r}, but {root!r} does not.")
-    moving = [joint for joint in path if joint.kind != "fixed"]
-    missing = [joint.name for joint in moving if joint.limits is None]
-    locked = [joint.name for joint in moving if joint.limits == (0.0, 0.0)]
-    for names, what in ((missing, _MISSING), (locked, _LOCKED)):
+    for limits, what in ((None, _MISSING), ((0.0, 0.0), _LOCKED)):
+        names = [joint.name for joint in path if joint.kind != "fixed" and joint.limits == limits]
         if names:
             warnings.warn(f"joints {names} {what}", stacklevel=3)
     return path
@@ -134,8 +132,8 @@ def _check_tree(links: list[str], joints: Sequence[Any]) -> None:
         if doubled:
             raise ValueError(f"every {what} of a URDF must occur once, got {doubled} more often.")
     for joint in joints:
-        for what, link in (("<parent>", joint.parent), ("<child>", joint.child)):
-            _one_of(link, links, f"{what} of joint {joint.name!r}")
+        _one_of(joint.parent, links, f"<parent> of joint {joint.name!r}")
+        _one_of(joint.child, links, f"<child> of joint {joint.name!r}")
     try:
         TopologicalSorter({joint.child: [joint.parent] for joint in joints}).prepare()
     except CycleError as error:
@@ -150,26 +148,22 @@ def _check_tree(links: list[str], joints: Sequence[Any]) -> None:
 
 
 def _urdf_joint(joint: Any) -> Joint:
-    if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
+    mimic, known = joint.mimic, ("revolute", "continuous", "prismatic", "fixed")
+    if joint.type not in known or mimic is not None:
+        does = f"is {joint.type}" if mimic is None else f"mimics {mimic.joint!r}"
         raise ValueError(
-            f"joint {joint.name!r} is {joint.type}; only revolute, continuous, prismatic and fixed "
-            "joints are supported on the way to `end_link`; choose a `root_link` after it."
-        )
-    if joint.mimic is not None:
-        raise ValueError(
-            f"joint {joint.name!r} mimics {joint.mimic.joint!r}, which is not supported on the way "
-            "to `end_link`."
+            f"joint {joint.name!r} {does}; only {known} joints that mimic no other are supported "
+            "on the way to `end_link`; choose a `root_link` after it."
         )
     origin = np.eye(4)
     if joint.origin is not None:
         turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0])
         origin = _matrix(turn, joint.origin.xyz or [0, 0, 0])
-    kind = "revolute" if joint.type == "continuous" else joint.type
     axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # the URDF default
-    limits = _UNLIMITED if joint.type == "continuous" else None
-    if joint.type != "continuous" and joint.limit is not None:
-        limits = (joint.limit.lower, joint.limit.upper)
-    return Joint(origin, kind, axis, joint.name, limits)
+    if joint.type == "continuous":
+        return Joint(origin, "revolute", axis, joint.name, _UNLIMITED)
+    limits = None if joint.limit is None else (joint.limit.lower, joint.limit.upper)
+    return Joint(origin, joint.type, axis, joint.name, limits)
 
 
 def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[Joint]:
@@ -227,9 +221,8 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
                 f"`range` of joint {name!r} must be an interval, got {limits}: MuJoCo would ignore "
                 'it. Remove the joint to lock it, or set limited="false".'
             )
-        back, none = -zero * axis, np.zeros(3)  # from MuJoCo's reference to q = 0
-        turn, slide = (back, none) if _MJCF_KINDS[kind] == "revolute" else (none, back)
-        origin = _matrix(Rotation.from_rotvec(turn), anchor + slide)
+        back, slides = -zero * axis, kind == 2  # from MuJoCo's reference to q = 0
+        origin = _matrix(Rotation.from_rotvec((not slides) * back), anchor + slides * back)
         steps.append(Joint(origin, _MJCF_KINDS[kind], axis, name, limits))
         steps.append(Joint(_matrix(Rotation.identity(), -anchor)))
     return steps

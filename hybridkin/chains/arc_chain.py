@@ -16,7 +16,7 @@ from hybridkin._core.arrays import Numbers, Transform, identity, number
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
-from hybridkin._core.units import warn_millimetres
+from hybridkin._core.units import LONGEST_PULL, millimetres_message, warn_millimetres
 from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
 from hybridkin.chains._checks import actuator_counts, filled, flat_angles, lengths_of, pose
 from hybridkin.chains.chain import Chain
@@ -58,6 +58,12 @@ class ArcChain(Chain):
     angles: Tensor  # (n,)
     offsets: Tensor  # (S,)
     rest_bends: Tensor  # (S, 2)
+    lengths: Tensor | None  # (S,), of extensible segments None
+
+    @property
+    def reach(self) -> Tensor:
+        """The natural size of the robot, shape () [m]: its backbone, or else 10 mean radii."""
+        return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
 
     def _checked(
         self,
@@ -295,7 +301,14 @@ class ArcChain(Chain):
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
         where = "" if self.tip_at == self.n_segments else f", tip at {self.tip_at:g}"
-        return f"{self.n_segments} segments, {self.n_actuators} actuators{where}"
+        size = f"{self.n_segments} segments, {self.n_actuators} actuators"
+        return f"{size}{where}, routing {self.routing!r}"
+
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return a warning where lengths exceed 10 m, or length changes the backbone's 4-fold."""
+        limit = 10.0 if self.lengths is None else LONGEST_PULL * float(self.lengths.detach().sum())
+        message = millimetres_message(name, q.abs(), factor * limit)
+        return [] if message is None else [message]
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return arcs (3 S, N) of rows (N, n) and their derivative, (3 S, n) or (3 S, n, N).

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform, identity
 from hybridkin._core.stored import Layout
-from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
@@ -75,8 +74,6 @@ class ConstantCurvatureChain(ArcChain):
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
     layout = Layout("constant_curvature", dict.fromkeys(_entries, ""), STRUCTURE)
 
-    lengths: Tensor | None
-
     def __init__(
         self,
         radii: Numbers,
@@ -112,11 +109,6 @@ class ConstantCurvatureChain(ArcChain):
     def default_parameters(self) -> tuple[str, ...]:
         """The geometry that a calibration fits by default."""
         return ("radii", "base") if self.lengths is None else ("radii", "lengths", "base")
-
-    @property
-    def reach(self) -> Tensor:
-        """The natural size of the robot, shape () [m]: its backbone, or else 10 mean radii."""
-        return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
 
     def consistency(self, q: Tensor) -> Tensor:
         """Return how far the actuator readings of each segment contradict each other.
@@ -229,16 +221,10 @@ class ConstantCurvatureChain(ArcChain):
                 f"row {row}; for tendon length changes build the chain with `lengths=`."
             )
 
-    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return a warning where lengths exceed 10 m, or length changes the backbone's 4-fold."""
-        limit = 10.0 if self.lengths is None else LONGEST_PULL * float(self.lengths.detach().sum())
-        message = millimetres_message(name, q.abs(), factor * limit)
-        return [] if message is None else [message]
-
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
         kind = "extensible" if self.lengths is None else "inextensible"
-        return f"{kind}, {super().extra_repr()}, routing {self.routing!r}"
+        return f"{kind}, {super().extra_repr()}"
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         super()._set_geometry(geometry)

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.stored import Layout
-from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains import _slack
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled, float_dtype
@@ -180,11 +179,6 @@ class ElasticTendonChain(ArcChain):
         stiffness = ("bending_stiffness", "axial_stiffness")
         return ("base", "angles", "rest_bends", *stiffness, "tendon_zeros")
 
-    @property
-    def reach(self) -> Tensor:
-        """The natural size of the robot, shape () [m]: its backbone."""
-        return self.lengths.sum()
-
     def tensions(self, q: Tensor) -> Tensor:
         """Return how far every tendon is stretched.
 
@@ -211,16 +205,6 @@ class ElasticTendonChain(ArcChain):
     def slack(self, q: Tensor) -> Tensor:
         """Return which tendons hang slack, a bool tensor of the shape of q."""
         return ~self._balance(self._rows(q)).taut.reshape(q.shape)
-
-    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return a warning where length changes exceed the backbone's length 4-fold."""
-        limit = LONGEST_PULL * float(self.lengths.detach().sum())
-        message = millimetres_message(name, q.abs(), factor * limit)
-        return [] if message is None else [message]
-
-    def extra_repr(self) -> str:
-        """Return the summary shown by repr()."""
-        return f"{super().extra_repr()}, routing {self.routing!r}"
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_table": None}
@@ -284,7 +268,7 @@ class ElasticTendonChain(ArcChain):
         return _slack.Balance(shape, stretch.relu() * taut, taut, compliance)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        straight = nn.functional.pad(self.lengths.to(rows), (0, 2 * self.n_segments))
+        straight = nn.functional.pad(self.get_buffer("lengths").to(rows), (0, 2 * self.n_segments))
         _, at, responses = self._find(rows)
         maps = responses.shape.index_select(0, at)
         arcs = (_slack.applied(maps, _slack.extended(rows)) + straight).T.contiguous()

@@ -76,7 +76,7 @@ def check_log(
             f"`log` must have {chain.n_actuators} actuators, as `chain` has, got {n_actuators}."
         )
     columns = np.column_stack([log.q, log.x]).astype(float)
-    valid = np.isfinite(columns).all(axis=1)
+    valid = np.asarray(np.isfinite(columns).all(axis=1))
     findings = [*_invalid(log, valid, drop_invalid)]
     if valid.any():
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))

@@ -97,30 +97,23 @@ class LogReport:
 
     def accepting(self, kind: str) -> LogReport:
         """Return the report with findings of a kind, whose rows were left out, as notes."""
-        note = {"severity": "note", "advice": "find out why."}
         others = [f for f in self.findings if f.kind != kind]
-        notes = [
-            replace(f, message=f"{f.message} They were left out.", **note)
-            for f in self.findings
-            if f.kind == kind
-        ]
-        return replace(self, findings=(*others, *notes))
+        for f in self.findings:
+            if f.kind == kind:
+                message = f"{f.message} They were left out."
+                others.append(LogFinding(kind, "note", message, "find out why.", f.rows))
+        return replace(self, findings=tuple(others))
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as numbers, text and lists, for JSON."""
-        return {
-            "source": self.source,
-            "ok": self.ok,
-            "n_rows": self.n_rows,
-            "n_actuators": self.n_actuators,
-            "n_motions": self.n_motions,
-            "duration_s": self.duration,
-            "q_range": self.q_range.tolist(),
-            "x_range": self.x_range.tolist(),
-            "findings": [
-                {**vars(f), "rows": f.rows.tolist(), "n_rows": len(f.rows)} for f in self.findings
-            ],
-        }
+        record = {**vars(self), "ok": self.ok, "duration_s": self.duration}
+        del record["duration"]
+        for name in ("q_range", "x_range"):
+            record[name] = record[name].tolist()
+        record["findings"] = [
+            {**vars(f), "rows": f.rows.tolist(), "n_rows": len(f.rows)} for f in self.findings
+        ]
+        return record
 
     def summary(self) -> str:
         """Return one sentence: how many errors and warnings."""

@@ -20,7 +20,6 @@ from typing_extensions import Self
 from hybridkin._core.arrays import real_array
 from hybridkin._core.units import METRES, UNITS
 
-_PARQUET = (".parquet", ".pq")
 _DELIMITERS = (",", ";", "\t")
 
 
@@ -171,7 +170,9 @@ def load_log(
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
-    table = _read(path, delimiter)
+    read = {".npz": _read_npz, ".parquet": _read_parquet, ".pq": _read_parquet}
+    suffix = path.suffix.lower()
+    table = read[suffix](path) if suffix in read else _read_text(path, delimiter)
     q, x = table.names("q", q), table.names("x", x)
     if len(x) != 3:
         raise ValueError(f"`x` must name 3 columns, got {len(x)}: {x}.")
@@ -190,17 +191,20 @@ def load_log(
             "drop_invalid=True."
         )
     if not valid.any():
-        raise ValueError(
-            f"{str(path)!r} has no valid row left: all have a missing, NaN or infinite value."
-        )
+        raise ValueError(f"{str(path)!r} has no valid row left: all miss a value or have NaN.")
     values, n, length = values[valid], len(q), q_scale is not None or q_unit in METRES
-    columns = {"q": values[:, :n], "x": values[:, n : n + 3]}
-    for name, unit in (("q", q_unit), ("x", x_unit)):
-        if unit == "m":
-            _warn_of_millimetres(name, columns[name])
+    columns = values[:, :n], values[:, n : n + 3]
+    for name, unit, column in zip("qx", (q_unit, x_unit), columns, strict=True):
+        span, middle = np.ptp(column, axis=0).max(), np.median(np.abs(column))
+        if unit == "m" and (middle > 10 or span > 5):
+            warnings.warn(
+                f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
+                f"millimetres, give {name}_unit='mm'.",
+                stacklevel=2,
+            )
     return Log(
-        columns["q"] * factor,
-        columns["x"] * METRES[x_unit],
+        columns[0] * factor,
+        columns[1] * METRES[x_unit],
         groups=None if labels is None else labels[valid],
         time=None if time is None else values[:, -1],
         line=places[valid],
@@ -284,16 +288,6 @@ class _Table(NamedTuple):
         return np.column_stack([*found.values()]), labels
 
 
-def _warn_of_millimetres(name: str, values: NDArray) -> None:
-    span, middle = np.ptp(values, axis=0).max(), np.median(np.abs(values))
-    if middle > 10 or span > 5:
-        warnings.warn(
-            f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
-            f"millimetres, give {name}_unit='mm'.",
-            stacklevel=3,
-        )
-
-
 def _checked_factor(
     n: int, q_unit: str, x_unit: str, q_sign: ArrayLike, q_scale: ArrayLike | None
 ) -> NDArray:
@@ -314,13 +308,6 @@ def _checked_factor(
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
         raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
     return sign * scale
-
-
-def _read(path: Path, delimiter: str | None) -> _Table:
-    suffix = path.suffix.lower()
-    if suffix == ".npz":
-        return _read_npz(path)
-    return _read_parquet(path) if suffix in _PARQUET else _read_text(path, delimiter)
 
 
 def _read_text(path: Path, delimiter: str | None) -> _Table:
@@ -351,17 +338,14 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
 
 def _read_npz(path: Path) -> _Table:
     """Return the arrays (N,) of a file, columns of arrays (N, k) as ``name[i]``."""
-    columns: dict[str, NDArray] = {}
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, BadZipFile, AttributeError) as error:
         raise ValueError(f"{str(path)!r} is not an npz file of plain arrays: {error}.") from error
+    columns = {name: array for name, array in arrays.items() if array.ndim == 1}
     for name, array in arrays.items():
-        if array.ndim == 1:
-            columns[name] = array
-        elif array.ndim == 2:
-            columns |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
+        columns |= {f"{name}[{i}]": c for i, c in enumerate(array.T) if array.ndim == 2}
     return _Table(path, [*columns], [*columns.values()])
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from sklearn.utils import Bunch
@@ -14,6 +15,8 @@ from hybridkin.datasets._logs import load_log
 DATA_HOME = "HYBRIDKIN_DATA"
 
 FTDCR_SERVOS = tuple(f"servo_{i}_mm" for i in (4, 3, 9, 5, 2, 8, 6, 1, 7))
+FTDCR_TIP = ("tip_x", "tip_y", "tip_z")
+FTDCR_FORMAT: Any = {"time": "timestamp", "q_unit": "mm", "x_unit": "mm", "q_sign": -1}
 FTDCR_FILES = {"train": "train.csv", "tendon_pull": "tendon_pull.csv"}
 
 SOURCES = {
@@ -69,25 +72,12 @@ def load_ftdcr(data_home: str | os.PathLike[str] | None = None, *, subset: str =
     if subset not in FTDCR_FILES:
         raise ValueError(f"`subset` must be one of {list(FTDCR_FILES)}, got {subset!r}.")
     path, origin = _locate(data_home, "ftdcr_v4", FTDCR_FILES[subset])
-    log = load_log(
-        path,
-        FTDCR_SERVOS,
-        ("tip_x", "tip_y", "tip_z"),
-        "pattern_label",
-        time="timestamp",
-        q_unit="mm",
-        x_unit="mm",
-        q_sign=-1,
-    )
-    labels = [] if log.groups is None else log.groups
+    log = load_log(path, FTDCR_SERVOS, FTDCR_TIP, "pattern_label", **FTDCR_FORMAT)
+    labels = np.asarray(log.groups)
     return Bunch(
-        q=log.q,
-        x=log.x,
+        **{name: vars(log)[name] for name in ("q", "x", "time", "q_names", "units")},
         groups=np.array([label.removesuffix("_hold") for label in labels]),
-        pattern_label=log.groups,
-        time=log.time,
-        q_names=log.q_names,
-        units=log.units,
+        pattern_label=labels,
         DESCR=inspect.getdoc(load_ftdcr),
         **origin,
     )

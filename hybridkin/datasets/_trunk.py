@@ -191,12 +191,8 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
 
 def _measure(rows, targets, part, made):
     """Settle a chunk of rows; the noise of a row is seeded by (seed, row) whoever makes it."""
-    seed, plant, failed, targets = (
-        made["random_state"],
-        TrunkPlant(**made["plant"]),
-        [],
-        targets + 0,
-    )
+    seed, plant = made["random_state"], TrunkPlant(**made["plant"])
+    failed, targets = [], targets.copy()
     q, x = np.full((len(rows), 9), np.nan), np.full((len(rows), 3), np.nan)
     for i, row in enumerate(rows.tolist()):
         for attempt in range(1 if part[i] == OWN else 1 + MAX_REDRAWS):
