@@ -26,7 +26,7 @@ def float_dtype(dtype: Any) -> torch.dtype:
 
 def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
     """Return one positive length per segment, shape (S,)."""
-    lengths = shaped(value, name, (size,), dtype, unknown="S")
+    lengths = shaped(value, name, (size,), dtype)
     if not len(lengths) or not (lengths > 0).all():
         raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
     return lengths
@@ -68,14 +68,12 @@ def shaped(
     dtype: torch.dtype = torch.float64,
     *,
     finite: bool = True,
-    unknown: str = "n",
 ) -> Tensor:
-    """Return an array as a tensor of the given shape; None is any length, called `unknown`."""
+    """Return an array as a tensor of the given shape; None is any length."""
     tensor = numeric(value, name, dtype, finite=finite)
     pairs = zip(tensor.shape, shape, strict=False)
     if tensor.ndim != len(shape) or any(need not in (None, size) for size, need in pairs):
-        need = ", ".join(unknown if size is None else str(size) for size in shape)
-        need = f"({need},)" if len(shape) == 1 else f"({need})"
+        need = str(shape).replace("None", "n")
         raise ValueError(f"`{name}` must have shape {need}, got {tuple(tensor.shape)}.")
     return tensor
 
@@ -92,9 +90,9 @@ def actuator_counts(
         )
     counts = tuple(np.broadcast_to(given, n_segments).tolist())
     if min(counts) < least:
-        why = "; two actuators do not determine which way a segment bends" if least == 3 else ""
         raise ValueError(
-            f"`n_actuators` must be at least {least} on every segment, got {counts}{why}."
+            f"`n_actuators` must be at least {least} on every segment, got {counts}; fewer do not "
+            "determine which way a segment bends."
         )
     return counts
 

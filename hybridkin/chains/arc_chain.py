@@ -362,9 +362,7 @@ class ArcChain(Chain):
 
     def _why_shape(self) -> str:
         per_segment = " + ".join(str(n) for n in self.actuators_per_segment)
-        if len(set(self.actuators_per_segment)) == 1:
-            per_segment = f"{self.actuators_per_segment[0]} actuators each"
-        return f"this chain has {self.n_segments} segments of {per_segment}"
+        return f"this chain has {self.n_segments} segments of {per_segment} actuators"
 
     def _arcs(self, q: Tensor) -> Tensor:
         return self._arcs_and_slope(self._rows(q))[0]

@@ -172,8 +172,8 @@ class ConstantCurvatureChain(ArcChain):
         readings = self._by_segment(self._rows(q) - self.actuator_zeros.to(q), q)
         residual = self.consistency(q)
         explained = (readings.square() - residual.square()).clamp(min=0.0).sqrt()
-        tall = residual > _NOTICED * self.radii.to(q)
-        return tall & (residual > _CONTRADICTED * explained)
+        least = torch.maximum(_NOTICED * self.radii.to(q), _CONTRADICTED * explained)
+        return residual > least
 
     def contradiction(self, q: Tensor, name: str = "q") -> str | None:
         """Return a warning where the tendons of an inextensible chain contradict each other.

@@ -335,11 +335,10 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
             "`spool_radius` [m]; of pressures or other units any name but a length, with `q_scale` "
             f"[m per unit] instead; got {unit!r}."
         )
-    for key in ("q_sign", "q_scale", "spool_radius"):
-        values = each(table, key, "[log]", len(table["q"]))
-        if key == "spool_radius" and key in given:
-            del given[key]
-            given["q_scale"] = tuple((UNITS[unit] * values).tolist())
+    keys = ("q_sign", "q_scale", "spool_radius")
+    *_, radii = (each(table, key, "[log]", len(table["q"])) for key in keys)
+    if given.pop("spool_radius", None):
+        given["q_scale"] = tuple((UNITS[unit] * radii).tolist())
     return LogFormat(**given)
 
 

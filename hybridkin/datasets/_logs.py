@@ -19,6 +19,7 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import real_array
 from hybridkin._core.units import METRES, UNITS
+from hybridkin.datasets._log_report import named_rows
 
 _DELIMITERS = (",", ";", "\t")
 
@@ -182,16 +183,13 @@ def load_log(
     values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
     places = np.arange(len(values)) if table.lines is None else table.lines
     valid = np.isfinite(values).all(axis=1)
-    if not valid.all() and not drop_invalid:
-        kind = "row" if table.lines is None else "line"
-        first = ", ".join(map(str, places[~valid][:5]))
+    if not valid.any() or not (drop_invalid or valid.all()):
+        where = named_rows(places[~valid], "row" if table.lines is None else "line")
         raise ValueError(
             f"{(~valid).sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
-            f"infinite value, the first in {kind} {first}; correct them or leave them out by "
-            "drop_invalid=True."
+            f"infinite value ({where}); correct them, or leave them out by drop_invalid=True where "
+            "others are left."
         )
-    if not valid.any():
-        raise ValueError(f"{str(path)!r} has no valid row left: all miss a value or have NaN.")
     values, n, length = values[valid], len(q), q_scale is not None or q_unit in METRES
     columns = values[:, :n], values[:, n : n + 3]
     for name, unit, column in zip("qx", (q_unit, x_unit), columns, strict=True):

@@ -777,7 +777,7 @@ def test_reverse_mode_jacobian_of_any_module(rng):
     ("make", "message"),
     [
         (lambda: ConstantCurvatureChain([0.1, -0.1]), "`radii` must be positive"),
-        (lambda: ConstantCurvatureChain([[0.1]]), r"`radii` must have shape \(S,\)"),
+        (lambda: ConstantCurvatureChain([[0.1]]), r"`radii` must have shape \(n,\)"),
         (lambda: ConstantCurvatureChain([0.1, float("nan")]), "`radii` must be finite"),
         (lambda: ConstantCurvatureChain(["a"]), "`radii` must be numeric"),
         (lambda: bha(n_actuators=2), "at least 3 on every segment"),
