@@ -22,6 +22,7 @@ _CONVERT = (
     "set `spool_radius` (of motors) or `q_scale` (of pressures or steps: metres per unit) in [log] "
     "of the robot description"
 )
+_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 # Of the tip's spread over the robot's reach: what cannot be, what is usual. Of strokes over radii
 # (a bend, in rad) and of chamber lengths over radii: what is too small, usual and too large.
 _REACH, _USUAL_REACH = 5.0, 0.7
@@ -140,14 +141,13 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
 
 
 def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
-    sizes = {unit: METRES[unit] for unit in ("m", "cm", "mm")}
-    true = next((u for u in sizes if np.isclose(sizes[u] * factor, METRES.get(unit, 0.0))), None)
+    true = next((u for u in _NAMES if np.isclose(METRES[u] * factor, METRES.get(unit, 0.0))), None)
     where = f"in [log] of the robot description or --{name}-unit"
     remedy = f'set {name}_unit = "{true}" {where} {true}'
     if true is None:
         q_remedy = f"where these are no lengths, {_CONVERT}"
         remedy = q_remedy if name == "q" else f"check `{name}_unit` {where}"
-    looks = f"these look like {true}" if true else f"they are off by about {factor:g}"
+    looks = f"these look like {_NAMES[true]}" if true else f"they are off by about {factor:g}"
     message = f"columns of {name} are declared as {unit}, but {what}; {looks}."
     advice = f"{remedy}; or correct the radii and lengths of the description, which are metres."
     return LogFinding("units", "error", message, advice)
