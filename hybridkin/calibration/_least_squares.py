@@ -46,11 +46,12 @@ class Rows(NamedTuple):
         with torch.no_grad():
             return (chain(self.q) - self.x).numpy()
 
-    def jacobian(self, problem: Problem, theta: Tensor) -> NDArray:
-        """Return the derivative of the residual (N, 3, P)."""
+    def jacobian(self, problem: Problem, theta: NDArray) -> NDArray:
+        """Return the derivative of the residual, times the roots of the weights, (3 N, P)."""
         with torch.no_grad():
-            chain = problem.moved(theta)
-            return chain.geometry_jacobian(self.q, problem.tangents(theta)).numpy()
+            tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
+            J = problem.chain_at(theta).geometry_jacobian(self.q, tangents)
+            return (self.weight.sqrt()[:, None, None] * J).numpy().reshape(-1, theta.size)
 
     def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
@@ -99,9 +100,7 @@ class Fit:
 
     def chain(self) -> Chain:
         """Return the chain at the end of the search."""
-        base = self.problem.chain.geometry()["base"]
-        with torch.no_grad():
-            return self.problem.moved(torch.from_numpy(self.theta).to(base))
+        return self.problem.chain_at(self.theta)
 
 
 def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: bool = False) -> Fit:
@@ -113,24 +112,20 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
     root = np.sqrt(weight)[:, None]
 
     def residual(theta: NDArray) -> NDArray:
-        return rows.residual(problem.moved(torch.from_numpy(theta).to(rows.q)))
-
-    def jacobian(theta: NDArray) -> NDArray:
-        J = rows.jacobian(problem, torch.from_numpy(theta).to(rows.q))
-        return (root[..., None] * J).reshape(-1, theta.size)
+        return rows.residual(problem.chain_at(theta))
 
     def whitened(theta: NDArray, sigma: float) -> NDArray:
         return np.concatenate([(root * residual(theta)).ravel() / sigma, theta / problem.prior_std])
 
-    def whitened_jacobian(theta: NDArray, sigma: float) -> NDArray:
-        return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
+    def jacobian(theta: NDArray, sigma: float) -> NDArray:
+        return np.vstack([rows.jacobian(problem, theta) / sigma, np.diag(1.0 / problem.prior_std)])
 
     floor = 1e-12 * float(problem.chain.reach)
     robust = loss != "linear"
     sigma = max(rows.noise(residual(theta), robust), floor)
     converged, tol = False, 1e-5 if roughly else 1e-12
     options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol)
-    options |= {"jac": whitened_jacobian, "bounds": (problem.low, problem.high), "max_nfev": 100}
+    options |= {"jac": jacobian, "bounds": (problem.low, problem.high), "max_nfev": 100}
     options |= {"loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"}
     for _ in range(2 if roughly else _MAX_ROUNDS):
         solution = least_squares(whitened, theta, args=(sigma,), **options)
@@ -138,8 +133,7 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
         previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    found = float(rows.rmse(problem.moved(torch.from_numpy(theta).to(rows.q))))
-    count = float(weight.sum())
+    found, count = rows.rmse(problem.chain_at(theta)), float(weight.sum())
     free = max(3.0 * count - theta.size, 1.0)
     noise = max(sigma if robust else found * (count / free) ** 0.5, floor)
-    return Fit(problem, theta, jacobian(theta), noise, found, bool(converged))
+    return Fit(problem, theta, rows.jacobian(problem, theta), noise, found, bool(converged))

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.rotations import cross_matrix, rotation
@@ -24,7 +24,7 @@ _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the 
 
 
 @dataclass(frozen=True, eq=False)
-class Parameter:
+class _Named:
     """One name of `calibrate`, and how its free directions move an entry of the geometry.
 
     Attributes
@@ -53,101 +53,65 @@ class Parameter:
         """Number of free directions."""
         return len(self.labels)
 
-    def moved(self, part: Tensor) -> Tensor:
-        """Return the entry at a point of the free directions (size,)."""
-        raise NotImplementedError
-
-    def tangents(self, part: Tensor) -> Tensor:
-        """Return the derivatives of `moved`, shape (size, ...)."""
-        raise NotImplementedError
-
-    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
-        """Return the limits of the free directions, by default the physical ones."""
-        raise NotImplementedError
-
-    def value(self, entry: Tensor) -> Tensor:
-        """Return the part of the entry that the user calls by this name."""
-        return entry
-
-    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
-        """Return the standard errors of `value` from those of the free directions."""
-        return std * self.units
-
-    def flags(self, identified: NDArray) -> NDArray:
-        """Return for each entry of `value` whether the directions that move it are identified."""
-        return identified
-
-
-class Scaled(Parameter):
-    """Positive numbers, moved by their logarithm."""
-
-    def moved(self, part: Tensor) -> Tensor:
-        return self.start * torch.exp(part).reshape(self.start.shape)
-
-    def tangents(self, part: Tensor) -> Tensor:
-        return torch.diag(self.moved(part).flatten()).reshape(-1, *self.start.shape)
-
-    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
-        start = self.start.numpy().ravel()
-        if bound is None:
-            farthest = math.log(SCALED[self.name])
-            return np.full(start.size, -farthest), np.full(start.size, farthest)
-        if bound[0] < 0:
-            raise ValueError(f"`bounds` of {self.name!r} must not be negative, got {bound}.")
-        with np.errstate(divide="ignore"):
-            return np.log(bound[0] / start), np.log(bound[1] / start)
-
-    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
-        return std.reshape(value.shape) * value
-
-    def flags(self, identified: NDArray) -> NDArray:
-        return identified.reshape(tuple(self.start.shape))
-
 
 @dataclass(frozen=True, eq=False)
-class Shifted(Parameter):
+class Entries(_Named):
     """Numbers moved along constant directions, each entry by at most one of them.
 
-    Bounds count from `origin`; `physical` are the default ones. The user's value has the entries
-    with the indices `shown`, in `shape`.
+    Positive numbers (`log`) are moved by their logarithm. `physical` are the default bounds. The
+    user's value has the entries with the indices `shown`, in `shape`.
     """
 
     directions: NDArray  # (numel, size)
-    physical: tuple[float, float]
+    physical: tuple[ArrayLike, ArrayLike]
     shown: NDArray
     shape: tuple[int, ...]
-
-    @property
-    def origin(self) -> NDArray:
-        """What the bounds count from, shape (size,)."""
-        return self.start.numpy().ravel()[self.shown]
+    log: bool
 
     def moved(self, part: Tensor) -> Tensor:
-        directions = torch.from_numpy(self.directions).to(part)
-        return self.start + (directions @ part).reshape(self.start.shape)
+        """Return the entry at a point of the free directions (size,)."""
+        change = (torch.from_numpy(self.directions).to(part) @ part).reshape(self.start.shape)
+        return self.start * torch.exp(change) if self.log else self.start + change
 
     def tangents(self, part: Tensor) -> Tensor:
-        return torch.from_numpy(self.directions.T.copy()).to(part).reshape(-1, *self.start.shape)
+        """Return the derivatives of `moved`, shape (size, ...)."""
+        slope = torch.from_numpy(self.directions.T.copy()).to(part).reshape(-1, *self.start.shape)
+        return slope * self.moved(part) if self.log else slope
 
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
+        """Return the limits of the free directions, by default the physical ones."""
+        origin = self.start.numpy().ravel()[self.shown]
         low, high = self.physical if bound is None else bound
         if bound is None:  # the start itself is always allowed
-            low, high = np.minimum(low, self.origin), np.maximum(high, self.origin)
-        return (low - self.origin) / self.units, (high - self.origin) / self.units
+            low, high = np.minimum(low, origin), np.maximum(high, origin)
+        if not np.all(np.less(low, high)) or (self.log and np.any(np.less(low, 0.0))):
+            need = "(low, high) with low < high" + ", and must not be negative" * self.log
+            raise ValueError(f"`bounds` of {self.name!r} must be {need}, got {bound}.")
+        if not self.log:
+            return (low - origin) / self.units, (high - origin) / self.units
+        with np.errstate(divide="ignore"):
+            return np.log(low / origin), np.log(high / origin)
 
     def value(self, entry: Tensor) -> Tensor:
+        """Return the part of the entry that the user calls by this name."""
         return entry.flatten()[torch.as_tensor(self.shown, device=entry.device)].reshape(self.shape)
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
-        return (np.abs(self.directions) @ std)[self.shown].reshape(self.shape)
+        """Return the standard errors of `value` from those of the free directions."""
+        error = (np.abs(self.directions) @ std)[self.shown].reshape(self.shape)
+        return error * value if self.log else error
 
     def flags(self, identified: NDArray) -> NDArray:
+        """Return for each entry of `value` whether the directions that move it are identified."""
         flags = ~((self.directions != 0) & ~identified).any(axis=1)
         return flags[self.shown].reshape(self.shape)
 
 
-class Posed(Parameter):
-    """A pose, turned by a rotation vector and moved, both in the measuring frame."""
+class Posed(_Named):
+    """A pose, turned by a rotation vector and moved, both in the measuring frame.
+
+    Its methods are those of `Entries`.
+    """
 
     def moved(self, part: Tensor) -> Tensor:
         turned = rotation(part[:3])[0] @ self.start[:3, :3]
@@ -169,6 +133,18 @@ class Posed(Parameter):
             )
         return np.full(6, -np.inf), np.full(6, np.inf)
 
+    def value(self, entry: Tensor) -> Tensor:
+        return entry
+
+    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
+        return std * self.units
+
+    def flags(self, identified: NDArray) -> NDArray:
+        return identified
+
+
+Parameter = Entries | Posed
+
 
 def parameter_names(chain: Chain) -> list[str]:
     """Return the names that `calibrate` takes for a chain."""
@@ -186,10 +162,11 @@ def parameter(chain: Chain, name: str) -> Parameter:
         labels = tuple(f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z"))
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
-    if name in SCALED:
-        return Scaled(name, name, start, _labels(name, shape), np.ones(size), ("-",) * size)
     unit, kind, physical = reach, "m", (-np.inf, np.inf)
-    if entry == "rest_bends":
+    if name in SCALED:
+        unit, kind, origin = 1.0, "-", start.numpy().ravel()
+        physical = origin / SCALED[name], origin * SCALED[name]
+    elif entry == "rest_bends":
         unit, kind, physical = 1.0, "rad", (-math.pi, math.pi)
     elif entry == "angles":
         unit, kind = 1.0, "rad"
@@ -205,8 +182,8 @@ def parameter(chain: Chain, name: str) -> Parameter:
     elif name != entry:  # "tool", the last of the offsets
         directions, shown, shape = directions[:, -1:], shown[-1:], ()
     labels, size = _labels(name, shape), len(shown)
-    units, kinds = np.full(size, unit), (kind,) * size
-    return Shifted(name, entry, start, labels, units, kinds, directions, physical, shown, shape)
+    basic = name, entry, start, labels, np.full(size, unit), (kind,) * size
+    return Entries(*basic, directions, physical, shown, shape, log=name in SCALED)
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
@@ -258,6 +235,11 @@ class Problem:
         ends = np.cumsum([part.size for part in self.parameters])
         starts = [0, *ends[:-1]]
         return [theta[a:b] for a, b in zip(starts, ends, strict=True)]
+
+    def chain_at(self, theta: NDArray) -> Chain:
+        """Return the chain at theta (P,), without a graph."""
+        with torch.no_grad():
+            return self.moved(torch.from_numpy(theta).to(self.chain.geometry()["base"]))
 
     def moved(self, theta: Tensor) -> Chain:
         """Return the chain at theta (P,), differentiable in it."""

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor, labels
@@ -23,6 +22,7 @@ from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import LOSSES, Fit, Rows, solve
 from hybridkin.calibration._parameters import ALIASES, Problem, parameter_names
 from hybridkin.calibration._unidentified import sentences
+from hybridkin.calibration.measured import check_finite, folds
 from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
@@ -371,20 +371,9 @@ def _result(
     )
 
 
-def motion_folds(groups: NDArray) -> list[tuple[NDArray, NDArray]]:
-    """Return the training and the held-out rows of at most 5 folds of whole motions."""
-    folds = min(5, len(np.unique(groups)))
-    if folds < 2:
-        raise ValueError(
-            "`groups` must name at least 2 motions to hold one out, got 1; record more motions, or "
-            "calibrate without `groups`."
-        )
-    return list(GroupKFold(folds).split(groups, groups=groups))
-
-
 def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     squares = 0.0
-    for train, test in motion_folds(groups):
+    for train, test in folds(groups, groups):
         fit = solve(best.problem, Rows(*(part[train] for part in rows)), best.theta, loss)
         held_out = Rows(*(part[test] for part in rows))
         squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weight.sum())
@@ -413,11 +402,6 @@ def _check_parameters(
     for argument, given in (("bounds", bounds), ("prior", prior)):
         if isinstance(given, Mapping) and not set(given) <= set(names):
             raise ValueError(f"`{argument}` must name only {names}, got {sorted(given)}.")
-    for name, (low, high) in (bounds or {}).items():
-        if not low < high:
-            raise ValueError(
-                f"`bounds` of {name!r} must be (low, high) with low < high, got {(low, high)}."
-            )
     stds = list(prior.values()) if isinstance(prior, Mapping) else [prior]
     if not all(std > 0 for std in stds):
         raise ValueError(f"`prior` must be positive standard deviations, got {prior}.")
@@ -428,21 +412,16 @@ def _check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, l
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q, x = as_tensor(q, "q").to("cpu", dtype), as_tensor(x, "x").to("cpu", dtype)
-    if q.ndim != 2:
-        raise ValueError(f"`q` must have shape (N, n_actuators), got {tuple(q.shape)}.")
+    if q.ndim != 2 or not len(q):
+        need = "must have shape (N, n_actuators) and hold at least one row"
+        raise ValueError(f"`q` {need}, got shape {tuple(q.shape)}.")
     if x.shape != (len(q), 3):
         raise ValueError(
             f"`x` must have shape ({len(q)}, 3), one tip position per row of `q`, got "
             f"{tuple(x.shape)}."
         )
-    if len(q) == 0:
-        raise ValueError("`q` must hold at least one row, got none.")
     messages = chain.check_actuators(q)
-    if not torch.isfinite(x).all():
-        rows = int((~torch.isfinite(x).all(dim=1)).sum())
-        raise ValueError(
-            f"`x` must be finite, got NaN or infinity in {rows} of {len(x)} rows; leave them out."
-        )
+    check_finite(x=x)
     return q, x, [*messages, motion_message("x", x, chain(q), float(chain.reach.detach()))]
 
 

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import Numbers, labels, real_array
-from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry, motion_folds
+from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
+from hybridkin.calibration.measured import folds
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 
@@ -120,7 +121,7 @@ def fit_play(
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q, x = real_array(q, "q"), real_array(x, "x")
     groups = labels(groups, len(q))
-    splits = motion_folds(groups)
+    splits = folds(groups, groups)
     sizes = [len(test) for _, test in splits]
     effective, mean_squares = {}, {}  # by width
 

@@ -1,4 +1,4 @@
-"""Folds of whole motions, and kernel ridge regression with parameters tuned on them."""
+"""Folds by the size of a log, and kernel ridge regression with parameters tuned on them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.model_selection import GroupKFold, KFold
+
+from hybridkin.calibration.measured import folds
 
 _FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
@@ -17,17 +18,7 @@ _GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # over the mean variance of the in
 
 def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
     """Return training and held-out rows of 5 folds of groups, or of rows; 10 of a small log."""
-    n_folds = _FOLDS if len(X) >= _FEW else _FOLDS_OF_FEW
-    if groups is None:
-        n_folds = min(n_folds, len(X))
-        return [*KFold(n_folds, shuffle=True, random_state=0).split(X)]
-    n_folds = min(n_folds, len(np.unique(groups)))
-    if n_folds < 2:
-        raise ValueError(
-            "`groups` must hold at least two motions where an error model is chosen by held-out "
-            "motions, got one; leave `groups` out to hold out single rows."
-        )
-    return [*GroupKFold(n_folds, shuffle=True, random_state=0).split(X, groups=groups)]
+    return folds(X, groups, _FOLDS if len(X) >= _FEW else _FOLDS_OF_FEW, shuffle=True)
 
 
 def distance(a: NDArray, b: NDArray) -> NDArray:
@@ -42,7 +33,7 @@ def tuned_kernel(
 
     The search starts on a coarse grid and walks to the best neighbour until none is better.
     """
-    folds = folds_of(X, groups)
+    splits = folds_of(X, groups)
     spread = X.var(axis=0).mean() or 1.0
 
     def ridge(at: tuple[int, int]) -> KernelRidge:
@@ -52,7 +43,7 @@ def tuned_kernel(
     @cache
     def held_out(at: tuple[int, int]) -> float:
         total = 0.0
-        for train, test in folds:
+        for train, test in splits:
             fitted = ridge(at).fit(X[train], error[train], sample_weight=weights[train])
             total += float(weights[test] @ distance(fitted.predict(X[test]), error[test]))
         return total

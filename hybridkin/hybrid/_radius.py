@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.model_selection import GroupKFold, KFold
 
+from hybridkin.calibration.measured import folds
 from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid
 from hybridkin.hybrid._kernel import distance
 from hybridkin.hybrid._selection import choose_mechanics, select
 
-_FOLDS = 5
 _ROUNDING = 1e-9  # of shares
 
 
@@ -52,15 +51,8 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
     rows, place = given.distinct()
     X, y = rows.X, rows.tips
     groups = np.arange(len(y)) if rows.groups is None else rows.groups
-    n_folds = min(_FOLDS, len(np.unique(groups)))
-    if n_folds < 2:
-        raise ValueError(
-            "`coverage` needs at least two groups, so that one can be held out, got one; leave "
-            "`groups` out to hold out single rows, or fit with coverage=None."
-        )
-    splitter = KFold(n_folds, shuffle=True, random_state=0) if rows.groups is None else None
     inside, errors = np.zeros(len(y), dtype=bool), np.full(len(y), np.nan)
-    for train, test in (splitter or GroupKFold(n_folds)).split(X, y, rows.groups):
+    for train, test in folds(X, rows.groups):
         part = given.take(np.isin(place, train))
         chosen = spec if spec.parts else select(choose_mechanics(spec, part), part)[0]
         module = fit_hybrid(chosen, part).module

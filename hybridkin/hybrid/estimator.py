@@ -18,12 +18,12 @@ from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import as_forward_model
 from hybridkin._core.units import motion_message
+from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
 from hybridkin.hybrid import _fit
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Part, Rows, Spec, calibrated, few_rows, fit_hybrid, residuals
-from hybridkin.hybrid._measured import check_finite, check_unscaled
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._radius import Radius, conformal_radius

@@ -627,7 +627,7 @@ def test_numpy_in_numpy_out_and_groups(rng):
         ({"x": np.full((10, 3), np.inf)}, "`x` must be finite"),
         ({"q": np.zeros((0, 9)), "x": np.zeros((0, 3))}, "at least one row"),
         ({"groups": [1, 2]}, r"`groups` must have shape \(10,\)"),
-        ({"groups": [1] * 10}, "at least 2 motions"),
+        ({"groups": [1] * 10}, "at least two motions"),
         ({"sample_weight": [0] * 10}, "`sample_weight` must hold 10 non-negative"),
         ({"loss": "squared"}, r"`loss` must be one of \['linear', .* got 'squared'"),
     ],

@@ -223,7 +223,7 @@ def test_no_play_is_kept_where_there_is_none():
 
 def test_one_motion_is_too_few():
     truth, q, x, _ = log_of(0.0, 0.0)
-    with pytest.raises(ValueError, match="at least 2 motions"):
+    with pytest.raises(ValueError, match="at least two motions"):
         fit_play(truth, q, x, np.zeros(len(q)))
 
 

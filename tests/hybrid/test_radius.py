@@ -199,5 +199,5 @@ def test_clear_errors():
         HybridForwardModel(chain, coverage=90).fit(q, x)
     with pytest.raises(ValueError, match="needs a model that was fitted with `coverage`"):
         HybridForwardModel(chain).fit(q, x).predict(q, return_radius=True)
-    with pytest.raises(ValueError, match="needs at least two groups"):
+    with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
         HybridForwardModel(chain, coverage=0.9).fit(q, x, groups=np.zeros(len(q)))

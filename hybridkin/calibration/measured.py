@@ -1,9 +1,12 @@
-"""Checks of measured rows before a fit: missing values, and values that were scaled."""
+"""Measured rows before a fit: missing values, values that were scaled, folds of motions."""
 
 from __future__ import annotations
 
+from collections.abc import Sized
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sklearn.model_selection import GroupKFold, KFold
 
 
 def check_finite(**arrays: ArrayLike) -> None:
@@ -15,8 +18,8 @@ def check_finite(**arrays: ArrayLike) -> None:
         bad = ~np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
         raise ValueError(
             f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(rows)} rows "
-            f"(first: row {bad.argmax()}); leave these rows out of `X` and `y` (np.isfinite finds "
-            "them), or read the log by datasets.load_log(..., drop_invalid=True)."
+            f"(first: row {bad.argmax()}); leave these rows out (np.isfinite finds them), or "
+            "read the log by datasets.load_log(..., drop_invalid=True)."
         )
 
 
@@ -33,3 +36,22 @@ def check_unscaled(name: str, values: NDArray, meant: str) -> None:
             f"{scaler}; take it out of the pipeline. Error models scale their inputs themselves; "
             "one that needs more can bring it: error_model=make_pipeline(StandardScaler(), ...)."
         )
+
+
+def folds(
+    X: Sized, groups: NDArray | None, most: int = 5, shuffle: bool = False
+) -> list[tuple[NDArray, NDArray]]:
+    """Return training and held-out rows of at most so many folds of whole groups, or of rows.
+
+    Rows are always shuffled, groups where asked.
+    """
+    n_folds = min(most, len(X) if groups is None else len(np.unique(groups)))
+    if n_folds < 2:
+        raise ValueError(
+            "`groups` must hold at least two motions, so that one can be held out, got one; record "
+            "more motions, or leave `groups` out."
+        )
+    if groups is None:
+        return [*KFold(n_folds, shuffle=True, random_state=0).split(X)]
+    splitter = GroupKFold(n_folds, shuffle=shuffle, random_state=0 if shuffle else None)
+    return [*splitter.split(X, groups=groups)]
