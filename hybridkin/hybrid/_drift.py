@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.regressor_modules import AffineModule
 
 
@@ -35,11 +36,9 @@ class Drift(NamedTuple):
     @classmethod
     def of_range(cls, q: Tensor, n_outputs: int) -> Drift:
         """Return the drift before any measurement, for a fit to rows q (N, n)."""
-        low, high = q.amin(0).numpy(), q.amax(0).numpy()
-        scale = 0.5 * (high - low)
-        scale = np.where(scale > 0, scale, 1.0)
+        center, scale = center_and_scale(q)
         n = len(scale) + 1
-        return cls(0.5 * (low + high), scale, np.zeros((n, n)), np.zeros((n, n_outputs)))
+        return cls(center.numpy(), scale.numpy(), np.zeros((n, n)), np.zeros((n, n_outputs)))
 
     def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.

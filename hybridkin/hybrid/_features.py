@@ -19,6 +19,17 @@ _POSE_BLOCK = 2048  # rows of pose features, whose temporaries stay in the cache
 _BLOCK = 2**18  # numbers in the features of a block of rows, which stay in the cache
 
 
+def center_and_scale(q: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the map of the range of rows q (N, n) to [-1, 1]; of constant columns the scale is 1.
+
+    A column that is constant up to rounding has no range either.
+    """
+    low, high = q.amin(0), q.amax(0)
+    scale = 0.5 * (high - low)
+    flat = scale <= 4.0 * torch.finfo(q.dtype).eps * q.abs().amax(0)
+    return 0.5 * (low + high), torch.where(flat, torch.ones_like(scale), scale)
+
+
 class Features(PortableModule):
     """Features phi(q) = [1, u], with u = (q - center) / scale.
 
@@ -40,11 +51,7 @@ class Features(PortableModule):
     @classmethod
     def of_range(cls, q: Tensor, *args: Any, **options: Any) -> Self:
         """Return the features for the range of rows q (N, n); constant columns stay."""
-        low, high = q.amin(0), q.amax(0)
-        scale = 0.5 * (high - low)
-        flat = scale <= 4.0 * torch.finfo(q.dtype).eps * q.abs().amax(0)
-        scale = torch.where(flat, torch.ones_like(scale), scale)
-        return cls(0.5 * (low + high), scale, *args, **options)
+        return cls(*center_and_scale(q), *args, **options)
 
     @property
     def n_linear(self) -> int:

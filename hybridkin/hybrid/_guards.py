@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from hybridkin._core.arrays import identity
 from hybridkin._core.model import PortableModule, reverse_jacobian
 from hybridkin._core.stored import Layout
+from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.network import LeverageModule
 
 GUARDS = ("leverage", "box", None)
@@ -187,11 +188,8 @@ class QuadraticLeverage(LeverageModule):
     @classmethod
     def fit(cls, q: Tensor, alpha: float = 0.1) -> QuadraticLeverage:
         """Return the leverage of training rows q (N, n)."""
-        low, high = q.amin(0), q.amax(0)
-        half_width = 0.5 * (high - low)
-        half_width = torch.where(half_width > 0, half_width, torch.ones_like(half_width))
         n = q.shape[1]
-        found = cls(0.5 * (low + high), half_width, identity(2 * n + 1, q))
+        found = cls(*center_and_scale(q), identity(2 * n + 1, q))
         features = found.forward(q)
         gram = features.mT @ features
         gram.diagonal().add_(alpha)
@@ -249,8 +247,6 @@ def _unexcited(q: Tensor) -> Tensor:
     about it, but the mechanical model does. If every small step along it left the domain, inverse
     kinematics could use the fading of the error model as a way to move the tip.
     """
-    spread = q - q.mean(0)
-    half_width = 0.5 * (q.amax(0) - q.amin(0))
-    spread = spread / torch.where(half_width > 0, half_width, 1.0)
+    spread = (q - q.mean(0)) / center_and_scale(q)[1]
     axes, variances, _ = torch.linalg.svd(spread.mT @ spread)
     return axes[:, variances < _STILL**2 * variances[0]]

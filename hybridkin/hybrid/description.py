@@ -141,16 +141,10 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
     known: dict[str, Any] = {}
     error = model.error_model_
     error = error.error_models[0] if isinstance(error, Blend) else error
+    if model._fitted_rows is not None:
+        known["rows"] = len(model._fitted_rows)
     if isinstance(error, ReadoutFit):
-        known["rows"] = int(np.isfinite(error.residual).all(axis=1).sum())
         known["left_out_rmse"] = error.rmse
-    elif isinstance(error, (ELMRegressor, ELMRegressorCV)):
-        network = error.best_estimator_ if isinstance(error, ELMRegressorCV) else error
-        known["rows"] = network.n_samples_seen_
-    elif isinstance(error, KernelRidge):
-        known["rows"] = len(vars(error)["X_fit_"])
-    elif model.radius_ is not None:
-        known["rows"] = model.radius_.n_rows
     if (found := model.calibration_) is not None:
         known["calibration"] = {"rmse": found.rmse, "held_out_rmse": found.cv_rmse}
         known["calibration"]["converged"] = found.converged

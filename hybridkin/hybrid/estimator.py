@@ -291,24 +291,21 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
             if not 0.0 < number(value, name) <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
-        X, y, sample_weight = map(table, (X, y, sample_weight), ("X", "y", "sample_weight"))
-        check_finite(X=X, y=y)
-        X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES, reset=False)
+        rows = self._checked_rows(X, y, sample_weight, None, reset=False)
         if self.play_ is not None:
-            X, self._play_state = self.play_.apply(X, self._play_state)
-        q, y = torch.from_numpy(X.astype(np.float64)), np.asarray(y, dtype=np.float64)
-        weights = _check_sample_weight(sample_weight, X, dtype=np.float64, ensure_non_negative=True)
+            X, self._play_state = self.play_.apply(rows.X, self._play_state)
+            rows = rows._replace(X=X)
+        chain, q = self.mechanical_model_, rows.q
         with torch.no_grad():
-            error = residuals(self.mechanical_model_, q, y, self.output).reshape(len(y), -1)
+            error = residuals(chain, q, rows.y, self.output).reshape(rows.tips.shape)
             residual = error - self.module_.with_drift(None).error_part(q).numpy()
-        chain = self.mechanical_model_
         if isinstance(chain, Chain):
             tips = chain(q).detach()
-            both = torch.cat([tips, torch.from_numpy(y[:, :3])])
+            both = torch.cat([tips, torch.from_numpy(rows.tips[:, :3])])
             message = motion_message("y", both, tips, float(chain.reach))
             if message is not None:
                 warnings.warn(message, stacklevel=2)
-        self._drift = self._drift.learned(q.numpy(), residual, weights, decay)
+        self._drift = self._drift.learned(q.numpy(), residual, rows.counts, decay)
         # What was handed out before stays as it was.
         self.module_ = self.module_.with_drift(self._drift.correction(alpha))
         return self
@@ -375,11 +372,13 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         return self._evaluated(lambda m, q: (m.error_weight(q),), X, groups, warn=False)[0]
 
-    def _checked_rows(self, X: Any, y: Any, weights: ArrayLike | None, groups: Any) -> Rows:
+    def _checked_rows(
+        self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
+    ) -> Rows:
         """Return the measured rows, checked."""
         X, y, weights = map(table, (X, y, weights), ("X", "y", "sample_weight"))
         check_finite(X=X, y=y)
-        X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES)
+        X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES, reset=reset)
         X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
         groups = None if groups is None else labels(groups, len(X))
         if weights is not None:
@@ -439,7 +438,6 @@ def _messages(fitted: _fit.FittedHybrid, rows: Rows) -> tuple[str, ...]:
     if fitted.calibration is not None or not isinstance(chain, Chain):
         return fitted.messages
     found = [*chain.check_actuators(rows.q, "X"), chain.contradiction(rows.q, "X")]
-    if rows.y.ndim == 2:
-        tips = torch.from_numpy(rows.y[:, :3])
-        found.append(motion_message("y", tips, chain(rows.q), float(chain.reach)))
+    tips = torch.from_numpy(rows.tips[:, :3])
+    found.append(motion_message("y", tips, chain(rows.q), float(chain.reach)))
     return tuple(message for message in found if message is not None)
