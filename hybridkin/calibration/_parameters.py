@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from hybridkin._core.arrays import identity
 from hybridkin._core.rotations import cross_matrix, rotation
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
@@ -248,11 +249,8 @@ class Problem:
 
     def tangents(self, theta: Tensor) -> dict[str, Tensor]:
         """Return the derivatives of the geometry by theta, (P, ...) for every moved entry."""
-        tangents, row = {}, 0
-        for part, at in zip(self.parameters, self.parts(theta), strict=True):
-            own = part.tangents(at)
-            whole = own.new_zeros(len(theta), *own.shape[1:])
-            whole[row : row + part.size] = own
-            tangents[part.entry] = whole
-            row += part.size
-        return tangents
+        rows = self.parts(identity(len(theta), theta))
+        pairs = zip(self.parameters, self.parts(theta), rows, strict=True)
+        return {
+            part.entry: torch.tensordot(own.mT, part.tangents(at), 1) for part, at, own in pairs
+        }

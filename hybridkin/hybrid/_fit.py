@@ -247,10 +247,8 @@ def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, q: Tensor) -
 
 
 def _named(kind: str, mechanical: ForwardModel, q: Tensor) -> Features:
-    if kind == "linear":
-        return Features.of_range(q)
-    if kind == "quadratic":
-        return QuadraticFeatures.of_range(q)
+    if kind != "pose":
+        return (QuadraticFeatures if kind == "quadratic" else Features).of_range(q)
     if not isinstance(mechanical, ArcChain):
         raise TypeError(
             "`mechanical_model` must be a chain of arcs with error_model='pose', got "

@@ -40,11 +40,6 @@ class Guard(PortableModule):
         """Return how far q is from the training rows, at most 1 among them, shape (...)."""
         raise NotImplementedError
 
-    def distance_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `domain_distance(q)` (N,) and its derivative (N, n) at rows q (N, n)."""
-        distance, gradient = reverse_jacobian(lambda rows: self.domain_distance(rows)[..., None], q)
-        return distance[:, 0], gradient[:, 0]
-
     def forward(self, q: Tensor) -> Tensor:
         """Return g(q), shape (..., 1)."""
         excess = (self.domain_distance(q) - 1.0).clamp(min=0.0)
@@ -52,11 +47,7 @@ class Guard(PortableModule):
 
     def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return g(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
-        distance, gradient = self.distance_and_gradient(q)
-        excess = (distance - 1.0).clamp(min=0.0)
-        weight = 1.0 / (1.0 + excess**3)
-        slope = -3.0 * (excess * weight) ** 2
-        return weight[:, None], (slope[:, None] * gradient)[:, None]
+        return reverse_jacobian(self, q)
 
     def shortened(self, correction: Tensor) -> Tensor:
         """Return corrections (..., m), those longer than the largest shortened [m]."""
@@ -71,23 +62,20 @@ class Guard(PortableModule):
         own, J_own = correction[long], J[long]
         relative = self._relative(own)
         kept, slope = self._kept(relative)
-        # d(factor c) = factor dc + c d(factor), and the factor depends on the length of c alone.
-        factor = kept / relative
-        d_relative = (own[:, None] @ J_own)[:, 0] / (relative * self._unit(own) ** 2)
-        d_factor = (slope - factor) / relative * d_relative
-        J_own = factor[..., None] * J_own + own[..., None] * d_factor[:, None]
+        # Along the correction its length changes by the slope, across it by the factor.
+        factor, along = kept / relative, (own / own.norm(dim=-1, keepdim=True))[..., None]
+        change = (slope - factor)[..., None] * along @ (along.mT @ J_own)
+        J_own = factor[..., None] * J_own + change
         return correction.index_copy(0, long, factor * own), J.index_copy(0, long, J_own)
 
     def is_long(self, correction: Tensor) -> Tensor:
         """Return which corrections (..., m) are longer than the largest, shape (...)."""
         return self._relative(correction)[..., 0] > 1.0
 
-    def _unit(self, correction: Tensor) -> Tensor:
-        return self.largest.to(correction).clamp(min=torch.finfo(correction.dtype).tiny ** 0.25)
-
     def _relative(self, correction: Tensor) -> Tensor:
         # Lengths up to the largest count as one: the root stays smooth, and nothing changes.
-        squares = (correction / self._unit(correction)).square().sum(-1, keepdim=True)
+        unit = self.largest.to(correction).clamp(min=torch.finfo(correction.dtype).tiny ** 0.25)
+        squares = (correction / unit).square().sum(-1, keepdim=True)
         return squares.clamp(min=1.0).sqrt()
 
     def _kept(self, relative: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,12 +120,6 @@ class LeverageGuard(Guard):
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the leverage of q over the limit, shape (...)."""
         return self.model.leverage(q) / self.limit.to(q)
-
-    def distance_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `domain_distance(q)` (N,) and its derivative (N, n) at rows q (N, n)."""
-        leverage, gradient = self.model.leverage_and_gradient(q)
-        limit = self.limit.to(q)
-        return leverage / limit, gradient / limit
 
 
 class BoxGuard(Guard):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
-from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import labels, number, table
@@ -30,8 +30,7 @@ from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._selection import choose_mechanics, select
 from hybridkin.hybrid._settings import check_settings, resolved_error_model
 from hybridkin.learning.elm import ELMRegressor
-
-_DTYPES = (np.float64, np.float32)
+from hybridkin.learning.hidden_layer import DTYPES, check_rows
 
 
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -376,14 +375,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
     ) -> Rows:
         """Return the measured rows, checked."""
-        X, y, weights = map(table, (X, y, weights), ("X", "y", "sample_weight"))
+        X, y = table(X, "X"), table(y, "y")
         check_finite(X=X, y=y)
-        X, y = validate_data(self, X, y=y, multi_output=True, dtype=_DTYPES, reset=reset)
+        X, y, weights = check_rows(self, X, y, weights, reset)
         X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
         groups = None if groups is None else labels(groups, len(X))
-        if weights is not None:
-            weights = _check_sample_weight(weights, X, dtype=np.float64, ensure_non_negative=True)
-        return Rows(X, np.asarray(y, dtype=np.float64), cast("NDArray | None", weights), groups)
+        return Rows(X, y, cast("NDArray | None", weights), groups)
 
     def _spec(self, rows: Rows) -> Spec:
         """Return what the settings ask for, with a copy of the mechanical model."""
@@ -417,7 +414,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> list[NDArray]:
         """Return what a function of the module gives for the rows of X, in the dtype of X."""
         check_is_fitted(self)
-        X = validate_data(self, table(X, "X"), dtype=_DTYPES, reset=False)
+        X = validate_data(self, table(X, "X"), dtype=DTYPES, reset=False)
         q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
         chain = self.mechanical_model_
         if warn and isinstance(chain, Chain):

@@ -1,17 +1,18 @@
 """Extreme learning machine: a random hidden layer with a ridge readout."""
 
 import warnings
+from functools import partial
 from numbers import Integral, Real
 
 import numpy as np
 import torch
 from scipy import linalg
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
-from sklearn.utils import gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from hybridkin._core.arrays import real_array, table
+from hybridkin._core.blocks import in_blocks
 from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
 from hybridkin.learning._ridge import BLOCK_ELEMENTS, Statistics, fit_readout, gather, merge
 from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer
@@ -46,9 +47,9 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if not return_std:
             return self._map(X, lambda elm, q: (elm(q),))[0]
-        y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)))
+        y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)[:, None]))
         noise = self.noise_variance_ if y.ndim == 2 else self.noise_variance_[0]
-        std = np.sqrt(np.multiply.outer(1 + leverage, noise))
+        std = np.sqrt((1 + leverage) * noise)
         return y, std.astype(y.dtype)
 
     def jacobian(self, X):
@@ -95,22 +96,19 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Influence that a row of weight 1 would have had on its own prediction [-]. With an
             intercept the features are centred, and 1 / n is added.
         """
-        return self._map(X, lambda elm, q: (elm.leverage(q),))[0]
+        return self._map(X, lambda elm, q: (elm.leverage(q)[:, None],))[0].ravel()
 
     def _map(self, X, function):
         """Return the arrays that `function(module, q)` gives, computed block by block."""
         check_is_fitted(self, "module_")
         X = table(X, "X")
         X = np.asarray(validate_data(self, X, reset=False, dtype=DTYPES, order="C"))
-        elm, outputs = self.module_, ()
-        width = max(elm.output_weights.shape[0], elm.tangent.shape[1])
+        elm = self.module_
+        size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
-            for rows in gen_batches(len(X), self.block_size or max(1, BLOCK_ELEMENTS // width)):
-                q = torch.tensor(X[rows], dtype=torch.float64, device=elm.input_center.device)
-                parts = function(elm, q)
-                outputs = outputs or [np.empty((len(X), *p.shape[1:]), X.dtype) for p in parts]
-                for array, part in zip(outputs, parts, strict=True):
-                    array[rows] = part.cpu().numpy()
+            q = torch.tensor(X, dtype=torch.float64, device=elm.input_center.device)
+            parts = in_blocks(partial(function, elm), q, self.block_size or max(1, size))
+        outputs = (part.cpu().numpy().astype(X.dtype, copy=False) for part in parts)
         return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
 
 

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from hybridkin._core.blocks import check_vectors, in_blocks
-from hybridkin._core.model import ForwardModel, reverse_jacobian
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Layout
 
 _BLOCK = 2**17  # numbers in the hidden layer of a block of rows: a megabyte, so that it stays near
@@ -28,11 +28,6 @@ class LeverageModule(ForwardModel):
     def leverage(self, q):
         """Return the leverage of `q`, shape (...), smooth; at most 1 on the training rows."""
         raise NotImplementedError
-
-    def leverage_and_gradient(self, q):
-        """Return the leverage (...) and its derivative by `q` (..., n_inputs)."""
-        leverage, gradient = reverse_jacobian(lambda rows: self.leverage(rows)[..., None], q)
-        return leverage[..., 0], gradient[..., 0, :]
 
     def forward_jacobian_and_below(self, q, limit):
         """Return ``forward(q)``, ``jacobian(q)`` and where the leverage is surely below `limit`."""
@@ -156,19 +151,6 @@ class ELM(LeverageModule):
         """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
         r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
         return (r * r).sum(-1) + self.leverage_offset.to(q)
-
-    def leverage_and_gradient(self, q):
-        """Return the leverage (...) and its derivative by `q` (..., n_inputs) in closed form."""
-        u, a, s = self._hidden(q)
-        factor = self.leverage_factor.to(q)
-        r = (self._features(u, s) - self.leverage_center.to(q)) @ factor
-        by_features = 2 * r @ factor.T
-        n_hidden = s.shape[-1]
-        by_a = by_features[..., :n_hidden] * ACTIVATIONS[self.activation][1](a, s)
-        gradient = by_a @ self.input_weights.to(q)
-        if by_features.shape[-1] > n_hidden:
-            gradient = gradient + by_features[..., n_hidden:]
-        return (r * r).sum(-1) + self.leverage_offset.to(q), gradient / self.input_scale.to(q)
 
     def leverage_is_below(self, limit, features):
         """Return where the leverage is certainly below `limit`, shape (...), bool.

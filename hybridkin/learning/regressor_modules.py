@@ -118,23 +118,18 @@ class PolynomialModule(ForwardModel):
         exponents, coef = np.asarray(powers), np.asarray(readout)
         if not np.isin(exponents, range(_MOST_POWER)).all():
             raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
-        monomials = [tuple(map(int, row)) for row in exponents]
-        derivatives = [
-            (k, j, (*row[:j], power - 1, *row[j + 1 :]))
-            for k, row in enumerate(monomials)
-            for j, power in enumerate(row)
-            if power
-        ]
-        distinct = dict.fromkeys([*monomials, *(lower for _, _, lower in derivatives)])
-        where = {monomial: i for i, monomial in enumerate(distinct)}
         self.n_actuators, self.n_outputs = exponents.shape[1], coef.shape[1]
-        values = np.zeros((len(where), self.n_outputs))
-        slope = np.zeros((*values.shape, self.n_actuators))
-        np.add.at(values, [where[row] for row in monomials], coef)
-        for k, j, lower in derivatives:
-            slope[where[lower], :, j] += monomials[k][j] * coef[k]
-        slope = (slope / np.asarray(scale)).reshape(len(where), -1)
-        _register(self, powers=list(where), readout=values, center=center, scale=scale, slope=slope)
+        k, j = np.nonzero(exponents)  # monomial k has a derivative along input j
+        lower = exponents[k] - np.eye(self.n_actuators)[j]
+        both = np.vstack([exponents, lower])
+        distinct, where = np.unique(both, axis=0, return_inverse=True)
+        own, below = np.split(where.reshape(-1), [len(exponents)])
+        values = np.zeros((len(distinct), self.n_outputs))
+        slope = np.zeros((len(distinct), self.n_actuators, self.n_outputs))
+        np.add.at(values, own, coef)
+        np.add.at(slope, (below, j), exponents[k, j][:, None] * coef[k])
+        slope = (slope.swapaxes(1, 2) / np.asarray(scale)).reshape(len(distinct), -1)
+        _register(self, powers=distinct, readout=values, center=center, scale=scale, slope=slope)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the polynomial, shape (..., m)."""
