@@ -75,9 +75,10 @@ def _paper(command: argparse.ArgumentParser) -> None:
     with the hybrid model, and how well the paper's samples identify the trunk's geometry. Needs the
     extra `sim` (MuJoCo).
     """
-    command.add_argument("--out", type=Path, default=Path("results"), help="folder (results)")
-    command.add_argument("--splits", type=_count, default=20, help="random test sets (20)")
-    command.add_argument("--points", type=_count, default=151, help="time steps per path (151)")
+    add = command.add_argument
+    add("--out", type=Path, default=Path("results"), help="folder (results)")
+    add("--splits", type=_count, default=20, help="random test sets (20)")
+    add("--points", type=_count, default=151, help="time steps per path (151)")
     _add_work(command)
 
 
@@ -115,28 +116,24 @@ def _fit(command: argparse.ArgumentParser) -> None:
     The log is checked first. Errors (a frozen sensor, wrong units, NaN) stop the fit with advice
     and exit code 2; warnings are printed and stand in the report.
     """
-    command.add_argument("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
-    command.add_argument("--robot", type=Path, required=True, metavar="ROBOT.toml")
-    command.add_argument("--out", type=Path, required=True, help="folder for model and report")
+    add = command.add_argument
+    add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
+    add("--robot", type=Path, required=True, metavar="ROBOT.toml")
+    add("--out", type=Path, required=True, help="folder for model and report")
     _add_log(command)
-    command.add_argument(
+    add(
         "--loss",
         default="linear",
         choices=("linear", "soft_l1", "huber", "cauchy", "arctan"),
         help="loss of the calibration; all but linear bound outliers (linear)",
     )
-    command.add_argument(
-        "--coverage",
-        type=_share,
-        help="estimate an error radius that covers this share of tips, such as 0.9; slow",
-    )
-    command.add_argument(
-        "--folds", type=partial(_count, least=2), default=5, help="parts to hold out in turn (5)"
-    )
-    command.add_argument(
-        "--no-auto", action="store_true", help="leave out the hybrid that chooses for itself: fast"
-    )
-    command.add_argument(
+    radius = "estimate an error radius that covers this share of tips, such as 0.9; slow"
+    add("--coverage", type=_share, help=radius)
+    folds = partial(_count, least=2)
+    add("--folds", type=folds, default=5, help="parts to hold out in turn (5)")
+    fast = "leave out the hybrid that chooses for itself: fast"
+    add("--no-auto", action="store_true", help=fast)
+    add(
         "--play",
         type=_play,
         metavar="auto|WIDTH",
@@ -144,13 +141,8 @@ def _fit(command: argparse.ArgumentParser) -> None:
         "in the unit of q, or auto, found on held-out motions; the rows of a motion must be in the "
         "order of time (none)",
     )
-    command.add_argument(
-        "--max-rows",
-        type=partial(_count, least=0),
-        default=2000,
-        metavar="N",
-        help="of a longer log take every k-th row, N at most; 0: all (2000)",
-    )
+    rows, few = partial(_count, least=0), "of a longer log take every k-th row, N at most; 0: all"
+    add("--max-rows", type=rows, default=2000, metavar="N", help=f"{few} (2000)")
     _add_work(command)
 
 
@@ -167,13 +159,11 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
       hybridkin evaluate robot.toml log.csv            # the mechanical model alone
       hybridkin evaluate model next_day.csv --json --fail-above 3.5 > errors.json
     """
-    command.add_argument("model", type=Path, metavar="MODEL")
-    command.add_argument("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
-    _add_robot(command)
-    command.add_argument("--out", type=Path, help="folder for report and figures (none)")
-    command.add_argument(
-        "--fail-above", type=float, metavar="MM", help="exit with 1 if the mean error is larger"
-    )
+    add = command.add_argument
+    _add_model(command)
+    add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
+    add("--out", type=Path, help="folder for report and figures (none)")
+    add("--fail-above", type=float, metavar="MM", help="exit with 1 if the mean error is larger")
     _add_log(command)
 
 
@@ -200,42 +190,29 @@ def _track(command: argparse.ArgumentParser) -> None:
     the log, or --from path (no lead-in). Of a model with play, track.csv has what to send, and in
     the columns effective_... what the actuators do.
     """
-    command.add_argument("model", type=Path, metavar="MODEL")
-    command.add_argument("path", type=Path, nargs="?", metavar="PATH.csv", help="points to pass")
-    _add_robot(command)
-    command.add_argument("--out", type=Path, required=True, help="folder for commands and figure")
-    command.add_argument("--shape", choices=("figure-eight", "spiral", "line"))
-    command.add_argument(
-        "--center",
-        type=_numbers,
-        metavar="X,Y,Z",
-        help="centre of the shape (a tip in the middle of the workspace)",
-    )
-    command.add_argument(
-        "--size",
-        type=_numbers,
-        help="W,H of a figure eight; radii R0,R1 of a spiral; X,Y,Z from end to end of a line",
-    )
-    command.add_argument("--scale", type=_positive, default=1.0, help="about the path's centre (1)")
-    command.add_argument("--normal", type=_numbers, metavar="X,Y,Z", help="of its plane (base z)")
-    command.add_argument("--turns", type=float, default=3.0, help="of a spiral (3)")
-    command.add_argument(
-        "--rise", type=float, default=0.0, help="of a spiral, along the normal (0)"
-    )
-    command.add_argument("--duration", type=_positive, default=10.0, help="of the shape [s] (10)")
-    command.add_argument("--dt", type=_positive, help="time between points [s] (0.02 of a shape)")
-    command.add_argument("--unit", choices=METRES, help="of path and shape (the log's x)")
-    command.add_argument("--q-min", type=_numbers, help="least q, in the unit and sign of the log")
-    command.add_argument("--q-max", type=_numbers, help="largest q")
-    command.add_argument("--dq-max", type=_numbers, help="largest speed of an actuator, per second")
-    command.add_argument(
-        "--tol", type=_positive, default=0.1, help="error that is reached [mm] (0.1)"
-    )
+    add = command.add_argument
+    _add_model(command)
+    add("path", type=Path, nargs="?", metavar="PATH.csv", help="points to pass")
+    add("--out", type=Path, required=True, help="folder for commands and figure")
+    add("--shape", choices=("figure-eight", "spiral", "line"))
+    center = "centre of the shape (a tip in the middle of the workspace)"
+    add("--center", type=_numbers, metavar="X,Y,Z", help=center)
+    size = "W,H of a figure eight; radii R0,R1 of a spiral; X,Y,Z from end to end of a line"
+    add("--size", type=_numbers, help=size)
+    add("--scale", type=_positive, default=1.0, help="about the path's centre (1)")
+    add("--normal", type=_numbers, metavar="X,Y,Z", help="of its plane (base z)")
+    add("--turns", type=float, default=3.0, help="of a spiral (3)")
+    add("--rise", type=float, default=0.0, help="of a spiral, along the normal (0)")
+    add("--duration", type=_positive, default=10.0, help="of the shape [s] (10)")
+    add("--dt", type=_positive, help="time between points [s] (0.02 of a shape)")
+    add("--unit", choices=METRES, help="of path and shape (the log's x)")
+    add("--q-min", type=_numbers, help="least q, in the unit and sign of the log")
+    add("--q-max", type=_numbers, help="largest q")
+    add("--dq-max", type=_numbers, help="largest speed of an actuator, per second")
+    add("--tol", type=_positive, default=0.1, help="error that is reached [mm] (0.1)")
     where, values = "where the robot stands (rest)", "rest|path|A,B,..."
-    command.add_argument(
-        "--from", type=_start, default="rest", dest="start", metavar=values, help=where
-    )
-    command.add_argument("--force", action="store_true", help="go as near as the tip can")
+    add("--from", type=_start, default="rest", dest="start", metavar=values, help=where)
+    add("--force", action="store_true", help="go as near as the tip can")
 
 
 def _animate(command: argparse.ArgumentParser) -> None:
@@ -246,13 +223,13 @@ def _animate(command: argparse.ArgumentParser) -> None:
       hybridkin animate model track/track.csv --out track.html --frames 80
       hybridkin animate robot.toml log.csv --out log.gif      # the commands of a log
     """
-    command.add_argument("model", type=Path, metavar="MODEL")
-    command.add_argument("track", type=Path, metavar="TRACK", help="track.csv or its folder")
-    _add_robot(command)
-    command.add_argument("--out", type=Path, required=True, metavar="FILE", help=".mp4 .gif .html")
-    command.add_argument("--unit", choices=METRES, default="mm", help="of the axes (mm)")
-    command.add_argument("--speed", type=_positive, default=1.0, help="times real time (1)")
-    command.add_argument("--frames", type=_count, default=150, help="at most (150)")
+    add = command.add_argument
+    _add_model(command)
+    add("track", type=Path, metavar="TRACK", help="track.csv or its folder")
+    add("--out", type=Path, required=True, metavar="FILE", help=".mp4 .gif .html")
+    add("--unit", choices=METRES, default="mm", help="of the axes (mm)")
+    add("--speed", type=_positive, default=1.0, help="times real time (1)")
+    add("--frames", type=_count, default=150, help="at most (150)")
 
 
 def _describe(command: argparse.ArgumentParser) -> None:
@@ -266,8 +243,7 @@ def _describe(command: argparse.ArgumentParser) -> None:
       hybridkin describe robot.toml
       hybridkin describe log.csv --robot robot.toml
     """
-    command.add_argument("log", type=Path, metavar="MODEL|ROBOT.toml|LOG")
-    _add_robot(command)
+    _add_model(command, "log", "MODEL|ROBOT.toml|LOG")
     _add_log(command)
 
 
@@ -276,37 +252,30 @@ def _add_work(command: argparse.ArgumentParser) -> None:
     command.add_argument("--jobs", type=int, default=-1, help="processes; -1: all cores (-1)")
 
 
-def _add_robot(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--robot",
-        type=Path,
-        metavar="ROBOT.toml",
-        help="description with [log] and [limits] (that beside the model)",
-    )
+def _add_model(
+    command: argparse.ArgumentParser, name: str = "model", metavar: str = "MODEL"
+) -> None:
+    command.add_argument(name, type=Path, metavar=metavar)
+    known = "description with [log] and [limits] (that beside the model)"
+    command.add_argument("--robot", type=Path, metavar="ROBOT.toml", help=known)
 
 
 def _add_log(command: argparse.ArgumentParser) -> None:
     log = command.add_argument_group("how the log is written, over what [log] of the robot says")
-    log.add_argument("--q", type=_names, metavar="A,B,...", help="columns of the actuators")
-    log.add_argument("--x", type=_names, metavar="X,Y,Z", help="columns of the tip")
-    log.add_argument("--q-unit", choices=UNITS)
-    log.add_argument("--x-unit", choices=METRES)
-    log.add_argument("--q-sign", type=int, choices=(1, -1), help="-1: pulled counts as positive")
-    log.add_argument("--groups", metavar="COLUMN", help="column that names the motion; or none")
-    log.add_argument("--time", metavar="COLUMN", help="column of the time stamp [s]; or none")
-    log.add_argument("--delimiter", help="separator of a text file (found out)")
-    log.add_argument(
-        "--exclude",
-        action="append",
-        default=[],
-        metavar="PATTERN",
-        help="motions to leave out, such as '*tendon*'; may be repeated",
-    )
-    log.add_argument("--drop-invalid", action="store_true", help="leave out rows with gaps or NaN")
-    log.add_argument(
-        "--drop-frozen", action="store_true", help="leave out rows whose tip is frozen"
-    )
-    log.add_argument("--force", action="store_true", help="go on in spite of errors in the log")
+    add = log.add_argument
+    add("--q", type=_names, metavar="A,B,...", help="columns of the actuators")
+    add("--x", type=_names, metavar="X,Y,Z", help="columns of the tip")
+    add("--q-unit", choices=UNITS)
+    add("--x-unit", choices=METRES)
+    add("--q-sign", type=int, choices=(1, -1), help="-1: pulled counts as positive")
+    add("--groups", metavar="COLUMN", help="column that names the motion; or none")
+    add("--time", metavar="COLUMN", help="column of the time stamp [s]; or none")
+    add("--delimiter", help="separator of a text file (found out)")
+    some = "motions to leave out, such as '*tendon*'; may be repeated"
+    add("--exclude", action="append", default=[], metavar="PATTERN", help=some)
+    add("--drop-invalid", action="store_true", help="leave out rows with gaps or NaN")
+    add("--drop-frozen", action="store_true", help="leave out rows whose tip is frozen")
+    add("--force", action="store_true", help="go on in spite of errors in the log")
 
 
 def _count(text: str, least: int = 1) -> int:

@@ -23,10 +23,13 @@ from hybridkin._core.units import METRES
 from hybridkin.cli._parser import parser
 
 if TYPE_CHECKING:
-    from hybridkin.chains.robots import LogFormat, RobotDescription
-    from hybridkin.workflow import MeasuredLog, Report
+    from hybridkin.chains.chain import Chain
+    from hybridkin.chains.robots import LogFormat
+    from hybridkin.workflow import MeasuredLog
 
 _DT = 0.02
+# What the user can correct is printed without a traceback.
+_OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
 _PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
 
 
@@ -35,10 +38,6 @@ class _Outcome(NamedTuple):
     text: str
     paths: Sequence[Path] = ()
     code: int = 0
-
-    @classmethod
-    def of(cls, report: Report, paths: Sequence[Path] = (), code: int = 0) -> _Outcome:
-        return cls(report.record, report.plain(), paths, code)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,9 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             outcome = _RUN[arguments.command](arguments, bars)
     except KeyboardInterrupt:
         return _failed("interrupted; nothing was written", 130, arguments.json)
-    except Exception as error:
-        if not _is_of_input(error):
-            raise
+    except (*_OF_INPUT, hybridkin.simulation.NotSettledError) as error:
         return _failed(f"error: {error}", 2, arguments.json)
     written = "\n  ".join(["\n\nWrote", *map(str, outcome.paths)]) if outcome.paths else ""
     text = outcome.text + written
@@ -109,13 +106,6 @@ class _Bars:
         self._bar = self._what = None
 
 
-def _is_of_input(error: Exception) -> bool:
-    """Return whether the user can correct it: such errors are printed without a traceback."""
-    if isinstance(error, (ValueError, TypeError, OSError, ImportError, MemoryError)):
-        return True
-    return isinstance(error, hybridkin.simulation.NotSettledError)
-
-
 def _paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     report, paths = hybridkin.paper.run_paper(
         arguments.out,
@@ -125,7 +115,7 @@ def _paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         n_jobs=arguments.jobs,
         progress=bars,
     )
-    return _Outcome.of(report, paths)
+    return _Outcome(report.record, report.plain(), paths)
 
 
 def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
@@ -141,7 +131,7 @@ def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
     )
-    log = _read_for(robot, arguments, log_format)
+    log = _read(arguments, log_format, robot.chain, "base" in robot.calibrate)
     print(f"{log.report}\n", file=sys.stderr)
     report, paths = hybridkin.workflow.fit_log(
         log,
@@ -152,7 +142,7 @@ def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         n_jobs=arguments.jobs,
         progress=bars,
     )
-    return _Outcome.of(report, paths)
+    return _Outcome(report.record, report.plain(), paths)
 
 
 def _evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
@@ -160,7 +150,7 @@ def _evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     known = None if loaded.description is None else loaded.description.log
     nominal = loaded.chain if loaded.header is None else None
     log_format = _log_format(arguments, known, arguments.model)
-    log = _read(arguments, log_format, chain=nominal, base_is_free=False)
+    log = _read(arguments, log_format, nominal, False)
     print(f"{log.report}\n", file=sys.stderr)
     report, paths = hybridkin.workflow.evaluate_log(
         loaded, log, arguments.out, force=arguments.force
@@ -169,7 +159,7 @@ def _evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     judged = next(filter(None, map(report.record.get, ("new", "held_out", "all"))))
     limit = arguments.fail_above
     code = 1 if limit is not None and 1000 * judged["mean"] > limit else 0
-    return _Outcome.of(report, paths, code)
+    return _Outcome(report.record, report.plain(), paths, code)
 
 
 def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
@@ -178,7 +168,9 @@ def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     log_format = loaded.log_format()
     if (arguments.path is None) == (arguments.shape is None):
         raise ValueError("give either a file of points or --shape, one of the two.")
-    limits = workflow.path_limits(loaded, **_limits(arguments, log_format))
+    # In the log's unit and sign, which may swap least and largest.
+    asked = hybridkin.robots.Limits(arguments.q_min, arguments.q_max, arguments.dq_max)
+    limits = workflow.path_limits(loaded, **vars(asked.scaled(log_format.q_factor)))
     unit = arguments.unit or log_format.x_unit
     if arguments.path is not None:
         path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
@@ -188,8 +180,8 @@ def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
             loaded,
             limits,
             arguments.shape,
-            [metre * v for v in arguments.size or ()],
-            center=None if center is None else [metre * v for v in center],
+            np.multiply(metre, arguments.size or ()).tolist(),
+            center=None if center is None else np.multiply(metre, center),
             normal=arguments.normal,
             turns=arguments.turns,
             rise=metre * arguments.rise,
@@ -208,7 +200,7 @@ def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         progress=bars,
     )
     code = 0 if report.record["reached"] == report.record["n"] else 1
-    return _Outcome.of(report, paths, code)
+    return _Outcome(report.record, report.plain(), paths, code)
 
 
 def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
@@ -228,38 +220,29 @@ def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
 def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     if arguments.log.suffix.lower() not in hybridkin.workflow.LOG_SUFFIXES:
         loaded = hybridkin.workflow.open_model(arguments.log, arguments.robot)
-        return _Outcome.of(hybridkin.workflow.describe(loaded))
+        report = hybridkin.workflow.describe(loaded)
+        return _Outcome(report.record, report.plain())
     if arguments.robot is None:
         raise ValueError(f"{arguments.log} is a log; name its robot: --robot ROBOT.toml.")
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
-    found = _read_for(robot, arguments, log_format).report
+    found = _read(arguments, log_format, robot.chain, "base" in robot.calibrate).report
     return _Outcome(found.to_dict(), str(found), code=0 if found.ok else 1)
 
 
-_RUN = {
-    "paper": _paper,
-    "fit": _fit,
-    "evaluate": _evaluate,
-    "track": _track,
-    "animate": _animate,
-    "describe": _describe,
-}
+_COMMANDS = (_paper, _fit, _evaluate, _track, _animate, _describe)
+_RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 
-def _read(arguments: argparse.Namespace, log_format: LogFormat, **check: Any) -> MeasuredLog:
+def _read(
+    arguments: argparse.Namespace, log_format: LogFormat, chain: Chain | None, base_is_free: bool
+) -> MeasuredLog:
     """Return the log of the arguments, read and checked."""
     names = ("exclude", "drop_invalid", "drop_frozen", "delimiter")
     options = {name: vars(arguments)[name] for name in names}
-    return hybridkin.workflow.read_log(arguments.log, log_format, **options, **check)
-
-
-def _read_for(
-    robot: RobotDescription, arguments: argparse.Namespace, log_format: LogFormat
-) -> MeasuredLog:
-    """Return the log, checked against the robot's nominal chain."""
-    free = "base" in robot.calibrate
-    return _read(arguments, log_format, chain=robot.chain, base_is_free=free)
+    return hybridkin.workflow.read_log(
+        arguments.log, log_format, chain=chain, base_is_free=base_is_free, **options
+    )
 
 
 def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: Path) -> LogFormat:
@@ -276,10 +259,3 @@ def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: 
             "help(hybridkin.robots.read_description); or name the columns by --q and --x."
         )
     return hybridkin.robots.LogFormat(**given)
-
-
-def _limits(arguments: argparse.Namespace, log_format: LogFormat) -> dict[str, Any]:
-    """Return the limits [m] as the model counts them, from options in the log's unit and sign."""
-    given = {name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max")}
-    given = {k: v[0] if v is not None and len(v) == 1 else v for k, v in given.items()}
-    return vars(hybridkin.robots.Limits(**given).scaled(log_format.q_factor))

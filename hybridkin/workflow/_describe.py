@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from hybridkin.chains.robots import Limits, LogFormat
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.workflow._fit_report import auto_entry, auto_in_short, radius_entry
 from hybridkin.workflow.model import LoadedModel
-from hybridkin.workflow.report import Report, millimetres
+from hybridkin.workflow.report import Report, in_millimetres, millimetres
 
 
 def describe(loaded: LoadedModel) -> Report:
@@ -53,22 +52,22 @@ def describe(loaded: LoadedModel) -> Report:
         **{key: header.get(key) for key in ("training", "created", "versions")},
     }
     if hybrid is not None:
-        _add_hybrid(report.record, hybrid)
+        report.record |= _of_hybrid(hybrid)
     _write_geometry(report, report.record["geometry"])
     _write_model(report, loaded)
     _write_training(report, report.record["training"] or {})
     return report
 
 
-def _add_hybrid(record: dict[str, Any], model: HybridForwardModel) -> None:
+def _of_hybrid(model: HybridForwardModel) -> dict[str, Any]:
     calibrated = [model.calibrate] if isinstance(model.calibrate, str) else list(model.calibrate)
-    kind = "none" if model.error_model_ is None else type(model.error_model_).__name__
+    auto, kind = None, "none" if model.error_model_ is None else type(model.error_model_).__name__
     error = {"kind": kind, "coupling": model.coupling}
-    record["radius"] = radius_entry(model)
     if model.cv_results_ is not None:
-        record["auto"] = auto_entry(model)
-        error = {"kind": auto_in_short(record["auto"]), "coupling": None}
-    record["error_model"] = {**error, "guard": model.guard, "calibrated": calibrated}
+        auto = auto_entry(model)
+        error = {"kind": auto_in_short(auto), "coupling": None}
+    error |= {"guard": model.guard, "calibrated": calibrated}
+    return {"error_model": error, "radius": radius_entry(model), "auto": auto}
 
 
 def geometry(chain: Chain) -> dict[str, Any]:
@@ -123,8 +122,8 @@ def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
         header = ["segment", "radius [mm]", "length [mm]", "offset [mm]", "actuators at [deg]"]
         report.table(header, rows)
     turn = ", ".join(f"{v:.1f}" for v in geometry["base"]["rotation_vector_deg"])
-    position = _millimetres(geometry["base"]["position"])
-    report.text(f"Base at ({position}) mm, turned by ({turn}) deg.")
+    position = in_millimetres(geometry["base"]["position"])
+    report.text(f"Base at {position}, turned by ({turn}) deg.")
 
 
 def _write_model(report: Report, loaded: LoadedModel) -> None:
@@ -175,7 +174,3 @@ def _write_training(report: Report, training: dict[str, Any]) -> None:
     if report.record["versions"] is not None:
         versions = ", ".join(f"{name} {value}" for name, value in report.record["versions"].items())
         report.text(f"Saved on {report.record['created']} by {versions}.")
-
-
-def _millimetres(lengths: Iterable[float]) -> str:
-    return ", ".join(f"{1e3 * value:.4g}" for value in lengths)

@@ -127,20 +127,17 @@ def sample_domain(loaded: LoadedModel, limits: PathLimits) -> Domain:
     """
     low, high, rng = limits.q_min, limits.q_max, np.random.default_rng(0)
     q = rng.uniform(low, high, (_WALKERS, loaded.n_actuators))
-    module, rest = loaded.module, preferred(loaded, limits)
-    with torch.no_grad():
-        if loaded.hybrid is not None:
-            q = np.tile(rest, (_WALKERS, 1))
-            bending = _bending_projector(loaded)
-            for _ in range(_STEPS):
-                step = _STEP * (high - low) * rng.standard_normal(q.shape)
-                ahead = q + step @ bending
-                inside = module.in_domain(torch.from_numpy(ahead)).numpy()
-                inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
-                q[inside] = ahead[inside]
-            # Beside the preferred one, which may be exactly straight.
-            q[0] = rest + 0.01 * (high - low) * rng.standard_normal(len(rest)) @ bending
-        tips = module(torch.from_numpy(q)).numpy()
+    if loaded.hybrid is not None:
+        rest, bending = preferred(loaded, limits), _bending_projector(loaded)
+        q = np.tile(rest, (_WALKERS, 1))
+        for _ in range(_STEPS):
+            ahead = q + _STEP * (high - low) * rng.standard_normal(q.shape) @ bending
+            inside = loaded.module.in_domain(torch.from_numpy(ahead)).numpy()
+            inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
+            q[inside] = ahead[inside]
+        # Beside the preferred one, which may be exactly straight.
+        q[0] = rest + 0.01 * (high - low) * rng.standard_normal(len(rest)) @ bending
+    tips = loaded.tips(q)
     finite = np.isfinite(tips).all(axis=1)
     return q[finite], tips[finite]
 

@@ -58,12 +58,11 @@ def write_comparison(
     )
     shown = _SHOWN if _SHOWN[0] in record else _SHOWN_OF_DATA
     present = [name for name in shown if name in record]
-    calibrated, *hybrids = (record[name]["mean"] for name in present)
-    pairs = zip(present[1:], hybrids, strict=True)
-    ratios = [f"over {name}: **{calibrated / mean:.2f}**" for name, mean in pairs]
+    first, *others = ((name, record[name]["mean"]) for name in present)
+    ratios = [f"over {name}: **{first[1] / mean:.2f}**" for name, mean in others]
     best = min(record, key=lambda name: record[name]["mean"])
-    first = "Calibrated mechanical model" if shown is _SHOWN else "Linear model"
-    report.text(f"{first} {', '.join(ratios)}. Least mean error: {best}.")
+    start = "Calibrated mechanical model" if shown is _SHOWN else "Linear model"
+    report.text(f"{start} {', '.join(ratios)}. Least mean error: {best}.")
     _add_figures(report, errors, (present[0], present[-1]))
     motions, counts = np.unique(log.motions, return_counts=True)
     means = np.array([[errors[n][log.motions == m].mean() for n in present] for m in motions])
@@ -73,6 +72,12 @@ def write_comparison(
         for i in np.argsort(means[:, -1])[::-1][:5]
     ]
     report.table(["motion", "rows", *present], rows)
+    saved, chosen = report.record["saved"], report.record["chosen"]
+    by_fold = "; ".join(choices.get(saved, "-") for choices in report.record["choices_by_fold"])
+    report.text(
+        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error of "
+        f"the models that a fit saves. Chosen in the folds: {by_fold}."
+    )
 
 
 def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, str]) -> None:

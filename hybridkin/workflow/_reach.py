@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from hybridkin.ik.solver import InverseKinematics
@@ -11,7 +10,7 @@ from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow._domain import Domain, PathLimits, preferred
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.path import scaled_path
-from hybridkin.workflow.report import Progress
+from hybridkin.workflow.report import Progress, in_millimetres
 
 _POINTS = 13  # of the path, evenly in time; those furthest in every direction come in addition
 _STARTS = 12  # for every point, the commands whose tips are nearest to it
@@ -43,8 +42,7 @@ def check_reach(
     shares = np.random.default_rng(0).uniform(size=(_BOX, len(limits.q_min)))
     shares[::2] = shares[::2].round()
     box = limits.q_min + shares * (limits.q_max - limits.q_min)
-    with torch.no_grad():
-        reached = loaded.module(torch.from_numpy(box)).numpy()
+    reached = loaded.tips(box)
     home = preferred(loaded, limits)
     ik = InverseKinematics(loaded.module, q_min=limits.q_min, q_max=limits.q_max, q_pref=home)
     ends = [f(column) for column in path.x.T for f in (np.argmin, np.argmax)]
@@ -63,8 +61,8 @@ def check_reach(
     if len(far_out) == 0:
         return
     worst = path.x[rows[missed.argmax()]]
-    low, high, point = map(_words, (tips.min(axis=0), tips.max(axis=0), worst))
-    way_out = f"its centre is out of reach too: tips go from ({low}) to ({high}) mm, check --unit"
+    low, high, point = map(in_millimetres, (tips.min(axis=0), tips.max(axis=0), worst))
+    way_out = f"its centre is out of reach too: tips go from {low} to {high}, check --unit"
     if not missed_by(0.0, far_out[:1]).any():
         scale = 0.0
         for step in 0.5 ** np.arange(1, _HALVINGS + 1):
@@ -73,7 +71,7 @@ def check_reach(
         way_out = f"about its centre {scale:.2g} of its size can be reached: --scale {scale:.2g}"
     raise ValueError(
         f"`path` leaves the reach of the robot within its limits ({limits.source}): "
-        f"{len(far_out)} of {len(rows)} points tried are out of reach, ({point}) mm by "
+        f"{len(far_out)} of {len(rows)} points tried are out of reach, {point} by "
         f"{1e3 * missed.max():.3g} mm; {way_out}. To go as near as the tip can: --force."
     )
 
@@ -81,7 +79,3 @@ def check_reach(
 def _nearest(x: NDArray, tips: NDArray) -> NDArray:
     """Return for each of the points x (N, 3) which of the tips are nearest (N, _STARTS)."""
     return np.linalg.norm(tips - x[:, None], axis=2).argsort(axis=1)[:, :_STARTS]
-
-
-def _words(point: NDArray) -> str:
-    return ", ".join(f"{1e3 * v:.3g}" for v in point)

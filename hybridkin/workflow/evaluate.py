@@ -77,7 +77,7 @@ def evaluate_log(
             _, radius = loaded.hybrid.predict(log.q, return_radius=True, groups=motion)
             columns["share_in_radius"] = np.where(np.isinf(radius), np.nan, errors <= radius)
             report.record["radius"] = radius_entry(loaded.hybrid)
-    motions = {str(name): measured.motions == name for name in dict.fromkeys(measured.motions)}
+    motions = {name: measured.motions == name for name in dict.fromkeys(measured.motions)}
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
     parts = {} if fitted is None else {"new": ~fitted, "fitted": fitted}
     parts = {name: _entry(columns, rows) for name, rows in parts.items() if rows.any()}
@@ -85,7 +85,7 @@ def evaluate_log(
         model=str(loaded.path),
         log=log.source,
         all=_entry(columns, slice(None)),
-        motions={name: _entry(columns, rows) for name, rows in motions.items()},
+        motions={str(name): _entry(columns, rows) for name, rows in motions.items()},
         fitted_rows=None if fitted is None else int(fitted.sum()),
         **{name: parts.get(name) for name in ("new", "fitted")},
         held_out=loaded.held_out if "fitted" in parts else None,
@@ -117,8 +117,8 @@ def _write_errors(report: Report) -> None:
             f"**{record['fitted_rows']} of {everything['rows']} rows were fitted: their errors are "
             "training errors.** To test the model, evaluate a log of other motions."
         )
-    parts = {title: record[name] for title, name in _PARTS.items() if record["fitted"]}
-    parts = {title: entry for title, entry in parts.items() if entry is not None}
+    known = _PARTS if record["fitted"] else {}
+    parts = {title: record[name] for title, name in known.items() if record[name] is not None}
     columns = ["rows", "mean", "median", "p95", "max", *(s for s in _SHARES if s in everything)]
     report.errors({"all rows": everything, **parts, **dict(motions)}, columns)
     if "radius" in report.record:

@@ -55,10 +55,13 @@ AUTO = "hybrid, auto"
 CALIBRATED = "mechanical, calibrated"
 ELM = "hybrid, ELM"
 LINEAR = "hybrid, linear"
-_DATA_LINEAR = "data-driven, linear"
+_DATA_LINEAR, _DATA_ELM = "data-driven, linear", "data-driven, ELM"
 _SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # what a file can hold
-_OF_CHAINS = ("mechanical, nominal", CALIBRATED, LINEAR)
-_SAVED_OF_DATA = (_DATA_LINEAR, ELM, AUTO)  # of a robot without segments
+_OF_CHAINS = ("mechanical, nominal", CALIBRATED, LINEAR)  # the others do without
+_MODELS = (
+    *("mechanical, nominal", CALIBRATED, _DATA_LINEAR, "data-driven, quadratic", _DATA_ELM),
+    *(LINEAR, "hybrid, quadratic", ELM, AUTO),
+)
 _N_HIDDEN, _INNER_FOLDS = 100, 4
 _ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto: fewer do not pay for a start
 
@@ -112,33 +115,6 @@ class Comparison(NamedTuple):
     errors: dict[str, NDArray]
     fold: NDArray
     choices: list[dict[str, str]]
-
-
-class _Choice(NamedTuple):
-    """An ELM by its ridge weight and guard; no ridge weight: no correction at all."""
-
-    alpha: float | None = None
-    guard: str | None = None
-
-    def __str__(self) -> str:
-        if self.alpha is None:
-            return "no correction"
-        return f"alpha = {self.alpha:g}, guard: {self.guard or 'none'}"
-
-    def model(self, mechanical: ForwardModel | None, seed: int = 0) -> HybridForwardModel:
-        if self.alpha is None:
-            return HybridForwardModel(mechanical, "drop")
-        elm = ELMRegressor(_N_HIDDEN, self.alpha, random_state=seed)
-        return HybridForwardModel(mechanical, elm, guard=self.guard)
-
-
-_DATA_CHOICES = tuple(_Choice(alpha) for alpha in ALPHAS)
-_HYBRID_CHOICES = (
-    _Choice(),
-    *(_Choice(alpha, guard) for guard in ("leverage", "box", None) for alpha in ALPHAS),
-)
-# Without a mechanical model nothing but this guard keeps a path near the data.
-_GUARDED_CHOICES = tuple(_Choice(alpha, "leverage") for alpha in ALPHAS)
 
 
 class _Rows(NamedTuple):
@@ -292,17 +268,29 @@ def fit_log(
     for message in messages:
         warnings.warn(message, stacklevel=2)
     compared = compare_by_group(data, robot, settings, n_jobs=n_jobs, progress=progress)
-    savable = _SAVED_OF_DATA if robot.chain is None else _SAVED
+    savable = _SAVED if robot.chain is not None else (_DATA_LINEAR, ELM, AUTO)
     errors = {name: values.mean() for name, values in compared.errors.items() if name in savable}
     saved = min(errors, key=lambda name: (errors[name], name))
     progress(f"fitting {saved} to all motions", 0, 1)
     mechanical = rows.mechanical() if result is None else result.chain
-    model, chosen = _fit_saved(saved, rows, mechanical)
+    model = _fit_saved(saved, rows, mechanical)
     progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
-    report.record.update(n=len(data.q), saved=saved, chosen=chosen)
-    _write_log(report, whole, robot, settings)
-    _write_choice(report, compared, data)
+    report.record.update(
+        n=len(data.q),
+        saved=saved,
+        chosen=_chosen(model),
+        log=Path(log.source).name,
+        robot=robot.name,
+        n_whole=len(whole.q),
+        n_motions=len(np.unique(whole.motions)),
+        excluded=list(whole.excluded),
+        n_seeds=settings.n_seeds,
+        loss=settings.loss,
+        choices_by_fold=compared.choices,
+    )
+    write_check(report, whole)
+    write_comparison(report, compared.errors, compared.fold, data)
     write_model(report, model)
     if robot.chain is not None and result is not None:
         write_calibration(report, robot.chain, result, messages)
@@ -331,46 +319,13 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
     log.check(force)
 
 
-def _write_log(
-    report: Report, log: MeasuredLog, robot: robots.RobotDescription, settings: FitSettings
-) -> None:
-    """Add what was fitted to what, and what the check of the log found."""
-    report.record.update(
-        log=Path(log.source).name,
-        robot=robot.name,
-        n_whole=len(log.q),
-        n_motions=len(np.unique(log.motions)),
-        excluded=list(log.excluded),
-        n_seeds=settings.n_seeds,
-        loss=settings.loss,
-    )
-    write_check(report, log)
-
-
-def _write_choice(report: Report, compared: Comparison, data: MeasuredLog) -> None:
-    """Add the errors on held-out motions, and which model was saved for them."""
-    saved, chosen = report.record["saved"], report.record["chosen"]
-    report.record["choices_by_fold"] = compared.choices
-    write_comparison(report, compared.errors, compared.fold, data)
-    by_fold = "; ".join(choices.get(saved, "-") for choices in compared.choices)
-    report.text(
-        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error of "
-        "the models that a fit saves. "
-        f"Chosen in the folds: {by_fold}."
-    )
-
-
-def _fit_saved(saved: str, rows: _Rows, mechanical: ForwardModel) -> tuple[HybridForwardModel, str]:
-    """Return the model to save, fitted to all rows, and what was chosen for it."""
-    choice = _choose(rows, hybrid=True) if saved == ELM else _Choice()
-    model, chosen = choice.model(mechanical), str(choice)
-    if saved == LINEAR:
-        model, chosen = HybridForwardModel(mechanical, linear()), "linear"
-    elif saved == AUTO:
-        model = rows.auto_model(mechanical)
+def _fit_saved(saved: str, rows: _Rows, mechanical: ForwardModel) -> HybridForwardModel:
+    """Return the model to save, fitted to all rows."""
+    # The linear model of a robot without segments is what stands for its mechanical one.
+    model = _models(CALIBRATED if saved == _DATA_LINEAR else saved, rows, mechanical)[0]
     model.set_params(coverage=rows.settings.coverage)
     model.fit_with_messages(rows.q, rows.x, groups=rows.groups)
-    return model, auto_in_short(auto_entry(model)) if saved == AUTO else chosen
+    return model
 
 
 def _write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:
@@ -399,33 +354,54 @@ def _add_model(
 @threadpool_limits.wrap(limits=1)  # the processes share the cores already
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors on test rows of every model fitted to training rows, and the choices."""
-    seeds, chain = range(train.settings.n_seeds), train.robot.chain
-    data_choice, hybrid_choice = _choose(train, hybrid=False), _choose(train, hybrid=True)
-    nominal, mechanical = chain, train.mechanical()
-    if chain is not None and "base" in train.robot.calibrate:
-        nominal = train.calibrated(chain, ("base",))[0].chain
+    chain = train.robot.chain
+    names = _MODELS if train.settings.auto else _MODELS[:-1]
+    mechanical = train.mechanical()
     models = {
-        "mechanical, nominal": [HybridForwardModel(nominal, "drop")],
-        CALIBRATED: [HybridForwardModel(mechanical, "drop")],
-        _DATA_LINEAR: [HybridForwardModel(None, linear())],
-        "data-driven, quadratic": [HybridForwardModel(None, quadratic())],
-        "data-driven, ELM": [data_choice.model(None, seed) for seed in seeds],
-        LINEAR: [HybridForwardModel(mechanical, linear())],
-        "hybrid, quadratic": [HybridForwardModel(mechanical, quadratic())],
-        ELM: [hybrid_choice.model(mechanical, seed) for seed in seeds],
+        name: _models(name, train, mechanical)
+        for name in names
+        if chain is not None or name not in _OF_CHAINS
     }
-    if chain is None:
-        models = {name: models[name] for name in models if name not in _OF_CHAINS}
-    chosen = {"data-driven, ELM": str(data_choice), ELM: str(hybrid_choice)}
-    if train.settings.auto:
-        models[AUTO] = [train.auto_model(mechanical)]
     errors = {
         name: np.mean([_held_out(model, train, test) for model in some], axis=0)
         for name, some in models.items()
     }
-    if train.settings.auto:
-        chosen[AUTO] = auto_in_short(auto_entry(models[AUTO][0]))
-    return errors, chosen
+    choosing = (name for name in (_DATA_ELM, ELM, AUTO) if name in models)
+    return errors, {name: _chosen(models[name][0]) for name in choosing}
+
+
+def _models(name: str, rows: _Rows, mechanical: ForwardModel) -> list[HybridForwardModel]:
+    """Return the models of that name, to be fitted: one, of ELMs one for each seed."""
+    part, learner = name.split(", ")
+    base = None if part == "data-driven" else mechanical
+    if learner == "auto":
+        return [rows.auto_model(mechanical)]
+    if learner == "ELM":
+        choice = _choose(rows, hybrid=base is not None)
+        return [_elm(base, *choice, seed) for seed in range(rows.settings.n_seeds)]
+    chain = rows.robot.chain
+    if chain is not None and learner == "nominal":
+        free = "base" in rows.robot.calibrate
+        base = rows.calibrated(chain, ("base",))[0].chain if free else chain
+    learners = {"linear": linear, "quadratic": quadratic}
+    return [HybridForwardModel(base, learners[learner]() if learner in learners else "drop")]
+
+
+def _elm(
+    base: ForwardModel | None, alpha: float | None, guard: str | None, seed: int = 0
+) -> HybridForwardModel:
+    """Return an ELM by its ridge weight and guard; no ridge weight: no correction at all."""
+    elm = "drop" if alpha is None else ELMRegressor(_N_HIDDEN, alpha, random_state=seed)
+    return HybridForwardModel(base, elm, guard=guard)
+
+
+def _chosen(model: HybridForwardModel) -> str:
+    """Return in words what was chosen for a fitted model."""
+    if model.cv_results_ is not None:
+        return auto_in_short(auto_entry(model))
+    if isinstance(model.error_model, ELMRegressor):
+        return f"alpha = {model.error_model.alpha:g}, guard: {model.guard or 'none'}"
+    return "no correction" if model.error_model == "drop" else "linear"
 
 
 def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
@@ -436,15 +412,18 @@ def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
         return distance(model.module_(torch.from_numpy(np.array(q, dtype=float))).numpy(), test.x)
 
 
-def _choose(rows: _Rows, *, hybrid: bool) -> _Choice:
-    """Return the ELM with the least mean error on held-out groups, calibrated anew."""
-    candidates = _DATA_CHOICES
-    if hybrid:
-        candidates = _GUARDED_CHOICES if rows.robot.chain is None else _HYBRID_CHOICES
+def _choose(rows: _Rows, *, hybrid: bool) -> tuple[float | None, str | None]:
+    """Return weight and guard of the ELM with the least mean error on held-out groups."""
+    guards: Sequence[str | None] = ("leverage", "box", None) if hybrid else (None,)
+    if hybrid and rows.robot.chain is None:
+        guards = ("leverage",)  # nothing else keeps a path near the data
+    candidates: list[Any] = [(alpha, guard) for guard in guards for alpha in ALPHAS]
+    if len(guards) > 1:
+        candidates.insert(0, (None, "leverage"))
     errors = np.zeros(len(candidates))
     folds = GroupKFold(min(_INNER_FOLDS, len(np.unique(rows.groups))))
     for train, test in folds.split(rows.q, groups=rows.groups):
         known, new = rows.of(train), rows.of(test)
-        mechanical = known.mechanical() if hybrid else None
-        errors += [_held_out(choice.model(mechanical), known, new).sum() for choice in candidates]
+        base = known.mechanical() if hybrid else None
+        errors += [_held_out(_elm(base, *choice), known, new).sum() for choice in candidates]
     return candidates[int(errors.argmin())]

@@ -102,6 +102,10 @@ class LoadedModel:
         """Return tips (N, 3) [m]; with play by `groups`, the motion of every row."""
         if self.hybrid is not None:
             return self.hybrid.predict(q, groups=groups)
+        return self.tips(q)
+
+    def tips(self, q: NDArray) -> NDArray:
+        """Return tips (N, 3) [m] where the actuators do q (N, n), whatever the play."""
         with torch.no_grad():
             return self.module(torch.from_numpy(np.ascontiguousarray(q))).numpy()
 

@@ -33,13 +33,10 @@ _UNITS = {
     **dict.fromkeys(("angles", "turns", "rest_bends"), _DEGREES),
 }
 
-_COLUMNS = {  # of tables of errors: heading, factor, format
+_COLUMNS = {  # of tables of errors: heading, factor, format; others in mm
     "rows": ("rows", 1, ".0f"),
-    "mean": ("mean", 1e3, ".2f"),
-    "median": ("median", 1e3, ".2f"),
     "std": ("std over rows", 1e3, ".2f"),
     "p95": ("95 %", 1e3, ".2f"),
-    "max": ("max", 1e3, ".2f"),
     "std_folds": ("std over folds", 1e3, ".2f"),
     "std_error": ("std error (motions)", 1e3, ".2f"),
     "share_in_domain": ("in domain [%]", 100, ".0f"),
@@ -89,6 +86,11 @@ def statistics(errors: NDArray, motions: NDArray | None = None) -> dict[str, Any
 def millimetres(lengths: Sequence[float]) -> str:
     """Return the largest of some lengths [m] in words."""
     return f"{1e3 * max(lengths):.3g} mm"
+
+
+def in_millimetres(point: NDArray) -> str:
+    """Return a point [m] in words."""
+    return f"({', '.join(f'{1e3 * v:.4g}' for v in point)}) mm"
 
 
 def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, Any]]:
@@ -164,14 +166,15 @@ class Report:
 
     def errors(self, record: dict[str, dict[str, Any]], columns: Sequence[str]) -> None:
         """Add a table of tip errors [mm] by name, with some of their `statistics`."""
-        titles, factors, formats = zip(*(_COLUMNS[key] for key in columns), strict=True)
+        looks = {key: _COLUMNS.get(key, (key, 1e3, ".2f")) for key in columns}
         rows = []
         for name, entry in record.items():
-            values = [
-                factor * entry.get(key, math.nan)
-                for key, factor in zip(columns, factors, strict=True)
-            ]
-            rows.append([name, *(c.replace("nan", "-") for c in map(format, values, formats))])
+            values = (
+                f"{factor * entry.get(key, math.nan):{form}}"
+                for key, (_, factor, form) in looks.items()
+            )
+            rows.append([name, *(value.replace("nan", "-") for value in values)])
+        titles = (title for title, *_ in looks.values())
         self.table(["tip error [mm]", *titles], rows)
 
     def geometry(self, entries: Sequence[dict[str, Any]]) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.units import METRES
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.datasets import load_log
+from hybridkin.datasets import Log, load_log
 from hybridkin.ik import trajectories
 from hybridkin.ik.results import IKStatus, Track
 from hybridkin.ik.solver import InverseKinematics
@@ -38,7 +38,6 @@ from hybridkin.workflow.report import Progress, Report, check_out, millimetres, 
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
-_COLUMNS = ("q", "q_unit", "q_sign", "q_scale", "x", "x_unit")  # of a log format, in the record
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
 _GUESSES = 16
@@ -130,16 +129,14 @@ def track_path(
         lead_in={"rows": n_lead, "duration_s": whole.t[n_lead] - whole.t[0], "start": stands},
         limits=dict(vars(limits)),
         largest_speed=speeds.max(initial=0.0),
-        columns={name: vars(log_format)[name] for name in _COLUMNS},
+        columns=dict(vars(log_format)),
     )
     _write_summary(report)
     _add_path(report, track)
     shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
     _add_commands(report, loaded, whole.t, shown, limits)
-    effective = None if loaded.play is None else whole.q
-    names = [*["LEAD_IN"] * n_lead, *names]
-    write = partial(_write_track, whole, sent, effective, names, log_format)
-    report.file("track.csv", write)
+    statuses = [*["LEAD_IN"] * n_lead, *names]
+    report.file("track.csv", partial(_write_track, whole, shown, statuses, log_format))
     return report, report.write(out)
 
 
@@ -175,8 +172,7 @@ def _with_lead_in(
     speed = _SLOW * widest if limits.dq_max is None else limits.dq_max
     n = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
     q = track.q[0] - (1.0 - trajectories.min_jerk(np.arange(n) / max(n, 1)))[:, None] * way
-    with torch.no_grad():
-        x = loaded.module(torch.from_numpy(q)).numpy()
+    x = loaded.tips(q)
     before = {"q": q, "x": x, "target": x, "error": np.zeros(n)}
     rows = {name: np.concatenate([rows, vars(track)[name]]) for name, rows in before.items()}
     t = np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt])
@@ -195,14 +191,14 @@ def _best_track(
     commands, tips = domain
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
-    fine, every = _in_steps(path, max(1, math.ceil(way / (_STEP * extent))))
+    every = max(1, math.ceil(way / (_STEP * extent)))
+    fine = _in_steps(path, every)
     dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
     bounds: Any = {name: vars(limits)[name] for name in ("q_min", "q_max", "dq_max")}
     tracks: list[Track] = []
     for attempt, pull in enumerate(_PULLS):
         posture = preferred_posture(loaded, limits, pull)
-        options = {"q_pref": posture, "beta": min(1.0, 1.0 / dt), "dt": dt}
-        ik = InverseKinematics(loaded.module, **bounds, **options)
+        ik = InverseKinematics(loaded.module, **bounds, q_pref=posture, beta=min(1, 1 / dt), dt=dt)
 
         def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
             progress(what, done + 1, total)
@@ -217,14 +213,12 @@ def _best_track(
     return max(tracks, key=_score)  # of equals the first
 
 
-def _in_steps(path: Trajectory, n: int) -> tuple[Trajectory, int]:
-    """Return the path with every way between two points cut into n, and n."""
-    if n == 1 or len(path) < 2:
-        return path, 1
+def _in_steps(path: Trajectory, n: int) -> Trajectory:
+    """Return the path with every way between two points cut into n."""
     places = np.arange((len(path) - 1) * n + 1) / n
     columns = np.column_stack([path.t, path.x])
     t, *x = (np.interp(places, np.arange(len(path)), column) for column in columns.T)
-    return Trajectory(t, np.stack(x, axis=1)), n
+    return Trajectory(t, np.stack(x, axis=1))
 
 
 def _initial_guesses(
@@ -296,15 +290,13 @@ def animate_track(
     file = Path(path)
     if file.is_dir():
         file = file / "track.csv"
-    q, target, t = _read_track(file, loaded.log_format())
+    log = _read_track(file, loaded.log_format())
     out = Path(out)
     if not out.absolute().parent.is_dir():
         raise FileNotFoundError(f"`out` must lie in a folder that exists, got {out}.")
-    q = loaded.effective(q)
-    with torch.no_grad():
-        tips = loaded.module(torch.from_numpy(q)).numpy()
+    q, target = loaded.effective(log.q), log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
-        loaded.chain, q, target=target, t=t, x=tips, n_frames=n_frames
+        loaded.chain, q, target=target, t=log.time, x=loaded.tips(q), n_frames=n_frames
     )
     film.name = "tip (model)"
     staging = out.with_name(f".{out.stem}-unfinished{out.suffix}")
@@ -320,51 +312,40 @@ def animate_track(
         "bytes": out.stat().st_size,
         "frames": len(film.rows),
         "fps": speed * film.fps,
-        "duration_s": None if t is None else float(t[-1] - t[0]),
+        "duration_s": None if log.time is None else float(np.ptp(log.time)),
     }
 
 
-def _read_track(
-    file: Path, log_format: robots.LogFormat
-) -> tuple[NDArray, NDArray | None, NDArray | None]:
-    """Return commands, targets and times of a file, the last two where it has them."""
+def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
+    """Return commands and times of a file; its tips are the targets where it has them."""
     if not file.is_file():
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
-    has_targets = set(TARGET) <= set(header)
     columns = dict(vars(log_format), groups=None)
     del columns["group_suffix"]
     columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
-    if has_targets:
+    if {*TARGET} <= {*header}:
         columns["x"] = TARGET
-    log = load_log(file, **columns)
-    return log.q, log.x if has_targets else None, log.time
+    return load_log(file, **columns)
 
 
 def _write_track(
-    track: Track,
-    sent: NDArray,
-    effective: NDArray | None,
-    statuses: list[str],
-    log_format: robots.LogFormat,
-    file: Path,
+    track: Track, shown: dict[str, NDArray], statuses: list[str], log: robots.LogFormat, file: Path
 ) -> None:
     """Write commands, and what the actuators do where that is something else, point by point."""
-    unit, scale = log_format.q_factor, 1 / METRES[log_format.x_unit]
-    columns = np.column_stack([track.t, sent / unit, scale * track.x, scale * track.target])
-    head = [TIME, *log_format.q, *log_format.x, *TARGET, "error", "status"]
-    cells = [*_text("%.9g", columns).T, _text("%.6g", scale * track.error), statuses]
-    if effective is not None:
-        head += [f"effective_{name}" for name in log_format.q]
-        cells += [*_text("%.9g", effective / unit).T]
+    scale = 1 / METRES[log.x_unit]
+    sent, *effective = (_text(q / log.q_factor) for q in shown.values())
+    rest = _text(scale * np.column_stack([track.x, track.target, track.error]))
+    head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
+    head += [f"effective_{name}" for name in log.q for _ in effective]
+    cells = [_text(track.t), *sent, *rest, statuses, *(column for q in effective for column in q)]
     with open(file, "w", encoding="utf-8", newline="") as lines:
-        writer = csv.writer(lines, lineterminator="\n")
-        writer.writerows([head, *zip(*cells, strict=True)])
+        csv.writer(lines, lineterminator="\n").writerows([head, *zip(*cells, strict=True)])
 
 
-def _text(form: str, values: NDArray) -> NDArray:
-    return np.char.mod(form, values + 0.0)  # no -0
+def _text(values: NDArray) -> NDArray:
+    return np.char.mod("%.9g", values + 0.0).T  # no -0
 
 
 def _add_path(report: Report, track: Track) -> None:
