@@ -17,10 +17,7 @@ _FAR = 1.6  # the eye from the scene's middle, in longest sides of the scene
 
 
 def page(
-    scene: Scene,
-    fps: float,
-    view: tuple[float, float],
-    progress: Callable[[int, int], None] | None,
+    scene: Scene, fps: float, view: tuple[float, float], progress: Callable[[int, int], None] | None
 ) -> str:
     """Return the page as HTML that holds everything it needs."""
     try:
@@ -97,32 +94,19 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
 
     buttons = [animate("Play", None, play), animate("Pause", [None], jump)]
     steps = [animate(caption, [str(k)], jump) for k, caption in enumerate(scene.captions)]
-    slider = {
-        **{"steps": steps, "x": 0.14, "len": 0.84, "y": 0.0, "pad": {"t": 30}, "ticklen": 0},
-        "minorticklen": 0,
-        "currentvalue": {"font": {"size": 16, "color": "black"}, "xanchor": "left"},
-        "font": {"color": "rgba(0, 0, 0, 0)"},
-    }
-    menu = {
-        **{"type": "buttons", "direction": "left", "buttons": buttons, "showactive": False},
-        **{"x": 0.0, "xanchor": "left", "y": 0.0, "yanchor": "top", "pad": {"t": 40}},
-    }
-    axes = {}
-    for letter, *corners in zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True):
-        axes[f"{letter}axis"] = {"title": {"text": f"{letter} [{scene.unit}]"}, "range": corners}
+    slider = {"steps": steps, "x": 0.14, "len": 0.84, "y": 0.0, "pad": {"t": 30}, "ticklen": 0}
+    slider |= {"minorticklen": 0, "font": {"color": "rgba(0, 0, 0, 0)"}}
+    slider["currentvalue"] = {"font": {"size": 16, "color": "black"}, "xanchor": "left"}
+    menu = {"type": "buttons", "direction": "left", "buttons": buttons, "showactive": False}
+    menu |= {"x": 0.0, "xanchor": "left", "y": 0.0, "yanchor": "top", "pad": {"t": 40}}
     width = 1.0 if scene.error is None else 0.66
     sides = (scene.high - scene.low) / (scene.high - scene.low).max()
     up, around = np.radians(view)
-    eye = _FAR * np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    space = {
-        **axes,
-        **{"aspectmode": "manual", "aspectratio": dict(zip("xyz", sides.tolist(), strict=True))},
-        "domain": {"x": [0.0, width], "y": [0.0, 1.0]},
-        "camera": {
-            "eye": dict(zip("xyz", eye.tolist(), strict=True)),
-            "center": {"x": 0.0, "y": 0.0, "z": -0.05},
-        },
-    }
+    eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    space = {"aspectmode": "manual", "aspectratio": _point(sides), "domain": {"x": [0.0, width]}}
+    space["camera"] = {"eye": _point(_FAR * eye), "center": {"x": 0.0, "y": 0.0, "z": -0.05}}
+    for letter, *corners in zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True):
+        space[f"{letter}axis"] = {"title": {"text": f"{letter} [{scene.unit}]"}, "range": corners}
     layout = {
         **{"template": "plotly_white", "scene": space, "updatemenus": [menu], "sliders": [slider]},
         "margin": {"l": 20, "r": 20, "t": 20, "b": 110, "autoexpand": False},
@@ -134,6 +118,10 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
         layout["xaxis"] = {"domain": [width + 0.06, 1.0], "title": {"text": scene.when}}
         layout["yaxis"] = {**error, "domain": [0.15, 0.9]}
     return layout
+
+
+def _point(values: NDArray) -> dict[str, float]:
+    return dict(zip("xyz", values.tolist(), strict=True))
 
 
 def _xyz(points: NDArray, digits: int) -> dict[str, list[float | None]]:

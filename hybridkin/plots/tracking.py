@@ -253,7 +253,8 @@ class ActuatorDisplay:
         ActuatorDisplay
             Itself, drawn.
         """
-        n = len(self.actuators_per_segment)
+        shares, names = self.actuators_per_segment, self.names or ()
+        n = len(shares)
         scale = scale_of(unit, _ACTUATOR_UNITS) if per_unit is None else 1.0 / np.asarray(per_unit)
         if axes is None:
             size = (6.0, 1.0 + 1.6 * n)
@@ -262,26 +263,23 @@ class ActuatorDisplay:
         if len(axes) != n:
             raise ValueError(f"`axes` must hold {n} axes, got {len(axes)}.")
         steps, when = steps_of(self.t, len(next(iter(self.paths.values()))))
-        ends = np.cumsum(self.actuators_per_segment)
-        for k, ax in enumerate(axes):
-            part = slice(ends[k] - self.actuators_per_segment[k], ends[k])
+        parts = np.split(np.arange(sum(shares)), np.cumsum(shares)[:-1])
+        for k, (ax, own) in enumerate(zip(axes, parts, strict=True)):
+            colors = [COLORS[j % 8] if names else "black" for j in range(len(own))]
             for i, (name, q) in enumerate(self.paths.items()):
-                lines = ax.plot(steps, (scale * q)[:, part], **{**look_of(i), "linewidth": 1.2})
+                lines = ax.plot(steps, (scale * q)[:, own], **{**look_of(i), "linewidth": 1.2})
                 lines[0].set_label(name)
-                for j, line in enumerate(lines if self.names else ()):
-                    label = (self.names or ())[part][j] if i == 0 else line.get_label()
-                    line.set(color=COLORS[j % 8], linestyle="-:"[i % 2], label=label)
+                for j, line in enumerate(lines if names else ()):
+                    label = names[own[j]] if i == 0 else line.get_label()
+                    line.set(color=colors[j], linestyle="-:"[i % 2], label=label)
             if self.limits is not None:
-                values = (scale * self.limits)[:, part]
-                colors = (
-                    [COLORS[j % 8] for j in range(values.shape[1])] if self.names else ["black"]
-                )
                 look = {"colors": 2 * colors, "linestyles": "dashed", "linewidth": 0.8}
-                ax.hlines(values.ravel(), steps[0], steps[-1], label="limits", **look)
+                values = (scale * self.limits)[:, own].ravel()
+                ax.hlines(values, steps[0], steps[-1], label="limits", **look)
             ax.set(ylabel=f"segment {k + 1} [{unit}]")
         beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-        look = beside if self.names else {"ncols": len(self.paths)}
-        for ax in axes if self.names else axes[:1]:
+        look = beside if names else {"ncols": len(self.paths)}
+        for ax in axes if names else axes[:1]:
             ax.legend(frameon=False, fontsize="small", **look)
         axes[-1].set(xlabel=when)
         self.axes_, self.figure_ = axes, axes[0].figure
