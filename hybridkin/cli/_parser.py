@@ -62,10 +62,16 @@ class _Parser(argparse.ArgumentParser):
     """Errors in the form of all others of the command line."""
 
     def error(self, message: str) -> NoReturn:
-        message = f"{message}; see `{self.prog} --help`"
-        if "--json" in sys.argv:
-            print(json.dumps({"error": message, "exit_code": 2}, indent=2))
-        self.exit(2, f"hybridkin: error: {message}\n")
+        message = f"error: {message}; see `{self.prog} --help`"
+        raise SystemExit(failed(message, 2, "--json" in sys.argv))
+
+
+def failed(message: str, code: int, as_json: bool) -> int:
+    """Print why a command failed, with --json also as a document, and return the exit code."""
+    print(f"hybridkin: {message}", file=sys.stderr)
+    if as_json:
+        print(json.dumps({"error": message.removeprefix("error: "), "exit_code": code}, indent=2))
+    return code
 
 
 def _paper(command: argparse.ArgumentParser) -> None:
@@ -130,9 +136,9 @@ def _fit(command: argparse.ArgumentParser) -> None:
     radius = "estimate an error radius that covers this share of tips, such as 0.9; slow"
     add("--coverage", type=_share, help=radius)
     folds = partial(_count, least=2)
-    add("--folds", type=folds, default=5, help="parts to hold out in turn (5)")
+    add("--folds", type=folds, default=5, dest="n_folds", help="parts to hold out in turn (5)")
     fast = "leave out the hybrid that chooses for itself: fast"
-    add("--no-auto", action="store_true", help=fast)
+    add("--no-auto", action="store_false", dest="auto", help=fast)
     add(
         "--play",
         type=_play,
@@ -248,8 +254,9 @@ def _describe(command: argparse.ArgumentParser) -> None:
 
 
 def _add_work(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--seeds", type=_count, default=5, help="random networks (5)")
-    command.add_argument("--jobs", type=int, default=-1, help="processes; -1: all cores (-1)")
+    add = command.add_argument
+    add("--seeds", type=_count, default=5, dest="n_seeds", help="random networks (5)")
+    add("--jobs", type=int, default=-1, help="processes; -1: all cores (-1)")
 
 
 def _add_model(

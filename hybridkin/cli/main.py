@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import re
 import sys
@@ -20,7 +19,7 @@ from tqdm import tqdm
 
 import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin._core.units import METRES
-from hybridkin.cli._parser import parser
+from hybridkin.cli._parser import failed, parser
 
 if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
@@ -49,9 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.showwarning = bars.warn
             outcome = _RUN[arguments.command](arguments, bars)
     except KeyboardInterrupt:
-        return _failed("interrupted; nothing was written", 130, arguments.json)
+        return failed("interrupted; nothing was written", 130, arguments.json)
     except (*_OF_INPUT, hybridkin.simulation.NotSettledError) as error:
-        return _failed(f"error: {error}", 2, arguments.json)
+        return failed(f"error: {error}", 2, arguments.json)
     written = "\n  ".join(["\n\nWrote", *map(str, outcome.paths)]) if outcome.paths else ""
     text = outcome.text + written
     if arguments.json:
@@ -62,14 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, `head` for example, has what it wants
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
     return outcome.code
-
-
-def _failed(message: str, code: int, as_json: bool) -> int:
-    """Print why a command failed, with --json also as a document, and return the exit code."""
-    print(f"hybridkin: {message}", file=sys.stderr)
-    if as_json:
-        print(json.dumps({"error": message.removeprefix("error: "), "exit_code": code}, indent=2))
-    return code
 
 
 class _Bars:
@@ -110,7 +101,7 @@ def _paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     report, paths = hybridkin.paper.run_paper(
         arguments.out,
         n_splits=arguments.splits,
-        n_seeds=arguments.seeds,
+        n_seeds=arguments.n_seeds,
         n_points=arguments.points,
         n_jobs=arguments.jobs,
         progress=bars,
@@ -122,12 +113,9 @@ def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
     play = arguments.play
+    names = ("loss", "coverage", "n_folds", "n_seeds", "auto")
     settings = hybridkin.workflow.FitSettings(
-        loss=arguments.loss,
-        coverage=arguments.coverage,
-        n_folds=arguments.folds,
-        n_seeds=arguments.seeds,
-        auto=not arguments.no_auto,
+        **{name: vars(arguments)[name] for name in names},
         play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
     )

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
+from hybridkin._core.arrays import real_array
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.robots import Limits, LogFormat
@@ -80,13 +80,13 @@ def geometry(chain: Chain) -> dict[str, Any]:
         "segments", each with radius, length and offset [m], angles and rest bend [deg] and, of
         elastic tendons, stiffnesses.
     """
-    pose = _numbers(chain.base)
+    pose = real_array(chain.base, "base")
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec(degrees=True)
     base = {"position": pose[:3, 3], "rotation_vector_deg": turn}
     found: dict[str, Any] = {"kind": type(chain).__name__, "base": base}
     if not isinstance(chain, ArcChain):
         return found
-    parts = {name: _numbers(value) for name, value in chain.geometry().items()}
+    parts = {name: real_array(value, name) for name, value in chain.geometry().items()}
     angles = np.split(np.degrees(parts["angles"]), np.cumsum(chain.actuators_per_segment)[:-1])
     columns = {
         "radius": parts["radii"],
@@ -101,10 +101,6 @@ def geometry(chain: Chain) -> dict[str, Any]:
     rows = zip(*columns.values(), strict=True)
     segments = [dict(zip(columns, row, strict=True)) for row in rows]
     return {**found, "routing": chain.routing, "segments": segments}
-
-
-def _numbers(value: torch.Tensor) -> np.ndarray:
-    return value.detach().cpu().double().numpy()
 
 
 def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,7 +17,6 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.workflow.model import LoadedModel
 
 _WALKERS, _STEPS, _STEP = 256, 60, 0.12  # length of a step, as a share of the range
-Domain = tuple[NDArray, NDArray]  # commands (K, n) in it and their tips (K, 3) [m]
 _EASE = 0.5  # domain distance from which the posture turns back; 1 is the edge of the domain
 
 
@@ -92,97 +92,106 @@ def path_limits(
             f"in, got {low.tolist()} and {high.tolist()} m."
         )
     sources = {"robot description": described, "range of the fit": trained}
-    known = [words for words, limits in sources.items() if limits.q_min is not None]
-    asked_for = ["given"] if {"q_min", "q_max"} & {*asked} else []
-    if not {"q_min", "q_max"} <= {*asked}:
-        asked_for.append(", within the ".join(known))
-    return PathLimits(low, high, fast, " and ".join(asked_for))
+    known = (words for words, limits in sources.items() if limits.q_min is not None)
+    ends = len({"q_min", "q_max"} & {*asked})
+    parts = ["given"] * (ends > 0) + [", within the ".join(known)] * (ends < 2)
+    return PathLimits(low, high, fast, " and ".join(parts))
 
 
-def preferred(loaded: LoadedModel, limits: PathLimits) -> NDArray:
-    """Return a configuration (n,) in the domain of the model, within the limits.
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """Where a model may be steered: within limits, and near the rows that it was fitted to."""
 
-    It is the middle of the fit's range or, where that lies outside the domain, no tendon pulled;
-    without a fit the second, else the middle of the limits.
-    """
-    trained, chain = loaded.trained_range, loaded.chain
-    low, high = (vars(trained or limits)[name] for name in ("q_min", "q_max"))
-    candidates = [0.5 * (low + high) @ _bending_projector(loaded)]
-    if isinstance(chain, ArcChain) and chain.lengths is not None:
-        candidates.insert(0 if trained is None else 1, np.zeros(loaded.n_actuators))
-    q = np.clip(candidates, limits.q_min, limits.q_max)
-    with torch.no_grad():
-        distance = loaded.module.domain_distance(torch.from_numpy(q)).numpy()
-    return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
+    loaded: LoadedModel
+    limits: PathLimits
 
+    @cached_property
+    def preferred(self) -> NDArray:
+        """A configuration (n,) in the domain of the model, within the limits.
 
-def sample_domain(loaded: LoadedModel, limits: PathLimits) -> Domain:
-    """Return commands (K, n) from all over the domain, within the limits, and their tips (K, 3).
+        It is the middle of the fit's range or, where that lies outside the domain, no tendon
+        pulled; without a fit the second, else the middle of the limits.
+        """
+        trained, limits = self.loaded.trained_range, self.limits
+        low, high = (vars(trained or limits)[name] for name in ("q_min", "q_max"))
+        candidates = [0.5 * (low + high) @ self.bending]
+        if self.has_tendons:
+            candidates.insert(0 if trained is None else 1, np.zeros(self.loaded.n_actuators))
+        q = np.clip(candidates, limits.q_min, limits.q_max)
+        with torch.no_grad():
+            distance = self.loaded.module.domain_distance(torch.from_numpy(q)).numpy()
+        return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
 
-    The first is near the preferred one.
+    @property
+    def has_tendons(self) -> bool:
+        """Whether the robot is one of tendons, which none pulls at zero."""
+        return isinstance(self.loaded.chain, ArcChain) and self.loaded.chain.lengths is not None
 
-    Random walks from the preferred configuration that do not leave the domain: with many actuators
-    most of the box around the training rows lies outside it. On a plain tendon chain no tendon
-    pulls against the others. Without a learned part they are drawn from the limits.
-    """
-    low, high, rng = limits.q_min, limits.q_max, np.random.default_rng(0)
-    q = rng.uniform(low, high, (_WALKERS, loaded.n_actuators))
-    if loaded.hybrid is not None:
-        rest, bending = preferred(loaded, limits), _bending_projector(loaded)
-        q = np.tile(rest, (_WALKERS, 1))
-        for _ in range(_STEPS):
-            ahead = q + _STEP * (high - low) * rng.standard_normal(q.shape) @ bending
-            inside = loaded.module.in_domain(torch.from_numpy(ahead)).numpy()
-            inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
-            q[inside] = ahead[inside]
-        # Beside the preferred one, which may be exactly straight.
-        q[0] = rest + 0.01 * (high - low) * rng.standard_normal(len(rest)) @ bending
-    tips = loaded.tips(q)
-    finite = np.isfinite(tips).all(axis=1)
-    return q[finite], tips[finite]
+    @cached_property
+    def sample(self) -> tuple[NDArray, NDArray]:
+        """Commands (K, n) from all over the domain, and their tips (K, 3) [m].
 
+        The first is near the preferred one.
 
-def _bending_projector(loaded: LoadedModel) -> NDArray:
-    """Return the projector (n, n) on what bends a plain tendon chain; of others the identity.
+        Random walks from the preferred configuration that do not leave the domain: with many
+        actuators most of the box around the training rows lies outside it. On a plain tendon chain
+        no tendon pulls against the others. Without a learned part they are drawn from the limits.
+        """
+        low, high, rng = self.limits.q_min, self.limits.q_max, np.random.default_rng(0)
+        q = rng.uniform(low, high, (_WALKERS, len(low)))
+        if self.loaded.hybrid is not None:
+            q[:] = self.preferred
+            for _ in range(_STEPS):
+                ahead = q + _STEP * (high - low) * rng.standard_normal(q.shape) @ self.bending
+                inside = self.loaded.module.in_domain(torch.from_numpy(ahead)).numpy()
+                inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
+                q[inside] = ahead[inside]
+            # Beside the preferred one, which may be exactly straight.
+            near = 0.01 * (high - low) * rng.standard_normal(len(low)) @ self.bending
+            q[0] = self.preferred + near
+        tips = self.loaded.tips(q)
+        finite = np.isfinite(tips).all(axis=1)
+        return q[finite], tips[finite]
 
-    The bendings of such a chain are linear in q, and blind to what its tendons pull against each
-    other.
-    """
-    chain = loaded.chain
-    if not isinstance(chain, ConstantCurvatureChain) or chain.lengths is None:
-        return np.eye(loaded.n_actuators)
-    zero = torch.from_numpy(np.zeros(chain.n_actuators))
-    slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
-    return (torch.linalg.pinv(slopes) @ slopes).numpy()
+    @cached_property
+    def bending(self) -> NDArray:
+        """The projector (n, n) on what bends a plain tendon chain; of others the identity.
 
+        The bendings of such a chain are linear in q, and blind to what its tendons pull against
+        each other.
+        """
+        chain = self.loaded.chain
+        if not isinstance(chain, ConstantCurvatureChain) or chain.lengths is None:
+            return np.eye(self.loaded.n_actuators)
+        zero = torch.from_numpy(np.zeros(chain.n_actuators))
+        slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
+        return (torch.linalg.pinv(slopes) @ slopes).numpy()
 
-def preferred_posture(
-    loaded: LoadedModel, limits: PathLimits, pull: float
-) -> Callable[[Tensor], Tensor] | NDArray:
-    """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.
+    def posture(self, pull: float) -> Callable[[Tensor], Tensor] | NDArray:
+        """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.
 
-    Half way to the edge of the domain it begins to turn back, down the domain distance of q, and it
-    is drawn to the `preferred` configuration, a share `pull` of the way; it is that configuration
-    where nothing guards the domain.
-    """
-    rest = preferred(loaded, limits)
-    if loaded.hybrid is None or loaded.hybrid.guard is None:
-        return rest
-    home, squares = torch.from_numpy(rest), torch.from_numpy((limits.q_max - limits.q_min) ** 2)
-    bending, module = torch.from_numpy(_bending_projector(loaded)), loaded.module
+        Half way to the edge of the domain it begins to turn back, down the domain distance of q,
+        and it is drawn to the `preferred` configuration, a share `pull` of the way; it is that
+        configuration where nothing guards the domain.
+        """
+        hybrid, module, limits = self.loaded.hybrid, self.loaded.module, self.limits
+        if hybrid is None or hybrid.guard is None:
+            return self.preferred
+        home, bending = torch.from_numpy(self.preferred), torch.from_numpy(self.bending)
+        squares = torch.from_numpy((limits.q_max - limits.q_min) ** 2)
 
-    def posture(q: Tensor) -> Tensor:
-        rows = q.detach().reshape(-1, q.shape[-1])
-        with torch.enable_grad():
-            leaf = rows.clone().requires_grad_()
-            value = module.domain_distance(leaf)
-            (slope,) = torch.autograd.grad(value.sum(), leaf)
-        # Newton's step to the distance _EASE, in units of the range of every actuator.
-        downhill = squares.to(slope) * slope
-        steepness = (slope * downhill).sum(-1, keepdim=True)
-        over = (value.detach() - _EASE).clamp(min=0.0)[:, None]
-        step = over * downhill / steepness.clamp(min=torch.finfo(q.dtype).tiny)
-        step = step @ bending.to(step)
-        return (rows - step + pull * (home.to(rows) - rows)).reshape(q.shape)
+        def posture(q: Tensor) -> Tensor:
+            rows = q.detach().reshape(-1, q.shape[-1])
+            with torch.enable_grad():
+                leaf = rows.clone().requires_grad_()
+                value = module.domain_distance(leaf)
+                (slope,) = torch.autograd.grad(value.sum(), leaf)
+            # Newton's step to the distance _EASE, in units of the range of every actuator.
+            downhill = squares.to(slope) * slope
+            steepness = (slope * downhill).sum(-1, keepdim=True)
+            over = (value.detach() - _EASE).clamp(min=0.0)[:, None]
+            step = over * downhill / steepness.clamp(min=torch.finfo(q.dtype).tiny)
+            step = step @ bending.to(step)
+            return (rows - step + pull * (home.to(rows) - rows)).reshape(q.shape)
 
-    return posture
+        return posture

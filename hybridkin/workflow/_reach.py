@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.workflow._domain import Domain, PathLimits, preferred
-from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow._domain import Domain
 from hybridkin.workflow.path import scaled_path
 from hybridkin.workflow.report import Progress, in_millimetres
 
@@ -20,16 +19,10 @@ _OTHER_UNIT = 100.0  # a path so many times larger than the workspace is in anot
 
 
 def check_reach(
-    loaded: LoadedModel,
-    path: Trajectory,
-    limits: PathLimits,
-    domain: Domain,
-    tol: float,
-    force: bool,
-    progress: Progress,
+    domain: Domain, path: Trajectory, tol: float, force: bool, progress: Progress
 ) -> None:
     """Raise where a path is in another unit or, unless `force` is set, leaves the robot's reach."""
-    tips = domain[1]
+    loaded, limits, (commands, tips) = domain.loaded, domain.limits, domain.sample
     far, reach = (float(np.linalg.norm(x, axis=1).max()) for x in (path.x, tips))
     if far > _OTHER_UNIT * reach:
         raise ValueError(
@@ -39,19 +32,19 @@ def check_reach(
     if force:
         return
     # Starts from all of the box as well: many of its corners lie outside the domain.
-    shares = np.random.default_rng(0).uniform(size=(_BOX, len(limits.q_min)))
+    low, high = limits.q_min, limits.q_max
+    shares = np.random.default_rng(0).uniform(size=(_BOX, len(low)))
     shares[::2] = shares[::2].round()
-    box = limits.q_min + shares * (limits.q_max - limits.q_min)
-    reached = loaded.tips(box)
-    home = preferred(loaded, limits)
-    ik = InverseKinematics(loaded.module, q_min=limits.q_min, q_max=limits.q_max, q_pref=home)
+    box = low + shares * (high - low)
+    sources = ((commands, tips), (box, loaded.tips(box)))
+    ik = InverseKinematics(loaded.module, q_min=low, q_max=high, q_pref=domain.preferred)
     ends = [f(column) for column in path.x.T for f in (np.argmin, np.argmax)]
     rows = np.unique([*np.linspace(0, len(path) - 1, _POINTS).astype(int), *ends])
 
     def missed_by(scale: float, rows: NDArray) -> NDArray:
         progress("checking the reach", 0, 1)
         x = scaled_path(path, scale).x[rows]
-        starts = np.concatenate([q[_nearest(x, p)] for q, p in (domain, (box, reached))], axis=1)
+        starts = np.concatenate([q[_nearest(x, p)] for q, p in sources], axis=1)
         targets = np.repeat(x[:, None], starts.shape[1], axis=1)
         error = ik.solve(targets, q0=starts, tol=tol, max_iter=100).error.min(axis=1)
         return np.where(error <= tol, 0.0, error)
@@ -61,8 +54,8 @@ def check_reach(
     if len(far_out) == 0:
         return
     worst = path.x[rows[missed.argmax()]]
-    low, high, point = map(in_millimetres, (tips.min(axis=0), tips.max(axis=0), worst))
-    way_out = f"its centre is out of reach too: tips go from {low} to {high}, check --unit"
+    ends = " to ".join(map(in_millimetres, (tips.min(axis=0), tips.max(axis=0))))
+    way_out = f"its centre is out of reach too: tips go from {ends}, check --unit"
     if not missed_by(0.0, far_out[:1]).any():
         scale = 0.0
         for step in 0.5 ** np.arange(1, _HALVINGS + 1):
@@ -71,7 +64,7 @@ def check_reach(
         way_out = f"about its centre {scale:.2g} of its size can be reached: --scale {scale:.2g}"
     raise ValueError(
         f"`path` leaves the reach of the robot within its limits ({limits.source}): "
-        f"{len(far_out)} of {len(rows)} points tried are out of reach, {point} by "
+        f"{len(far_out)} of {len(rows)} points tried are out of reach, {in_millimetres(worst)} by "
         f"{1e3 * missed.max():.3g} mm; {way_out}. To go as near as the tip can: --force."
     )
 

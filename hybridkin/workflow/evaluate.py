@@ -95,7 +95,7 @@ def evaluate_log(
     _write_errors(report)
     if out is None:
         return report, []
-    _add_figures(report, loaded, measured, predicted, errors, motion)
+    _add_figures(report, loaded, measured, predicted, motion)
     return report, report.write(out)
 
 
@@ -126,13 +126,9 @@ def _write_errors(report: Report) -> None:
 
 
 def _add_figures(
-    report: Report,
-    loaded: LoadedModel,
-    log: MeasuredLog,
-    predicted: NDArray,
-    errors: NDArray,
-    motion: NDArray,
+    report: Report, loaded: LoadedModel, log: MeasuredLog, predicted: NDArray, motion: NDArray
 ) -> None:
+    errors = distance(predicted, log.x)
     figure, ax = new_figure(6.0, 3.6)
     ErrorHistogramDisplay({loaded.name: errors}).plot(ax, unit="mm")
     ax.set(ylabel="rows")

@@ -273,7 +273,10 @@ def fit_log(
     saved = min(errors, key=lambda name: (errors[name], name))
     progress(f"fitting {saved} to all motions", 0, 1)
     mechanical = rows.mechanical() if result is None else result.chain
-    model = _fit_saved(saved, rows, mechanical)
+    # The linear model of a robot without segments is what stands for its mechanical one.
+    model = _models(CALIBRATED if saved == _DATA_LINEAR else saved, rows, mechanical)[0]
+    model.set_params(coverage=settings.coverage)
+    model.fit_with_messages(rows.q, rows.x, groups=rows.groups)
     progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
     report.record.update(
@@ -317,15 +320,6 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
             )
         log.check_order("`play`")
     log.check(force)
-
-
-def _fit_saved(saved: str, rows: _Rows, mechanical: ForwardModel) -> HybridForwardModel:
-    """Return the model to save, fitted to all rows."""
-    # The linear model of a robot without segments is what stands for its mechanical one.
-    model = _models(CALIBRATED if saved == _DATA_LINEAR else saved, rows, mechanical)[0]
-    model.set_params(coverage=rows.settings.coverage)
-    model.fit_with_messages(rows.q, rows.x, groups=rows.groups)
-    return model
 
 
 def _write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:

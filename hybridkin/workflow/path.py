@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from hybridkin.ik import trajectories
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.workflow._domain import PathLimits, sample_domain
+from hybridkin.workflow._domain import Domain, PathLimits
 from hybridkin.workflow.model import LoadedModel
 
 
@@ -129,7 +129,7 @@ def shape_path(
         raise ValueError(f"--size must be {n_sizes} numbers for a {shape}, got {len(size)}.")
     if center is None:
         # The tip nearest to the mean of all tips in the domain: some robots reach only a surface.
-        tips = sample_domain(loaded, limits)[1]
+        tips = Domain(loaded, limits).sample[1]
         center = tips[np.linalg.norm(tips - tips.mean(axis=0), axis=1).argmin()]
     if normal is None:
         normal = (0.0, 0.0, 1.0) if loaded.chain is None else loaded.chain.base[:3, 2].tolist()

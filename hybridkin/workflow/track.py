@@ -24,14 +24,7 @@ from hybridkin.ik.results import IKStatus, Track
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.plots import ActuatorDisplay, TrackAnimation, TrackingDisplay, new_figure
-from hybridkin.workflow._domain import (
-    Domain,
-    PathLimits,
-    path_limits,
-    preferred,
-    preferred_posture,
-    sample_domain,
-)
+from hybridkin.workflow._domain import Domain, PathLimits, path_limits
 from hybridkin.workflow._reach import check_reach
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, millimetres, quiet
@@ -106,12 +99,12 @@ def track_path(
     check_out(out)
     log_format = loaded.log_format()
     limits = path_limits(loaded) if limits is None else limits
-    stands = _start(loaded, limits, start)
-    domain = sample_domain(loaded, limits)
-    check_reach(loaded, path, limits, domain, tol, force, progress)
-    track = _best_track(loaded, path, limits, domain, tol, progress)
+    domain = Domain(loaded, limits)
+    stands = _start(domain, start)
+    check_reach(domain, path, tol, force, progress)
+    track = _best_track(domain, path, tol, progress)
     names = [IKStatus(int(code)).name for code in track.status]
-    whole, n_lead = _with_lead_in(track, stands, limits, loaded)
+    whole, n_lead = _with_lead_in(track, stands, domain)
     sent = whole.q if loaded.play is None else loaded.play.command(whole.q)[0]
     speeds = np.abs(np.diff(whole.q, axis=0) / np.diff(whole.t)[:, None])
     inside = loaded.module.in_domain(torch.from_numpy(track.q)).double().mean()
@@ -140,15 +133,14 @@ def track_path(
     return report, report.write(out)
 
 
-def _start(loaded: LoadedModel, limits: PathLimits, start: ArrayLike | str) -> NDArray | None:
+def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
     """Return where the actuators stand before the path (n,), None: at its first command."""
-    low, high, chain = limits.q_min, limits.q_max, loaded.chain
+    low, high = domain.limits.q_min, domain.limits.q_max
     if isinstance(start, str):
         if start not in ("rest", "path"):
             raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
-        has_tendons = isinstance(chain, ArcChain) and chain.lengths is not None
-        zero = has_tendons or ((low <= 0) & (high >= 0)).all()
-        rest = np.zeros(len(low)) if zero else preferred(loaded, limits)
+        zero = domain.has_tendons or ((low <= 0) & (high >= 0)).all()
+        rest = np.zeros(len(low)) if zero else domain.preferred
         return rest if start == "rest" else None
     q, span = np.array(start, dtype=float), high - low
     if q.shape != low.shape or (np.abs(q - 0.5 * (low + high)) > 1.5 * span).any():
@@ -159,36 +151,28 @@ def _start(loaded: LoadedModel, limits: PathLimits, start: ArrayLike | str) -> N
     return q
 
 
-def _with_lead_in(
-    track: Track, start: NDArray | None, limits: PathLimits, loaded: LoadedModel
-) -> tuple[Track, int]:
+def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[Track, int]:
     """Return a track that begins at `start`, and how many rows lead from there to the path.
 
     They begin and end at rest; their targets are the tips of the model.
     """
+    limits = domain.limits
     way = np.zeros_like(track.q[0]) if start is None else track.q[0] - start
     dt = float(track.t[1] - track.t[0]) if len(track.t) > 1 else _DT
     widest = max((limits.q_max - limits.q_min).max(), np.abs(way).max())
     speed = _SLOW * widest if limits.dq_max is None else limits.dq_max
     n = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
     q = track.q[0] - (1.0 - trajectories.min_jerk(np.arange(n) / max(n, 1)))[:, None] * way
-    x = loaded.tips(q)
+    x = domain.loaded.tips(q)
     before = {"q": q, "x": x, "target": x, "error": np.zeros(n)}
     rows = {name: np.concatenate([rows, vars(track)[name]]) for name, rows in before.items()}
     t = np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt])
     return replace(track, t=t, **rows), n
 
 
-def _best_track(
-    loaded: LoadedModel,
-    path: Trajectory,
-    limits: PathLimits,
-    domain: Domain,
-    tol: float,
-    progress: Progress,
-) -> Track:
+def _best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress) -> Track:
     """Return of several attempts the track that reaches most points within the domain."""
-    commands, tips = domain
+    limits, (commands, tips) = domain.limits, domain.sample
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     every = max(1, math.ceil(way / (_STEP * extent)))
@@ -197,8 +181,8 @@ def _best_track(
     bounds: Any = {name: vars(limits)[name] for name in ("q_min", "q_max", "dq_max")}
     tracks: list[Track] = []
     for attempt, pull in enumerate(_PULLS):
-        posture = preferred_posture(loaded, limits, pull)
-        ik = InverseKinematics(loaded.module, **bounds, q_pref=posture, beta=min(1, 1 / dt), dt=dt)
+        options = {"q_pref": domain.posture(pull), "beta": min(1.0, 1.0 / dt), "dt": dt}
+        ik = InverseKinematics(domain.loaded.module, **bounds, **options)
 
         def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
             progress(what, done + 1, total)

@@ -22,7 +22,7 @@ from hybridkin import (
 )
 from hybridkin.cli.main import main
 from hybridkin.saving.saved_model import model_header
-from hybridkin.workflow._domain import sample_domain
+from hybridkin.workflow._domain import Domain
 from hybridkin.workflow.report import geometry_entries, statistics
 
 ROBOT = """
@@ -328,7 +328,7 @@ def test_an_actuator_that_never_moved_is_held_where_it_was():
     assert limits.q_min == pytest.approx(q.min(axis=0))
     assert limits.q_max == pytest.approx(q.max(axis=0))
     assert limits.source == "range of the fit"
-    assert model.module_.in_domain(torch.from_numpy(sample_domain(loaded, limits)[0])).all()
+    assert model.module_.in_domain(torch.from_numpy(Domain(loaded, limits).sample[0])).all()
 
 
 @pytest.mark.slow
