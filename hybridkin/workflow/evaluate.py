@@ -79,8 +79,8 @@ def evaluate_log(
             report.record["radius"] = radius_entry(loaded.hybrid)
     motions = {name: measured.motions == name for name in dict.fromkeys(measured.motions)}
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
-    parts = {} if fitted is None else {"new": ~fitted, "fitted": fitted}
-    parts = {name: _entry(columns, rows) for name, rows in parts.items() if rows.any()}
+    some = {} if fitted is None else {"new": ~fitted, "fitted": fitted}
+    parts = {name: _entry(columns, rows) for name, rows in some.items() if rows.any()}
     report.record.update(
         model=str(loaded.path),
         log=log.source,

@@ -348,20 +348,16 @@ def _add_model(
 @threadpool_limits.wrap(limits=1)  # the processes share the cores already
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors on test rows of every model fitted to training rows, and the choices."""
-    chain = train.robot.chain
     names = _MODELS if train.settings.auto else _MODELS[:-1]
+    if train.robot.chain is None:
+        names = [name for name in names if name not in _OF_CHAINS]
     mechanical = train.mechanical()
-    models = {
-        name: _models(name, train, mechanical)
-        for name in names
-        if chain is not None or name not in _OF_CHAINS
-    }
+    models = {name: _models(name, train, mechanical) for name in names}
     errors = {
         name: np.mean([_held_out(model, train, test) for model in some], axis=0)
         for name, some in models.items()
     }
-    choosing = (name for name in (_DATA_ELM, ELM, AUTO) if name in models)
-    return errors, {name: _chosen(models[name][0]) for name in choosing}
+    return errors, {n: _chosen(models[n][0]) for n in (_DATA_ELM, ELM, AUTO) if n in models}
 
 
 def _models(name: str, rows: _Rows, mechanical: ForwardModel) -> list[HybridForwardModel]:

@@ -127,7 +127,7 @@ def track_path(
     _write_summary(report)
     _add_path(report, track)
     shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
-    _add_commands(report, loaded, whole.t, shown, limits)
+    _add_commands(report, domain, whole.t, shown)
     statuses = [*["LEAD_IN"] * n_lead, *names]
     report.file("track.csv", partial(_write_track, whole, shown, statuses, log_format))
     return report, report.write(out)
@@ -172,13 +172,13 @@ def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[
 
 def _best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress) -> Track:
     """Return of several attempts the track that reaches most points within the domain."""
-    limits, (commands, tips) = domain.limits, domain.sample
+    commands, tips = domain.sample
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     every = max(1, math.ceil(way / (_STEP * extent)))
     fine = _in_steps(path, every)
     dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
-    bounds: Any = {name: vars(limits)[name] for name in ("q_min", "q_max", "dq_max")}
+    bounds: Any = {name: vars(domain.limits)[name] for name in ("q_min", "q_max", "dq_max")}
     tracks: list[Track] = []
     for attempt, pull in enumerate(_PULLS):
         options = {"q_pref": domain.posture(pull), "beta": min(1.0, 1.0 / dt), "dt": dt}
@@ -343,10 +343,9 @@ def _add_path(report: Report, track: Track) -> None:
     report.figure("track", figure, "Path, tip by the model, and its error.")
 
 
-def _add_commands(
-    report: Report, loaded: LoadedModel, t: NDArray, shown: dict[str, NDArray], limits: PathLimits
-) -> None:
+def _add_commands(report: Report, domain: Domain, t: NDArray, shown: dict[str, NDArray]) -> None:
     """Add the commands against the limits, in names, unit and sign of the robot's logs."""
+    loaded, limits = domain.loaded, domain.limits
     chain, log_format = loaded.chain, loaded.log_format()
     shares = chain.actuators_per_segment if isinstance(chain, ArcChain) else (loaded.n_actuators,)
     n = len(shares)
