@@ -11,7 +11,6 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -135,7 +134,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
     )
     radius = "estimate an error radius that covers this share of tips, such as 0.9; slow"
     add("--coverage", type=_share, help=radius)
-    folds = partial(_count, least=2)
+    folds, rows = _between(1, float("inf"), int), _between(-1, float("inf"), int)
     add("--folds", type=folds, default=5, dest="n_folds", help="parts to hold out in turn (5)")
     fast = "leave out the hybrid that chooses for itself: fast"
     add("--no-auto", action="store_false", dest="auto", help=fast)
@@ -147,8 +146,8 @@ def _fit(command: argparse.ArgumentParser) -> None:
         "in the unit of q, or auto, found on held-out motions; the rows of a motion must be in the "
         "order of time (none)",
     )
-    rows, few = partial(_count, least=0), "of a longer log take every k-th row, N at most; 0: all"
-    add("--max-rows", type=rows, default=2000, metavar="N", help=f"{few} (2000)")
+    few = "of a longer log take every k-th row, N at most; 0: all (2000)"
+    add("--max-rows", type=rows, default=2000, metavar="N", help=few)
     _add_work(command)
 
 
@@ -285,13 +284,6 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     add("--force", action="store_true", help="go on in spite of errors in the log")
 
 
-def _count(text: str, least: int = 1) -> int:
-    value = int(text)
-    if value < least:
-        raise argparse.ArgumentTypeError(f"must be at least {least}, got {value}")
-    return value
-
-
 def _numbers(text: str) -> Sequence[float]:
     try:
         return tuple(float(part) for part in text.split(","))
@@ -316,15 +308,18 @@ def _play(text: str) -> float | str:
     return value
 
 
-def _between(low: float, high: float) -> Callable[[str], float]:
+def _between(low: float, high: float, kind: type = float) -> Callable[[str], Any]:
     """Return a type of options: a number between two others."""
 
-    def number(text: str) -> float:
-        if not low < float(text) < high:
-            raise argparse.ArgumentTypeError(f"must lie between {low:g} and {high:g}, got {text}")
-        return float(text)
+    def number(text: str) -> Any:
+        value = kind(text)
+        if not low < value < high:
+            need = f"must be more than {low:g} and less than {high:g}"
+            raise argparse.ArgumentTypeError(f"{need}, got {text}")
+        return value
 
     return number
 
 
 _positive, _share = _between(0.0, float("inf")), _between(0.0, 1.0)
+_count = _between(0, float("inf"), int)
