@@ -29,7 +29,6 @@ _REACH, _USUAL_REACH = 5.0, 0.7
 _BEND, _LONG = (0.02, 1.0, 15.0), (0.05, 3.0, 100.0)
 _SMALL_SHARE = 0.04  # of the way that the model predicts
 _FAR_BETTER, _GOOD = 0.6, 0.55  # of the motion missed: another reading's over the declared one's
-_SEARCHED = 0.1  # of the tip's motion missed: other orders are tried
 _ENOUGH = 0.75  # of the variance explained
 _TWIST, _TILT = 120.0, 45.0  # [deg] of a base that is turned about its axis, and upright
 _BENDS = (0.25, 0.4, 0.5, 0.65, 1.5, 2.0, 2.5, 4.0)  # factors on all bends that are tried
@@ -121,7 +120,11 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         length = sum(part.mean() for part in np.split(q, robot.ends, axis=1))
         length /= 1.0 if low <= size / radius <= high else _factor(size / radius, usual)
     else:
-        size, radius, (low, usual, high) = float(np.abs(q).max()), radii.sum(), _BEND
+        # A tendon bends its own segment, with routing "base" all before it too.
+        spans = np.cumsum(radii) if robot.chain.routing == "base" else radii
+        pulls, spans = np.abs(q).max(axis=0), np.repeat(spans, robot.chain.actuators_per_segment)
+        size, radius = max(zip(pulls, spans, strict=True), key=lambda pair: pair[0] / pair[1])
+        low, usual, high = _BEND
     stroke, spread = size / radius, float(np.linalg.norm(np.ptp(log.x, axis=0)))
     reach = spread / (length + robot.offsets)
     small = stroke < low and (robot.extensible or reach > 0.1 or stroke < low / 4)
@@ -175,25 +178,24 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
     q, x = log.q[rows], log.x[rows]
     if len(rows) < 10 or not np.ptp(x, axis=0).any():
         return
-    missed = least = float(misses(chain, q[None], x, base_is_free)[0])
+    missed = float(misses(chain, q[None], x, base_is_free)[0])
     free, image = (float(misses(chain, q[None], x * [s, 1, 1], True)[0]) for s in (1.0, -1.0))
     compared = f"the nominal model explains {_share(missed)} of the tip's motion as declared, but "
-    good, turned, way = min(_FAR_BETTER * missed, _GOOD), min(free, image), None
-    if missed > _SEARCHED:
-        way, least = better_way(chain, q, x, base_is_free)
-        reread = float(misses(chain, way.of(q)[None], x, True)[0])
-        if not base_is_free and turned < min(good, _FAR_BETTER * reread):
-            how = "turned, and one of them mirrored" if image < free else "turned"
-            message = f"{compared}{_share(turned)} with the axes of the tip {how}."
-            yield LogFinding("axes", "warning", message, _ADVICE["axes"])
-            return
+    good, turned = min(_FAR_BETTER * missed, _GOOD), min(free, image)
+    way, least = better_way(chain, q, x, base_is_free)
+    reread = float(misses(chain, way.of(q)[None], x, True)[0])
+    if not base_is_free and turned < min(good, _FAR_BETTER * reread):
+        how = "turned, and one of them mirrored" if image < free else "turned"
+        message = f"{compared}{_share(turned)} with the axes of the tip {how}."
+        yield LogFinding("axes", "warning", message, _ADVICE["axes"])
+        return
     few = slice(None, None, -(-len(q) // _FEW))
     changed = robot.changed(q[few])
     scores = misses(chain, np.stack([*changed.values()]), x[few], True)
     kind, i, by = [*changed][int(np.argmax(scores < _SIMPLE * scores.min()))]
     share = float(scores.min() / misses(chain, q[few][None], x[few], True)[0])
     twist, tilt = base_turn(chain, q, x)
-    if way is not None and least < good and least < share * missed:
+    if least < good and least < share * missed:
         yield _way_finding(log, robot, way, f"{compared}{_share(least)} with ")
     elif base_is_free and not robot.extensible and abs(twist) > _TWIST and tilt < _TILT:
         message = (

@@ -12,8 +12,6 @@ from hybridkin.workflow.path import scaled_path
 from hybridkin.workflow.report import Progress, in_millimetres
 
 _POINTS = 13  # of the path, evenly in time; those furthest in every direction come in addition
-_STARTS = 12  # for every point, the commands whose tips are nearest to it
-_BOX = 2000  # commands within the limits
 _HALVINGS = 7
 _OTHER_UNIT = 100.0  # a path so many times larger than the workspace is in another unit
 
@@ -31,12 +29,7 @@ def check_reach(
         )
     if force:
         return
-    # Starts from all of the box as well: many of its corners lie outside the domain.
     low, high = limits.q_min, limits.q_max
-    shares = np.random.default_rng(0).uniform(size=(_BOX, len(low)))
-    shares[::2] = shares[::2].round()
-    box = low + shares * (high - low)
-    sources = ((commands, tips), (box, loaded.tips(box)))
     ik = InverseKinematics(loaded.module, q_min=low, q_max=high, q_pref=domain.preferred)
     ends = [f(column) for column in path.x.T for f in (np.argmin, np.argmax)]
     rows = np.unique([*np.linspace(0, len(path) - 1, _POINTS).astype(int), *ends])
@@ -44,9 +37,8 @@ def check_reach(
     def missed_by(scale: float, rows: NDArray) -> NDArray:
         progress("checking the reach", 0, 1)
         x = scaled_path(path, scale).x[rows]
-        starts = np.concatenate([q[_nearest(x, p)] for q, p in sources], axis=1)
-        targets = np.repeat(x[:, None], starts.shape[1], axis=1)
-        error = ik.solve(targets, q0=starts, tol=tol, max_iter=100).error.min(axis=1)
+        nearest = np.linalg.norm(tips - x[:, None], axis=2).argmin(axis=1)
+        error = ik.solve(x, q0=commands[nearest], tol=tol, max_iter=100).error
         return np.where(error <= tol, 0.0, error)
 
     missed = missed_by(1.0, rows)
@@ -67,8 +59,3 @@ def check_reach(
         f"{len(far_out)} of {len(rows)} points tried are out of reach, {in_millimetres(worst)} by "
         f"{1e3 * missed.max():.3g} mm; {way_out}. To go as near as the tip can: --force."
     )
-
-
-def _nearest(x: NDArray, tips: NDArray) -> NDArray:
-    """Return for each of the points x (N, 3) which of the tips are nearest (N, _STARTS)."""
-    return np.linalg.norm(tips - x[:, None], axis=2).argsort(axis=1)[:, :_STARTS]
