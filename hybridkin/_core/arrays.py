@@ -71,6 +71,37 @@ def number(value: Any, name: str) -> float:
     return float(found)
 
 
+def check_shape(
+    value: NDArray | Tensor, name: str, need: Sequence[int | str], why: str = ""
+) -> None:
+    """Raise where the shape differs from `need`.
+
+    There digits are lengths, letters any length, and "..." in front any axes.
+    """
+    got, sizes = tuple(value.shape), [str(size) for size in need if size != "..."]
+    axes = got[-len(sizes) :] if len(sizes) < len(need) else got
+    fits = len(axes) == len(sizes)
+    if not fits or any(a.isdigit() and int(a) != n for a, n in zip(sizes, axes, strict=True)):
+        shape = ", ".join(map(str, need)) + "," * (len(need) == 1)
+        raise ValueError(f"`{name}` must have shape ({shape}), got {got}{why and '; '}{why}.")
+
+
+def shaped(
+    value: Numbers | Transform,
+    name: str,
+    need: Sequence[int | str],
+    length: int | None = None,
+    why: str = "",
+) -> NDArray[np.float64]:
+    """Return numbers of a checked shape, see `check_shape`, as a float64 array of their own.
+
+    `length` stands for the first letter. NaN is allowed.
+    """
+    array = np.array(real_array(value, name), dtype=float)
+    check_shape(array, name, need if length is None else (length, *need[1:]), why)
+    return array
+
+
 def table(value: Any, name: str) -> Any:
     """Return rows as scikit-learn takes them: a data frame of X as it is, else an array."""
     if value is None or isinstance(value, Real):
@@ -82,9 +113,7 @@ def table(value: Any, name: str) -> Any:
 def labels(groups: Any, n_rows: int) -> NDArray:
     """Return the motion of every row, shape (N,)."""
     found = groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
-    if found.shape != (n_rows,):
-        need = f"must have shape ({n_rows},), one entry for each row"
-        raise ValueError(f"`groups` {need} of the log, got {found.shape}.")
+    check_shape(found, "groups", [n_rows], "one entry for each row of the log")
     return found.astype(str) if found.dtype == object else found
 
 

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from hybridkin._core.arrays import check_shape
+
 
 def in_blocks(
     function: Callable[[Tensor], tuple[Tensor, ...]], q: Tensor, size: int = 4096
@@ -50,7 +52,4 @@ def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:
 def check_vectors(value: Tensor, size: int, name: str, why: str) -> None:
     """Raise where `value` is not a dense floating tensor of shape (..., size)."""
     check_tensor(value, name, size)
-    if value.ndim == 0 or value.shape[-1] != size:
-        raise ValueError(
-            f"`{name}` must have shape (..., {size}), got {tuple(value.shape)}; {why}."
-        )
+    check_shape(value, name, ("...", size), why)

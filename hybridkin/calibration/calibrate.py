@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor, labels
+from hybridkin._core.arrays import Numbers, as_tensor, check_shape, labels
 from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
@@ -412,14 +412,10 @@ def _check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, l
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q, x = as_tensor(q, "q").to("cpu", dtype), as_tensor(x, "x").to("cpu", dtype)
-    if q.ndim != 2 or not len(q):
-        need = "must have shape (N, n_actuators) and hold at least one row"
-        raise ValueError(f"`q` {need}, got shape {tuple(q.shape)}.")
-    if x.shape != (len(q), 3):
-        raise ValueError(
-            f"`x` must have shape ({len(q)}, 3), one tip position per row of `q`, got "
-            f"{tuple(x.shape)}."
-        )
+    check_shape(q, "q", ("N", "n_actuators"))
+    check_shape(x, "x", (len(q), 3), "one tip position per row of `q`")
+    if len(q) == 0:
+        raise ValueError("`q` must hold at least one row, got none.")
     messages = chain.check_actuators(q)
     check_finite(x=x)
     return q, x, [*messages, motion_message("x", x, chain(q), float(chain.reach.detach()))]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hybridkin._core import arrays
 from hybridkin._core.arrays import Numbers, Transform, real_array
 
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
@@ -26,7 +27,7 @@ def float_dtype(dtype: Any) -> torch.dtype:
 
 def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
     """Return one positive length per segment, shape (S,)."""
-    lengths = shaped(value, name, (size,), dtype)
+    lengths = shaped(value, name, "S", size, dtype)
     if not len(lengths) or not (lengths > 0).all():
         raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
     return lengths
@@ -64,18 +65,14 @@ def numeric(
 def shaped(
     value: Numbers,
     name: str,
-    shape: tuple[int | None, ...],
+    need: str,
+    length: int | None = None,
     dtype: torch.dtype = torch.float64,
     *,
     finite: bool = True,
 ) -> Tensor:
-    """Return an array as a tensor of the given shape; None is any length."""
-    tensor = numeric(value, name, dtype, finite=finite)
-    pairs = zip(tensor.shape, shape, strict=False)
-    if tensor.ndim != len(shape) or any(need not in (None, size) for size, need in pairs):
-        need = str(shape).replace("None", "n")
-        raise ValueError(f"`{name}` must have shape {need}, got {tuple(tensor.shape)}.")
-    return tensor
+    """Return an array as a tensor of a checked shape, see `arrays.shaped`."""
+    return numeric(arrays.shaped(value, name, need, length), name, dtype, finite=finite)
 
 
 def actuator_counts(

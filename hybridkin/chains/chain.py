@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import check_shape
 from hybridkin._core.blocks import check_tensor, check_vectors
 from hybridkin._core.model import PoseModel
 from hybridkin._core.units import span_message
@@ -71,9 +72,7 @@ class Chain(PoseModel):
                     f"`{name}` is not part of this chain's geometry; it has {sorted(current)}."
                 )
             check_tensor(value, name)
-            shape = tuple(current[name].shape)
-            if value.shape != shape:
-                raise ValueError(f"`{name}` must have shape {shape}, got {tuple(value.shape)}.")
+            check_shape(value, name, current[name].shape)
         chain = type(self).__new__(type(self))
         nn.Module.__init__(chain)
         chain.__dict__.update({name: self.__dict__[name] for name in self._structure})

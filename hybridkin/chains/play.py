@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from hybridkin._core.arrays import as_tensor, labels, real_array
+from hybridkin._core.arrays import as_tensor, check_shape, labels, real_array
 
 __all__ = ["PlayOperator", "PlayState"]
 
@@ -170,9 +170,7 @@ class PlayOperator:
         """Return the entry `wanted` of the state after every row given, and the last state."""
         rows = as_tensor(given, name)
         rows = given.to(rows.dtype) if isinstance(given, Tensor) else rows  # with its graph
-        if rows.ndim != 2 or self.width.shape not in ((), rows.shape[1:]):
-            needed = self.width.size if self.width.ndim else "n"
-            raise ValueError(f"`{name}` must have shape (T, {needed}), got {tuple(rows.shape)}.")
+        check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
         if not torch.isfinite(rows).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):

@@ -96,7 +96,7 @@ class RigidChain(Chain):
     ) -> None:
         super().__init__()
         dtype = float_dtype(dtype)
-        axes = shaped(axes, "axes", (None, 3))
+        axes = shaped(axes, "axes", "n3")
         n = len(axes)
         lengths = axes.norm(dim=1, keepdim=True)
         if n == 0 or not (lengths > 0).all():
@@ -104,7 +104,7 @@ class RigidChain(Chain):
                 f"`axes` must hold at least one axis, none of zero length, got {axes.tolist()}."
             )
         axes = axes / lengths
-        origins = shaped(origins, "origins", (n, 4, 4))
+        origins = shaped(origins, "origins", "n44", n)
         origins = torch.stack([rigid_pose(origins[k], f"origins[{k}]") for k in range(n)])
         self.n_actuators = n
         self.kinds = ("revolute",) * n if kinds is None else tuple(map(str, kinds))
@@ -114,8 +114,8 @@ class RigidChain(Chain):
             raise ValueError(f"`kinds` must hold {n} of {_KINDS}, one per joint, got {self.kinds}.")
         if len(self.names) != n:
             raise ValueError(f"`names` must hold {n} names, one per joint, got {self.names}.")
-        low = shaped(np.full(n, -np.inf) if q_min is None else q_min, "q_min", (n,), finite=False)
-        high = shaped(np.full(n, np.inf) if q_max is None else q_max, "q_max", (n,), finite=False)
+        low = shaped(np.full(n, -np.inf) if q_min is None else q_min, "q_min", "n", n, finite=False)
+        high = shaped(np.full(n, np.inf) if q_max is None else q_max, "q_max", "n", n, finite=False)
         if not (low <= high).all():
             raise ValueError(
                 f"`q_min` must not exceed `q_max`, got {low.tolist()} and {high.tolist()}."
@@ -128,7 +128,7 @@ class RigidChain(Chain):
             "q_min": low,
             "q_max": high,
             "tip": rigid_pose(np.eye(4) if tip is None else tip, "tip"),
-            "tool": shaped(tool, "tool", (3,)),
+            "tool": shaped(tool, "tool", "3"),
             "base": pose(base, "base", dtype),
             "motions": motions,
             "carriers": _joint_motions.column_carriers(motions, origins, axes),

@@ -15,7 +15,7 @@ from joblib import Memory, Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
 
-from hybridkin._core.arrays import real_array
+from hybridkin._core.arrays import shaped
 from hybridkin.datasets._protocol import RANGE, draw, paper_protocol
 from hybridkin.simulation import NotSettledError, TrunkPlant
 
@@ -147,9 +147,7 @@ def _targets(
         targets, part = paper_protocol(seed, n_segment=n_segment, n_random=n_random)
         sizes = {"n_segment": int(n_segment), "n_random": int(n_random)}
         return targets, part, {"protocol": sizes | RANGE}
-    targets = np.array(real_array(q_target, "q_target"), dtype=float)
-    if targets.ndim != 2 or targets.shape[1] != 9:
-        raise ValueError(f"`q_target` must have shape (n_samples, 9), got {targets.shape}.")
+    targets = shaped(q_target, "q_target", ("n_samples", 9))
     low, high = TrunkPlant.admissible
     bad = np.flatnonzero(~((targets >= low) & (targets <= high)).all(axis=1))
     if len(bad):

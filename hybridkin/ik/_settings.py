@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from hybridkin._core.arrays import as_tensor, real_array
+from hybridkin._core.arrays import as_tensor, check_shape, real_array
 from hybridkin._core.model import Portable
 from hybridkin.ik.tasks import Task, Tolerance
 
@@ -205,8 +205,7 @@ class StepSettings(Portable):
         """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
         q = as_tensor(value, name, self.task.device if like is None else like.device)
         n = self.n_actuators
-        good, need = q.ndim > 0 and n in (None, q.shape[-1]), f"(..., {n or 'n'}), n actuators"
-        require(good, f"`{name}` must have shape {need}, got {tuple(q.shape)}.")
+        check_shape(q, name, ("...", n or "n"), "one value per actuator")
         return q if like is None else q.to(like.device, torch.promote_types(q.dtype, like.dtype))
 
     def points(
@@ -223,12 +222,7 @@ class StepSettings(Portable):
         `lead` says which axes come first: "..." any, "T" one, "" none.
         """
         x, one = as_tensor(value, name, self.task.device), shape or self.task.shape
-        axes = x.ndim - len(one)
-        fits = axes >= 0 if lead == "..." else axes == len(lead)
-        sizes = [*filter(None, [lead]), *map(str, one)]
-        need = f"({', '.join(sizes)}{',' * (len(sizes) == 1)}) [m], one target per row"
-        good = fits and tuple(x.shape[axes:]) == one
-        require(good, f"`{name}` must have shape {need}, got {tuple(x.shape)}.")
+        check_shape(x, name, [*filter(None, [lead]), *one], "one point [m] per row")
         if shape is None:
             self.task.check(x, name)
         return x if like is None else x.to(like)

@@ -13,6 +13,7 @@ from torch import Tensor
 from hybridkin._core.arrays import (
     as_array,
     as_tensor,
+    check_shape,
     give_back,
     is_numpy,
     leading,
@@ -386,8 +387,7 @@ class InverseKinematics:
         if t is None:
             return dt * torch.arange(n, dtype=target.dtype, device=target.device), [dt] * n
         times = as_tensor(t, "t", target.device)
-        good, shape = times.shape == (n,), tuple(times.shape)
-        require(good, f"`t` must have shape ({n},), one time per point of `path`, got {shape}.")
+        check_shape(times, "t", [n], "one time per point of `path`")
         periods = times.diff().tolist()
         increasing = bool(torch.isfinite(times).all()) and min(periods, default=dt) > 0.0
         require(increasing, "`t` must be finite and increasing [s]; sort it, drop repeated times.")

@@ -11,7 +11,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridkin._core.arrays import real_array
+from hybridkin._core.arrays import real_array, shaped
 from hybridkin._core.units import METRES
 
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
@@ -38,11 +38,10 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
-        t, x = (np.array(real_array(vars(self)[name], name), dtype=float) for name in "tx")
-        if x.ndim != 2 or x.shape[1] != 3 or len(x) == 0:
-            raise ValueError(f"`x` must have shape (T, 3) with T >= 1, got {x.shape}.")
-        if t.shape != (len(x),):
-            raise ValueError(f"`t` must have shape ({len(x)},), as many as `x`, got {t.shape}.")
+        x = shaped(self.x, "x", "T3")
+        t = shaped(self.t, "t", "T", len(x))
+        if not len(x):
+            raise ValueError("`x` must hold at least one point, got none.")
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(x).all(axis=1)))
         if bad.size:
             rows = f"{bad.size} rows (first: row {bad[0]})"

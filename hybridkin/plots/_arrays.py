@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import real_array
+from hybridkin._core.arrays import real_array, shaped
 
 T = TypeVar("T")
 
@@ -18,26 +18,11 @@ def plain(value: Any, name: str = "array") -> NDArray:
     return np.array(real_array(value, name), dtype=float)
 
 
-def shaped(value: ArrayLike, name: str, letters: str, n_rows: int | None = None) -> NDArray:
-    """Return an array whose shape agrees with `letters`, such as "N3".
-
-    Digits are sizes; the first letter stands for `n_rows`, or any number of rows. NaN is allowed.
-    """
-    array = plain(value, name)
-    need = [*letters] if n_rows is None else [str(n_rows), *letters[1:]]
-    fits = array.ndim == len(need)
-    if not fits or any(x.isdigit() and int(x) != n for x, n in zip(need, array.shape, strict=True)):
-        raise ValueError(f"`{name}` must have shape ({', '.join(need)}), got {array.shape}.")
-    return array
-
-
 def times(value: ArrayLike | None, n_rows: int) -> NDArray | None:
     """Return times (T,) [s] that increase, or None."""
     if value is None:
         return None
-    t = plain(value, "t")
-    if t.shape != (n_rows,):
-        raise ValueError(f"`t` must have shape ({n_rows},), one time per row, got {t.shape}.")
+    t = shaped(value, "t", "T", n_rows)
     if not (np.diff(t) > 0.0).all():
         raise ValueError("`t` must increase [s]; sort the rows and drop repeated or unknown times.")
     return t

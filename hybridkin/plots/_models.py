@@ -9,6 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from hybridkin._core.arrays import shaped
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.plots._arrays import plain, positions
@@ -44,10 +45,7 @@ def body_of(model: Model, q: ArrayLike, n_points: int) -> dict[str, Any]:
             f"drawn; got {type(model).__name__} with {type(chain).__name__} as mechanical part. "
             "Give the points along the robot to the display yourself."
         )
-    q = np.atleast_2d(plain(q, "q"))
-    n = chain.n_actuators
-    if q.ndim != 2 or q.shape[1] != n:
-        raise ValueError(f"`q` must have shape (K, {n}) or ({n},), got {q.shape}.")
+    q = shaped(np.atleast_2d(plain(q, "q")), "q", ("K", chain.n_actuators))
     known = np.isfinite(q).all(axis=1)
     rows = torch.from_numpy(q[known])
 

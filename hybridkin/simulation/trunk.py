@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvalsh, null_space
+from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
+from hybridkin._core.arrays import shaped
 from hybridkin.simulation._mjcf import REST_LENGTH, TIME_STEP, trunk_mjcf
 
 # What "settled" means, and the hold over which it is checked with the length servos on.
@@ -138,12 +140,9 @@ class TrunkPlant:
         numbers |= {"cable_noise": cable_noise, "mocap_noise": mocap_noise}
         for name, value in numbers.items():
             _check_number(name, value)
-        error = np.asarray(base_error, dtype=float)
-        if error.shape != (6,) or not np.isfinite(error).all():
-            raise ValueError(
-                "`base_error` must be 6 finite numbers, position [m] and rotation vector [rad], "
-                f"got {base_error!r}."
-            )
+        error = shaped(base_error, "base_error", "6", why="position [m], rotation vector [rad]")
+        if not np.isfinite(error).all():
+            raise ValueError(f"`base_error` must be finite numbers, got {base_error!r}.")
         self._max_force, self._max_iter = float(max_force), int(max_iter)
         self._noise, self._random_state = (float(cable_noise), float(mocap_noise)), random_state
         self._T_mocap_base = np.eye(4)
@@ -222,12 +221,7 @@ class TrunkPlant:
         return q, pose
 
     def _check_lengths(self, q_target):
-        target = np.asarray(q_target, dtype=float)
-        if target.shape != (9,):
-            raise ValueError(
-                f"`q_target` must have shape (9,), got {target.shape}; the trunk has 3 segments "
-                "of 3 chambers and settles at one configuration at a time."
-            )
+        target = shaped(q_target, "q_target", "9", why="3 segments of 3 chambers, one command")
         low, high = self.admissible
         bad = ~((target >= low) & (target <= high))  # NaN included
         if bad.any():
@@ -251,17 +245,14 @@ class TrunkPlant:
         mujoco.mj_fwdActuation(model, data)
         return data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator, data.ten_length.copy()
 
-    def _derivatives(self, state, forces, lengths):
+    def _derivatives(self, state):
         """Joint derivatives of the forces (n_dof, n_dof) and of the lengths (9, n_dof)."""
         n = self._n_dof
-        stiffness, jacobian = np.empty((n, n)), np.empty((9, n))
-        for j in range(n):
-            moved = state.copy()
-            moved[j] += DIFFERENCE
-            forces_j, lengths_j = self._forces(moved)
-            stiffness[:, j] = (forces_j - forces) / DIFFERENCE
-            jacobian[:, j] = (lengths_j - lengths) / DIFFERENCE
-        return stiffness, jacobian
+
+        def both(joints):
+            return np.concatenate(self._forces(np.concatenate([joints, state[n:]])))
+
+        return np.split(approx_fprime(state[:n], both, DIFFERENCE), [n])
 
     def _newton(self, state, target, held, budget):
         """Equilibrium near `state`, or None; chambers not `held` keep their force."""
@@ -276,7 +267,7 @@ class TrunkPlant:
                     f"Not settled: no equilibrium within max_iter={self._max_iter} Newton "
                     "iterations; raise `max_iter`."
                 )
-            stiffness, jacobian = self._derivatives(state, forces, lengths)
+            stiffness, jacobian = self._derivatives(state)
             kkt = np.zeros((n + 9, n + 9))
             kkt[:n, :n] = stiffness
             kkt[:n, n:] = jacobian.T
@@ -327,7 +318,7 @@ class TrunkPlant:
         )
 
     def _check_stable(self, state, held):
-        stiffness, jacobian = self._derivatives(state, *self._forces(state))
+        stiffness, jacobian = self._derivatives(state)
         free = null_space(jacobian[held]) if held.any() else np.eye(self._n_dof)
         reduced = -free.T @ (stiffness + stiffness.T) @ free / 2
         lowest = eigvalsh(reduced, subset_by_index=(0, 0))[0]

@@ -436,7 +436,7 @@ def test_weight_and_its_derivative(kind, error_model):
     [
         ({"calibrate": True}, None, "`calibrate` must be a sequence of names.*got True"),
         ({"calibrate": "radii"}, None, "`calibrate` must be a sequence of names.*got 'radii'"),
-        ({}, np.zeros(3), r"`groups` must have shape \(20,\), one entry for each row.*got \(3,\)"),
+        ({}, np.zeros(3), r"`groups` must have shape \(20,\), got \(3,\); one entry for each row"),
     ],
 )
 def test_settings_and_groups_are_checked(settings, groups, message):

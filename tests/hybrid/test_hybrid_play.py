@@ -181,6 +181,6 @@ def test_clear_errors(log):
     with pytest.warns(UserWarning, match="`play` 0.5 is no less than the range of `X`"):
         HybridForwardModel(CHAIN, "drop", play=0.5).fit(q, x)
     model = HybridForwardModel(CHAIN, "linear", play=WIDTH).fit(q, x, groups=groups)
-    message = r"`groups` must have shape \(480,\), one entry for each row of the log, got \(3,\)"
+    message = r"`groups` must have shape \(480,\), got \(3,\); one entry for each row of the log"
     with pytest.raises(ValueError, match=message):
         model.predict(q, groups=groups[:3])
