@@ -336,12 +336,14 @@ def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[T
     with torch.enable_grad():
         leaf = q if keep else q.detach().requires_grad_(True)
         x = function(leaf)
-        rows = [
-            grad(a.sum(), leaf, create_graph=keep, retain_graph=True, materialize_grads=True)[0]
-            for a in x.unbind(-1)
-        ]
-    J = torch.stack(rows, dim=-2)
+        J = slopes(x, leaf, create_graph=keep)
     return (x, J) if keep else (x.detach(), J.detach())
+
+
+def slopes(x: Tensor, leaf: Tensor, create_graph: bool = False) -> Tensor:
+    """Return dx/dq (..., m, n) of rows x (..., m) that were computed from rows of a leaf q."""
+    options = {"create_graph": create_graph, "retain_graph": True, "materialize_grads": True}
+    return torch.stack([grad(a.sum(), leaf, **options)[0] for a in x.unbind(-1)], dim=-2)
 
 
 def _checked(x: Any) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hybridkin._core.model import slopes
 from hybridkin.ik._gram import apply_columns, apply_rows, damped_solve, row_gram
 from hybridkin.ik._settings import StepSettings
 
@@ -69,11 +70,7 @@ def _newton(
         scaled = held * unit
         mu = damped_solve(row_gram(scaled), apply_rows(scaled, unit * posture.detach()))
         pull = posture - apply_columns(J, mu)
-        rows = [
-            torch.autograd.grad(a.sum(), leaf, retain_graph=True, materialize_grads=True)[0]
-            for a in pull.unbind(-1)
-        ]
-        H = torch.stack(rows, dim=-2)
+        H = slopes(pull, leaf)
     both = free[:, :, None] & free[:, None, :]
     H = torch.where(both, H.detach(), torch.diag_embed((~free).to(q)))
     corner = held.new_zeros(len(q), held.shape[-2], held.shape[-2])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TypeVar
 
 import torch
@@ -53,14 +53,6 @@ class Point:
         """Overwrite some rows, in place, in the fields that both have."""
         for name in vars(self).keys() & vars(other).keys():
             vars(self)[name][rows] = vars(other)[name]
-
-    def where(self: RowsT, rows: Tensor, other: Point) -> RowsT:
-        """Return the batch with the rows of another one where `rows` is true, (N,)."""
-        picked = {
-            name: torch.where(rows.view(-1, *[1] * (a.ndim - 1)), a, vars(self)[name])
-            for name, a in vars(other).items()
-        }
-        return replace(self, **picked)
 
 
 @dataclass
@@ -212,7 +204,8 @@ class Search:
             little = better & (error - error_new < 0.01 * metres)
             live.slow = torch.where(little, live.slow + 1.0, 0.0)
             live.held = step.saturated.any(-1)
-            live = live.where(better, new)
+            taken = better.nonzero()[:, 0]
+            live.put(taken, new.take(taken))
         return found
 
     def _enter_domain(self, found: Found) -> None:
@@ -229,14 +222,12 @@ class Search:
         Zero where the distance has no gradient, as that of a function that only says whether q is
         in its domain.
         """
-        slope = None
+        slope = torch.zeros_like(q)
         with torch.enable_grad():
             leaf = q.detach().requires_grad_(True)
             distance = self.settings.task.domain_distance(leaf)
             if distance.requires_grad:
-                (slope,) = torch.autograd.grad(distance.sum(), leaf, allow_unused=True)
-        if slope is None:
-            return torch.zeros_like(q)
+                (slope,) = torch.autograd.grad(distance.sum(), leaf, materialize_grads=True)
         beyond = (distance.detach() - _INSIDE).clamp_min(0.0)
         square = slope.square().sum(-1)
         return -(beyond / torch.where(square > 0.0, square, 1.0))[:, None] * slope
@@ -277,7 +268,8 @@ class Search:
             new.share = torch.where(curvature > 0.0, 1.0 / curvature, 2.0 * live.share)
             new.share = new.share.clamp(0.1, 4.0)
             live.share = 0.25 * live.share
-            rows, live = rows[going], live.where(ok, new).take(going)
+            live.put(ok, new.take(ok))
+            rows, live = rows[going], live.take(going)
             if rows.numel() == 0:
                 break
         _, ended = self._try_step(found.points(all_rows), None, hold=True)

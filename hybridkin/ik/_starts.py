@@ -42,10 +42,9 @@ def nearest_starts(
     low, high = (a.to(q).expand(1, n) for a in (settings.q_min, settings.q_max))
     if not torch.isfinite(high - low).all():
         size = size[:, None]
-        low, high = (
-            torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size),
-            torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size),
-        )
+        lower = torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size)
+        high = torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size)
+        low = lower
     k = max(count, _SHARED if len(low) == 1 else _OWN)
     low, high = low[:, None], high[:, None]
     sample = torch.lerp(low, high, _even_shares(n, k, q.device).to(q)).clamp(low, high)

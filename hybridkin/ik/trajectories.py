@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -272,7 +273,7 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     with open(path, encoding="utf-8-sig") as file:
         rows = [text.split(",") for text in map(str.strip, file) if text and text[0] != "#"]
     columns, need = (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
-    named = bool(rows) and not _is_number(rows[0][0])
+    named = bool(rows) and not re.match(r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE)
     try:
         table = np.array(rows[named:], dtype=float)
     except ValueError as error:
@@ -319,11 +320,3 @@ def _checked(
 
 def _period(value: float, name: str) -> float:
     return float(_checked(value, name, "positive [s]", (), _ABOVE_ZERO))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
