@@ -165,14 +165,9 @@ def _proximal_box_step(
     J dq + lambda^2 mu = v.
     """
     used = torch.maximum(damping_sq, floor)
-    excess = (used - damping_sq)[:, None]
-    dq, mu = box_limited_step(problem._replace(v=problem.v + excess * centre), used, centre)
-    weak = (used > damping_sq).nonzero()[:, 0]
-    if weak.numel() > 0:
-        part, excess, used = problem.take(weak), excess[weak], used[weak]
-        for _ in range(_PROXIMAL_ROUNDS):
-            aim = part.v + excess * mu[weak]
-            dq[weak], mu[weak] = box_limited_step(part._replace(v=aim), used, mu[weak])
+    excess, dq, mu = (used - damping_sq)[:, None], problem.z, centre
+    for _ in range(1 + _PROXIMAL_ROUNDS):
+        dq, mu = box_limited_step(problem._replace(v=problem.v + excess * mu), used, mu)
     return dq, mu
 
 

@@ -119,9 +119,12 @@ class Search:
         return found
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
-        """Return what one start leads to."""
+        """Return what one start leads to; from outside the models' domain slide towards it."""
         found = self._lower(q, target)
-        self._enter_domain(found)
+        rows = (self._cost(found) == _OUTSIDE).nonzero()[:, 0]
+        part = found.take(rows)
+        self._descend(part, self._inward)
+        found.put(rows, part)
         return found
 
     def _start_elsewhere(self, found: Found, rows: Tensor, q: Tensor, restarts: int) -> None:
@@ -207,14 +210,6 @@ class Search:
             taken = better.nonzero()[:, 0]
             live.put(taken, new.take(taken))
         return found
-
-    def _enter_domain(self, found: Found) -> None:
-        """Slide rows that are reached outside the models' domain towards it."""
-        rows = (self._cost(found) == _OUTSIDE).nonzero()[:, 0]
-        if rows.numel() > 0:
-            part = found.take(rows)
-            self._descend(part, self._inward)
-            found.put(rows, part)
 
     def _inward(self, q: Tensor) -> Tensor:
         """Return Newton's step of the domain distance to a little less than 1.

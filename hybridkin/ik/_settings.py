@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -50,7 +50,8 @@ _FAST = 5.0  # times the largest plausible q in a second is too fast
 class StepSettings(Portable):
     """What a step depends on besides q and the target; see `InverseKinematics`.
 
-    Limits, weights and a fixed posture are float64 tensors of shape () or (n,).
+    Limits, weights and a fixed posture are float64 tensors of shape () or (n,). `posture` is
+    `q_pref`, and the middle of the limits where none is given.
     """
 
     task: Task
@@ -64,6 +65,7 @@ class StepSettings(Portable):
     limits: str
     dt: float
     weights: Tensor | None
+    posture: Tensor | Posture | None = field(init=False)
 
     def __post_init__(self) -> None:
         """Check the settings, and take the middle of the limits where no posture is given."""
@@ -73,8 +75,7 @@ class StepSettings(Portable):
         low, high = self.q_min.tolist(), self.q_max.tolist()
         good = (self.q_min <= self.q_max).all()
         require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
-        if self.q_pref is None:
-            object.__setattr__(self, "q_pref", self.middle)
+        object.__setattr__(self, "posture", self.middle if self.q_pref is None else self.q_pref)
         good = 0.0 < self.dt < math.inf
         require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
         self.rates()
@@ -84,18 +85,12 @@ class StepSettings(Portable):
         good, text = not isinstance(share, str) and 0.0 <= share < math.inf, '"adaptive" or'
         require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
 
-    @property
-    def given(self) -> dict[str, object]:
-        """The settings by name, without a posture that is only the middle of the limits."""
-        q_pref, middle = self.q_pref, self.middle
-        derived = isinstance(q_pref, Tensor) and middle is not None and q_pref.equal(middle)
-        return {k: v for k, v in vars(self).items() if k != "q_pref" or not derived}
-
     def unit_messages(self) -> list[str]:
         """Return warnings where limits or a posture look like another unit than the model's."""
         found, n = [], self.n_actuators
-        for name, value in self.given.items():
-            if isinstance(value, Tensor) and name != "weights" and n is not None:
+        for name in ("q_min", "q_max", "dq_max", "q_pref"):
+            value = vars(self)[name]
+            if isinstance(value, Tensor) and n is not None:
                 q = torch.where(torch.isfinite(value), value, 0.0).expand(1, n)
                 factor = _FAST if name == "dq_max" else 1.0
                 found += self.task.models[0].robot.unit_messages(q, name, factor)
@@ -127,7 +122,7 @@ class StepSettings(Portable):
     @property
     def has_posture(self) -> bool:
         """Whether there is a preferred configuration to go to."""
-        return self.q_pref is not None and self.beta > 0.0
+        return self.posture is not None and self.beta > 0.0
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (N, ...) and J (N, m, n) at q of shape (N, n)."""
@@ -137,13 +132,13 @@ class StepSettings(Portable):
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
-        wanted = self.q_pref(q) if callable(self.q_pref) else self.q_pref
+        wanted = self.posture(q) if callable(self.posture) else self.posture
         assert wanted is not None
         return wanted.to(q)
 
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); where it is a function, that at the middle."""
-        start = self.middle if callable(self.q_pref) else self.q_pref
+        start = self.middle if callable(self.q_pref) else self.posture
         need = "give `q0` or `q_pref` of shape (n,)"
         if start is None:
             raise ValueError(f"a start is needed: {need}, or finite `q_min` and `q_max`.")

@@ -144,9 +144,9 @@ class InverseKinematics:
 
     def __repr__(self) -> str:
         """Return the model's name, the limits, and the settings that are not the default ones."""
-        parts, given = [type(self.model).__name__], self.settings.given
+        parts = [type(self.model).__name__]
         for name, default in signature(type(self)).parameters.items():
-            value = given.get(name)
+            value = vars(self.settings).get(name)
             if isinstance(value, Tensor):
                 ends = dict.fromkeys(f"{float(end):.4g}" for end in (value.min(), value.max()))
                 parts += [f"{name}={' to '.join(ends)}"] if torch.isfinite(value).any() else []

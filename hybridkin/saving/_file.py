@@ -17,10 +17,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import secrets
 import sys
 from contextlib import suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +69,9 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
     kinds = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
 
     def described(header: Header) -> Stored:
-        if not isinstance(header, dict):
-            raise ValueError(f"a part must be an object, got {header!r:.60}")
-        for key, kind in kinds.items():
-            if not isinstance(header.get(key), kind):
-                raise ValueError(f"`{key}` must be a {kind.__name__}, got {header.get(key)!r:.60}")
+        entries = [header.get(key) for key in kinds] if isinstance(header, dict) else []
+        if [type(entry) for entry in entries] != [*kinds.values()]:
+            raise ValueError(f"a part must hold {', '.join(kinds)}, got {header!r:.60}")
         missing = [name for name in header["arrays"].values() if name not in arrays]
         if missing:
             raise ValueError(f"the array {missing[0]!r:.60} is missing")
@@ -133,9 +131,8 @@ def _folder_of_saves(path: Path) -> int:
     folder = os.open(path.parent, os.O_RDONLY)
     with suppress(OSError):  # others are at work, or the file system has no locks
         fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        ours = re.compile(rf"\.{re.escape(path.name)}-[0-9a-f]{{16}}\.part")
-        for left in filter(ours.fullmatch, os.listdir(folder)):
-            os.unlink(left, dir_fd=folder)
+        for left in path.parent.glob(f".{escape(path.name)}-{16 * '[0-9a-f]'}.part"):
+            left.unlink()
     with suppress(OSError):
         fcntl.flock(folder, fcntl.LOCK_SH)
     return folder

@@ -1,7 +1,5 @@
 """The MuJoCo model (MJCF) of the simulated trunk."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 RADII = (0.100, 0.093, 0.079)  # hull radius per segment [m]
@@ -12,10 +10,7 @@ RELAXATION = 0.2  # damping / stiffness of every joint [s]
 
 
 def trunk_mjcf(
-    gravity: tuple[float, float],
-    mass: float,
-    tip_mass: float,
-    stiffness: Mapping[str, float],
+    gravity: tuple[float, float], mass: float, tip_mass: float, stiffness: tuple[float, ...]
 ) -> str:
     """Return the MJCF of a trunk along z, with sites and tendons for its nine chambers.
 
@@ -31,7 +26,7 @@ def trunk_mjcf(
         Mass of the three segments together [kg].
     tip_mass : float
         Mass at the tip [kg].
-    stiffness : mapping
+    stiffness : tuple of three floats
         Bending and torsional [N m^2] and axial [N] stiffness of the first segment.
 
     Returns
@@ -59,9 +54,7 @@ def trunk_mjcf(
 
     bodies = [ring(0, 0)]
     for s in range(3):
-        bend, twist, stretch = (
-            stiffness[name] * share[s] / height for name in ("bending", "torsional", "axial")
-        )
+        bend, twist, stretch = (value * share[s] / height for value in stiffness)
         slide = joint("slide", "0 0 1", 2 * stretch, 0.01)  # one of two in series
         link_mass = mass * share[s] / share.sum() / LINKS
         for k in range(LINKS):

@@ -132,12 +132,11 @@ class TrunkPlant:
             raise ImportError(
                 "TrunkPlant needs MuJoCo; install it with `pip install hybridkin[sim]`."
             ) from error
-        stiffness = {"bending": bending_stiffness, "torsional": torsional_stiffness}
-        stiffness["axial"] = axial_stiffness
-        numbers = {f"{name}_stiffness": value for name, value in stiffness.items()}
-        numbers |= {"tilt": tilt, "gravity": gravity, "mass": mass, "tip_mass": tip_mass}
-        numbers |= {"max_force": max_force, "max_iter": max_iter}
-        numbers |= {"cable_noise": cable_noise, "mocap_noise": mocap_noise}
+        stiffness = (bending_stiffness, torsional_stiffness, axial_stiffness)
+        names = ("bending_stiffness", "torsional_stiffness", "axial_stiffness")
+        numbers = {**dict(zip(names, stiffness, strict=True)), "tilt": tilt, "gravity": gravity}
+        numbers |= {"mass": mass, "tip_mass": tip_mass, "max_force": max_force}
+        numbers |= {"max_iter": max_iter, "cable_noise": cable_noise, "mocap_noise": mocap_noise}
         for name, value in numbers.items():
             _check_number(name, value)
         error = shaped(base_error, "base_error", "6", why="position [m], rotation vector [rad]")
