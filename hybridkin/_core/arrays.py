@@ -76,12 +76,14 @@ def check_shape(
 ) -> None:
     """Raise where the shape differs from `need`.
 
-    There digits are lengths, letters any length, and "..." in front any axes.
+    There digits are lengths, equal letters equal lengths, and "..." in front any axes.
     """
     got, sizes = tuple(value.shape), [str(size) for size in need if size != "..."]
     axes = got[-len(sizes) :] if len(sizes) < len(need) else got
-    fits = len(axes) == len(sizes)
-    if not fits or any(a.isdigit() and int(a) != n for a, n in zip(sizes, axes, strict=True)):
+    lengths = {
+        size: int(size) if size.isdigit() else n for size, n in zip(sizes, axes, strict=False)
+    }
+    if tuple(lengths.get(size) for size in sizes) != axes:
         shape = ", ".join(map(str, need)) + "," * (len(need) == 1)
         raise ValueError(f"`{name}` must have shape ({shape}), got {got}{why and '; '}{why}.")
 

@@ -40,13 +40,8 @@ def rotation_vector(R: Tensor) -> Tensor:
     # Row k: 4 q_k times the quaternion (w, x, y, z).
     symmetric = R + R.mT - torch.diag_embed(2.0 * diagonal)
     inner = symmetric + torch.diag_embed(1.0 + 2.0 * diagonal - trace)
-    whole = torch.cat(
-        [
-            torch.cat([1.0 + trace, skew], dim=-1)[..., None, :],
-            torch.cat([skew[..., None], inner], dim=-1),
-        ],
-        dim=-2,
-    )
+    first = torch.cat([1.0 + trace, skew], dim=-1)[..., None, :]
+    whole = torch.cat([first, torch.cat([skew[..., None], inner], dim=-1)], dim=-2)
     largest = torch.diagonal(whole, dim1=-2, dim2=-1).argmax(-1)[..., None, None]
     row = whole.gather(-2, largest.expand(*largest.shape[:-1], 4))[..., 0, :]
     row = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from torch import Tensor
 
-from hybridkin._core.arrays import as_array
+from hybridkin._core.arrays import as_array, check_shape
 
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
@@ -118,7 +118,7 @@ class Stored:
         return values
 
     def array(
-        self, name: str, shape: tuple[int | None, ...] | None = None, *, finite: bool = True
+        self, name: str, shape: Sequence[int | str] | None = None, *, finite: bool = True
     ) -> NDArray:
         """Return an array of floating-point numbers.
 
@@ -126,8 +126,8 @@ class Stored:
         ----------
         name : str
             Its name.
-        shape : tuple of int or None, optional
-            The shape that it must have; None stands for any length.
+        shape : sequence of int or str, optional
+            The shape that it must have, see `check_shape`.
         finite : bool, default=True
             Whether NaN and infinite entries are refused.
         """
@@ -136,11 +136,8 @@ class Stored:
         array = self.arrays[name]
         if array.dtype not in (np.float32, np.float64):
             raise ValueError(f"{name!r} must be float32 or float64, got {array.dtype}")
-        sizes = array.shape if shape is None else shape
-        fits = len(sizes) == array.ndim
-        if not fits or any(n not in (None, m) for n, m in zip(sizes, array.shape, strict=True)):
-            wanted = str(shape).replace("None", "any")
-            raise ValueError(f"{name!r} must have shape {wanted}, got {array.shape}")
+        if shape is not None:
+            check_shape(array, name, shape)
         if finite and not np.isfinite(array).all():
             raise ValueError(f"{name!r} must be finite")
         return array
@@ -156,9 +153,8 @@ class Stored:
         """
         lengths, found = {}, {}
         for name, letters in shapes.items():
-            array = self.array(name, tuple(lengths.get(letter) for letter in letters))
+            array = self.array(name, [lengths.get(letter, letter) for letter in letters])
             lengths |= dict(zip(letters, array.shape, strict=True))
-            array = self.array(name, tuple(lengths[letter] for letter in letters))
             found[name] = torch.tensor(array, device="cpu")
         return found
 

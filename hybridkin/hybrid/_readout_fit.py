@@ -56,7 +56,7 @@ class ReadoutFit(NamedTuple):
         return cls(
             restore(stored.part("readout")),
             (first, second),
-            stored.array("residual", (None, None), finite=False),
+            stored.array("residual", "Nm", finite=False),
             {(float(a), float(b)): float(c) for a, b, c in stored.list_of(list, "scores")},
             stored.value("gradient", float),
             float(stored.value("noise_ratio", str)),

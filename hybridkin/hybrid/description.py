@@ -130,7 +130,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         # Earlier files hold a finite radius outside the domain, which no log supports.
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
     known = "fitted_rows" in stored.arrays  # older files do not have it
-    model._fitted_rows = stored.array("fitted_rows", (None,)) if known else None
+    model._fitted_rows = stored.array("fitted_rows", "N") if known else None
     results = training.get("cv_results") if isinstance(training, dict) else None
     model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
     return model

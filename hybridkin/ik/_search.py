@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
@@ -65,10 +65,6 @@ class Found(Point):
     n_iter: Tensor
     n_starts: Tensor
 
-    def points(self, rows: Tensor) -> Point:
-        """Return the points of some rows."""
-        return Point(*(vars(self)[field.name][rows] for field in fields(Point)))
-
 
 @dataclass
 class _Descent(Found):
@@ -107,9 +103,7 @@ class Search:
             nudged = settings.inside(self._nudged(at_start))
             q = torch.where(at_start.reached[:, None], q, nudged)
         found = self._attempt(q, target)
-        lost = ~found.reached
-        lost[lost.clone()] = row_gram(found.J[lost]).is_singular
-        rows = lost.nonzero()[:, 0]
+        rows = (~found.reached & row_gram(found.J).is_singular).nonzero()[:, 0]
         self._try_again(found, rows, self._nudged(found)[rows, None])
         rows = ((self._cost(found) > _DONE) & torch.isfinite(found.error)).nonzero()[:, 0]
         for some in rows.split(_ROWS):
@@ -171,10 +165,9 @@ class Search:
     def _lower(self, q: Tensor, target: Tensor) -> Found:
         """Lower the error until it is within tol or cannot be lowered."""
         found = self._start(q, target)
-        start = found.error
-        nu, growth = torch.full_like(start, _FIRST_DAMPING), torch.full_like(start, 2.0)
-        slow = torch.zeros_like(start)
-        live = _Descent(**vars(found), start=start, nu=nu, growth=growth, slow=slow)
+        one = torch.ones_like(found.error)
+        own = (found.error, _FIRST_DAMPING * one, 2.0 * one, 0.0 * one)
+        live = _Descent(*vars(found).values(), *own)
         rows = torch.arange(len(q), device=q.device)
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
@@ -241,7 +234,7 @@ class Search:
             return
         task, unit = self.settings.task, self.settings.unit(found.q)
         inside = task.in_domain(found.q)
-        live = self._slide(found.points(rows), wanted, torch.ones_like(found.e[rows, 0]))
+        live = self._slide(found.take(rows), wanted, torch.ones_like(found.e[rows, 0]))
         for iteration in range(_NULL_STEPS):
             last = iteration == _NULL_STEPS - 1
             step, point = self._try_step(live, None if last else live.share[:, None] * live.free)
@@ -267,14 +260,14 @@ class Search:
             rows, live = rows[going], live.take(going)
             if rows.numel() == 0:
                 break
-        _, ended = self._try_step(found.points(all_rows), None, hold=True)
+        _, ended = self._try_step(found.take(all_rows), None, hold=True)
         better = ended.error < found.error[all_rows]
         found.put(all_rows[better], ended.take(better))
 
     def _slide(self, at: Point, wanted: Callable[[Tensor], Tensor], share: Tensor) -> _Slide:
         wish = wanted(at.q)
         free = null_step(self.settings, at.J, wish)
-        return _Slide(**vars(at), wish=wish, free=free, share=share)
+        return _Slide(at.q, at.x, at.J, at.e, at.target, wish, free, share)
 
     def _try_step(
         self, at: Point, posture: Tensor | None, hold: bool = False

@@ -5,21 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 
-from hybridkin._core.arrays import as_tensor, check_shape, real_array
+from hybridkin._core.arrays import Numbers, Transform, as_tensor, check_shape, real_array
 from hybridkin._core.model import Portable
 from hybridkin.ik.tasks import Task, Tolerance
 
-if TYPE_CHECKING:
-    from pytorch_kinematics import Transform3d
-
-Array: TypeAlias = "ArrayLike | Tensor | Transform3d"  # what comes in, NumPy or torch
+Array: TypeAlias = Numbers | Transform  # what comes in
 Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 

@@ -102,7 +102,7 @@ def test_entries_are_checked_when_they_are_read():
     stored = Stored.of("thing", {**arrays, "i": np.arange(3)}, count=3, flag=True, names=["x", 1])
     assert stored.value("count", float) == 3.0
     assert {*stored.tensors(a="kn", b="n")} == {"a", "b"}
-    assert np.isnan(stored.array("n", (None,), finite=False)).all()
+    assert np.isnan(stored.array("n", "k", finite=False)).all()
     wrong = [
         ("`missing` of 'thing' is missing", lambda: stored.value("missing", str)),
         ("`flag` of 'thing' must be int or null", lambda: stored.value("flag", (int, None))),
@@ -110,8 +110,8 @@ def test_entries_are_checked_when_they_are_read():
         ("the part 'x' of 'thing' is missing", lambda: stored.part("x")),
         ("the array 'x' of 'thing' is missing", lambda: stored.array("x")),
         ("'i' must be float32 or float64", lambda: stored.array("i")),
-        (r"'a' must have shape \(2,\)", lambda: stored.array("a", (2,))),
-        (r"'b' must have shape \(2,\), got \(3,\)", lambda: stored.tensors(a="nk", b="n")),
+        (r"`a` must have shape \(2,\), got \(2, 3\)", lambda: stored.array("a", (2,))),
+        (r"`b` must have shape \(2,\), got \(3,\)", lambda: stored.tensors(a="nk", b="n")),
         ("'n' must be finite", lambda: stored.array("n")),
     ]
     for message, read in wrong:

@@ -214,5 +214,5 @@ def test_matrices_of_a_file_are_square_where_they_must_be():
     from hybridkin._core.stored import Stored
 
     stored = Stored.of("thing", {"a": np.zeros((2, 3))})
-    with pytest.raises(ValueError, match=r"'a' must have shape \(3, 3\), got \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"`a` must have shape \(n, n\), got \(2, 3\)"):
         stored.tensors(a="nn")
