@@ -106,8 +106,12 @@ class Search:
         rows = (~found.reached & row_gram(found.J).is_singular).nonzero()[:, 0]
         self._try_again(found, rows, self._nudged(found)[rows, None])
         rows = ((self._cost(found) > _DONE) & torch.isfinite(found.error)).nonzero()[:, 0]
-        for some in rows.split(_ROWS):
-            self._start_elsewhere(found, some, q[some], restarts)
+        for some in rows.split(_ROWS) if restarts * len(rows) > 0 else ():
+            size = _per_tip(found.J, found.error)[some]
+            starts = nearest_starts(settings, q[some], size, found.target[some], restarts)
+            for part in starts.tensor_split([_FIRST], dim=1):  # a few, then the others
+                open_rows = self._cost(found)[some] > _DONE
+                self._try_again(found, some[open_rows], part[open_rows])
         if settings.has_posture:
             self._descend(found, lambda p: settings.preferred(p) - p)
         return found
@@ -120,16 +124,6 @@ class Search:
         self._descend(part, self._inward)
         found.put(rows, part)
         return found
-
-    def _start_elsewhere(self, found: Found, rows: Tensor, q: Tensor, restarts: int) -> None:
-        """Search rows that started at q from further starts: a few, then the others."""
-        if restarts == 0 or rows.numel() == 0:
-            return
-        size = _per_tip(found.J, found.error)
-        starts = nearest_starts(self.settings, q, size[rows], found.target[rows], restarts)
-        for part in starts.split([min(_FIRST, restarts), max(restarts - _FIRST, 0)], dim=1):
-            open_rows = self._cost(found)[rows] > _DONE
-            self._try_again(found, rows[open_rows], part[open_rows])
 
     def _try_again(self, found: Found, rows: Tensor, starts: Tensor) -> None:
         """Search rows (k,) from further starts (k, s, n) at once, and keep what is best."""

@@ -18,7 +18,7 @@ from hybridkin.ik.results import Track
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.learning.elm import ELMRegressor
-from hybridkin.paper.tables import PAPER_ELM, cell, chains_of, run_all
+from hybridkin.paper.tables import PAPER_ELM, cell, chains_of, mechanical_over_hybrid, run_all
 from hybridkin.plots import ActuatorDisplay, ErrorBoxDisplay, TrackingDisplay, new_figure
 from hybridkin.simulation import TrunkPlant
 from hybridkin.workflow.report import Progress, Report, quiet
@@ -130,11 +130,9 @@ def write_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Trac
             record[label][name] = stats = {**_statistics(error), "lost_steps": lost}
             cells = [cell(stats), f"{100 * stats['p95']:.2f}", str(lost)]
             rows.append([label, name, *cells, paper.get(name, "") if label == "both" else ""])
-    report.record["tracking"], both = record, record["both"]
-    report.record["tracking_mechanical_over_hybrid"] = ratios = {
-        name: both[f"mechanical, {name}"]["mean"] / both[f"hybrid on {name}"]["mean"]
-        for name in ("nominal", "calibrated")
-    }
+    means = {name: stats["mean"] for name, stats in record["both"].items()}
+    ratios = mechanical_over_hybrid(means)
+    report.record |= {"tracking": record, "tracking_mechanical_over_hybrid": ratios}
     report.text(
         "## Figs. 3 and 4: tracking on the simulated trunk",
         f"Each path of {len(paths['spiral'].x)} points becomes chamber lengths by eq. (1) on the "
