@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
@@ -342,8 +343,8 @@ def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[T
 
 def slopes(x: Tensor, leaf: Tensor, create_graph: bool = False) -> Tensor:
     """Return dx/dq (..., m, n) of rows x (..., m) that were computed from rows of a leaf q."""
-    options = {"create_graph": create_graph, "retain_graph": True, "materialize_grads": True}
-    return torch.stack([grad(a.sum(), leaf, **options)[0] for a in x.unbind(-1)], dim=-2)
+    slope = partial(grad, create_graph=create_graph, retain_graph=True, materialize_grads=True)
+    return torch.stack([slope(a.sum(), leaf)[0] for a in x.unbind(-1)], dim=-2)
 
 
 def _checked(x: Any) -> Tensor:

@@ -160,8 +160,8 @@ class Search:
         """Lower the error until it is within tol or cannot be lowered."""
         found = self._start(q, target)
         one = torch.ones_like(found.error)
-        own = (found.error, _FIRST_DAMPING * one, 2.0 * one, 0.0 * one)
-        live = _Descent(*vars(found).values(), *own)
+        own = {"start": found.error, "nu": _FIRST_DAMPING * one, "growth": 2.0 * one}
+        live = _Descent(**vars(found), **own, slow=0.0 * one)
         rows = torch.arange(len(q), device=q.device)
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)

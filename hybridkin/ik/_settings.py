@@ -128,9 +128,11 @@ class StepSettings(Portable):
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
-        wanted = self.posture(q) if callable(self.posture) else self.posture
-        assert wanted is not None
-        return wanted.to(q)
+        posture = self.posture if isinstance(self.posture, Tensor) else None
+        if callable(self.posture):
+            posture = self.posture(q)
+        assert posture is not None
+        return posture.to(q)
 
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); where it is a function, that at the middle."""

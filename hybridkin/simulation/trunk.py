@@ -251,7 +251,7 @@ class TrunkPlant:
         def both(joints):
             return np.concatenate(self._forces(np.concatenate([joints, state[n:]])))
 
-        return np.split(approx_fprime(state[:n], both, DIFFERENCE), [n])
+        return np.split(np.asarray(approx_fprime(state[:n], both, DIFFERENCE)), [n])
 
     def _newton(self, state, target, held, budget):
         """Equilibrium near `state`, or None; chambers not `held` keep their force."""
