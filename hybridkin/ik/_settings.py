@@ -128,15 +128,13 @@ class StepSettings(Portable):
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
-        posture = self.posture if isinstance(self.posture, Tensor) else None
-        if callable(self.posture):
-            posture = self.posture(q)
-        assert posture is not None
-        return posture.to(q)
+        wanted = self.posture(q) if callable(self.posture) else self.posture
+        assert wanted is not None
+        return wanted.to(q)
 
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); where it is a function, that at the middle."""
-        start = self.middle if callable(self.q_pref) else self.posture
+        start = self.posture if isinstance(self.posture, Tensor) else self.middle
         need = "give `q0` or `q_pref` of shape (n,)"
         if start is None:
             raise ValueError(f"a start is needed: {need}, or finite `q_min` and `q_max`.")
