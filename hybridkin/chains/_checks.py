@@ -27,7 +27,7 @@ def float_dtype(dtype: Any) -> torch.dtype:
 
 def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
     """Return one positive length per segment, shape (S,)."""
-    lengths = shaped(value, name, "S", size, dtype)
+    lengths = shaped(value, name, "n", size, dtype)
     if not len(lengths) or not (lengths > 0).all():
         raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
     return lengths
