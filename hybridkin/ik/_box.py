@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hybridkin.ik._gram import apply_columns, apply_rows, damped_solve, quick_gram
+from hybridkin.ik._gram import apply_columns, apply_rows, solve_rows
 
 _PROXIMAL_ROUNDS = 2
 _MAX_NEWTON = 60  # steps; a handful is usual
@@ -100,7 +100,7 @@ def box_limited_step(
         # Newton's step of F on the linear piece of y, where the actuators at a limit stay there.
         J, _, _, lower, upper = live
         free = (y > lower) & (y < upper)
-        newton = -damped_solve(quick_gram(J * free[:, None], True), residual, damping_sq)
+        newton = -solve_rows(J * free[:, None], residual, damping_sq)
         slope = apply_columns(J, newton)
         full = y + slope
         # A full step that stays on its linear piece has solved it, and with it the problem.

@@ -176,6 +176,15 @@ def adaptive_damping(gram: RowGram) -> Tensor:
     return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
 
 
+def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
+    """Return mu with (J J^T + lambda^2 1) mu = v, for lambda^2 > 0, which nothing is added to."""
+    if J.shape[-2] == 3:
+        return _solve_3x3(_entries_3x3(J), v, damping_sq)
+    damping = damping_sq[..., None, None] * identity(J.shape[-2], J)
+    factor = torch.linalg.cholesky_ex(J @ J.mT + damping)[0]
+    return torch.cholesky_solve(v[..., None], factor)[..., 0]
+
+
 def _factor(G: Tensor, damping_sq: Tensor) -> Tensor:
     """Return the Cholesky factor of G + lambda^2, kept positive definite against rounding."""
     trace = torch.diagonal(G, dim1=-2, dim2=-1).sum(-1)
