@@ -107,7 +107,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
             q = torch.tensor(X, dtype=torch.float64, device=elm.input_center.device)
-            parts = in_blocks(partial(function, elm), q, self.block_size or max(1, size))
+            parts = in_blocks(partial(function, elm), q, int(self.block_size or max(1, size)))
         outputs = (part.cpu().numpy().astype(X.dtype, copy=False) for part in parts)
         return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
 

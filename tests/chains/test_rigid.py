@@ -579,7 +579,8 @@ def test_mjcf_limits(compiler, joint, limits):
         ('limited="true"', "must be a valid MJCF"),
     ],
 )
-def test_wrong_mjcf_limits_name_the_joint(joint, message):
+def test_wrong_mjcf_limits_name_the_joint(joint, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its own there
     pytest.importorskip("mujoco")
     with pytest.raises(ValueError, match=message):
         RigidChain.from_mjcf(HINGE.format("", joint), "b")
