@@ -404,7 +404,7 @@ MISTAKES: dict[str, tuple[Mistake, tuple[str, ...]]] = {
     "tip axes left-handed": (_left_handed, ("numbering", "axes", "order")),
     "absolute lengths for changes, or the reverse": (_absolute, ("geometry",)),
     "an actuator column twice": (_doubled, ("same column",)),
-    "an actuator and a tip column exchanged": (_exchanged, ("geometry", "units", "same column")),
+    "an actuator and a tip column exchanged": (_exchanged, ("exchanged", "geometry", "units")),
     "constant offset of one actuator": (_offset, ("offset", "geometry")),
     "one segment too many described": (_segment_count, ("actuators",)),
     "radii half or twice": (_radius, ("size", "calibration")),

@@ -29,7 +29,7 @@ _REACH, _USUAL_REACH = 5.0, 0.7
 _BEND, _LONG = (0.02, 1.0, 15.0), (0.05, 3.0, 100.0)
 _SMALL_SHARE = 0.04  # of the way that the model predicts
 _FAR_BETTER, _GOOD = 0.6, 0.55  # of the motion missed: another reading's over the declared one's
-_ENOUGH = 0.75  # of the variance explained
+_ENOUGH = 0.85  # of the variance explained
 _TWIST, _TILT = 120.0, 45.0  # [deg] of a base that is turned about its axis, and upright
 _BENDS = (0.25, 0.4, 0.5, 0.65, 1.5, 2.0, 2.5, 4.0)  # factors on all bends that are tried
 _SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # offsets, in standard deviations
@@ -190,6 +190,12 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
         yield LogFinding("axes", "warning", message, _ADVICE["axes"])
         return
     few = slice(None, None, -(-len(q) // _FEW))
+    other, i, j = _exchanged(chain, q[few], x[few])
+    if other < min(good, _FAR_BETTER * least):
+        name, axis = column_names(log, "q")[i], column_names(log, "x")[j]
+        message = f"{compared}{_share(other)} with columns {name!r} and {axis!r} exchanged."
+        yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
+        return
     changed = robot.changed(q[few])
     scores = misses(chain, np.stack([*changed.values()]), x[few], True)
     kind, i, by = [*changed][int(np.argmax(scores < _SIMPLE * scores.min()))]
@@ -216,6 +222,16 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
         explained = f"{_share(missed)} of the tip's motion, in any order and sign of q"
         message = f"the nominal model explains only {explained}."
         yield LogFinding("geometry", "warning", message, _ADVICE["geometry"])
+
+
+def _exchanged(chain: Any, q: NDArray, x: NDArray) -> tuple[float, int, int]:
+    """Return what is missed after the best exchange of a column of q with one of x, and which."""
+    found = []
+    for i, j in itertools.product(range(q.shape[1]), range(3)):
+        a, b = q.copy(), x.copy()
+        a[:, i], b[:, j] = x[:, j], q[:, i]
+        found.append((float(misses(chain, a[None], b, True)[0]), i, j))
+    return min(found)
 
 
 def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding:

@@ -12,7 +12,6 @@ from scipy.linalg import eigvalsh, null_space
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from hybridkin._core.arrays import shaped
 from hybridkin.simulation._mjcf import REST_LENGTH, TIME_STEP, trunk_mjcf
 
 # What "settled" means, and the hold over which it is checked with the length servos on.
@@ -139,9 +138,12 @@ class TrunkPlant:
         numbers |= {"max_iter": max_iter, "cable_noise": cable_noise, "mocap_noise": mocap_noise}
         for name, value in numbers.items():
             _check_number(name, value)
-        error = shaped(base_error, "base_error", "6", why="position [m], rotation vector [rad]")
-        if not np.isfinite(error).all():
-            raise ValueError(f"`base_error` must be finite numbers, got {base_error!r}.")
+        error = np.asarray(base_error, dtype=float)
+        if error.shape != (6,) or not np.isfinite(error).all():
+            raise ValueError(
+                "`base_error` must be 6 finite numbers, position [m] and rotation vector [rad], "
+                f"got {base_error!r}."
+            )
         self._max_force, self._max_iter = float(max_force), int(max_iter)
         self._noise, self._random_state = (float(cable_noise), float(mocap_noise)), random_state
         self._T_mocap_base = np.eye(4)
@@ -220,7 +222,12 @@ class TrunkPlant:
         return q, pose
 
     def _check_lengths(self, q_target):
-        target = shaped(q_target, "q_target", "9", why="3 segments of 3 chambers, one command")
+        target = np.asarray(q_target, dtype=float)
+        if target.shape != (9,):
+            raise ValueError(
+                f"`q_target` must have shape (9,), got {target.shape}; the trunk has 3 segments "
+                "of 3 chambers and settles at one configuration at a time."
+            )
         low, high = self.admissible
         bad = ~((target >= low) & (target <= high))  # NaN included
         if bad.any():

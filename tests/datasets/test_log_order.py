@@ -158,3 +158,12 @@ def test_recordings_of_real_robots_raise_no_false_alarm(data_home, name, load):
     log = Log(data.q[::5], data.x[::5], data.groups[::5])
     report = check_log(log, chain=robot.chain, base_is_free="base" in robot.calibrate)
     assert {f.kind for f in report.findings} <= {"jumps"}
+
+
+def test_an_actuator_and_a_tip_column_that_are_exchanged():
+    chain = ConstantCurvatureChain([0.05, 0.05])
+    q = 0.2 + 0.02 * np.random.default_rng(0).standard_normal((100, 6))
+    x = chain(torch.from_numpy(q)).numpy()
+    q[:, 3], x[:, 2] = x[:, 2], q[:, 3].copy()
+    found = {f.kind: f for f in check_log(Log(q, x), chain=chain, base_is_free=True).findings}
+    assert "columns 'q[3]' and 'x[2]' exchanged" in found["exchanged"].message

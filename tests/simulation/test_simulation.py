@@ -298,7 +298,7 @@ def test_bad_commands_raise(plant, q_target, message):
     ],
 )
 def test_bad_parameters_raise(name, value):
-    with pytest.raises(ValueError, match=f"`{name}` must (be|have)"):
+    with pytest.raises(ValueError, match=f"`{name}` must be"):
         TrunkPlant(**{name: value})
 
 
