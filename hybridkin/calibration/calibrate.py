@@ -145,8 +145,8 @@ def calibrate(
         "turns", of each segment's ring of actuators as a whole, and instead of all offsets "tool",
         the last one.
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
-        All but "linear" bound the influence of outliers: rho(|e|^2 / 3) of SciPy's
-        ``least_squares``, with the distance |e| of a row over the noise, times its weight.
+        All but "linear" bound the influence of outliers: ``rho(|e|^2 / 3)`` of SciPy's
+        ``least_squares``, with the distance ``|e|`` of a row over the noise, times its weight.
     bounds : dict of str to (low, high), optional
         Limits of all entries of a name, in its own unit. Default: a factor of 5 on radii and
         lengths and of 10 000 on stiffnesses, half a turn on rest bends, and offsets that are no

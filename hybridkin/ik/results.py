@@ -30,7 +30,7 @@ class IKStatus(IntEnum):
     UNREACHABLE = 2
     """No motion within the limits brings the tip nearer, from any start: the nearest point found.
 
-    `IKSolution.n_starts` says how many starts were tried."""
+    ``IKSolution.n_starts`` says how many starts were tried."""
     SINGULAR = 3
     """Not converged; the Jacobian has (nearly) lost a direction."""
     MAX_ITER = 4
