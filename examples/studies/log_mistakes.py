@@ -4,7 +4,7 @@ The figures of the docs page "Your own robot"::
 
     python examples/studies/log_mistakes.py --out results/log_mistakes
 
-About ten minutes on an idle core. Every robot is drawn at random (seed k for robot k): extensible
+About ten minutes on one core. Every robot is drawn at random (seed k for robot k): extensible
 segments, tendons or elastic tendons; 1 to 3 segments of 3 or 4 actuators; 0.1 to 1 m long. Its log
 is simulated: circular arcs, a smooth error that the model does not know, and noise. Every mistake
 is made in a copy of that log, which is checked (`check_log`), and fitted where the check found
