@@ -19,6 +19,7 @@ FLOORS = [
     {"hybrid"},
     {"calibration"},
     {"chains", "learning", "ik"},
+    {"native"},
     {"_core", "datasets", "plots", "simulation"},
 ]
 BESIDE = {

@@ -14,6 +14,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_tensor
 from hybridkin._core.stored import Layout, Restore, Stored
 
@@ -75,15 +76,17 @@ class PortableModule(Portable, nn.Module):
         TypeError
             For modules that could only be stored as code.
         """
-        kind, arrays, settings, parts = self.layout
+        kind, arrays, settings, parts, derived = self.layout
         if not kind:
             raise TypeError(_only_code(self))
-        return Stored.of(
+        stored = Stored.of(
             kind,
             {name: self._buffers[name] for name in arrays},
             {name: _described(self._modules.get(name)) for name in parts},
             **{name: vars(self)[name] for name in settings},
         )
+        stored.derived.update((name, as_array(self.get_buffer(name).detach())) for name in derived)
+        return stored
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:

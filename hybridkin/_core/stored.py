@@ -32,12 +32,15 @@ class Layout(NamedTuple):
         Plain attributes.
     parts : tuple of str
         Submodules, lists of them, or None.
+    derived : tuple of str
+        Buffers that follow from the others. Kernels use them; files do not hold them.
     """
 
     kind: str
     arrays: dict[str, str]
     settings: Mapping[str, type] = MappingProxyType({})
     parts: tuple[str, ...] = ()
+    derived: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -57,12 +60,15 @@ class Stored:
         float64 or float32 arrays by name.
     parts : dict of str to Stored
         The models that this one is made of.
+    derived : dict of str to ndarray
+        Arrays that follow from the others, for kernels; not in files.
     """
 
     kind: str
     settings: dict[str, Any] = field(default_factory=dict)
     arrays: dict[str, NDArray] = field(default_factory=dict)
     parts: dict[str, Stored] = field(default_factory=dict)
+    derived: dict[str, NDArray] = field(default_factory=dict, compare=False)
 
     @classmethod
     def of(

@@ -72,7 +72,12 @@ class ConstantCurvatureChain(ArcChain):
     """
 
     _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
-    layout = Layout("constant_curvature", dict.fromkeys(_entries, ""), STRUCTURE)
+    layout = Layout(
+        "constant_curvature",
+        dict.fromkeys(_entries, ""),
+        STRUCTURE,
+        derived=("arc_matrix", "arc_offset"),
+    )
 
     def __init__(
         self,

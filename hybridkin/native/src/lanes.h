@@ -1,0 +1,116 @@
+/* The type V that the kernels compute in: one row, or HK_LANES rows side by side.
+
+   Included once for each. M is the result of a comparison. A name HK(f) stands for f of this V. */
+
+#undef V
+#undef M
+#undef HK
+#undef SPLAT
+#undef NOT
+#undef SELECT
+#undef EACH
+#undef LANE
+
+#if HK_LANES == 1
+#define V real
+#define M int
+#define HK(f) hk_##f
+#define SPLAT(c) ((real)(c))
+#define NOT(m) (!(m))
+#define SELECT(m, a, b) ((m) ? (a) : (b))
+#define EACH(i)
+#define LANE(v, i) (v)
+
+static inline int hk_any(int m) { return m; }
+static inline real hk_sqrt(real x) { return HK_MATH(sqrt)(x); }
+static inline real hk_exp(real x) { return HK_MATH(exp)(x); }
+static inline real hk_tanh(real x) { return HK_MATH(tanh)(x); }
+static inline void hk_sincos(real x, real *s, real *c) {
+    *s = HK_MATH(sin)(x);
+    *c = HK_MATH(cos)(x);
+}
+
+#else
+typedef real hk_lanes __attribute__((vector_size(HK_LANES * sizeof(real))));
+typedef hk_bits hk_mask __attribute__((vector_size(HK_LANES * sizeof(real))));
+#define V hk_lanes
+#define M hk_mask
+#define HK(f) hkv_##f
+#define SPLAT(c) ((V){0} + (real)(c))
+#define NOT(m) (~(m))
+#define SELECT(m, a, b) ((V)(((M)(a) & (m)) | ((M)(b) & ~(m))))
+#define EACH(i) for (int i = 0; i < HK_LANES; i++)
+#define LANE(v, i) ((v)[i])
+
+static inline int hkv_any(M m) {
+    hk_bits any = 0;
+    EACH(i) any |= m[i];
+    return any != 0;
+}
+
+static inline V hkv_sqrt(V x) {
+    V r;
+    EACH(i) r[i] = HK_MATH(sqrt)(x[i]);
+    return r;
+}
+
+/* exp by x = k ln 2 + r and a polynomial in r; double precision. */
+static inline V hkv_exp(V x) {
+    const V round = SPLAT(6755399441055744.0); /* 1.5 * 2^52: the sum's last bits are k */
+    x = SELECT(x < SPLAT(-708.0), SPLAT(-708.0), x);
+    x = SELECT(x > SPLAT(709.0), SPLAT(709.0), x);
+    const V shifted = x * 1.4426950408889634 + round, k = shifted - round;
+    const V r = (x - k * 6.93147180369123816490e-1) - k * 1.90821492927058770002e-10;
+    V y = SPLAT(1.0 / 39916800.0);
+    y = y * r + 1.0 / 3628800.0;
+    y = y * r + 1.0 / 362880.0;
+    y = y * r + 1.0 / 40320.0;
+    y = y * r + 1.0 / 5040.0;
+    y = y * r + 1.0 / 720.0;
+    y = y * r + 1.0 / 120.0;
+    y = y * r + 1.0 / 24.0;
+    y = y * r + 1.0 / 6.0;
+    y = y * r + 0.5;
+    y = y * r + 1.0;
+    y = y * r + 1.0;
+    return (V)((M)y + ((M)shifted << 52));
+}
+
+static inline V hkv_tanh(V x) {
+    return 1.0 - 2.0 / (hkv_exp(2.0 * x) + 1.0);
+}
+
+/* sin and cos by x = k pi / 2 + r and Taylor's series in r, up to pi / 4; huge x one by one. */
+static inline void hkv_sincos(V x, V *s, V *c) {
+    const V round = SPLAT(6755399441055744.0);
+    const V shifted = x * 6.36619772367581382433e-01 + round, k = shifted - round;
+    const V r = ((x - k * 1.57079632673412561417e+00) - k * 6.07710050630396597660e-11) -
+                k * 2.02226624879595063154e-21;
+    const V z = r * r;
+    V a = SPLAT(1.58969099521155010221e-10), b = SPLAT(-1.13596475577881948265e-11);
+    a = a * z - 2.50507602534068634195e-08;
+    b = b * z + 2.08757232129817482790e-09;
+    a = a * z + 2.75573137070700676789e-06;
+    b = b * z - 2.75573143513906633035e-07;
+    a = a * z - 1.98412698298579493134e-04;
+    b = b * z + 2.48015872894767294178e-05;
+    a = a * z + 8.33333333332248946124e-03;
+    b = b * z - 1.38888888888741095749e-03;
+    a = a * z - 1.66666666666666324348e-01;
+    b = b * z + 4.16666666666666019037e-02;
+    const V sine = r + r * z * a, cosine = (1.0 - 0.5 * z) + z * z * b;
+    const M quadrant = (M)shifted, odd = (quadrant & 1) != 0;
+    const M sign_s = (quadrant & 2) << 62, sign_c = ((quadrant + 1) & 2) << 62;
+    *s = (V)((M)SELECT(odd, cosine, sine) ^ sign_s);
+    *c = (V)((M)SELECT(odd, sine, cosine) ^ sign_c);
+    const M huge = (x > SPLAT(1e5)) | (x < SPLAT(-1e5));
+    if (hkv_any(huge))
+        EACH(i) if (huge[i]) {
+            (*s)[i] = sin(x[i]);
+            (*c)[i] = cos(x[i]);
+        }
+}
+#endif
+
+static inline V HK(max)(V a, V b) { return SELECT(a < b, b, a); }
+static inline V HK(min)(V a, V b) { return SELECT(b < a, b, a); }

@@ -1,0 +1,12 @@
+/* Any model of a plan: value, Jacobian and domain distance of one row, or of HK_LANES rows. */
+
+#include "lanes.h"
+#include "linear.h"
+#include "arcs.h"
+#include "chains.h"
+
+/* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. */
+static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance) {
+    if (distance) *distance = SPLAT(0.0);
+    HK(chain)(p, at, q, x, J);
+}

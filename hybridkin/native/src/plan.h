@@ -1,0 +1,62 @@
+/* A plan: what the kernels compute, as one array of numbers and one of positions in it. */
+
+#ifndef HK_PLAN_H
+#define HK_PLAN_H
+
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef HK_FLOAT
+typedef float real;
+typedef int32_t hk_bits;
+#define HK_MATH(f) f##f
+#define HK_EPS 1.1920929e-7f
+#define HK_TINY 1.17549435e-38f
+#else
+typedef double real;
+typedef int64_t hk_bits;
+#define HK_MATH(f) f
+#define HK_EPS 2.220446049250313e-16
+#define HK_TINY 2.2250738585072014e-308
+#endif
+#define R(c) ((real)(c))
+
+/* Largest sizes that the kernels have room for on the stack; an exported model sets its own. */
+#ifndef HK_MAX_N
+#define HK_MAX_N 64 /* actuators */
+#define HK_MAX_S 16 /* segments */
+#define HK_MAX_M 64 /* outputs of a regressor, or inner coordinates */
+#define HK_MAX_F 4096 /* features whose leverage is taken */
+#endif
+#define HK_MAX_Z (3 * HK_MAX_S > HK_MAX_N ? 3 * HK_MAX_S : HK_MAX_N) /* inner coordinates */
+
+/* A node of a plan: code[at] is its kind, then the lengths of its input and output, where its
+   numbers begin in `data`, and what else its kind needs: sizes, and where its parts stand. */
+enum { HK_KIND, HK_N, HK_M, HK_DATA, HK_MORE };
+
+enum {
+    HK_ARCS = 1,
+    HK_ELASTIC,
+    HK_RIGID,
+    HK_AFFINE,
+    HK_ELM,
+    HK_POLYNOMIAL,
+    HK_KERNEL,
+    HK_READOUT,
+    HK_LEVERAGE_GUARD,
+    HK_BOX_GUARD,
+    HK_QUADRATIC_LEVERAGE,
+    HK_HYBRID
+};
+
+typedef struct {
+    const int32_t *code;
+    const real *data;
+} hk_plan;
+
+static inline const real *hk_numbers(const hk_plan *p, int at) {
+    return p->data + p->code[at + HK_DATA];
+}
+
+#endif
