@@ -4,7 +4,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from hybridkin.native import available
+
 torch.set_num_threads(1)
+
+
+def pytest_collection_modifyitems(items):
+    if not available():
+        why = "the compiled core is not there: no C compiler at installation, or it is off"
+        for item in items:
+            if item.get_closest_marker("needs_core"):
+                item.add_marker(pytest.mark.skip(why))
 
 
 @pytest.fixture

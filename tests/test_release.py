@@ -122,7 +122,9 @@ def test_the_sdist_builds_the_same_and_can_be_tested(built):
     assert built[0].stat().st_size < 1_000_000
     wheel = zipfile.ZipFile(io.BytesIO(built[1].read_bytes()))
     package = {name for name in wheel.namelist() if name.startswith("hybridkin/")}
-    assert package <= names
+    assert {name for name in package if "/lib/hk_" not in name} <= names
+    assert "hatch_build.py" in names
+    assert not any("/lib/" in name for name in names)
 
 
 @pytest.mark.slow

@@ -34,11 +34,12 @@ class Portable:
     """An object whose pickle and joblib hash are the same in every process.
 
     Its tensors, those in its dicts too, are pickled as plain arrays. They come back on their
-    device, or on the CPU where that device does not exist.
+    device, or on the CPU where that device does not exist. What was compiled of the object stays
+    behind.
     """
 
     def __getstate__(self) -> dict[str, Any]:
-        return _closed(vars(self))
+        return _closed({key: value for key, value in vars(self).items() if key != "_program"})
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(_opened(state))

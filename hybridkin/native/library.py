@@ -4,58 +4,234 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
+import zlib
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.model import ForwardModel
-from hybridkin.native.plan import Plan
+from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin._core.stored import Stored
+from hybridkin.native.plan import NoKernel, Plan
 
-_FOLDER = Path(__file__).parent / "lib"
+_FOLDER = Path(__file__).parent
+_SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+_LEVELS = {"hk_v2": 2, "hk_v3": 3, "hk_v4": 4}  # what hk_level() must be, at least
+_CHUNK = 20_000  # rows that one thread computes at a time
+_BYTE = ctypes.c_char
+_version = attrgetter("_version")
+
+Results = tuple[NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.float64] | None]
 
 
-@cache
 def library() -> ctypes.CDLL | None:
     """Return the compiled library, None where there is none."""
-    path = _FOLDER / "hk.so"
-    if os.environ.get("HYBRIDKIN_NATIVE") == "off" or not path.exists():
-        return None
-    return ctypes.CDLL(str(path))
+    return _opened()[0]
 
 
 def available() -> bool:
-    """Return whether the compiled core is there; without it all is computed by torch."""
+    """Return whether the compiled core is there; without it torch computes everything.
+
+    The environment variable HYBRIDKIN_NATIVE=off turns it off.
+    """
     return library() is not None
 
 
+def backend(model: ForwardModel) -> str:
+    """Return what computes a model for NumPy arrays: "compiled", or "torch: " and the reason."""
+    missing, reason = library() is None, _opened()[1]
+    if not missing:
+        program_of(model)
+        reason = vars(model)["_program"].reason
+    return f"torch: {reason}" if reason else "compiled"
+
+
+@cache
+def _opened() -> tuple[ctypes.CDLL | None, str]:
+    """Return the best library that this processor can use, or the reason why there is none."""
+    choice = os.environ.get("HYBRIDKIN_NATIVE", "")  # off, or the name of a variant
+    if choice == "off":
+        return None, "HYBRIDKIN_NATIVE=off"
+    paths = sorted((_FOLDER / "lib").glob(f"hk_{choice or '*'}{_SUFFIX}"))
+    reason = "hybridkin was installed without compiled kernels; reinstall it with a C compiler"
+    try:
+        level = ctypes.CDLL(str(paths[0])).hk_level() if paths else 0
+        for path in reversed(paths):
+            if _LEVELS.get(path.stem, 0) <= level:
+                opened = ctypes.CDLL(str(path))
+                reason = _fault(opened)
+                if not reason:
+                    return opened, ""
+                reason = f"{path.name} {reason}"
+    except (OSError, AttributeError) as error:
+        reason = f"the compiled library cannot be used ({error})"
+    return None, reason
+
+
+def _fault(opened: ctypes.CDLL) -> str:
+    """Return what is wrong with a library."""
+    sources = sorted((_FOLDER / "src").glob("*.[ch]"))
+    stamp = zlib.crc32(b"".join(path.read_bytes() for path in sources))
+    if opened.hk_sources() & 0xFFFFFFFF != stamp:
+        return "was compiled from other sources; reinstall hybridkin, or run hatch_build.py"
+    pointer = ctypes.c_void_p
+    opened.hk_evaluate.argtypes = [pointer, pointer, ctypes.c_int32, pointer, ctypes.c_int64]
+    opened.hk_evaluate.argtypes += [pointer] * 3
+    opened.hk_evaluate.restype = None
+    return "" if _is_right(opened) else "computes wrong numbers"
+
+
+def _is_right(opened: ctypes.CDLL) -> bool:
+    """Return whether a library computes circles as their closed form does."""
+    # Two equal segments make one arc of length r [m] that turns by t, in the direction a.
+    r, a, t, o = 0.7, 0.3, np.array([0.5, 2.0, 3.0, 5.0, 9.0]), np.zeros(5)
+    sine, versine, c, s = np.sin(t) / t, (1.0 - np.cos(t)) / t, np.cos(a), np.sin(a)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    q, x = (np.stack(v, 1) @ turn.T for v in ([t, o, o + r], [r * versine, o, r * sine]))
+    slopes = [
+        [r * (sine - versine / t), o, versine],
+        [o, r * versine / t, o],
+        [r * (np.cos(t) - sine) / t, o, sine],
+    ]
+    J = turn @ np.moveaxis(np.array(slopes), 2, 0) @ turn.T
+    halves = 0.5 * np.repeat(np.eye(3)[[2, 0, 1]], 2, axis=0)
+    circles = Stored(
+        "constant_curvature",
+        {"tip_at": 2.0},
+        {"base": np.eye(4), "offsets": np.zeros(2)},
+        derived={"arc_matrix": halves, "arc_offset": np.zeros(6)},
+    )
+    program = Program(Plan(circles), opened)
+    block, ones = program.evaluate(q, True)[:2], [program.evaluate(row, True)[:2] for row in q]
+    found = [*block, *map(np.array, zip(*ones, strict=True))]
+    pairs = zip(found, (x, J, x, J), strict=True)
+    return all(np.abs(ours - right).max() < 1e-12 for ours, right in pairs)
+
+
 class Program:
-    """A model that the compiled core computes."""
+    """A model that the compiled core computes.
 
-    def __init__(self, plan: Plan) -> None:
+    Parameters
+    ----------
+    plan : Plan
+        The model.
+    opened : ctypes.CDLL, optional
+        The library. Default: that of `library()`.
+    """
+
+    def __init__(self, plan: Plan, opened: ctypes.CDLL | None = None) -> None:
+        opened = opened or library()
+        if opened is None:
+            raise RuntimeError(f"the compiled core is not there: {_opened()[1]}.")
         self.plan = plan
-        self._code = plan.code.ctypes.data_as(ctypes.c_void_p)
-        self._data = plan.data.ctypes.data_as(ctypes.c_void_p)
+        self._sizes = plan.n_inputs, plan.n_outputs
+        self._evaluate = opened.hk_evaluate
+        self._head = plan.code.ctypes.data, plan.data.ctypes.data, plan.root
 
-    def evaluate(self, q: NDArray, jacobian: bool = False, distance: bool = False):
-        n, m, lead = self.plan.n_inputs, self.plan.n_outputs, q.shape[:-1]
+    def __reduce__(self) -> tuple[type[Program], tuple[Plan]]:
+        return Program, (self.plan,)
+
+    def evaluate(self, q: NDArray, jacobian: bool = False, distance: bool = False) -> Results:
+        """Return x (..., m), and dx/dq (..., m, n) and the domain distance (...), or None.
+
+        Rows beyond 20,000 are computed by the threads that torch may use. Their number does not
+        change the result.
+
+        Parameters
+        ----------
+        q : ndarray of shape (..., n)
+            Actuator vectors, any strides.
+        jacobian : bool, default=False
+            Whether dx/dq is computed.
+        distance : bool, default=False
+            Whether the domain distance is computed.
+        """
+        (n, m), lead = self._sizes, q.shape[:-1]
+        if q.shape[-1] != n:
+            raise ValueError(f"`q` must have shape (..., {n}), got {q.shape}.")
         q = np.ascontiguousarray(q, dtype=np.float64)
+        rows = q.size // n
         x = np.empty((*lead, m))
         J = np.empty((*lead, m, n)) if jacobian else None
         d = np.empty(lead) if distance else None
-        pointers = [None if a is None else ctypes.c_void_p(a.ctypes.data) for a in (q, x, J, d)]
-        library().hk_evaluate(
-            self._code,
-            self._data,
-            ctypes.c_int32(self.plan.root),
-            pointers[0],
-            ctypes.c_int64(q.size // n),
-            *pointers[1:],
-        )
+        if rows == 1:
+            self._evaluate(*self._head, q.tobytes(), 1, _address(x), _address(J), _address(d))
+        elif rows:
+            self._in_chunks(rows, q.ctypes.data, [(x, m), (J, m * n), (d, 1)])
         return x, J, d
 
+    def _in_chunks(self, rows: int, q: int, results: list[tuple[NDArray | None, int]]) -> None:
+        n, starts = self._sizes[0], range(0, rows, _CHUNK)
+        places = [(_address(a), 8 * width) for a, width in results]
 
-def program_of(model: ForwardModel) -> Program:
-    """Return the program of a model, raises NoKernel."""
-    return Program(Plan(model.stored()))
+        def run(start: int) -> None:
+            to = [None if place is None else place + start * step for place, step in places]
+            self._evaluate(*self._head, q + 8 * n * start, min(_CHUNK, rows - start), *to)
+
+        threads = min(len(starts), torch.get_num_threads())
+        if threads == 1:
+            for start in starts:
+                run(start)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(run, starts))
+
+
+def _address(a: NDArray | None) -> int | None:
+    """Return where a contiguous array of our own lies; faster than `a.ctypes`."""
+    if a is None:
+        return None
+    return ctypes.addressof(_BYTE.from_buffer(a))  # pyright: ignore[reportArgumentType]
+
+
+class _Compiled:
+    """What was made of a model, and the buffers and submodules that it was made of."""
+
+    def __init__(self, model: ForwardModel) -> None:
+        self.program, self.reason = None, ""
+        modules = [*model.modules()]
+        dicts = [d for m in modules for d in (m._modules, m._buffers, m._parameters)]
+        self.dicts = [d for d in dicts if d]
+        self.seen = [dict(d) for d in self.dicts]
+        self.tensors = [*model.buffers(), *model.parameters()]
+        self.versions = [*map(_version, self.tensors)]
+        try:
+            _check_classes(modules)
+            if any(tensor.device.type != "cpu" for tensor in self.tensors):
+                raise NoKernel("the compiled core needs a model on the CPU")
+            self.program = Program(Plan(model.stored()))
+        except (NoKernel, TypeError) as error:
+            self.reason = str(error).split(";")[0]
+
+    def holds(self) -> bool:
+        """Return whether the model is still the same."""
+        try:
+            same = self.dicts == self.seen  # identity first; else tensors are compared
+        except RuntimeError:
+            return False
+        return same and [*map(_version, self.tensors)] == self.versions
+
+
+def _check_classes(modules: list[torch.nn.Module]) -> None:
+    """Raise NoKernel for classes that inherit their description: they may compute otherwise."""
+    for module in modules:
+        if isinstance(module, PortableModule) and "layout" not in vars(type(module)):
+            raise NoKernel(f"a {type(module).__name__} has no kernel")
+
+
+def program_of(model: ForwardModel) -> Program | None:
+    """Return the program of a model, None where torch computes it; see `backend`.
+
+    It is kept on the model until a buffer or a submodule is changed.
+    """
+    if library() is None:
+        return None
+    compiled = model.__dict__.get("_program")
+    if compiled is None or not compiled.holds():
+        compiled = model.__dict__["_program"] = _Compiled(model)
+    return compiled.program

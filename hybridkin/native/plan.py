@@ -43,6 +43,7 @@ class Plan:
         self.root = self.node_of(stored)
         self.code = np.array(self._code, dtype=np.int32)
         self.data = np.concatenate([*self._data, np.zeros(8)])
+        self._data = []  # not twice in pickles
         for array in (self.code, self.data):
             array.flags.writeable = False
 

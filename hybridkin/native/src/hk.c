@@ -21,27 +21,49 @@
 #define HK_API __attribute__((visibility("default")))
 #endif
 
-/* x (rows, m), J (rows, m, n) and domain distances (rows) of q (rows, n); NULL is left out. */
+#if defined(__x86_64__)
+#include <cpuid.h>
+
+/* 2, 3 or 4: the best variant that processor and system can run. (__builtin_cpu_supports would
+   say it, but is empty in the libraries of zig.) */
+HK_API int32_t hk_level(void) {
+    const unsigned avx512 = bit_AVX512F | bit_AVX512CD | bit_AVX512BW | bit_AVX512DQ | bit_AVX512VL;
+    unsigned a, b, c, d, kept;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_OSXSAVE) || !(c & bit_FMA)) return 2;
+    __asm__("xgetbv" : "=a"(kept), "=d"(d) : "c"(0)); /* the registers that the system keeps */
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(b & bit_AVX2) || (kept & 0x06) != 0x06)
+        return 2;
+    return (b & avx512) == avx512 && (kept & 0xe6) == 0xe6 ? 4 : 3;
+}
+#else
+HK_API int32_t hk_level(void) { return 0; }
+#endif
+
+/* A sum over the sources that this was compiled from. */
+HK_API uint32_t hk_sources(void) { return HK_SOURCES; }
+
+static void hk_block(const hk_plan *p, int at, const real *q, int rows, real *x, real *J,
+                     real *distance) {
+    V vq[HK_MAX_N], vx[HK_MAX_M], vJ[HK_MAX_M * HK_MAX_N], far;
+    const int n = p->code[at + HK_N], m = p->code[at + HK_M];
+    EACH(i) for (int j = 0; j < n; j++) vq[j][i] = q[(i < rows ? i : rows - 1) * n + j];
+    hkv_model(p, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL);
+    for (int i = 0; i < rows; i++) {
+        for (int j = 0; j < m; j++) x[i * m + j] = vx[j][i];
+        for (int j = 0; J && j < m * n; j++) J[i * m * n + j] = vJ[j][i];
+        if (distance) distance[i] = far[i];
+    }
+}
+
+/* x (rows, m), J (rows, m, n) and domain distances (rows) of q (rows, n); NULL: no J, no distance. */
 HK_API void hk_evaluate(const int32_t *code, const real *data, int32_t at, const real *q,
                         int64_t rows, real *x, real *J, real *distance) {
     const hk_plan plan = {code, data};
     const int n = code[at + HK_N], m = code[at + HK_M];
-    if (rows == 1) {
-        real own_x[HK_MAX_M];
-        hk_model(&plan, at, q, x ? x : own_x, J, distance);
-        return;
-    }
-    for (int64_t r = 0; r < rows; r += HK_LANES) {
-        V vq[HK_MAX_N], vx[HK_MAX_M], vJ[HK_MAX_M * HK_MAX_N], far;
-        const int here = (int)(rows - r < HK_LANES ? rows - r : HK_LANES);
-        EACH(i) for (int j = 0; j < n; j++) vq[j][i] = q[(r + (i < here ? i : here - 1)) * n + j];
-        hkv_model(&plan, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL);
-        for (int i = 0; i < here; i++) {
-            if (x)
-                for (int j = 0; j < m; j++) x[(r + i) * m + j] = vx[j][i];
-            if (J)
-                for (int j = 0; j < m * n; j++) J[(r + i) * m * n + j] = vJ[j][i];
-            if (distance) distance[r + i] = far[i];
-        }
-    }
+    if (rows == 1)
+        hk_model(&plan, at, q, x, J, distance);
+    else
+        for (int64_t r = 0; r < rows; r += HK_LANES)
+            hk_block(&plan, at, q + r * n, (int)(rows - r < HK_LANES ? rows - r : HK_LANES),
+                     x + r * m, J ? J + r * m * n : NULL, distance ? distance + r : NULL);
 }

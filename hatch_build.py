@@ -1,0 +1,108 @@
+"""Compile the kernels of hybridkin.native, where there is a C compiler.
+
+hatchling calls `KernelsHook` for wheels and editable installations. `python hatch_build.py`
+compiles in place; names of variants, such as v3, compile these alone.
+
+The variable CC names the compiler with its options. HYBRIDKIN_PLATFORM is the platform tag of the
+wheel where the compiler is one for another machine.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+try:
+    from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+except ImportError:  # compiling in place needs no hatchling
+    BuildHookInterface = object
+
+NATIVE = Path(__file__).parent / "hybridkin" / "native"
+FLAGS = (
+    "-std=c99 -O3 -Wall -Wextra -pedantic -fno-math-errno -fno-trapping-math -ffp-contract=fast "
+    "-fvisibility=hidden -shared -s"
+).split()
+# By features: compilers know these for longer than -march=x86-64-v3. hk_level asks for the same.
+AVX2 = "-mavx2 -mfma"
+X86 = {
+    "v2": "-msse4.2",
+    "v3": AVX2,
+    "v4": AVX2 + " -mavx512f -mavx512cd -mavx512bw -mavx512dq -mavx512vl -mprefer-vector-width=512",
+}
+
+
+def host() -> str:
+    """Return the platform tag of wheels for this machine."""
+    tag = sysconfig.get_platform().replace("universal2", platform.machine())
+    return tag.replace("-", "_").replace(".", "_")
+
+
+def compiler() -> list[str]:
+    """Return the C compiler as a command."""
+    given = shlex.split(os.environ.get("CC", ""))
+    for command in [given] if given else [["cc"], ["gcc"], ["clang"]]:
+        if shutil.which(command[0]):
+            return command
+    raise OSError(f"no C compiler: {shlex.join(given) or 'cc'} was not found")
+
+
+def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
+    """Return the libraries of a platform, compiled side by side; at least one."""
+    windows, apple = target.startswith("win"), target.startswith("macos")
+    suffix = ".dll" if windows else ".dylib" if apple else ".so"
+    variants = X86 if target.endswith(("x86_64", "amd64")) else {"generic": ""}
+    sources = sorted((NATIVE / "src").glob("*.[ch]"))
+    stamp = zlib.crc32(b"".join(path.read_bytes() for path in sources))
+    command = [*compiler(), *FLAGS, f"-DHK_SOURCES={stamp}u", *([] if windows else ["-fPIC"])]
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder) as work:
+        running = {}
+        for name in names or variants:
+            path = Path(work, f"hk_{name}{suffix}")
+            options = [*variants[name].split(), "-o", str(path), str(NATIVE / "src/hk.c"), "-lm"]
+            running[path] = subprocess.Popen(
+                [*command, *options], stderr=subprocess.PIPE, text=True
+            )
+        said = {path: process.communicate()[1] for path, process in running.items()}
+        made = [path for path, process in running.items() if process.returncode == 0]
+        sys.stderr.write("".join(said[path] for path in made))
+        if not made:
+            raise OSError(f"the C compiler failed: {next(iter(said.values())).strip()[-500:]}")
+        # Replaced at once: another process may have the old one in use.
+        return [path.replace(folder / path.name) for path in made]
+
+
+class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssues]
+    """Adds the compiled kernels to a wheel, which then is one for this platform."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Compile; without a compiler the wheel is pure Python."""
+        self.work = tempfile.mkdtemp()
+        target = os.environ.get("HYBRIDKIN_PLATFORM") or host()
+        folder = NATIVE / "lib" if version == "editable" else Path(self.work)
+        try:
+            made = compile_into(folder, target, [])
+        except OSError as error:
+            sys.stderr.write(f"hybridkin: installed without compiled kernels; {error}\n")
+            return
+        build_data.update(pure_python=False, tag=f"py3-none-{target}")
+        if version != "editable":
+            places = {str(path): f"hybridkin/native/lib/{path.name}" for path in made}
+            build_data["force_include"].update(places)
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        """Remove what was compiled for the wheel alone."""
+        shutil.rmtree(self.work)
+
+
+if __name__ == "__main__":
+    compile_into(NATIVE / "lib", host(), sys.argv[1:])
