@@ -88,29 +88,79 @@ class Plan:
             raise NoKernel(f"{size} {what}: the kernels have room for {MOST[what]}")
 
 
-def _up_to_tip(stored: Stored, *by_arcs: NDArray) -> tuple[int, NDArray, list[NDArray]]:
-    """Return the segments up to the tip, the frame, and arrays (3 S, ...) cut to these segments.
+def _frame(stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
+    """Return the frame of a chain of arcs, and the shares (m,) of the m segments up to its tip.
 
-    The frame is the rotation of the base, its position, and the rigid offsets up to the tip.
+    The frame is the rotation of the base, its position, the reach, and the rigid offsets.
     """
     base, at = stored.array("base"), stored.value("tip_at", float)
     offsets = stored.array("offsets")
-    S, m = len(offsets), math.ceil(at)
-    Plan.limit("segments", S)
-    share = at - m + 1
-    ends = np.append(offsets[: m - 1], offsets[m - 1] * (at == m))
-    scale = np.append(np.ones(m - 1), share)
-    cut = [a.reshape(3, S, -1)[:, :m] * scale[:, None] for a in (np.asarray(a) for a in by_arcs)]
-    return m, np.concatenate([base[:3, :3].ravel(), base[:3, 3], ends]), cut
+    Plan.limit("segments", len(offsets))
+    m = math.ceil(at)
+    share = np.append(np.ones(m - 1), at - m + 1)
+    frame = [base[:3, :3].ravel(), base[:3, 3], [reach], offsets[:m] * (share == 1)]
+    return np.concatenate(frame), share
 
 
 def _constant_curvature(plan: Plan, stored: Stored) -> int:
-    S, frame, (matrix, offset) = _up_to_tip(
-        stored, stored.derived["arc_matrix"], stored.derived["arc_offset"]
+    given = stored.arrays.get("lengths")
+    reach = 10.0 * stored.array("radii").mean() if given is None else given.sum()
+    frame, share = _frame(stored, reach)
+    m, S = len(share), len(stored.array("radii"))
+    # Of segment by segment: lengths, x-, y-bendings.
+    matrix, zero = (
+        stored.derived[name].reshape(3, S, -1).swapaxes(0, 1)[:m] * share[:, None, None]
+        for name in ("arc_matrix", "arc_offset")
     )
-    return plan.node(ARCS, matrix.shape[2], 3, [matrix, offset, frame], S)
+    n = matrix.shape[2]
+    step, width = 0, n
+    if n % S == 0:  # each segment on the actuators that are its own
+        own = np.stack([part[:, k * n // S : (k + 1) * n // S] for k, part in enumerate(matrix)])
+        if np.count_nonzero(own) == np.count_nonzero(matrix):
+            matrix, step, width = own, n // S, n // S
+    return plan.node(ARCS, n, 3, [frame, zero, matrix], m, step, width)
+
+
+def _elastic_tendons(plan: Plan, stored: Stored) -> int:
+    lengths, radii, rest = (stored.array(name) for name in ("lengths", "radii", "rest_bends"))
+    frame, share = _frame(stored, lengths.sum())
+    counts, m, S = stored.list_of(int, "actuators_per_segment"), len(share), len(radii)
+    coupled = np.full(S, float(stored.value("routing", str) == "base"))
+    coupled[0] = 0.0
+    bending = stored.array("bending_stiffness")
+    stiffness = np.stack([stored.array("axial_stiffness"), bending, bending], 1)
+    share = np.append(share, np.zeros(S - m))[:, None]
+    arcs = share * np.column_stack([lengths, rest])
+    coupled = coupled[:, None]
+    segments = [stiffness, coupled * stiffness, arcs, share, coupled * share]
+    of = np.repeat(np.arange(S), counts)
+    angles = stored.array("angles")
+    x, y = -radii[of] * np.cos(angles), -radii[of] * np.sin(angles)
+    bent = np.cumsum(rest, 0) if coupled.any() else rest
+    zeros = stored.array("tendon_zeros") + x * bent[of, 0] + y * bent[of, 1]
+    tendons = np.stack([zeros, x, y, x * x, x * y, y * y], 1)
+    same = counts[0] if len({*counts}) == 1 else 0
+    numbers = [frame, np.hstack(segments), tendons]
+    return plan.node(ELASTIC, len(x), 3, numbers, m, S, same, *counts)
+
+
+def _rigid(plan: Plan, stored: Stored) -> int:
+    slides = [kind == "prismatic" for kind in stored.list_of(str, "kinds")]
+    before, numbers = stored.array("base"), []
+    for origin, axis in zip(stored.array("origins"), stored.array("axes"), strict=True):
+        side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+        side = side / np.linalg.norm(side)
+        turn = np.eye(4)  # after which the joint's axis is z
+        turn[:3, :3] = np.stack([side, np.cross(axis, side), axis], 1)
+        frame = before @ origin @ turn
+        numbers += [frame[:3, :3], frame[:3, 3]]
+        before = turn.T
+    tip = before @ stored.array("tip") @ np.append(stored.array("tool"), 1.0)
+    return plan.node(RIGID, len(slides), 3, [*numbers, tip[:3]], *slides)
 
 
 WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
     "constant_curvature": _constant_curvature,
+    "elastic_tendons": _elastic_tendons,
+    "rigid": _rigid,
 }

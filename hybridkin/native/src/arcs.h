@@ -1,29 +1,36 @@
 /* Chains of circular arcs. Arcs are the lengths of all segments, then the x-, then the y-bendings. */
 
+#define HK_FRAME 13 /* numbers of a frame before its offsets */
+
 typedef struct {
     V c, f, g, c3, c4;
 } HK(stumpff_t);
 
-/* Entire functions of s = theta^2: a power series up to 1 rad, trigonometry beyond. */
+/* Entire functions of s = theta^2: polynomials up to a half turn, to rounding as good as the power
+   series (interpolated where Chebyshev polynomials vanish); trigonometry beyond. */
 static inline HK(stumpff_t) HK(stumpff)(V s) {
-    const M bent = s > SPLAT(1.0);
+    const M bent = s > SPLAT(9.869604401089358);
     HK(stumpff_t) a;
-    a.c3 = SPLAT(-1.0 / 355687428096000.0);
-    a.c4 = SPLAT(-1.0 / 6402373705728000.0);
-    a.c3 = a.c3 * s + R(1.0 / 1307674368000.0);
-    a.c4 = a.c4 * s + R(1.0 / 20922789888000.0);
-    a.c3 = a.c3 * s - R(1.0 / 6227020800.0);
-    a.c4 = a.c4 * s - R(1.0 / 87178291200.0);
-    a.c3 = a.c3 * s + R(1.0 / 39916800.0);
-    a.c4 = a.c4 * s + R(1.0 / 479001600.0);
-    a.c3 = a.c3 * s - R(1.0 / 362880.0);
-    a.c4 = a.c4 * s - R(1.0 / 3628800.0);
-    a.c3 = a.c3 * s + R(1.0 / 5040.0);
-    a.c4 = a.c4 * s + R(1.0 / 40320.0);
-    a.c3 = a.c3 * s - R(1.0 / 120.0);
-    a.c4 = a.c4 * s - R(1.0 / 720.0);
-    a.c3 = a.c3 * s + R(1.0 / 6.0);
-    a.c4 = a.c4 * s + R(1.0 / 24.0);
+    a.c3 = SPLAT(-1.775165055612406e-20);
+    a.c4 = SPLAT(-8.135186188193454e-22);
+    a.c3 = a.c3 * s + R(8.183034366062202e-18);
+    a.c4 = a.c4 * s + R(4.094574861070063e-19);
+    a.c3 = a.c3 * s - R(2.811024030605762e-15);
+    a.c4 = a.c4 * s - R(1.5617392046473866e-16);
+    a.c3 = a.c3 * s + R(7.647133470817639e-13);
+    a.c4 = a.c4 * s + R(4.7794646505496603e-14);
+    a.c3 = a.c3 * s - R(1.6059042526461696e-10);
+    a.c4 = a.c4 * s - R(1.1470745048458593e-11);
+    a.c3 = a.c3 * s + R(2.5052108350866163e-08);
+    a.c4 = a.c4 * s + R(2.0876756973372715e-09);
+    a.c3 = a.c3 * s - R(2.755731922346156e-06);
+    a.c4 = a.c4 * s - R(2.7557319223766046e-07);
+    a.c3 = a.c3 * s + R(0.00019841269841265803);
+    a.c4 = a.c4 * s + R(2.4801587301585607e-05);
+    a.c3 = a.c3 * s - R(0.008333333333333321);
+    a.c4 = a.c4 * s - R(0.0013888888888888883);
+    a.c3 = a.c3 * s + R(0.16666666666666666);
+    a.c4 = a.c4 * s + R(0.041666666666666664);
     V cosine = SPLAT(0.0);
     if (HK(any)(bent)) {
         const V far = SELECT(bent, s, SPLAT(1.0)), theta = HK(sqrt)(far);
@@ -39,10 +46,11 @@ static inline HK(stumpff_t) HK(stumpff)(V s) {
 }
 
 /* The tip x (3) of arcs z (3 S) in the measuring frame, and its derivative C (3, 3 S) if asked for.
-   `frame` holds the rotation of the base (3, 3), its position (3) and the rigid offsets (S). */
+   `frame` holds the rotation of the base (3, 3), its position (3), the robot's reach and the rigid
+   offsets (S). */
 static inline __attribute__((always_inline)) void HK(arcs_tip_of)(
     int S, const real *frame, const V *z, V *x, V *C) {
-    const real *turn = frame, *origin = frame + 9, *offsets = frame + 12;
+    const real *turn = frame, *origin = frame + 9, *offsets = frame + HK_FRAME;
     HK(stumpff_t) arc[HK_MAX_S];
     V across[HK_MAX_S], rest[HK_MAX_S], tail[HK_MAX_S][3];
     V p[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
@@ -99,4 +107,36 @@ static inline void HK(arcs_tip)(int S, const real *frame, const V *z, V *x, V *C
     case 3: HK(arcs_tip_of)(3, frame, z, x, C); break;
     default: HK(arcs_tip_of)(S, frame, z, x, C);
     }
+}
+
+/* Arcs that follow from actuators linearly: segment k from `width` of them, from k `step` on. The
+   matrix (S, 3, width) and the arcs of q = 0 (S, 3). */
+typedef struct {
+    int S, step, width;
+    const real *matrix, *zero;
+} HK(linear_arcs);
+
+/* The arcs z (3 S) of q. */
+static inline __attribute__((always_inline)) void HK(arcs_of)(
+    HK(linear_arcs) a, const V *q, V *z) {
+    for (int k = 0; k < a.S; k++)
+        for (int part = 0; part < 3; part++) {
+            const real *row = a.matrix + (3 * k + part) * a.width;
+            V sum = SPLAT(a.zero[3 * k + part]);
+            for (int j = 0; j < a.width; j++) sum = sum + q[k * a.step + j] * row[j];
+            z[part * a.S + k] = sum;
+        }
+}
+
+/* J (rows, n) += C dz/dq, for C (rows, 3 S). */
+static inline __attribute__((always_inline)) void HK(pull_arcs)(
+    HK(linear_arcs) a, int rows, int n, const V *C, V *J) {
+    for (int i = 0; i < rows; i++, J += n, C += 3 * a.S)
+        for (int k = 0; k < a.S; k++) {
+            const real *row = a.matrix + 3 * k * a.width;
+            for (int j = 0; j < a.width; j++)
+                J[k * a.step + j] = J[k * a.step + j] + C[k] * row[j] +
+                                    C[a.S + k] * row[a.width + j] +
+                                    C[2 * a.S + k] * row[2 * a.width + j];
+        }
 }

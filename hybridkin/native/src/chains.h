@@ -1,43 +1,76 @@
 /* Mechanical models, taken apart: q -> inner coordinates z -> tip x. Serial coupling acts on z. */
 
-/* What `pull` needs to know of a row besides z. */
-typedef struct {
-    int nothing;
-} HK(inside);
-
+static inline HK(linear_arcs) HK(linear_arcs_of)(const hk_plan *p, int at) {
+    const int32_t *more = p->code + at + HK_MORE;
+    HK(linear_arcs) a = {more[0], more[1], more[2], NULL, NULL};
+    a.zero = hk_numbers(p, at) + HK_FRAME + a.S;
+    a.matrix = a.zero + 3 * a.S;
+    return a;
+}
 
 static inline int HK(n_coordinates)(const hk_plan *p, int at) {
-    return p->code[at] == HK_ARCS ? 3 * p->code[at + HK_MORE] : p->code[at + HK_N];
+    return p->code[at] == HK_RIGID ? p->code[at + HK_N] : 3 * p->code[at + HK_MORE];
 }
 
 /* The inner coordinates z of q, and what `pull` needs. */
 static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, HK(inside) *in) {
-    const int32_t *node = p->code + at;
-    const int n = node[HK_N], k = 3 * node[HK_MORE];
-    const real *numbers = hk_numbers(p, at);
-    (void)in;
-    if (n == 9 && k == 9)
-        HK(affine)(9, 9, numbers, numbers + 81, q, z);
-    else
-        HK(affine)(k, n, numbers, numbers + k * n, q, z);
+    const int n = p->code[at + HK_N];
+    if (p->code[at] == HK_ARCS) {
+        HK(linear_arcs) a = HK(linear_arcs_of)(p, at);
+        if (a.S == 3 && a.width == 3) /* sizes that are known keep all in registers */
+            HK(arcs_of)((HK(linear_arcs)){3, 3, 3, a.matrix, a.zero}, q, z);
+        else if (a.S == 3 && a.width == 9)
+            HK(arcs_of)((HK(linear_arcs)){3, 0, 9, a.matrix, a.zero}, q, z);
+        else
+            HK(arcs_of)(a, q, z);
+    } else if (p->code[at] == HK_ELASTIC) {
+        HK(elastic_t) e = HK(elastic_of)(p, at);
+        if (e.S == 3 && e.same == 3) {
+            e.S = e.same = 3;
+            e.n = 9;
+            HK(elastic_arcs)(e, q, in, z);
+        } else
+            HK(elastic_arcs)(e, q, in, z);
+    } else
+        for (int i = 0; i < n; i++) z[i] = q[i];
 }
 
 /* The tip x (3) of inner coordinates z, and its derivative C (3, k) where not NULL. */
 static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V *x, V *C) {
-    const int32_t *node = p->code + at;
-    const int n = node[HK_N], k = 3 * node[HK_MORE];
-    HK(arcs_tip)(node[HK_MORE], hk_numbers(p, at) + k * n + k, z, x, C);
+    const int32_t *more = p->code + at + HK_MORE;
+    if (p->code[at] == HK_RIGID)
+        HK(rigid)(p->code[at + HK_N], more, hk_numbers(p, at), z, x, C);
+    else
+        HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
+}
+
+/* J (rows, n) += C dz/dq, for C (rows, k). */
+static inline __attribute__((always_inline)) void HK(pull_rows)(
+    const hk_plan *p, int at, const HK(inside) *in, int rows, const V *C, V *J) {
+    const int n = p->code[at + HK_N];
+    if (p->code[at] == HK_ARCS) {
+        HK(linear_arcs) a = HK(linear_arcs_of)(p, at);
+        if (a.S == 3 && a.width == 3 && n == 9)
+            HK(pull_arcs)((HK(linear_arcs)){3, 3, 3, a.matrix, a.zero}, rows, 9, C, J);
+        else if (a.S == 3 && a.width == 9)
+            HK(pull_arcs)((HK(linear_arcs)){3, 0, 9, a.matrix, a.zero}, rows, 9, C, J);
+        else
+            HK(pull_arcs)(a, rows, n, C, J);
+    } else if (p->code[at] == HK_ELASTIC) {
+        HK(elastic_t) e = HK(elastic_of)(p, at);
+        if (e.S == 3 && e.same == 3) {
+            e.S = e.same = 3;
+            e.n = 9;
+            HK(pull_tendons)(e, in, rows, C, J);
+        } else
+            HK(pull_tendons)(e, in, rows, C, J);
+    } else
+        for (int i = 0; i < rows * n; i++) J[i] = J[i] + C[i];
 }
 
 /* J (3, n) += C dz/dq, for C (3, k). */
 static inline void HK(pull)(const hk_plan *p, int at, const HK(inside) *in, const V *C, V *J) {
-    const int32_t *node = p->code + at;
-    const int n = node[HK_N], k = 3 * node[HK_MORE];
-    (void)in;
-    if (n == 9 && k == 9)
-        HK(fold)(9, 9, C, hk_numbers(p, at), J);
-    else
-        HK(fold)(k, n, C, hk_numbers(p, at), J);
+    HK(pull_rows)(p, at, in, 3, C, J);
 }
 
 static inline void HK(chain)(const hk_plan *p, int at, const V *q, V *x, V *J) {

@@ -3,6 +3,8 @@
 #include "lanes.h"
 #include "linear.h"
 #include "arcs.h"
+#include "elastic.h"
+#include "rigid.h"
 #include "chains.h"
 
 /* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. */

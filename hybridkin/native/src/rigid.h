@@ -1,0 +1,37 @@
+/* Rigid serial arms. Every joint moves about or along the z-axis of its frame. */
+
+/* The tip x (3) and its derivative J (3, n) where not NULL. The numbers are the pose of every
+   joint's frame in the frame before it, turned so that its axis is z (rotation (3, 3), position
+   (3)); of the first one in the measuring frame; then the tip in the last one. `slides` (n) tells
+   which joints are prismatic. */
+static inline void HK(rigid)(
+    int n, const int32_t *slides, const real *numbers, const V *q, V *x, V *J) {
+    V turn[9], at[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)}, axes[HK_MAX_N][3], points[HK_MAX_N][3];
+    for (int i = 0; i < 9; i++) turn[i] = SPLAT(i % 4 == 0 ? 1.0 : 0.0);
+    for (int k = 0; k < n; k++, numbers += 12) {
+        V sine = SPLAT(0.0), cosine = SPLAT(1.0);
+        if (!slides[k]) HK(sincos)(q[k], &sine, &cosine);
+        for (int i = 0; i < 3; i++) {
+            const V a = turn[3 * i], b = turn[3 * i + 1], c = turn[3 * i + 2];
+            V column[3];
+            at[i] = at[i] + a * numbers[9] + b * numbers[10] + c * numbers[11];
+            for (int j = 0; j < 3; j++)
+                column[j] = a * numbers[j] + b * numbers[3 + j] + c * numbers[6 + j];
+            points[k][i] = at[i];
+            axes[k][i] = turn[3 * i + 2] = column[2];
+            turn[3 * i] = column[0] * cosine + column[1] * sine;
+            turn[3 * i + 1] = column[1] * cosine - column[0] * sine;
+            if (slides[k]) at[i] = at[i] + column[2] * q[k];
+        }
+    }
+    for (int i = 0; i < 3; i++)
+        x[i] = at[i] + turn[3 * i] * numbers[0] + turn[3 * i + 1] * numbers[1] +
+               turn[3 * i + 2] * numbers[2];
+    for (int k = 0; J && k < n; k++)
+        for (int i = 0; i < 3; i++) {
+            const int j = (i + 1) % 3, l = (i + 2) % 3;
+            J[n * i + k] = slides[k] ? axes[k][i]
+                                     : axes[k][j] * (x[l] - points[k][l]) -
+                                           axes[k][l] * (x[j] - points[k][j]);
+        }
+}
