@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,12 @@ def _frame(stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
     share = np.append(np.ones(m - 1), at - m + 1)
     frame = [base[:3, :3].ravel(), base[:3, 3], [reach], offsets[:m] * (share == 1)]
     return np.concatenate(frame), share
+
+
+def whole_chain(plan: Plan, stored: Stored) -> int:
+    """Write the node of a chain of arcs up to the robot's end, wherever it is steered."""
+    end = {"tip_at": float(len(stored.array("offsets")))}
+    return plan.node_of(replace(stored, settings={**stored.settings, **end}))
 
 
 def _constant_curvature(plan: Plan, stored: Stored) -> int:

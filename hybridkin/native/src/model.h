@@ -6,6 +6,7 @@
 #include "elastic.h"
 #include "rigid.h"
 #include "chains.h"
+#include "pose.h"
 
 /* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. */
 static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance) {

@@ -1,0 +1,130 @@
+/* Readouts of pose features: weights on the axes of a robot's frames, and on moments about them. */
+
+/* What a readout needs of segment k: the frame before it, the features of the frame after it, and in
+   the frame before it how the end of its arc moves and turns by its length and bendings. */
+typedef struct {
+    V before[9];        /* axes of the frame before the segment, in the base frame */
+    V vectors[6][3];    /* axes of the frame after it, then these x d, d the lever to the robot's end */
+    V arc_end[3], end[3]; /* end of the arc, and with its rigid offset */
+    V moves[3][3], spins[3][3];
+} HK(posed);
+
+static inline void HK(cross)(const V *a, const V *b, V *c) {
+    for (int i = 0; i < 3; i++)
+        c[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3];
+}
+
+/* Follow one arc with a rigid offset from the frame `axes`, `at`, which become those after it. */
+static inline void HK(follow)(
+    V length, V bx, V by, real offset, V axes[3][3], V *at, HK(posed) *s) {
+    const HK(stumpff_t) a = HK(stumpff)(bx * bx + by * by);
+    const V slope_f = (a.c3 - a.g) * length, slope_g = (a.c4 + a.c4 - a.c3) * length;
+    const V zero = SPLAT(0.0), one = SPLAT(1.0), gl = a.g * length, across = slope_g * bx * by;
+    const V local[3][3] = {{one - a.g * bx * bx, -(a.g * bx * by), -(a.f * bx)},
+                           {-(a.g * bx * by), one - a.g * by * by, -(a.f * by)},
+                           {a.f * bx, a.f * by, a.c}};
+    const V moves[3][3] = {{a.g * bx, a.g * by, a.f},
+                           {gl + slope_g * bx * bx, across, slope_f * bx},
+                           {across, gl + slope_g * by * by, slope_f * by}};
+    const V spins[3][3] = {{zero, zero, zero},
+                           {-(a.c3 * bx * by), one - a.c3 * by * by, -(a.g * by)},
+                           {a.c3 * bx * bx - one, a.c3 * bx * by, a.g * bx}};
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            s->before[3 * i + j] = axes[i][j];
+            s->moves[i][j] = moves[i][j];
+            s->spins[i][j] = spins[i][j];
+        }
+    for (int j = 0; j < 3; j++) {
+        const V x = axes[0][j], y = axes[1][j], z = axes[2][j];
+        for (int i = 0; i < 3; i++)
+            axes[i][j] = x * local[i][0] + y * local[i][1] + z * local[i][2];
+        s->arc_end[j] = at[j] + (x * moves[0][0] + y * moves[0][1] + z * moves[0][2]) * length;
+        s->end[j] = at[j] = s->arc_end[j] + axes[2][j] * offset;
+    }
+}
+
+/* What a weighted sum of features does: its value, and by virtual work its slope by the arcs (3 S),
+   for forces w on the lever from the base (3), then on the vectors of every frame (18; the last has
+   no moments). Forces on a frame turn as one with every segment before it; every segment after it
+   moves the end of its lever. */
+static inline V HK(virtual_work)(int S, const HK(posed) *s, V reach, const real *w, V *by_arcs) {
+    const V *end = s[S - 1].end;
+    V pulls[HK_MAX_S][3], turns[HK_MAX_S][3], value = SPLAT(0.0), turned[3], pull[3];
+    for (int i = 0; i < 3; i++) {
+        pull[i] = SPLAT(w[i]);
+        value = value + end[i] / reach * w[i];
+    }
+    w += 3;
+    for (int k = 0; k < S; k++, w += 18) {
+        for (int i = 0; i < 3; i++) {
+            pulls[k][i] = pull[i];
+            turns[k][i] = SPLAT(0.0);
+        }
+        for (int v = 0; v < (k < S - 1 ? 6 : 3); v++) {
+            const V force[3] = {SPLAT(w[3 * v]), SPLAT(w[3 * v + 1]), SPLAT(w[3 * v + 2])};
+            const V *vector = s[k].vectors[v];
+            value = value + force[0] * vector[0] + force[1] * vector[1] + force[2] * vector[2];
+            HK(cross)(vector, force, turned);
+            for (int i = 0; i < 3; i++) turns[k][i] = turns[k][i] + turned[i];
+            if (v < 3) continue;
+            HK(cross)(force, s[k].vectors[v - 3], turned);
+            for (int i = 0; i < 3; i++) pull[i] = pull[i] + turned[i];
+        }
+    }
+    V turn[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
+    for (int k = S - 1; by_arcs && k >= 0; k--) {
+        V lever[3], force[3], moment[3], local[2][3];
+        for (int i = 0; i < 3; i++) {
+            turn[i] = turn[i] + turns[k][i];
+            force[i] = pulls[k][i] / reach;
+            lever[i] = end[i] - s[k].arc_end[i];
+        }
+        HK(cross)(lever, force, moment);
+        for (int i = 0; i < 3; i++) moment[i] = moment[i] + turn[i];
+        for (int i = 0; i < 3; i++) {
+            const V *axis = s[k].before + 3 * i;
+            local[0][i] = axis[0] * force[0] + axis[1] * force[1] + axis[2] * force[2];
+            local[1][i] = axis[0] * moment[0] + axis[1] * moment[1] + axis[2] * moment[2];
+        }
+        for (int part = 0; part < 3; part++) {
+            by_arcs[part * S + k] = SPLAT(0.0);
+            for (int i = 0; i < 3; i++)
+                by_arcs[part * S + k] = by_arcs[part * S + k] + local[0][i] * s[k].moves[part][i] +
+                                        local[1][i] * s[k].spins[part][i];
+        }
+    }
+    return value;
+}
+
+/* value (n_out) += W phi(q) and slope (n_out, n), where not NULL, += its derivative, for weights W
+   (n_out, 18 S - 6) of the pose features of a chain of arcs, which ends at the robot's end. */
+static inline void HK(pose_readout)(
+    const hk_plan *p, int at, int n_out, const real *weights, const V *q, V *value, V *slope) {
+    const int S = p->code[at + HK_MORE], n = p->code[at + HK_N];
+    const real *frame = hk_numbers(p, at);
+    const V reach = SPLAT(frame[HK_FRAME - 1]);
+    V z[3 * HK_MAX_S], by_arcs[3 * HK_MAX_S];
+    V axes[3][3], end[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
+    HK(posed) segments[HK_MAX_S];
+    HK(inside) in;
+    HK(coordinates)(p, at, q, z, &in);
+    for (int i = 0; i < 9; i++) axes[i / 3][i % 3] = SPLAT(i % 4 == 0 ? 1.0 : 0.0);
+    for (int k = 0; k < S; k++)
+        HK(follow)(z[k], z[S + k], z[2 * S + k], frame[HK_FRAME + k], axes, end, segments + k);
+    for (int k = 0; k < S; k++) {
+        HK(posed) *s = segments + k;
+        V lever[3];
+        for (int i = 0; i < 3; i++) lever[i] = (end[i] - s->end[i]) / reach;
+        for (int axis = 0; axis < 3; axis++) {
+            const V *after = k + 1 < S ? segments[k + 1].before + 3 * axis : axes[axis];
+            for (int i = 0; i < 3; i++) s->vectors[axis][i] = after[i];
+            HK(cross)(after, lever, s->vectors[3 + axis]);
+        }
+    }
+    for (int i = 0; i < n_out; i++, weights += 18 * S - 6) {
+        const V more = HK(virtual_work)(S, segments, reach, weights, slope ? by_arcs : NULL);
+        value[i] = value[i] + more;
+        if (slope) HK(pull_rows)(p, at, &in, 1, by_arcs, slope + n * i);
+    }
+}
