@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from hybridkin._core.arrays import as_tensor, check_shape, labels, real_array
+from hybridkin.native.library import available, play
 
 __all__ = ["PlayOperator", "PlayState"]
 
@@ -168,25 +169,29 @@ class PlayOperator:
         self, given: Any, state: PlayState | None, name: str, step: _Step, wanted: int
     ) -> tuple[Any, PlayState]:
         """Return the entry `wanted` of the state after every row given, and the last state."""
-        rows = as_tensor(given, name)
-        rows = given.to(rows.dtype) if isinstance(given, Tensor) else rows  # with its graph
+        as_numpy = not isinstance(given, Tensor)
+        rows = real_array(given, name) if as_numpy else given.to(as_tensor(given, name).dtype)
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
-        if not torch.isfinite(rows).all():
+        if not (np if as_numpy else torch).isfinite(rows).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
             raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
         start = (rows[0], rows[0]) if state is None else state
-        at = PlayState(*(torch.as_tensor(part, device=rows.device).to(rows) for part in start))
-        shapes = [tuple(part.shape) for part in at]
+        shapes = [tuple(np.shape(part)) for part in start]
         if shapes != [tuple(rows.shape[1:])] * 2:
             raise ValueError(
                 f"`state` must hold vectors of shape ({rows.shape[1]},), got {shapes}."
             )
+        if as_numpy and len(rows) and rows.dtype == np.float64 and available():
+            found, *last = play(rows, start, self.width / 2, wanted == 0)
+            return found, PlayState(*last)
+        rows = torch.tensor(rows) if as_numpy else rows
+        at = PlayState(*(torch.as_tensor(part, device=rows.device).to(rows) for part in start))
         found, half = [], as_tensor(self.width / 2, "width").to(rows)
         for row in rows:
             at = step(row, at, half)
             found.append(at[wanted])
         out = torch.stack(found) if found else rows.clone()
-        if isinstance(given, Tensor):
+        if not as_numpy:
             return out, at
         return out.numpy(), PlayState(*(part.numpy() for part in at))

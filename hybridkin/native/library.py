@@ -6,10 +6,12 @@ import ctypes
 import os
 import sys
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -82,7 +84,8 @@ def _fault(opened: ctypes.CDLL) -> str:
     pointer = ctypes.c_void_p
     opened.hk_evaluate.argtypes = [pointer, pointer, ctypes.c_int32, pointer, ctypes.c_int64]
     opened.hk_evaluate.argtypes += [pointer] * 3
-    opened.hk_evaluate.restype = None
+    opened.hk_evaluate.restype = opened.hk_play.restype = None
+    opened.hk_play.argtypes = [ctypes.c_int64, ctypes.c_int32, ctypes.c_int32, *[pointer] * 5]
     return "" if _is_right(opened) else "computes wrong numbers"
 
 
@@ -103,7 +106,7 @@ def _is_right(opened: ctypes.CDLL) -> bool:
     circles = Stored(
         "constant_curvature",
         {"tip_at": 2.0},
-        {"base": np.eye(4), "offsets": np.zeros(2)},
+        {"base": np.eye(4), "offsets": np.zeros(2), "radii": np.ones(2)},
         derived={"arc_matrix": halves, "arc_offset": np.zeros(6)},
     )
     program = Program(Plan(circles), opened)
@@ -180,6 +183,32 @@ class Program:
         else:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(run, starts))
+
+
+def play(rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool) -> list[NDArray]:
+    """Return what rows (T, n) become behind the play of tendons, and the state after them.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (T, n)
+        Commands, with `lead` effective changes; contiguous, float64, at least one.
+    state : sequence of two array-likes of shape (n,)
+        The command and the effective change before.
+    half : ndarray of shape () or (n,)
+        Half the width of every tendon.
+    lead : bool
+        Whether commands are asked for, not effective changes.
+    """
+    opened = library()
+    if opened is None:
+        raise RuntimeError(f"the compiled core is not there: {_opened()[1]}.")
+    n = rows.shape[1]
+    vectors = np.empty((3, n))
+    vectors[0], vectors[1], vectors[2] = half, *state
+    at, found = _address(vectors), np.empty_like(rows)
+    places = at, _address(rows), at + 8 * n, at + 16 * n, _address(found)
+    opened.hk_play(len(rows), n, lead, *places)
+    return [found, vectors[1], vectors[2]]
 
 
 def _address(a: NDArray | None) -> int | None:

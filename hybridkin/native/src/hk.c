@@ -1,6 +1,7 @@
 /* The compiled core: the kernels for one row and for blocks of rows, and what Python calls. */
 
 #include "plan.h"
+#include "play.h"
 
 #define HK_LANES 1
 #include "model.h"
@@ -66,4 +67,10 @@ HK_API void hk_evaluate(const int32_t *code, const real *data, int32_t at, const
         for (int64_t r = 0; r < rows; r += HK_LANES)
             hk_block(&plan, at, q + r * n, (int)(rows - r < HK_LANES ? rows - r : HK_LANES),
                      x + r * m, J ? J + r * m * n : NULL, distance ? distance + r : NULL);
+}
+
+/* Rows through the play of tendons, see play.h. */
+HK_API void hk_play(int64_t rows, int32_t n, int32_t lead, const real *half, const real *given,
+                    real *command, real *effective, real *found) {
+    hk_play_rows(rows, n, lead, half, given, command, effective, found);
 }
