@@ -10,13 +10,13 @@
 #ifdef HK_FLOAT
 typedef float real;
 typedef int32_t hk_bits;
-#define HK_MATH(f) f##f
+#define HK_MATH(name) name##f
 #define HK_EPS 1.1920929e-7f
 #define HK_TINY 1.17549435e-38f
 #else
 typedef double real;
 typedef int64_t hk_bits;
-#define HK_MATH(f) f
+#define HK_MATH(name) name
 #define HK_EPS 2.220446049250313e-16
 #define HK_TINY 2.2250738585072014e-308
 #endif

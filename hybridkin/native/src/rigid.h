@@ -30,8 +30,10 @@ static inline void HK(rigid)(
     for (int k = 0; J && k < n; k++)
         for (int i = 0; i < 3; i++) {
             const int j = (i + 1) % 3, l = (i + 2) % 3;
-            J[n * i + k] = slides[k] ? axes[k][i]
-                                     : axes[k][j] * (x[l] - points[k][l]) -
-                                           axes[k][l] * (x[j] - points[k][j]);
+            if (slides[k])
+                J[n * i + k] = axes[k][i] + (x[i] - x[i]); /* NaN in a row of NaN */
+            else
+                J[n * i + k] = axes[k][j] * (x[l] - points[k][l]) -
+                               axes[k][l] * (x[j] - points[k][j]);
         }
 }
