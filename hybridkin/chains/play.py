@@ -172,7 +172,7 @@ class PlayOperator:
         as_numpy = not isinstance(given, Tensor)
         rows = real_array(given, name) if as_numpy else given.to(as_tensor(given, name).dtype)
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
-        if not (np if as_numpy else torch).isfinite(rows).all():
+        if not torch.as_tensor(rows).isfinite().all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
             raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
@@ -182,10 +182,11 @@ class PlayOperator:
             raise ValueError(
                 f"`state` must hold vectors of shape ({rows.shape[1]},), got {shapes}."
             )
-        if as_numpy and len(rows) and rows.dtype == np.float64 and available():
-            found, *last = play(rows, start, self.width / 2, wanted == 0)
-            return found, PlayState(*last)
-        rows = torch.tensor(rows) if as_numpy else rows
+        if isinstance(rows, np.ndarray):
+            if len(rows) and rows.dtype == np.float64 and available():
+                found, *last = play(rows, start, self.width / 2, wanted == 0)
+                return found, PlayState(*last)
+            rows = torch.tensor(rows)
         at = PlayState(*(torch.as_tensor(part, device=rows.device).to(rows) for part in start))
         found, half = [], as_tensor(self.width / 2, "width").to(rows)
         for row in rows:

@@ -110,17 +110,15 @@ def whole_chain(plan: Plan, stored: Stored) -> int:
 
 
 def _constant_curvature(plan: Plan, stored: Stored) -> int:
-    given = stored.arrays.get("lengths")
-    reach = 10.0 * stored.array("radii").mean() if given is None else given.sum()
-    frame, share = _frame(stored, reach)
-    m, S = len(share), len(stored.array("radii"))
-    # Of segment by segment: lengths, x-, y-bendings.
+    given, radii = stored.arrays.get("lengths"), stored.array("radii")
+    frame, share = _frame(stored, 10.0 * radii.mean() if given is None else given.sum())
+    m, S = len(share), len(radii)
+    # Segment by segment: lengths, x-, y-bendings.
     matrix, zero = (
         stored.derived[name].reshape(3, S, -1).swapaxes(0, 1)[:m] * share[:, None, None]
         for name in ("arc_matrix", "arc_offset")
     )
-    n = matrix.shape[2]
-    step, width = 0, n
+    n, step, width = matrix.shape[2], 0, matrix.shape[2]
     if n % S == 0:  # each segment on the actuators that are its own
         own = np.stack([part[:, k * n // S : (k + 1) * n // S] for k, part in enumerate(matrix)])
         if np.count_nonzero(own) == np.count_nonzero(matrix):
@@ -132,23 +130,20 @@ def _elastic_tendons(plan: Plan, stored: Stored) -> int:
     lengths, radii, rest = (stored.array(name) for name in ("lengths", "radii", "rest_bends"))
     frame, share = _frame(stored, lengths.sum())
     counts, m, S = stored.list_of(int, "actuators_per_segment"), len(share), len(radii)
-    coupled = np.full(S, float(stored.value("routing", str) == "base"))
-    coupled[0] = 0.0
+    share = np.append(share, np.zeros(S - m))[:, None]
+    base = stored.value("routing", str) == "base"
+    coupled = base * (np.arange(S) > 0)[:, None]
     bending = stored.array("bending_stiffness")
     stiffness = np.stack([stored.array("axial_stiffness"), bending, bending], 1)
-    share = np.append(share, np.zeros(S - m))[:, None]
     arcs = share * np.column_stack([lengths, rest])
-    coupled = coupled[:, None]
-    segments = [stiffness, coupled * stiffness, arcs, share, coupled * share]
-    of = np.repeat(np.arange(S), counts)
-    angles = stored.array("angles")
+    segments = np.hstack([stiffness, coupled * stiffness, arcs, share, coupled * share])
+    of, angles = np.repeat(np.arange(S), counts), stored.array("angles")
     x, y = -radii[of] * np.cos(angles), -radii[of] * np.sin(angles)
-    bent = np.cumsum(rest, 0) if coupled.any() else rest
-    zeros = stored.array("tendon_zeros") + x * bent[of, 0] + y * bent[of, 1]
+    bent = (np.cumsum(rest, 0) if base else rest)[of]  # the zeros become those of bends from rest
+    zeros = stored.array("tendon_zeros") + x * bent[:, 0] + y * bent[:, 1]
     tendons = np.stack([zeros, x, y, x * x, x * y, y * y], 1)
     same = counts[0] if len({*counts}) == 1 else 0
-    numbers = [frame, np.hstack(segments), tendons]
-    return plan.node(ELASTIC, len(x), 3, numbers, m, S, same, *counts)
+    return plan.node(ELASTIC, len(x), 3, [frame, segments, tendons], m, S, same, *counts)
 
 
 def _rigid(plan: Plan, stored: Stored) -> int:
