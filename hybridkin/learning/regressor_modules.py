@@ -109,7 +109,11 @@ class PolynomialModule(ForwardModel):
         Map of the inputs [unit of q].
     """
 
-    layout = Layout("polynomial", {"powers": "pn", "readout": "pm", "center": "n", "scale": "n"})
+    layout = Layout(
+        "polynomial",
+        {"powers": "pn", "readout": "pm", "center": "n", "scale": "n"},
+        derived=("slope",),
+    )
 
     def __init__(
         self, powers: ArrayLike, readout: ArrayLike, center: ArrayLike, scale: ArrayLike

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from hybridkin._core.stored import Stored
 
 # Kinds of nodes, as src/plan.h numbers them.
 ARCS, ELASTIC, RIGID, AFFINE, ELM, POLYNOMIAL, KERNEL, READOUT = range(1, 9)
 LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID = range(9, 13)
+GROUP = 8  # hidden units, or columns of a leverage, that stand together
+ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
+QUADRATIC, POSE = 1, 3  # features of a readout
+ROUNDING = 1e-7  # of weights that sum to one
 # What the kernels have room for, see src/plan.h.
-MOST = {"actuators": 64, "segments": 16, "outputs": 64, "features": 4096}
+MOST = {"actuators": 64, "segments": 16, "outputs": 64, "features": 2048, "powers": 1024}
 
 
 class NoKernel(ValueError):
@@ -41,6 +46,7 @@ class Plan:
         self._code: list[int] = []
         self._data: list[NDArray] = []
         self._length = 0
+        self._known: dict[tuple, int] = {}
         self.root = self.node_of(stored)
         self.code = np.array(self._code, dtype=np.int32)
         self.data = np.concatenate([*self._data, np.zeros(8)])
@@ -72,15 +78,21 @@ class Plan:
         return write(self, stored)
 
     def node(self, kind: int, n: int, m: int, numbers: list[NDArray], *more: int) -> int:
-        """Write a node with its numbers, and return its place."""
+        """Write a node with its numbers, and return its place; equal nodes have one place."""
         for what, size in (("actuators", n), ("outputs", m)):
             self.limit(what, size)
-        place, at = len(self._code), self._length
         flat = [np.asarray(part, dtype=np.float64).ravel() for part in numbers]
-        self._data += flat
-        self._length += sum(len(part) for part in flat)
-        self._code += [kind, n, m, at, *map(int, more)]
-        return place
+        key = (kind, n, m, *more, *(part.tobytes() for part in flat))
+        if key not in self._known:
+            self._known[key] = len(self._code)
+            self._code += [kind, n, m, self._length, *map(int, more)]
+            self._data += flat
+            self._length += sum(len(part) for part in flat)
+        return self._known[key]
+
+    def entry(self, place: int, k: int) -> int:
+        """Return an entry of a node: 0 its kind, 1 and 2 its lengths, from 4 on what it adds."""
+        return self._code[place + k]
 
     @staticmethod
     def limit(what: str, size: int) -> None:
@@ -161,8 +173,181 @@ def _rigid(plan: Plan, stored: Stored) -> int:
     return plan.node(RIGID, len(slides), 3, [*numbers, tip[:3]], *slides)
 
 
+def _units(
+    plan: Plan,
+    kind: tuple[int, str],
+    center: NDArray,
+    scale: NDArray,
+    readout: tuple[NDArray, NDArray, NDArray],
+    hidden: tuple[NDArray, NDArray],
+    lever: Sequence[NDArray] = (),
+) -> int:
+    """Write x = c + D u + V sigma(W u + b): (c, D, V) is the readout, (W, b) the hidden layer."""
+    (intercept, direct, output), (W, b) = readout, hidden
+    H, (m, n) = len(b), direct.shape
+    units = np.zeros((-(-H // GROUP) * GROUP, n + 1 + m))
+    units[:H] = np.column_stack([W, b, output.T])
+    groups = units.reshape(-1, GROUP, n + 1 + m).swapaxes(1, 2)
+    n_features, full, numbers = 0, 0, []
+    if lever:
+        n_features = len(lever[1])
+        full, numbers = _lever(*lever)
+    parts = [center, 1.0 / scale, intercept, direct, groups, *numbers]
+    more = (H, ACTIVATIONS.index(kind[1]), n_features, full)
+    return plan.node(kind[0], n, m, parts, *more)
+
+
+def _lever(offset: NDArray, center: NDArray, factor: NDArray) -> tuple[int, list[NDArray]]:
+    """Return whether a factor R (f, f) is full, and the numbers of |R' (phi - center)|^2 + offset.
+
+    R stands in blocks of columns, of an upper triangular one down to the diagonal.
+    """
+    f = len(center)
+    Plan.limit("features", f)
+    full = bool(np.tril(factor, -1).any())
+    padded = np.zeros((f, -(-f // GROUP) * GROUP))
+    padded[:, :f] = factor
+    blocks = [padded[: None if full else k + GROUP, k : k + GROUP] for k in range(0, f, GROUP)]
+    return int(full), [offset, center, *blocks]
+
+
+def _elm(plan: Plan, stored: Stored, leverage: bool = False) -> int:
+    W, b, out = (stored.array(name) for name in ("input_weights", "input_bias", "output_weights"))
+    direct = np.zeros((W.shape[1], out.shape[1]))
+    if len(out) > len(b):
+        direct = out[len(b) :]
+    names = ("offset", "center", "factor") if leverage else ()
+    lever = [stored.array(f"leverage_{name}") for name in names]
+    readout = stored.array("intercept"), direct.T, out[: len(b)].T
+    scaling = stored.array("input_center"), stored.array("input_scale")
+    return _units(plan, (ELM, stored.value("activation", str)), *scaling, readout, (W, b), lever)
+
+
+def _affine(plan: Plan, stored: Stored) -> int:
+    coef, bias = stored.array("coef"), stored.array("bias")
+    m, n = coef.shape
+    none = np.zeros((m, 0)), (np.zeros((0, n)), np.zeros(0))
+    return _units(
+        plan, (AFFINE, "sin"), np.zeros(n), np.ones(n), (bias, coef, none[0]), none[1]
+    )
+
+
+def _kernel(plan: Plan, stored: Stored) -> int:
+    rows, weights, bias = stored.array("rows"), stored.array("weights"), stored.array("bias")
+    direct = np.zeros((weights.shape[1], rows.shape[1]))
+    hidden = rows, -0.5 * (rows * rows).sum(1)
+    scaling = stored.array("center"), stored.array("scale")
+    return _units(plan, (KERNEL, "gaussian"), *scaling, (bias, direct, weights.T), hidden)
+
+
+def _polynomial(plan: Plan, stored: Stored) -> int:
+    powers, readout = stored.array("powers").astype(int), stored.array("readout")
+    slope, (P, n) = stored.derived["slope"], powers.shape
+    degrees = int(powers.max()) + 1
+    plan.limit("powers", n * degrees)
+    factors = []
+    for row in powers:
+        places = [j * degrees + power for j, power in enumerate(row) if power]
+        factors += [len(places), *places]
+    scaling = [stored.array("center"), 1.0 / stored.array("scale")]
+    numbers = [*scaling, np.column_stack([readout, slope])]
+    return plan.node(POLYNOMIAL, n, readout.shape[1], numbers, P, degrees, *factors)
+
+
+def _readout(plan: Plan, stored: Stored) -> int:
+    features, weights = stored.part("features"), stored.array("weights")
+    center, scale = features.array("center"), features.array("scale")
+    n, m = len(center), len(weights)
+    constant, linear, bent = np.split(weights, [1, 1 + n], axis=1)
+    kind = features.kind.removesuffix("_features")
+    if kind in ("linear", "hidden"):
+        hidden, activation = (np.zeros((0, n)), np.zeros(0)), "sin"
+        if kind == "hidden":
+            hidden = features.array("input_weights"), features.array("input_bias")
+            activation = features.value("activation", str)
+        return _units(plan, (ELM, activation), center, scale, (constant, linear, bent), hidden)
+    if kind == "quadratic":
+        i, j = np.triu_indices(n, 1)
+        crossed, squared = np.split(bent, [len(i)], axis=1)
+        hessian = np.zeros((m, n, n))
+        hessian[:, i, j] = hessian[:, j, i] = crossed
+        hessian[:, range(n), range(n)] = 3.0 * squared
+        constant = constant - 0.5 * squared.sum(1, keepdims=True)
+        rows = np.column_stack([constant, linear, hessian.reshape(m, -1)])
+        return plan.node(READOUT, n, m, [center, 1.0 / scale, rows], QUADRATIC)
+    if kind == "pose":
+        numbers = [center, 1.0 / scale, constant, linear, scale, bent]
+        chain = plan.node_of(features.part("chain"))
+        return plan.node(READOUT, n, m, numbers, POSE, chain)
+    raise NoKernel(f"a readout of {features.kind!r} has no kernel")
+
+
+def _quadratic_leverage(plan: Plan, stored: Stored) -> int:
+    center, half_width = stored.array("center"), stored.array("half_width")
+    # |L^-1 phi|^2 as the leverage of a network: R = L^-T is upper triangular.
+    factor = solve_triangular(stored.array("factor"), np.eye(2 * len(center) + 1), lower=True).T
+    lever = _lever(np.zeros(1), np.zeros(len(factor)), np.triu(factor))[1]
+    return plan.node(QUADRATIC_LEVERAGE, len(center), 0, [center, 1.0 / half_width, *lever])
+
+
+def _leverage_guard(plan: Plan, stored: Stored) -> int:
+    model = stored.part("model")
+    place = _elm(plan, model, leverage=True) if model.kind == "elm" else plan.node_of(model)
+    numbers = [stored.array("largest"), stored.array("limit")]
+    return plan.node(LEVERAGE_GUARD, plan.entry(place, 1), 0, numbers, place)
+
+
+def _box_guard(plan: Plan, stored: Stored) -> int:
+    low, high = stored.array("low"), stored.array("high")
+    width = np.where(high > low, high - low, 1.0)
+    return plan.node(BOX_GUARD, len(low), 0, [stored.array("largest"), low, high, 1.0 / width])
+
+
+def _equal(a: Stored | None, b: Stored) -> bool:
+    """Return whether two descriptions without parts are the same."""
+    return (
+        a is not None
+        and (a.kind, a.settings) == (b.kind, b.settings)
+        and all(np.array_equal(array, b.arrays[name]) for name, array in a.arrays.items())
+    )
+
+
+def _hybrid(plan: Plan, stored: Stored) -> int:
+    base = drift = -1
+    if "mechanical" in stored.parts:
+        base = plan.node_of(stored.part("mechanical"))
+        if plan.entry(base, 0) not in (ARCS, ELASTIC, RIGID):
+            raise NoKernel(f"the mechanical part {stored.part('mechanical').kind!r} is no chain")
+    if "drift" in stored.parts:
+        drift = plan.node_of(stored.part("drift"))
+    places, inner = [], []
+    for part in stored.part("corrections").parts.values():
+        inner.append(part.kind == "inner_correction")
+        regressor, guard = part.part("readout" if inner[-1] else "module"), part.parts.get("guard")
+        trust = -1 if guard is None else plan.node_of(guard)
+        if guard is not None and _equal(guard.parts.get("model"), regressor):
+            places += [0, plan.entry(trust, 4), trust]  # value and leverage share the features
+        else:
+            places += [inner[-1], plan.node_of(regressor), trust]
+    weights = stored.array("weights")
+    share = 1.0 - weights[inner].sum()
+    numbers = [weights, np.array([share * (share > ROUNDING), any(inner)])]
+    sized = base if base >= 0 else int(places[1])
+    n, m = plan.entry(sized, 1), plan.entry(sized, 2)
+    return plan.node(HYBRID, n, m, numbers, base, drift, len(inner), *places)
+
+
 WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
     "constant_curvature": _constant_curvature,
     "elastic_tendons": _elastic_tendons,
     "rigid": _rigid,
+    "elm": _elm,
+    "affine": _affine,
+    "kernel": _kernel,
+    "polynomial": _polynomial,
+    "readout": _readout,
+    "quadratic_leverage": _quadratic_leverage,
+    "leverage_guard": _leverage_guard,
+    "box_guard": _box_guard,
+    "hybrid_module": _hybrid,
 }

@@ -3,6 +3,8 @@
 #include "plan.h"
 #include "play.h"
 
+#define HK_ROW_LANES /* one row of a network has lanes over the hidden units */
+
 #define HK_LANES 1
 #include "model.h"
 #undef HK_LANES

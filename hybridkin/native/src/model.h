@@ -7,9 +7,18 @@
 #include "rigid.h"
 #include "chains.h"
 #include "pose.h"
+#include "regressors.h"
+#include "guards.h"
+#include "hybrid.h"
 
 /* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. */
 static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance) {
     if (distance) *distance = SPLAT(0.0);
-    HK(chain)(p, at, q, x, J);
+    switch (p->code[at]) {
+    case HK_ARCS:
+    case HK_ELASTIC:
+    case HK_RIGID: HK(chain)(p, at, q, x, J); break;
+    case HK_HYBRID: HK(hybrid)(p, at, q, x, J, distance); break;
+    default: HK(regress)(p, at, q, x, J, NULL);
+    }
 }

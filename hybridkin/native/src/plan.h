@@ -27,8 +27,10 @@ typedef int64_t hk_bits;
 #define HK_MAX_N 64 /* actuators */
 #define HK_MAX_S 16 /* segments */
 #define HK_MAX_M 64 /* outputs of a regressor, or inner coordinates */
-#define HK_MAX_F 4096 /* features whose leverage is taken */
+#define HK_MAX_F 2048 /* features whose leverage is taken */
+#define HK_MAX_P 1024 /* powers of the inputs of a polynomial */
 #endif
+#define HK_GROUP 8 /* hidden units, or columns of a leverage, that stand together */
 #define HK_MAX_Z (3 * HK_MAX_S > HK_MAX_N ? 3 * HK_MAX_S : HK_MAX_N) /* inner coordinates */
 
 /* A node of a plan: code[at] is its kind, then the lengths of its input and output, where its
@@ -49,6 +51,14 @@ enum {
     HK_QUADRATIC_LEVERAGE,
     HK_HYBRID
 };
+
+enum { HK_LOGISTIC, HK_TANH, HK_SIN, HK_GAUSSIAN };
+enum { HK_QUADRATIC_FEATURES = 1, HK_POSE_FEATURES = 3 };
+
+/* A hybrid adds the places of mechanical model and drift, the number of corrections, and of each
+   whether it acts inside, its regressor and its guard; -1 stands for none. */
+enum { HK_BASE, HK_DRIFT, HK_COUNT, HK_FIRST };
+enum { HK_INNER, HK_REGRESSOR, HK_GUARD, HK_STRIDE };
 
 typedef struct {
     const int32_t *code;

@@ -1,0 +1,165 @@
+/* x = f(q) + sum_k w_k s_k(q) + t(q) d(q): a mechanical model f, corrections s_k in front of the
+   tip or inside the robot, each faded and shortened by its guard, and a drift d with its trust t. */
+
+/* What all corrections of a row add to. C and its own `pull` hold df/dq in inner coordinates. */
+typedef struct {
+    V x[HK_MAX_M], *J;           /* x, and dx/dq without what C brings, or NULL */
+    V z[HK_MAX_Z], f[3];         /* inner coordinates of q, and their tip */
+    V C0[3 * HK_MAX_Z];          /* df/dz, if it was needed */
+    V C[3 * HK_MAX_Z];           /* the total derivative by z */
+    V trust, slope[HK_MAX_N];    /* of the drift */
+    V farthest;                  /* distance of any guard */
+    int has_C0, fades;
+    HK(inside) in;
+    HK(seen) seen;
+} HK(total);
+
+/* df/dz, computed once. */
+static inline const V *HK(base_slope)(const hk_plan *p, int base, HK(total) *sum) {
+    V f[3];
+    if (!sum->has_C0) HK(from_coordinates)(p, base, sum->z, f, sum->C0);
+    sum->has_C0 = 1;
+    return sum->C0;
+}
+
+/* Fades x (m) and its derivatives: J (m, k) by q with the slope (n = k), or any D (m, k) without. */
+static inline void HK(fade)(int m, int k, V g, const V *slope, const V *x, V *J) {
+    for (int i = 0; i < m; i++)
+        for (int j = 0; j < k; j++) {
+            J[k * i + j] = J[k * i + j] * g;
+            if (slope) J[k * i + j] = J[k * i + j] + x[i] * slope[j];
+        }
+}
+
+/* The guard's weight of a correction; keeps its part of trust and domain. */
+static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, HK(total) *sum, V *g,
+                              V *slope) {
+    V distance;
+    if (guard < 0) return 0;
+    const int fades = HK(fading)(p, guard, q, &sum->seen, &distance, g, sum->J ? slope : NULL);
+    /* NaN is the farthest. */
+    sum->farthest = SELECT(NOT(distance <= sum->farthest), distance, sum->farthest);
+    if (!fades) return 0;
+    sum->trust = sum->trust - w * (R(1.0) - *g);
+    for (int j = 0; sum->J && j < p->code[guard + HK_N]; j++)
+        sum->slope[j] = (sum->fades ? sum->slope[j] : SPLAT(0.0)) + w * slope[j];
+    sum->fades = 1;
+    return 1;
+}
+
+/* Adds a correction at the tip, w s(q). */
+static inline void HK(tip_correction)(
+    const hk_plan *p, const int32_t *part, const V *q, int m, real w, HK(total) *sum) {
+    const int at = part[HK_REGRESSOR], guard = part[HK_GUARD], n = p->code[at + HK_N];
+    const int own = guard >= 0 && p->code[guard] == HK_LEVERAGE_GUARD && p->code[guard + HK_MORE] == at;
+    V x[HK_MAX_M], J[HK_MAX_M * HK_MAX_N], g, slope[HK_MAX_N];
+    HK(shortening) how;
+    HK(regress)(p, at, q, x, sum->J ? J : NULL, own ? sum->seen.phi : NULL);
+    if (own) sum->seen.phi_of = at;
+    if (HK(guarded)(p, guard, q, w, sum, &g, slope)) {
+        if (sum->J) HK(fade)(m, n, g, slope, x, J);
+        for (int i = 0; i < m; i++) x[i] = x[i] * g;
+    }
+    if (guard >= 0 && HK(is_long)(p, guard, m, x, &how)) {
+        if (sum->J) HK(shorten)(&how, m, n, J);
+        for (int i = 0; i < m; i++) x[i] = x[i] * how.factor;
+    }
+    HK(add)(m, w, x, sum->x);
+    if (sum->J) HK(add)(m * n, w, J, sum->J);
+}
+
+/* Adds a correction inside the robot, w (f + s(q)) with s = F(z + delta(q)) - f. Rows that fade or
+   are too long need df/dz as well. All is linear in the columns, so one `pull` at the end serves
+   all corrections: C takes what multiplies dz/dq, J the rest. */
+static inline void HK(inner_correction)(
+    const hk_plan *p, int base, const int32_t *part, const V *q, real w, HK(total) *sum) {
+    const int guard = part[HK_GUARD], n = p->code[base + HK_N], k = HK(n_coordinates)(p, base);
+    V z[HK_MAX_Z], turn[HK_MAX_Z * HK_MAX_N], x[3], C[3 * HK_MAX_Z], J[3 * HK_MAX_N], g;
+    V slope[HK_MAX_N];
+    HK(shortening) how;
+    HK(regress)(p, part[HK_REGRESSOR], q, z, sum->J ? turn : NULL, NULL);
+    for (int i = 0; i < k; i++) z[i] = z[i] + sum->z[i];
+    HK(from_coordinates)(p, base, z, x, sum->J ? C : NULL);
+    if (sum->J && n == 9 && k == 9)
+        HK(multiply)(9, 9, C, turn, J);
+    else if (sum->J)
+        HK(multiply)(k, n, C, turn, J);
+    if (guard >= 0) {
+        for (int i = 0; i < 3; i++) x[i] = x[i] - sum->f[i];
+        const int fades = HK(guarded)(p, guard, q, w, sum, &g, slope);
+        V own[3] = {x[0], x[1], x[2]};
+        for (int i = 0; fades && i < 3; i++) own[i] = own[i] * g;
+        const int too_long = HK(is_long)(p, guard, 3, own, &how);
+        if (sum->J && (fades || too_long)) {
+            const V *C0 = HK(base_slope)(p, base, sum);
+            for (int i = 0; i < 3 * k; i++) C[i] = C[i] - C0[i];
+            if (fades) HK(fade)(3, k, g, NULL, x, C);
+            if (fades) HK(fade)(3, n, g, slope, x, J);
+            if (too_long) HK(shorten)(&how, 3, k, C);
+            if (too_long) HK(shorten)(&how, 3, n, J);
+            for (int i = 0; i < 3 * k; i++) C[i] = C[i] + C0[i];
+        }
+        for (int i = 0; i < 3; i++) x[i] = sum->f[i] + (too_long ? own[i] * how.factor : own[i]);
+    }
+    HK(add)(3, w, x, sum->x);
+    if (sum->J) HK(add)(3 * k, w, C, sum->C);
+    if (sum->J) HK(add)(3 * n, w, J, sum->J);
+}
+
+static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance) {
+    const int32_t *node = p->code + at, *more = node + HK_MORE, *part = more + HK_FIRST;
+    const int n = node[HK_N], m = node[HK_M], base = more[HK_BASE], count = more[HK_COUNT];
+    const real *w = hk_numbers(p, at), share = w[count]; /* of f beside inner corrections */
+    const int inner = w[count + 1] != R(0.0), k = inner ? HK(n_coordinates)(p, base) : 0;
+    HK(total) sum;
+    sum.J = J;
+    sum.has_C0 = sum.fades = 0;
+    sum.seen.phi_of = sum.seen.white_of = -1;
+    sum.trust = SPLAT(1.0);
+    sum.farthest = SPLAT(0.0);
+    for (int i = 0; i < m; i++) sum.x[i] = SPLAT(0.0);
+    for (int i = 0; J && i < m * n; i++) J[i] = SPLAT(0.0);
+    if (inner) {
+        HK(coordinates)(p, base, q, sum.z, &sum.in);
+        HK(from_coordinates)(p, base, sum.z, sum.f, NULL);
+        HK(add)(3, share, sum.f, sum.x);
+        for (int i = 0; i < 3 * k; i++) sum.C[i] = SPLAT(0.0);
+        if (J && share != R(0.0)) HK(add)(3 * k, share, HK(base_slope)(p, base, &sum), sum.C);
+    } else if (base >= 0)
+        HK(chain)(p, base, q, sum.x, J);
+    for (int c = 0; c < count; c++, part += HK_STRIDE)
+        if (part[HK_INNER])
+            HK(inner_correction)(p, base, part, q, w[c], &sum);
+        else
+            HK(tip_correction)(p, part, q, m, w[c], &sum);
+    if (inner && J) HK(pull)(p, base, &sum.in, sum.C, J);
+    if (more[HK_DRIFT] >= 0) {
+        V d[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N];
+        HK(elm)(p, more[HK_DRIFT], q, d, J ? slope : NULL, NULL);
+        if (J) HK(fade)(m, n, sum.trust, sum.fades ? sum.slope : NULL, d, slope);
+        for (int i = 0; i < m; i++) sum.x[i] = sum.x[i] + d[i] * sum.trust;
+        if (J) HK(add)(m * n, R(1.0), slope, J);
+    }
+    for (int i = 0; i < m; i++) x[i] = sum.x[i];
+    if (distance) *distance = sum.farthest;
+}
+
+/* The largest distance of any guard, and its slope (n) by q where not NULL. */
+static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
+    const int32_t *node = p->code + at, *part = node + HK_MORE + HK_FIRST;
+    const int n = node[HK_N], count = node[HK_KIND] == HK_HYBRID ? node[HK_MORE + HK_COUNT] : 0;
+    HK(seen) seen;
+    seen.phi_of = seen.white_of = -1;
+    *distance = SPLAT(0.0);
+    for (int j = 0; slope && j < n; j++) slope[j] = SPLAT(0.0);
+    for (int c = 0; c < count; c++, part += HK_STRIDE) {
+        if (part[HK_GUARD] < 0) continue;
+        V own[HK_MAX_N];
+        const V here = HK(guard_distance)(p, part[HK_GUARD], q, &seen);
+        const M farther = NOT(here <= *distance);
+        *distance = SELECT(farther, here, *distance);
+        if (!slope || !HK(any)(farther)) continue;
+        HK(guard_slope)(p, part[HK_GUARD], q, &seen, own);
+        for (int j = 0; j < n; j++) slope[j] = SELECT(farther, own[j], slope[j]);
+    }
+}

@@ -1,0 +1,224 @@
+/* Learned models q (n) -> x (m) with their Jacobians J (m, n). */
+
+/* sigma(a) of `count` hidden units in place of a, and sigma'(a) in d. */
+static inline __attribute__((always_inline)) void HK(activate)(
+    int activation, int count, V *a, V *d) {
+    switch (activation) {
+    case HK_LOGISTIC:
+        for (int i = 0; i < count; i++) {
+            a[i] = R(1.0) / (R(1.0) + HK(exp)(-a[i]));
+            d[i] = a[i] - a[i] * a[i];
+        }
+        break;
+    case HK_TANH:
+        for (int i = 0; i < count; i++) {
+            a[i] = HK(tanh)(a[i]);
+            d[i] = R(1.0) - a[i] * a[i];
+        }
+        break;
+    case HK_SIN:
+        for (int i = 0; i < count; i++) {
+            V sine;
+            HK(sincos)(a[i], &sine, &d[i]);
+            a[i] = sine;
+        }
+        break;
+    default: /* a Gaussian, of minus half the squared distance */
+        for (int i = 0; i < count; i++) d[i] = a[i] = HK(exp)(HK(min)(a[i], SPLAT(0.0)));
+    }
+}
+
+/* Adds the hidden units' share of x (m) and of its slope J (m, n) by u (n), where not NULL, and
+   writes sigma of every unit into `features`, where not NULL. The weights of HK_GROUP units stand
+   together: W transposed (n, HK_GROUP), b (HK_GROUP), output weights (m, HK_GROUP). */
+static inline __attribute__((always_inline)) void HK(units_of)(
+    int n, int m, int groups, int activation, const real *w, const V *u, V shift, V *x, V *J,
+    V *features) {
+    for (int g = 0; g < groups; g++, w += HK_GROUP * (n + 1 + m)) {
+        const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
+        V s[HK_GROUP], d[HK_GROUP];
+        for (int i = 0; i < HK_GROUP; i++) s[i] = shift + bias[i];
+        for (int j = 0; j < n; j++)
+            for (int i = 0; i < HK_GROUP; i++) s[i] = s[i] + u[j] * w[HK_GROUP * j + i];
+        HK(activate)(activation, HK_GROUP, s, d);
+        if (features)
+            for (int i = 0; i < HK_GROUP; i++) features[HK_GROUP * g + i] = s[i];
+        for (int o = 0; o < m; o++) {
+            V sum = x[o];
+            for (int i = 0; i < HK_GROUP; i++) sum = sum + s[i] * out[HK_GROUP * o + i];
+            x[o] = sum;
+        }
+        for (int o = 0; J && o < m; o++) {
+            V row[HK_MAX_N];
+            for (int j = 0; j < n; j++) row[j] = J[n * o + j];
+            for (int i = 0; i < HK_GROUP; i++) {
+                const V t = d[i] * out[HK_GROUP * o + i];
+                for (int j = 0; j < n; j++) row[j] = row[j] + t * w[HK_GROUP * j + i];
+            }
+            for (int j = 0; j < n; j++) J[n * o + j] = row[j];
+        }
+    }
+}
+
+#if HK_LANES == 1 && defined(HK_ROW_LANES)
+/* One row with lanes over the hidden units, below; it stands in the library alone. */
+static void hkr_units(int n, int m, int groups, int activation, const real *w, const real *u,
+                      real shift, real *x, real *J, real *features);
+#endif
+#if HK_LANES > 1
+static inline V HK(load)(const real *a) {
+    V v;
+    __builtin_memcpy(&v, a, sizeof v);
+    return v;
+}
+
+static inline real HK(sum)(V v) {
+    real sum = v[0];
+    for (int i = 1; i < HK_LANES; i++) sum += v[i];
+    return sum;
+}
+
+static inline __attribute__((always_inline)) void hkr_units_of(
+    int n, int m, int groups, int activation, const real *w, const real *u, real shift, real *x,
+    real *J, real *features) {
+    V value[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N];
+    for (int o = 0; o < m; o++) value[o] = SPLAT(0.0);
+    for (int k = 0; J && k < m * n; k++) slope[k] = SPLAT(0.0);
+    for (int g = 0; g < groups; g++, w += HK_GROUP * (n + 1 + m))
+        for (int at = 0; at < HK_GROUP; at += HK_LANES) {
+            V s = HK(load)(w + HK_GROUP * n + at) + shift, d;
+            for (int j = 0; j < n; j++) s = s + HK(load)(w + HK_GROUP * j + at) * u[j];
+            HK(activate)(activation, 1, &s, &d);
+            if (features) __builtin_memcpy(features + HK_GROUP * g + at, &s, sizeof s);
+            for (int o = 0; o < m; o++) {
+                const V out = HK(load)(w + HK_GROUP * (n + 1 + o) + at), t = d * out;
+                value[o] = value[o] + s * out;
+                for (int j = 0; J && j < n; j++)
+                    slope[n * o + j] = slope[n * o + j] + t * HK(load)(w + HK_GROUP * j + at);
+            }
+        }
+    for (int o = 0; o < m; o++) x[o] += HK(sum)(value[o]);
+    for (int k = 0; J && k < m * n; k++) J[k] += HK(sum)(slope[k]);
+}
+
+static void hkr_units(int n, int m, int groups, int activation, const real *w, const real *u,
+                      real shift, real *x, real *J, real *features) {
+    if (n == 9 && m == 3)
+        hkr_units_of(9, 3, groups, activation, w, u, shift, x, J, features);
+    else
+        hkr_units_of(n, m, groups, activation, w, u, shift, x, J, features);
+}
+#endif
+
+static inline void HK(units)(int n, int m, int groups, int activation, const real *w, const V *u,
+                             V shift, V *x, V *J, V *features) {
+#if HK_LANES == 1 && defined(HK_ROW_LANES)
+    hkr_units(n, m, groups, activation, w, u, shift, x, J, features);
+#else
+    if (n == 9 && m == 3)
+        HK(units_of)(9, 3, groups, activation, w, u, shift, x, J, features);
+    else if (n == 6 && m == 3)
+        HK(units_of)(6, 3, groups, activation, w, u, shift, x, J, features);
+    else
+        HK(units_of)(n, m, groups, activation, w, u, shift, x, J, features);
+#endif
+}
+
+/* u = (q - center) / scale; the scale's inverse follows the center. Folded into later weights it
+   would cancel digits. */
+static inline void HK(scaled)(int n, const real *center, const V *q, V *u) {
+    for (int j = 0; j < n; j++) u[j] = (q[j] - center[j]) * center[n + j];
+}
+
+/* x = c + D u + V sigma(W u + b): networks with direct link, affine maps, Gaussian kernels.
+
+   Writes the features too where asked: the hidden units', then u. A Gaussian at u_i is the unit
+   exp(u_i . u - |u_i|^2 / 2 - |u|^2 / 2). */
+static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features) {
+    const int32_t *node = p->code + at, *more = node + HK_MORE;
+    const int n = node[HK_N], m = node[HK_M], n_hidden = more[0], activation = more[1];
+    const int groups = (n_hidden + HK_GROUP - 1) / HK_GROUP, gaussian = activation == HK_GAUSSIAN;
+    const real *center = hk_numbers(p, at), *inverse = center + n;
+    const real *intercept = inverse + n, *direct = intercept + m;
+    V u[HK_MAX_N], shift = SPLAT(0.0);
+    HK(scaled)(n, center, q, u);
+    for (int j = 0; gaussian && j < n; j++) shift = shift - R(0.5) * u[j] * u[j];
+    for (int o = 0; o < m; o++) x[o] = SPLAT(0.0);
+    for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(0.0);
+    HK(units)(n, m, groups, activation, direct + m * n, u, shift, x, J, features);
+    for (int o = 0; o < m; o++) {
+        for (int j = 0; J && j < n; j++) {
+            if (gaussian) J[n * o + j] = J[n * o + j] - x[o] * u[j];
+            J[n * o + j] = (J[n * o + j] + direct[n * o + j]) * inverse[j];
+        }
+        x[o] = x[o] + intercept[o];
+        for (int j = 0; j < n; j++) x[o] = x[o] + u[j] * direct[n * o + j];
+    }
+    if (features)
+        for (int j = 0; j < n; j++) features[n_hidden + j] = u[j];
+}
+
+/* Sums of products of powers of u. Their factors stand as places in the table of powers. */
+static inline void HK(polynomial)(const hk_plan *p, int at, const V *q, V *x, V *J) {
+    const int32_t *node = p->code + at, *factor = node + HK_MORE + 2;
+    const int n = node[HK_N], m = node[HK_M], terms = node[HK_MORE], powers = node[HK_MORE + 1];
+    const real *center = hk_numbers(p, at), *readout = center + 2 * n;
+    V u[HK_MAX_N], power[HK_MAX_P];
+    HK(scaled)(n, center, q, u);
+    for (int j = 0; j < n; j++) {
+        power[j * powers] = SPLAT(1.0);
+        for (int k = 1; k < powers; k++) power[j * powers + k] = power[j * powers + k - 1] * u[j];
+    }
+    for (int o = 0; o < m; o++) x[o] = SPLAT(0.0);
+    for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(0.0);
+    for (int t = 0; t < terms; t++, readout += m + m * n) {
+        V phi = SPLAT(1.0);
+        for (int left = *factor++; left > 0; left--) phi = phi * power[*factor++];
+        for (int o = 0; o < m; o++) x[o] = x[o] + phi * readout[o];
+        for (int k = 0; J && k < m * n; k++) J[k] = J[k] + phi * readout[m + k];
+    }
+}
+
+/* value = c + D u + u' A u / 2 with symmetric A, output by output; its slope by u is D + A u. */
+static inline __attribute__((always_inline)) void HK(quadratic_of)(
+    int n, int m, const real *c, const real *inverse, const V *u, V *x, V *J) {
+    for (int o = 0; o < m; o++, c += 1 + n + n * n) {
+        V slope[HK_MAX_N], sum = SPLAT(0.0);
+        for (int j = 0; j < n; j++) slope[j] = SPLAT(c[1 + j]);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) slope[j] = slope[j] + u[i] * c[1 + n + n * i + j];
+        for (int j = 0; j < n; j++) sum = sum + u[j] * (slope[j] + c[1 + j]);
+        x[o] = R(0.5) * sum + c[0];
+        for (int j = 0; J && j < n; j++) J[n * o + j] = slope[j] * inverse[j];
+    }
+}
+
+/* A readout of quadratic features, or of the pose: linear features, then loads on the shape. */
+static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J) {
+    const int32_t *node = p->code + at, *more = node + HK_MORE;
+    const int n = node[HK_N], m = node[HK_M];
+    const real *center = hk_numbers(p, at), *inverse = center + n, *c = inverse + n;
+    V u[HK_MAX_N];
+    HK(scaled)(n, center, q, u);
+    if (more[0] == HK_QUADRATIC_FEATURES) {
+        if (n == 9)
+            HK(quadratic_of)(9, m, c, inverse, u, x, J);
+        else
+            HK(quadratic_of)(n, m, c, inverse, u, x, J);
+        return;
+    }
+    const real *direct = c + m, *scale = direct + m * n;
+    HK(affine)(m, n, direct, c, u, x);
+    for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(direct[k] * inverse[k % n]);
+    (void)scale;
+    // HK(pose_readout)(p, more[1], n, m, center, scale, scale + n, q, x, J);
+}
+
+/* Any regressor. `features` is for networks alone. */
+static inline void HK(regress)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features) {
+    switch (p->code[at]) {
+    case HK_POLYNOMIAL: HK(polynomial)(p, at, q, x, J); break;
+    case HK_READOUT: HK(readout)(p, at, q, x, J); break;
+    default: HK(elm)(p, at, q, x, J, features);
+    }
+}
