@@ -193,6 +193,7 @@ static inline int HK(is_long)(const hk_plan *p, int at, int m, const V *x, HK(sh
     V squares = SPLAT(0.0);
     how->factor = SPLAT(1.0);
     how->bend = SPLAT(0.0);
+    for (int i = 0; i < m; i++) how->along[i] = SPLAT(0.0);
     for (int i = 0; i < m; i++) squares = squares + (x[i] / unit) * (x[i] / unit);
     if (!HK(any)(squares > SPLAT(1.0))) return 0;
     const V relative = HK(sqrt)(HK(max)(squares, SPLAT(1.0)));

@@ -24,7 +24,10 @@
 static inline int hk_any(int m) { return m; }
 static inline real hk_sqrt(real x) { return HK_MATH(sqrt)(x); }
 static inline real hk_exp(real x) { return HK_MATH(exp)(x); }
+static inline real hk_logistic(real x) { return R(1.0) / (R(1.0) + hk_exp(-x)); }
 static inline real hk_tanh(real x) { return HK_MATH(tanh)(x); }
+static inline real hk_max(real a, real b) { return b > a ? b : a; }
+static inline real hk_min(real a, real b) { return b < a ? b : a; }
 static inline void hk_sincos(real x, real *s, real *c) {
     *s = HK_MATH(sin)(x);
     *c = HK_MATH(cos)(x);
@@ -54,26 +57,32 @@ static inline V hkv_sqrt(V x) {
     return r;
 }
 
-/* exp by x = k ln 2 + r and a polynomial in r; double precision. */
+static inline V hkv_max(V a, V b) { return SELECT(a < b, b, a); } /* the NaN of an a stays */
+static inline V hkv_min(V a, V b) { return SELECT(b < a, b, a); }
+
+/* exp by x = k ln 2 + r and a minimax polynomial in r, right to 3e-16 up to ln 2 / 2. */
 static inline V hkv_exp(V x) {
     const V round = SPLAT(6755399441055744.0); /* 1.5 * 2^52: the sum's last bits are k */
-    x = SELECT(x < SPLAT(-708.0), SPLAT(-708.0), x);
-    x = SELECT(x > SPLAT(709.0), SPLAT(709.0), x);
+    x = hkv_min(hkv_max(x, SPLAT(-708.0)), SPLAT(709.0));
     const V shifted = x * 1.4426950408889634 + round, k = shifted - round;
     const V r = (x - k * 6.93147180369123816490e-1) - k * 1.90821492927058770002e-10;
-    V y = SPLAT(1.0 / 39916800.0);
-    y = y * r + 1.0 / 3628800.0;
-    y = y * r + 1.0 / 362880.0;
-    y = y * r + 1.0 / 40320.0;
-    y = y * r + 1.0 / 5040.0;
-    y = y * r + 1.0 / 720.0;
-    y = y * r + 1.0 / 120.0;
-    y = y * r + 1.0 / 24.0;
-    y = y * r + 1.0 / 6.0;
-    y = y * r + 0.5;
+    V y = SPLAT(2.7476727591429536815e-7);
+    y = y * r + 2.7635013162445406779e-6;
+    y = y * r + 2.4801932040583279556e-5;
+    y = y * r + 1.9841185184666530655e-4;
+    y = y * r + 1.3888888515778345185e-3;
+    y = y * r + 8.3333333709071248824e-3;
+    y = y * r + 4.166666666813876456e-2;
+    y = y * r + 1.6666666666611474018e-1;
+    y = y * r + 4.9999999999998320886e-1;
     y = y * r + 1.0;
     y = y * r + 1.0;
     return (V)((M)y + ((M)shifted << 52));
+}
+
+static inline V hkv_logistic(V x) {
+    const V e = hkv_exp(x);
+    return e / (1.0 + e);
 }
 
 static inline V hkv_tanh(V x) {
@@ -111,6 +120,3 @@ static inline void hkv_sincos(V x, V *s, V *c) {
         }
 }
 #endif
-
-static inline V HK(max)(V a, V b) { return SELECT(a < b, b, a); }
-static inline V HK(min)(V a, V b) { return SELECT(b < a, b, a); }

@@ -6,7 +6,7 @@ static inline __attribute__((always_inline)) void HK(activate)(
     switch (activation) {
     case HK_LOGISTIC:
         for (int i = 0; i < count; i++) {
-            a[i] = R(1.0) / (R(1.0) + HK(exp)(-a[i]));
+            a[i] = HK(logistic)(a[i]);
             d[i] = a[i] - a[i] * a[i];
         }
         break;
@@ -28,41 +28,47 @@ static inline __attribute__((always_inline)) void HK(activate)(
     }
 }
 
-/* Adds the hidden units' share of x (m) and of its slope J (m, n) by u (n), where not NULL, and
-   writes sigma of every unit into `features`, where not NULL. The weights of HK_GROUP units stand
-   together: W transposed (n, HK_GROUP), b (HK_GROUP), output weights (m, HK_GROUP). */
-static inline __attribute__((always_inline)) void HK(units_of)(
-    int n, int m, int groups, int activation, const real *w, const V *u, V shift, V *x, V *J,
+/* Adds the share of `count` hidden units in x (m) and in its slope J (m, n) by u (n), where not
+   NULL, and writes their sigma into `features`, where not NULL. */
+static inline __attribute__((always_inline)) void HK(group_of)(
+    int n, int m, int count, int activation, const real *w, const V *u, V shift, V *x, V *J,
     V *features) {
-    for (int g = 0; g < groups; g++, w += HK_GROUP * (n + 1 + m)) {
-        const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
-        V s[HK_GROUP], d[HK_GROUP];
-        for (int i = 0; i < HK_GROUP; i++) s[i] = shift + bias[i];
-        for (int j = 0; j < n; j++)
-            for (int i = 0; i < HK_GROUP; i++) s[i] = s[i] + u[j] * w[HK_GROUP * j + i];
-        HK(activate)(activation, HK_GROUP, s, d);
-        if (features)
-            for (int i = 0; i < HK_GROUP; i++) features[HK_GROUP * g + i] = s[i];
-        for (int o = 0; o < m; o++) {
-            V sum = x[o];
-            for (int i = 0; i < HK_GROUP; i++) sum = sum + s[i] * out[HK_GROUP * o + i];
-            x[o] = sum;
+    const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
+    V s[HK_GROUP], d[HK_GROUP];
+    for (int i = 0; i < count; i++) s[i] = shift + bias[i];
+    for (int j = 0; j < n; j++)
+        for (int i = 0; i < count; i++) s[i] = s[i] + u[j] * w[HK_GROUP * j + i];
+    HK(activate)(activation, count, s, d);
+    for (int i = 0; features && i < count; i++) features[i] = s[i];
+    for (int o = 0; o < m; o++, out += HK_GROUP) {
+        V row[HK_MAX_N], sum = x[o];
+        for (int i = 0; i < count; i++) sum = sum + s[i] * out[i];
+        x[o] = sum;
+        if (!J) continue;
+        for (int j = 0; j < n; j++) row[j] = J[n * o + j];
+        for (int i = 0; i < count; i++) {
+            const V t = d[i] * out[i];
+            for (int j = 0; j < n; j++) row[j] = row[j] + t * w[HK_GROUP * j + i];
         }
-        for (int o = 0; J && o < m; o++) {
-            V row[HK_MAX_N];
-            for (int j = 0; j < n; j++) row[j] = J[n * o + j];
-            for (int i = 0; i < HK_GROUP; i++) {
-                const V t = d[i] * out[HK_GROUP * o + i];
-                for (int j = 0; j < n; j++) row[j] = row[j] + t * w[HK_GROUP * j + i];
-            }
-            for (int j = 0; j < n; j++) J[n * o + j] = row[j];
-        }
+        for (int j = 0; j < n; j++) J[n * o + j] = row[j];
     }
+}
+
+/* All hidden units. The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP),
+   b (HK_GROUP), output weights (m, HK_GROUP). */
+static inline __attribute__((always_inline)) void HK(units_of)(
+    int n, int m, int units, int activation, const real *w, const V *u, V shift, V *x, V *J,
+    V *features) {
+    for (; units > HK_GROUP / 2; units -= HK_GROUP, w += HK_GROUP * (n + 1 + m)) {
+        HK(group_of)(n, m, HK_GROUP, activation, w, u, shift, x, J, features);
+        if (features) features += HK_GROUP;
+    }
+    if (units > 0) HK(group_of)(n, m, HK_GROUP / 2, activation, w, u, shift, x, J, features);
 }
 
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
 /* One row with lanes over the hidden units, below; it stands in the library alone. */
-static void hkr_units(int n, int m, int groups, int activation, const real *w, const real *u,
+static void hkr_units(int n, int m, int units, int activation, const real *w, const real *u,
                       real shift, real *x, real *J, real *features);
 #endif
 #if HK_LANES > 1
@@ -79,12 +85,12 @@ static inline real HK(sum)(V v) {
 }
 
 static inline __attribute__((always_inline)) void hkr_units_of(
-    int n, int m, int groups, int activation, const real *w, const real *u, real shift, real *x,
+    int n, int m, int units, int activation, const real *w, const real *u, real shift, real *x,
     real *J, real *features) {
     V value[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N];
     for (int o = 0; o < m; o++) value[o] = SPLAT(0.0);
     for (int k = 0; J && k < m * n; k++) slope[k] = SPLAT(0.0);
-    for (int g = 0; g < groups; g++, w += HK_GROUP * (n + 1 + m))
+    for (int g = 0; HK_GROUP * g < units; g++, w += HK_GROUP * (n + 1 + m))
         for (int at = 0; at < HK_GROUP; at += HK_LANES) {
             V s = HK(load)(w + HK_GROUP * n + at) + shift, d;
             for (int j = 0; j < n; j++) s = s + HK(load)(w + HK_GROUP * j + at) * u[j];
@@ -101,26 +107,26 @@ static inline __attribute__((always_inline)) void hkr_units_of(
     for (int k = 0; J && k < m * n; k++) J[k] += HK(sum)(slope[k]);
 }
 
-static void hkr_units(int n, int m, int groups, int activation, const real *w, const real *u,
+static void hkr_units(int n, int m, int units, int activation, const real *w, const real *u,
                       real shift, real *x, real *J, real *features) {
     if (n == 9 && m == 3)
-        hkr_units_of(9, 3, groups, activation, w, u, shift, x, J, features);
+        hkr_units_of(9, 3, units, activation, w, u, shift, x, J, features);
     else
-        hkr_units_of(n, m, groups, activation, w, u, shift, x, J, features);
+        hkr_units_of(n, m, units, activation, w, u, shift, x, J, features);
 }
 #endif
 
-static inline void HK(units)(int n, int m, int groups, int activation, const real *w, const V *u,
+static inline void HK(units)(int n, int m, int units, int activation, const real *w, const V *u,
                              V shift, V *x, V *J, V *features) {
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
-    hkr_units(n, m, groups, activation, w, u, shift, x, J, features);
+    hkr_units(n, m, units, activation, w, u, shift, x, J, features);
 #else
     if (n == 9 && m == 3)
-        HK(units_of)(9, 3, groups, activation, w, u, shift, x, J, features);
+        HK(units_of)(9, 3, units, activation, w, u, shift, x, J, features);
     else if (n == 6 && m == 3)
-        HK(units_of)(6, 3, groups, activation, w, u, shift, x, J, features);
+        HK(units_of)(6, 3, units, activation, w, u, shift, x, J, features);
     else
-        HK(units_of)(n, m, groups, activation, w, u, shift, x, J, features);
+        HK(units_of)(n, m, units, activation, w, u, shift, x, J, features);
 #endif
 }
 
@@ -137,7 +143,7 @@ static inline void HK(scaled)(int n, const real *center, const V *q, V *u) {
 static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features) {
     const int32_t *node = p->code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M], n_hidden = more[0], activation = more[1];
-    const int groups = (n_hidden + HK_GROUP - 1) / HK_GROUP, gaussian = activation == HK_GAUSSIAN;
+    const int gaussian = activation == HK_GAUSSIAN;
     const real *center = hk_numbers(p, at), *inverse = center + n;
     const real *intercept = inverse + n, *direct = intercept + m;
     V u[HK_MAX_N], shift = SPLAT(0.0);
@@ -145,7 +151,7 @@ static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *
     for (int j = 0; gaussian && j < n; j++) shift = shift - R(0.5) * u[j] * u[j];
     for (int o = 0; o < m; o++) x[o] = SPLAT(0.0);
     for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(0.0);
-    HK(units)(n, m, groups, activation, direct + m * n, u, shift, x, J, features);
+    HK(units)(n, m, n_hidden, activation, direct + m * n, u, shift, x, J, features);
     for (int o = 0; o < m; o++) {
         for (int j = 0; J && j < n; j++) {
             if (gaussian) J[n * o + j] = J[n * o + j] - x[o] * u[j];
