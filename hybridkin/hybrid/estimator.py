@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import labels, number, table
@@ -30,7 +31,8 @@ from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._selection import choose_mechanics, select
 from hybridkin.hybrid._settings import check_settings, resolved_error_model
 from hybridkin.learning.elm import ELMRegressor
-from hybridkin.learning.hidden_layer import DTYPES, check_rows
+from hybridkin.learning.hidden_layer import check_inputs, check_rows
+from hybridkin.native.library import evaluate
 
 
 class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -331,45 +333,52 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
         if not return_radius:
-            return self._evaluated(lambda m, q: (m(q),), X, groups)[0]
+            return self._evaluated(lambda m, q: evaluate(m, q)[:1], X, groups)[0]
         check_is_fitted(self)
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9)."
             )
-        x, inside = self._evaluated(lambda m, q: (m(q), m.in_domain(q)), X, groups)
-        return x, self.radius_.at(inside).astype(x.dtype)
+        x, distance = self._evaluated(
+            lambda m, q: evaluate(m, q, distance=True)[::2], X, groups
+        )
+        return x, self.radius_.at(distance <= 1.0).astype(x.dtype)
 
     def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
-        return self._evaluated(lambda m, q: (m.mechanical_part(q),), X, groups)[0]
+        chain = self.mechanical_model_
+        if chain is None or self.output == "pose":
+            return self._evaluated(lambda m, q: _by_torch(m.mechanical_part, q), X, groups)[0]
+        return self._evaluated(lambda m, q: evaluate(chain, q)[:1], X, groups)[0]
 
     def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
-        return self._evaluated(lambda m, q: (m.error_part(q),), X, groups, warn=False)[0]
+        return self._evaluated(lambda m, q: _by_torch(m.error_part, q), X, groups, warn=False)[0]
 
     def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
         Of poses the last three rows give the angular velocity in the measuring frame.
         """
-        return self._evaluated(lambda m, q: (m.jacobian(q),), X, groups)[0]
+        return self._evaluated(lambda m, q: evaluate(m, q, True)[1:2], X, groups)[0]
 
     def predict_and_jacobian(
         self, X: ArrayLike, groups: ArrayLike | None = None
     ) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
-        x, J = self._evaluated(lambda m, q: m.forward_and_jacobian(q), X, groups)
+        x, J = self._evaluated(lambda m, q: evaluate(m, q, True)[:2], X, groups)
         return x, J
 
     def in_domain(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
-        return self._evaluated(lambda m, q: (m.in_domain(q),), X, groups, warn=False)[0]
+        distance = partial(evaluate, distance=True, value=False)
+        inside = self._evaluated(lambda m, q: (distance(m, q)[2] <= 1.0,), X, groups, warn=False)
+        return inside[0]
 
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
-        return self._evaluated(lambda m, q: (m.error_weight(q),), X, groups, warn=False)[0]
+        return self._evaluated(lambda m, q: _by_torch(m.error_weight, q), X, groups, warn=False)[0]
 
     def _checked_rows(
         self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
@@ -407,26 +416,30 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _evaluated(
         self,
-        function: Callable[[HybridModule, Tensor], tuple[Tensor, ...]],
+        function: Callable[[HybridModule, NDArray], Sequence[NDArray]],
         X: Any,
         groups: ArrayLike | None,
         warn: bool = True,
     ) -> list[NDArray]:
         """Return what a function of the module gives for the rows of X, in the dtype of X."""
-        check_is_fitted(self)
-        X = validate_data(self, table(X, "X"), dtype=DTYPES, reset=False)
-        q = torch.from_numpy(self._effective(X, groups).astype(np.float64))
+        check_is_fitted(self, "module_")
+        X = check_inputs(self, X)
+        q = self._effective(X, groups).astype(np.float64)
         chain = self.mechanical_model_
         if warn and isinstance(chain, Chain):
-            # Of the unit alone: lengths below zero are extrapolation.
-            units = chain.check_actuators(q.abs().clamp(min=1e-9), "X")
-            for message in (*units, chain.contradiction(q, "X")):
+            rows = torch.from_numpy(q)  # finite; lengths below zero are extrapolation
+            for message in (*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")):
                 if message is not None:
                     warnings.warn(message, stacklevel=3)
-        with torch.no_grad():
-            arrays = [part.numpy() for part in function(self.module_.rows(), q)]
+        arrays = function(self.module_.rows(), q)
         arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
+
+
+def _by_torch(method: Callable[[Tensor], Tensor], q: NDArray) -> tuple[NDArray]:
+    """Return what a method of a module gives for rows q."""
+    with torch.no_grad():
+        return (method(torch.from_numpy(q)).numpy(),)
 
 
 def _messages(fitted: _fit.FittedHybrid, rows: Rows) -> tuple[str, ...]:

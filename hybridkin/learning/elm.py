@@ -9,14 +9,15 @@ import torch
 from scipy import linalg
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
 from sklearn.utils._param_validation import Interval, StrOptions
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
-from hybridkin._core.arrays import real_array, table
+from hybridkin._core.arrays import real_array
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
 from hybridkin.learning._ridge import BLOCK_ELEMENTS, Statistics, fit_readout, gather, merge
-from hybridkin.learning.hidden_layer import DTYPES, check_rows, device_named, draw_layer
+from hybridkin.learning.hidden_layer import check_inputs, check_rows, device_named, draw_layer
 from hybridkin.learning.network import ACTIVATIONS, ELM, LAYER, READOUT
+from hybridkin.native.library import program_of
 
 
 class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -46,7 +47,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
             predictive of the Bayesian ridge with prior ``N(0, noise_variance_ / alpha)``.
         """
         if not return_std:
-            return self._map(X, lambda elm, q: (elm(q),))[0]
+            return self._evaluated(X)[0]
         y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)[:, None]))
         noise = self.noise_variance_ if y.ndim == 2 else self.noise_variance_[0]
         std = np.sqrt((1 + leverage) * noise)
@@ -65,7 +66,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         J : ndarray of shape (n_samples, n_inputs) or (n_samples, n_outputs, n_inputs)
             Jacobians [unit of y per unit of X]; gradients if the targets were one-dimensional.
         """
-        return self._map(X, lambda elm, q: (elm.jacobian(q),))[0]
+        return self._evaluated(X, jacobian=True)[1]
 
     def predict_and_jacobian(self, X):
         """Return ``predict(X), jacobian(X)`` for the price of one hidden layer.
@@ -80,7 +81,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         y, J : ndarray of their shapes
             As from `predict` and `jacobian`.
         """
-        return self._map(X, lambda elm, q: elm.forward_and_jacobian(q))
+        return self._evaluated(X, jacobian=True)
 
     def leverage(self, X):
         """Return ``phi' (G + alpha 1)^-1 phi``, at most 1 on the training rows.
@@ -98,17 +99,30 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         return self._map(X, lambda elm, q: (elm.leverage(q)[:, None],))[0].ravel()
 
+    def _evaluated(self, X, jacobian=False):
+        """Return the prediction and, where asked for, its derivative."""
+        check_is_fitted(self, "module_")
+        program = program_of(self.module_)
+        if program is None:
+            both = ELM.forward_and_jacobian if jacobian else lambda elm, q: (elm(q),)
+            return self._map(X, both)
+        X = check_inputs(self, X)
+        return self._shaped(X, program.evaluate(X, jacobian)[: 1 + jacobian])
+
     def _map(self, X, function):
         """Return the arrays that `function(module, q)` gives, computed block by block."""
         check_is_fitted(self, "module_")
-        X = table(X, "X")
-        X = np.asarray(validate_data(self, X, reset=False, dtype=DTYPES, order="C"))
+        X = check_inputs(self, X)
         elm = self.module_
         size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
             q = torch.tensor(X, dtype=torch.float64, device=elm.input_center.device)
             parts = in_blocks(partial(function, elm), q, int(self.block_size or max(1, size)))
-        outputs = (part.cpu().numpy().astype(X.dtype, copy=False) for part in parts)
+        return self._shaped(X, [part.cpu().numpy() for part in parts])
+
+    def _shaped(self, X, arrays):
+        """Return arrays in the dtype of X, of a one-dimensional y without its column."""
+        outputs = (array.astype(X.dtype, copy=False) for array in arrays)
         return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
 
 

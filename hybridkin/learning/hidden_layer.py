@@ -52,6 +52,21 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
     return X, y.astype(np.float64, copy=False), sample_weight
 
 
+def check_inputs(estimator, X):
+    """Return rows of new inputs for a fitted estimator, checked as scikit-learn does.
+
+    A plain array that has all that it asks for passes by a quick test.
+    """
+    if type(X) is np.ndarray and X.ndim == 2 and X.dtype in DTYPES and len(X):
+        named = "feature_names_in_" in vars(estimator)
+        with np.errstate(all="ignore"):
+            good = np.isfinite(X.sum()) and X.shape[1] == estimator.n_features_in_ and not named
+        if good:
+            return X
+    X = table(X, "X")
+    return np.asarray(validate_data(estimator, X, reset=False, dtype=DTYPES, order="C"))
+
+
 def draw_layer(params, X, sample_weight):
     """Return the hidden layer that an estimator's parameters ask for, without a readout."""
     rng, shape = check_random_state(params.random_state), (params.n_hidden, X.shape[1])

@@ -28,7 +28,7 @@ _CHUNK = 20_000  # rows that one thread computes at a time
 _BYTE = ctypes.c_char
 _version = attrgetter("_version")
 
-Results = tuple[NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.float64] | None]
+Results = tuple[NDArray, NDArray, NDArray]  # what was not asked for is None
 
 
 def library() -> ctypes.CDLL | None:
@@ -234,7 +234,7 @@ class _Compiled:
             if any(tensor.device.type != "cpu" for tensor in self.tensors):
                 raise NoKernel("the compiled core needs a model on the CPU")
             self.program = Program(Plan(model.stored()))
-        except (NoKernel, TypeError) as error:
+        except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
 
     def holds(self) -> bool:
@@ -264,3 +264,29 @@ def program_of(model: ForwardModel) -> Program | None:
     if compiled is None or not compiled.holds():
         compiled = model.__dict__["_program"] = _Compiled(model)
     return compiled.program
+
+
+def evaluate(
+    model: ForwardModel,
+    q: NDArray,
+    jacobian: bool = False,
+    distance: bool = False,
+    value: bool = True,
+) -> Results:
+    """Return x (..., m), dx/dq (..., m, n) and domain distance (...), what was asked for.
+
+    The compiled core computes them where it can, else torch. `q` must be writable float64.
+    """
+    program = program_of(model)
+    if program is not None:
+        return program.evaluate(q, jacobian, distance)
+    rows, x, J, d = torch.from_numpy(q), None, None, None
+    with torch.no_grad():
+        if jacobian:
+            x, J = model.forward_and_jacobian(rows)
+        elif value:
+            x = model(rows)
+        if distance:
+            d = model.domain_distance(rows)
+    x, J, d = (None if part is None else part.numpy() for part in (x, J, d))
+    return x, J, d
