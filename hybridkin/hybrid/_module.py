@@ -32,21 +32,20 @@ class Inside:
         """The tip f(q) = F(z), (N, m)."""
         return self.mechanical.from_coordinates(self.z)
 
-    def jacobian(self, rows: Tensor | slice = slice(None)) -> Tensor:
-        """Return df/dq of some rows, (k, m, n)."""
-        slope = self.slope if self.slope.ndim == 2 else self.slope[rows]
-        return self.mechanical.from_coordinates_and_jacobian(self.z[rows])[1] @ slope
+    @cached_property
+    def jacobian(self) -> Tensor:
+        """Return df/dq, (N, m, n)."""
+        return self.mechanical.from_coordinates_and_jacobian(self.z)[1] @ self.slope
 
 
 class Fading(NamedTuple):
-    """The weight of a correction in the rows where it may be less than one."""
+    """The weight of a correction, where it may be less than one."""
 
-    rows: Tensor  # (k,)
-    weight: Tensor  # g(q), (k, 1)
-    slope: Tensor  # dg/dq, (k, 1, n)
+    weight: Tensor  # g(q), (N, 1)
+    slope: Tensor  # dg/dq, (N, 1, n)
 
 
-Guarded = tuple[Tensor, Tensor, Fading | None]  # a correction, its derivative, what fades
+Guarded = tuple[Tensor, Tensor, Fading | None]  # a correction, its derivative, how it fades
 
 
 class TipCorrection(PortableModule):
@@ -74,23 +73,18 @@ class TipCorrection(PortableModule):
         return self.module(q)
 
     def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
-        """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and the rows that fade."""
+        """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and how it fades."""
         guard = self.guard
         if guard is None:
             return *self.module.forward_and_jacobian(q), None
         if isinstance(guard, LeverageGuard) and guard.model is self.module:
-            # Value and leverage share the features; a quick test passes most rows.
-            x, J, below = guard.model.forward_jacobian_and_below(q, guard.limit)
-            rows = (~below).nonzero()[:, 0]
-            rows = rows[_outside(guard, q[rows])] if len(rows) else rows
+            x, J, leverage = guard.model.forward_jacobian_and_leverage(q)
+            distance = leverage / guard.limit.to(q)
         else:
-            x, J = self.module.forward_and_jacobian(q)
-            rows = _outside(guard, q).nonzero()[:, 0]
-        fading = None
-        if len(rows):
-            fading = Fading(rows, *guard.weight_and_jacobian(q[rows]))
-            own, J_own = _weighed(x[rows], J[rows], fading.weight, fading.slope)
-            x, J = x.index_copy(0, rows, own), J.index_copy(0, rows, J_own)
+            (x, J), distance = self.module.forward_and_jacobian(q), guard.domain_distance(q)
+        fading = _fading(guard, q, distance)
+        if fading is not None:
+            x, J = _weighed(x, J, *fading)
         return *guard.shortened_with_jacobian(x, J), fading
 
 
@@ -125,9 +119,9 @@ class InnerCorrection(PortableModule):
         return self.mechanical.from_coordinates(inside.z + self.readout(q)) - inside.x
 
     def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
-        """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and what fades.
+        """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and how it fades.
 
-        It is F(z + W phi) but for rows that fade or are too long: only these need df/dq.
+        It is F(z + W phi) where no row fades or is too long: only these need df/dq.
         """
         assert inside is not None
         delta, turn = self.readout.forward_and_jacobian(q)
@@ -135,14 +129,14 @@ class InnerCorrection(PortableModule):
         J, guard = columns @ (inside.slope + turn), self.guard
         if guard is None:
             return x, J, None
-        rows = (guard.is_long(x - inside.x) | _outside(guard, q)).nonzero()[:, 0]
-        if not len(rows):
+        fading = _fading(guard, q, guard.domain_distance(q))
+        if fading is None and not guard.is_long(x - inside.x).any():
             return x, J, None
-        fading = Fading(rows, *guard.weight_and_jacobian(q[rows]))
-        f, J_f = inside.x[rows], inside.jacobian(rows)
-        own, J_own = _weighed(x[rows] - f, J[rows] - J_f, fading.weight, fading.slope)
-        own, J_own = guard.shortened_with_jacobian(own, J_own)
-        return x.index_copy(0, rows, f + own), J.index_copy(0, rows, J_f + J_own), fading
+        x, J = x - inside.x, J - inside.jacobian
+        if fading is not None:
+            x, J = _weighed(x, J, *fading)
+        x, J = guard.shortened_with_jacobian(x, J)
+        return inside.x + x, inside.jacobian + J, fading
 
 
 Correction = TipCorrection | InnerCorrection
@@ -277,7 +271,7 @@ class HybridModule(ForwardModel):
             inner = (weight for weight, c in self._parts() if isinstance(c, InnerCorrection))
             share = 1.0 - sum(inner)
             if share > _ROUNDING:
-                total = share * inside.x, share * inside.jacobian()
+                total = share * inside.x, share * inside.jacobian
         elif self.mechanical is not None:
             total = self.mechanical.forward_and_jacobian(q)
         return self._added(total, q, inside)
@@ -295,18 +289,18 @@ class HybridModule(ForwardModel):
             x, J = self.drift.forward_and_jacobian(q)
             if fadings:
                 trust, slope = q.new_ones(len(q), 1), q.new_zeros(len(q), 1, q.shape[1])
-                for weight, (rows, own, own_slope) in fadings:
-                    trust = trust.index_add(0, rows, own - 1.0, alpha=weight)
-                    slope = slope.index_add(0, rows, own_slope, alpha=weight)
+                for weight, (own, own_slope) in fadings:
+                    trust, slope = trust + weight * (own - 1.0), slope + weight * own_slope
                 x, J = _weighed(x, J, trust, slope)
             total = _plus(total, 1.0, x, J)
         assert total is not None, "a hybrid needs a mechanical model or a correction"
         return total
 
 
-def _outside(guard: Guard, q: Tensor) -> Tensor:
-    """Return which rows q (N, n) lie outside the domain of a guard, NaN too, shape (N,)."""
-    return ~(guard.domain_distance(q) <= 1.0)
+def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
+    """Return how a correction fades at rows q (N, n), None where all are inside the domain."""
+    inside = bool((distance <= 1.0).all())  # a NaN is not
+    return None if inside else Fading(*guard.weight_and_jacobian(q))
 
 
 def _plus(

@@ -46,12 +46,11 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Only if `return_std`: ``sqrt(noise_variance_ * (1 + leverage(X)))``, the posterior
             predictive of the Bayesian ridge with prior ``N(0, noise_variance_ / alpha)``.
         """
+        y = self._evaluated(X)[0]
         if not return_std:
-            return self._evaluated(X)[0]
-        y, leverage = self._map(X, lambda elm, q: (elm(q), elm.leverage(q)[:, None]))
-        noise = self.noise_variance_ if y.ndim == 2 else self.noise_variance_[0]
-        std = np.sqrt((1 + leverage) * noise)
-        return y, std.astype(y.dtype)
+            return y
+        std = np.sqrt(np.multiply.outer(1 + self.leverage(X), self.noise_variance_))
+        return y, std.reshape(y.shape).astype(y.dtype)
 
     def jacobian(self, X):
         """Return the derivative of the prediction by the inputs, in closed form.

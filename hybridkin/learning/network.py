@@ -29,9 +29,9 @@ class LeverageModule(ForwardModel):
         """Return the leverage of `q`, shape (...), smooth; at most 1 on the training rows."""
         raise NotImplementedError
 
-    def forward_jacobian_and_below(self, q, limit):
-        """Return ``forward(q)``, ``jacobian(q)`` and where the leverage is surely below `limit`."""
-        return *self.forward_and_jacobian(q), self.leverage(q) < limit
+    def forward_jacobian_and_leverage(self, q):
+        """Return ``forward(q)``, ``jacobian(q)`` and ``leverage(q)``."""
+        return *self.forward_and_jacobian(q), self.leverage(q)
 
 
 class ELM(LeverageModule):
@@ -125,41 +125,26 @@ class ELM(LeverageModule):
 
     def forward_and_jacobian(self, q):
         """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
-        x, J, _ = self.forward_jacobian_and(q, lambda features: features[..., :0])
-        return x, J
+        return self._in_blocks(q, lambda u, a, s: (self._readout(u, s), self._slope(a, s)))
 
-    def forward_jacobian_and(self, q, function):
-        """Return ``forward(q), jacobian(q), function(features(q))``, the last of shape (..., k)."""
+    def forward_jacobian_and_leverage(self, q):
+        """Return ``forward(q)``, ``jacobian(q)`` and ``leverage(q)``, which share the features."""
 
-        def rows(q):
-            u, a, s = self._hidden(q)
-            return self._readout(u, s), self._slope(a, s), function(self._features(u, s))
+        def rows(u, a, s):
+            leverage = self._leverage(self._features(u, s))
+            return self._readout(u, s), self._slope(a, s), leverage[..., None]
 
-        return in_blocks(rows, q, max(1, _BLOCK // len(self.input_weights)))
+        x, J, leverage = self._in_blocks(q, rows)
+        return x, J, leverage[..., 0]
 
-    def forward_jacobian_and_below(self, q, limit):
-        """Return value, Jacobian and where the leverage is surely below `limit`, as the base does.
-
-        The features serve all three.
-        """
-        x, J, below = self.forward_jacobian_and(
-            q, lambda features: self.leverage_is_below(limit, features)[..., None]
-        )
-        return x, J, below[..., 0]
+    def _in_blocks(self, q, function):
+        size = max(1, _BLOCK // len(self.input_weights))
+        return in_blocks(lambda rows: function(*self._hidden(rows)), q, size)
 
     def leverage(self, q):
         """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
-        r = (self.features(q) - self.leverage_center.to(q)) @ self.leverage_factor.to(q)
-        return (r * r).sum(-1) + self.leverage_offset.to(q)
+        return self._leverage(self.features(q))
 
-    def leverage_is_below(self, limit, features):
-        """Return where the leverage is certainly below `limit`, shape (...), bool.
-
-        In single precision, at half the price; rows close to the limit count as above it.
-        """
-        center, factor = self.leverage_center.float(), self.leverage_factor.float()
-        single = features.float()
-        half = torch.addmm(-center @ factor, single, factor)
-        rounding = 8 * len(center) ** 0.5 * torch.finfo(torch.float32).eps * factor.norm()
-        bound = half.norm(dim=-1) + rounding * (single.norm(dim=-1) + center.norm())
-        return bound < (limit - self.leverage_offset).clamp(min=0.0).sqrt()
+    def _leverage(self, phi):
+        r = (phi - self.leverage_center.to(phi)) @ self.leverage_factor.to(phi)
+        return (r * r).sum(-1) + self.leverage_offset.to(phi)
