@@ -276,9 +276,8 @@ def _readout(plan: Plan, stored: Stored) -> int:
         rows = np.column_stack([constant, linear, hessian.reshape(m, -1)])
         return plan.node(READOUT, n, m, [center, 1.0 / scale, rows], QUADRATIC)
     if kind == "pose":
-        numbers = [center, 1.0 / scale, constant, linear, scale, bent]
-        chain = plan.node_of(features.part("chain"))
-        return plan.node(READOUT, n, m, numbers, POSE, chain)
+        chain = whole_chain(plan, features.part("chain"))
+        return plan.node(READOUT, n, m, [center, 1.0 / scale, constant, linear, bent], POSE, chain)
     raise NoKernel(f"a readout of {features.kind!r} has no kernel")
 
 

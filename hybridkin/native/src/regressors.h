@@ -213,11 +213,10 @@ static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J)
             HK(quadratic_of)(n, m, c, inverse, u, x, J);
         return;
     }
-    const real *direct = c + m, *scale = direct + m * n;
+    const real *direct = c + m;
     HK(affine)(m, n, direct, c, u, x);
     for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(direct[k] * inverse[k % n]);
-    (void)scale;
-    // HK(pose_readout)(p, more[1], n, m, center, scale, scale + n, q, x, J);
+    HK(pose_readout)(p, more[1], m, direct + m * n, q, x, J);
 }
 
 /* Any regressor. `features` is for networks alone. */
