@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -272,3 +273,14 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
     layer = draw_layer(params, q.numpy(), None)
     inner = layer.input_weights, layer.input_bias, layer.activation
     return HiddenFeatures.of_range(q, *inner), alphas
+
+
+def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
+    """Return the warnings of a fit: of its calibration, or of the rows of an uncalibrated chain."""
+    chain = fitted.mechanical
+    if fitted.calibration is not None or not isinstance(chain, Chain):
+        return fitted.messages
+    found = [*chain.check_actuators(rows.q, "X"), chain.contradiction(rows.q, "X")]
+    tips = torch.from_numpy(rows.tips[:, :3])
+    found.append(motion_message("y", tips, chain(rows.q), float(chain.reach)))
+    return tuple(message for message in found if message is not None)

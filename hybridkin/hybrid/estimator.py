@@ -22,9 +22,17 @@ from hybridkin._core.units import motion_message
 from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
-from hybridkin.hybrid import _fit
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import Part, Rows, Spec, calibrated, few_rows, fit_hybrid, residuals
+from hybridkin.hybrid._fit import (
+    Part,
+    Rows,
+    Spec,
+    calibrated,
+    few_rows,
+    fit_hybrid,
+    fit_messages,
+    residuals,
+)
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -252,7 +260,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             used = given if asked.parts else rows
             self.radius_, message = conformal_radius(asked, used, self.coverage)
             said += [] if message is None else [message]
-        return [*few, *said, *_messages(fitted, given)]
+        return [*few, *said, *fit_messages(fitted, given)]
 
     def partial_fit(
         self,
@@ -333,24 +341,22 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
         if not return_radius:
-            return self._evaluated(lambda m, q: evaluate(m, q)[:1], X, groups)[0]
+            return self._evaluated(evaluate, X, groups)[0]
         check_is_fitted(self)
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9)."
             )
-        x, distance = self._evaluated(
-            lambda m, q: evaluate(m, q, distance=True)[::2], X, groups
-        )
-        return x, self.radius_.at(distance <= 1.0).astype(x.dtype)
+        x, inside = self._evaluated(_with_domain, X, groups)
+        return x, self.radius_.at(inside).astype(x.dtype)
 
     def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
         chain = self.mechanical_model_
         if chain is None or self.output == "pose":
             return self._evaluated(lambda m, q: _by_torch(m.mechanical_part, q), X, groups)[0]
-        return self._evaluated(lambda m, q: evaluate(chain, q)[:1], X, groups)[0]
+        return self._evaluated(lambda m, q: evaluate(chain, q), X, groups)[0]
 
     def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
@@ -361,20 +367,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Of poses the last three rows give the angular velocity in the measuring frame.
         """
-        return self._evaluated(lambda m, q: evaluate(m, q, True)[1:2], X, groups)[0]
+        return self._evaluated(partial(evaluate, jacobian=True), X, groups)[1]
 
     def predict_and_jacobian(
         self, X: ArrayLike, groups: ArrayLike | None = None
     ) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
-        x, J = self._evaluated(lambda m, q: evaluate(m, q, True)[:2], X, groups)
+        x, J = self._evaluated(partial(evaluate, jacobian=True), X, groups)
         return x, J
 
     def in_domain(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Return whether eps is fully trusted at each row, shape (N,)."""
-        distance = partial(evaluate, distance=True, value=False)
-        inside = self._evaluated(lambda m, q: (distance(m, q)[2] <= 1.0,), X, groups, warn=False)
-        return inside[0]
+        return self._evaluated(partial(_with_domain, value=False), X, groups, warn=False)[0]
 
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
@@ -436,18 +440,13 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
+def _with_domain(module: HybridModule, q: NDArray, value: bool = True) -> list[NDArray]:
+    """Return x of rows q where asked for, and whether they lie within the domain."""
+    *x, distance = evaluate(module, q, value, distance=True)
+    return [*x, distance <= 1.0]
+
+
 def _by_torch(method: Callable[[Tensor], Tensor], q: NDArray) -> tuple[NDArray]:
     """Return what a method of a module gives for rows q."""
     with torch.no_grad():
         return (method(torch.from_numpy(q)).numpy(),)
-
-
-def _messages(fitted: _fit.FittedHybrid, rows: Rows) -> tuple[str, ...]:
-    """Return the warnings of a fit: of its calibration, or of the rows of an uncalibrated chain."""
-    chain = fitted.mechanical
-    if fitted.calibration is not None or not isinstance(chain, Chain):
-        return fitted.messages
-    found = [*chain.check_actuators(rows.q, "X"), chain.contradiction(rows.q, "X")]
-    tips = torch.from_numpy(rows.tips[:, :3])
-    found.append(motion_message("y", tips, chain(rows.q), float(chain.reach)))
-    return tuple(message for message in found if message is not None)

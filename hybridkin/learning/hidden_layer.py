@@ -62,7 +62,7 @@ def check_inputs(estimator, X):
         with np.errstate(all="ignore"):
             good = np.isfinite(X.sum()) and X.shape[1] == estimator.n_features_in_ and not named
         if good:
-            return X
+            return np.ascontiguousarray(X)
     X = table(X, "X")
     return np.asarray(validate_data(estimator, X, reset=False, dtype=DTYPES, order="C"))
 

@@ -125,7 +125,8 @@ class ELM(LeverageModule):
 
     def forward_and_jacobian(self, q):
         """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
-        return self._in_blocks(q, lambda u, a, s: (self._readout(u, s), self._slope(a, s)))
+        x, J = self._in_blocks(q, lambda u, a, s: (self._readout(u, s), self._slope(a, s)))
+        return x, J
 
     def forward_jacobian_and_leverage(self, q):
         """Return ``forward(q)``, ``jacobian(q)`` and ``leverage(q)``, which share the features."""

@@ -28,7 +28,7 @@ _CHUNK = 20_000  # rows that one thread computes at a time
 _BYTE = ctypes.c_char
 _version = attrgetter("_version")
 
-Results = tuple[NDArray, NDArray, NDArray]  # what was not asked for is None
+Results = tuple[NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.float64] | None]
 
 
 def library() -> ctypes.CDLL | None:
@@ -154,19 +154,29 @@ class Program:
         distance : bool, default=False
             Whether the domain distance is computed.
         """
-        (n, m), lead = self._sizes, q.shape[:-1]
+        lead, m, n = q.shape[:-1], self._sizes[1], self._sizes[0]
+        x = np.empty((*lead, m))
+        J = np.empty((*lead, m, n)) if jacobian else None
+        d = np.empty(lead) if distance else None
+        self._fill(q, [(x, m), (J, m * n), (d, 1)])
+        return x, J, d
+
+    def domain(self, q: NDArray, slope: bool = False) -> tuple[NDArray, NDArray | None]:
+        """Return the domain distance (...) at q (..., n), and its slope by q (..., n) or None."""
+        d, slopes = np.empty(q.shape[:-1]), np.empty(q.shape) if slope else None
+        self._fill(q, [(None, 0), (slopes, self._sizes[0]), (d, 1)])
+        return d, slopes
+
+    def _fill(self, q: NDArray, results: list[tuple[NDArray | None, int]]) -> None:
+        n = self._sizes[0]
         if q.shape[-1] != n:
             raise ValueError(f"`q` must have shape (..., {n}), got {q.shape}.")
         q = np.ascontiguousarray(q, dtype=np.float64)
         rows = q.size // n
-        x = np.empty((*lead, m))
-        J = np.empty((*lead, m, n)) if jacobian else None
-        d = np.empty(lead) if distance else None
         if rows == 1:
-            self._evaluate(*self._head, q.tobytes(), 1, _address(x), _address(J), _address(d))
+            self._evaluate(*self._head, q.tobytes(), 1, *[_address(a) for a, _ in results])
         elif rows:
-            self._in_chunks(rows, q.ctypes.data, [(x, m), (J, m * n), (d, 1)])
-        return x, J, d
+            self._in_chunks(rows, q.ctypes.data, results)
 
     def _in_chunks(self, rows: int, q: int, results: list[tuple[NDArray | None, int]]) -> None:
         n, starts = self._sizes[0], range(0, rows, _CHUNK)
@@ -269,24 +279,29 @@ def program_of(model: ForwardModel) -> Program | None:
 def evaluate(
     model: ForwardModel,
     q: NDArray,
+    value: bool = True,
     jacobian: bool = False,
     distance: bool = False,
-    value: bool = True,
-) -> Results:
-    """Return x (..., m), dx/dq (..., m, n) and domain distance (...), what was asked for.
+) -> tuple[NDArray, ...]:
+    """Return what is asked for of x (..., m), dx/dq (..., m, n) and domain distance (...).
 
-    The compiled core computes them where it can, else torch. `q` must be writable float64.
+    The compiled core computes it where it can, else torch. `q` must be writable float64.
     """
     program = program_of(model)
+    if program is not None and not (value or jacobian):
+        return (program.domain(q)[0],)
     if program is not None:
-        return program.evaluate(q, jacobian, distance)
-    rows, x, J, d = torch.from_numpy(q), None, None, None
+        return _present(program.evaluate(q, jacobian, distance))
+    rows, found = torch.from_numpy(q), ()
     with torch.no_grad():
         if jacobian:
-            x, J = model.forward_and_jacobian(rows)
+            found = model.forward_and_jacobian(rows)
         elif value:
-            x = model(rows)
+            found = (model(rows),)
         if distance:
-            d = model.domain_distance(rows)
-    x, J, d = (None if part is None else part.numpy() for part in (x, J, d))
-    return x, J, d
+            found = *found, model.domain_distance(rows)
+    return tuple(part.numpy() for part in found)
+
+
+def _present(results: Sequence[NDArray | None]) -> tuple[NDArray, ...]:
+    return tuple(part for part in results if part is not None)

@@ -227,9 +227,7 @@ def _affine(plan: Plan, stored: Stored) -> int:
     coef, bias = stored.array("coef"), stored.array("bias")
     m, n = coef.shape
     none = np.zeros((m, 0)), (np.zeros((0, n)), np.zeros(0))
-    return _units(
-        plan, (AFFINE, "sin"), np.zeros(n), np.ones(n), (bias, coef, none[0]), none[1]
-    )
+    return _units(plan, (AFFINE, "sin"), np.zeros(n), np.ones(n), (bias, coef, none[0]), none[1])
 
 
 def _kernel(plan: Plan, stored: Stored) -> int:

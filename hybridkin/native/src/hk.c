@@ -48,27 +48,33 @@ HK_API uint32_t hk_sources(void) { return HK_SOURCES; }
 static void hk_block(const hk_plan *p, int at, const real *q, int rows, real *x, real *J,
                      real *distance) {
     V vq[HK_MAX_N], vx[HK_MAX_M], vJ[HK_MAX_M * HK_MAX_N], far;
-    const int n = p->code[at + HK_N], m = p->code[at + HK_M];
+    const int n = p->code[at + HK_N], m = x ? p->code[at + HK_M] : 1;
     EACH(i) for (int j = 0; j < n; j++) vq[j][i] = q[(i < rows ? i : rows - 1) * n + j];
-    hkv_model(p, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL);
+    if (x)
+        hkv_model(p, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL);
+    else
+        hkv_domain(p, at, vq, &far, J ? vJ : NULL);
     for (int i = 0; i < rows; i++) {
-        for (int j = 0; j < m; j++) x[i * m + j] = vx[j][i];
+        for (int j = 0; x && j < m; j++) x[i * m + j] = vx[j][i];
         for (int j = 0; J && j < m * n; j++) J[i * m * n + j] = vJ[j][i];
         if (distance) distance[i] = far[i];
     }
 }
 
-/* x (rows, m), J (rows, m, n) and domain distances (rows) of q (rows, n); NULL: no J, no distance. */
+/* x (rows, m), J (rows, m, n) and domain distances (rows) of q (rows, n); NULL: no J, no distance.
+   Where x is NULL, the distances alone, and their slopes (rows, n) in J. */
 HK_API void hk_evaluate(const int32_t *code, const real *data, int32_t at, const real *q,
                         int64_t rows, real *x, real *J, real *distance) {
     const hk_plan plan = {code, data};
-    const int n = code[at + HK_N], m = code[at + HK_M];
-    if (rows == 1)
+    const int n = code[at + HK_N], m = x ? code[at + HK_M] : 1;
+    if (rows == 1 && !x)
+        hk_domain(&plan, at, q, distance, J);
+    else if (rows == 1)
         hk_model(&plan, at, q, x, J, distance);
     else
         for (int64_t r = 0; r < rows; r += HK_LANES)
             hk_block(&plan, at, q + r * n, (int)(rows - r < HK_LANES ? rows - r : HK_LANES),
-                     x + r * m, J ? J + r * m * n : NULL, distance ? distance + r : NULL);
+                     x ? x + r * m : NULL, J ? J + r * m * n : NULL, distance ? distance + r : NULL);
 }
 
 /* Rows through the play of tendons, see play.h. */

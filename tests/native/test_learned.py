@@ -1,0 +1,322 @@
+"""Learned corrections, guards and hybrids in the compiled core against the same in torch."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from saved_models import FOLDER
+from sklearn.linear_model import LinearRegression
+
+from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel, load_model
+from hybridkin.hybrid._features import (
+    Features,
+    HiddenFeatures,
+    PoseFeatures,
+    QuadraticFeatures,
+    Readout,
+)
+from hybridkin.hybrid._guards import BoxGuard, LeverageGuard, QuadraticLeverage
+from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
+from hybridkin.learning.network import ELM
+from hybridkin.learning.regressor_modules import AffineModule, KernelModule, PolynomialModule
+from hybridkin.native import backend
+from hybridkin.native.library import program_of
+
+pytestmark = pytest.mark.needs_core
+
+N = 6
+CENTER, HALF = 0.2 + 0.01 * np.arange(N), 0.03 + 0.005 * np.arange(N)
+WITHOUT_KERNEL = ("pose_output",)
+STORED = [path for path in sorted(FOLDER.glob("*.safetensors")) if path.stem not in WITHOUT_KERNEL]
+NETWORKS = ("logistic", "tanh", "sin", "centred", "full")
+TIP = (*NETWORKS, "affine", "polynomial", "kernel", "linear", "quadratic", "hidden", "pose")
+INNER = ("linear", "quadratic", "hidden", "pose")
+
+
+def chain():
+    return ConstantCurvatureChain([0.05, 0.06], offsets=[0.02, 0.03])
+
+
+def draw(*shape, seed=0):
+    return np.random.default_rng([seed, *shape]).normal(size=shape)
+
+
+def network(kind, m=3, n=N, n_hidden=21):
+    """A network; "centred" has an intercept and a direct link, "full" a full leverage factor."""
+    direct = kind != "logistic"
+    f = n_hidden + n * direct
+    factor = draw(f, f) if kind == "full" else np.triu(draw(f, f))
+    return ELM(
+        kind if kind in ("tanh", "sin") else "logistic",
+        input_weights=draw(n_hidden, n),
+        input_bias=draw(n_hidden),
+        input_center=np.resize(CENTER, n),
+        input_scale=np.resize(HALF, n),
+        output_weights=0.002 * draw(f, m),
+        intercept=0.001 * draw(m),
+        leverage_center=0.3 * draw(f, seed=1) if kind == "centred" else np.zeros(f),
+        leverage_factor=0.1 * factor,
+        leverage_offset=0.02 if kind == "centred" else 0.0,
+    )
+
+
+def readout(kind, m):
+    center, scale = torch.from_numpy(CENTER), torch.from_numpy(HALF)
+    hidden = torch.from_numpy(draw(10, N)), torch.from_numpy(draw(10, seed=2))
+    features = {
+        "linear": lambda: Features(center, scale),
+        "quadratic": lambda: QuadraticFeatures(center, scale),
+        "hidden": lambda: HiddenFeatures(center, scale, *hidden, activation="tanh"),
+        "pose": lambda: PoseFeatures(center, scale, chain().with_tip(1.5)),
+    }[kind]()
+    size = features(center).shape[-1]
+    return Readout(features, torch.from_numpy(0.002 * draw(m, size)))
+
+
+def regressor(kind, m=3):
+    if kind in NETWORKS:
+        return network(kind, m)
+    if kind == "affine":
+        return AffineModule(0.05 * draw(m, N), 0.002 * draw(m))
+    if kind == "polynomial":
+        powers = np.random.default_rng(1).integers(0, 4, (9, N))
+        powers[0] = 0
+        return PolynomialModule(powers, 0.002 * draw(9, m), CENTER, HALF)
+    if kind == "kernel":
+        return KernelModule(0.6 * draw(21, N), 0.004 * draw(21, m), 0.001 * draw(m), CENTER, HALF)
+    return readout(kind, m)
+
+
+def guard(kind, module, largest=0.01):
+    longest = torch.tensor(largest).double()
+    if kind is None:
+        return None
+    if kind == "box":
+        low, high = torch.from_numpy(CENTER - HALF), torch.from_numpy(CENTER + HALF)
+        return BoxGuard(low, high, longest)
+    rows = torch.from_numpy(inputs(1.0, 40))
+    model = module if kind == "own" else QuadraticLeverage.fit(rows)
+    return LeverageGuard(model, model.leverage(rows).quantile(0.9).detach(), longest)
+
+
+def drift(m=3):
+    return AffineModule(0.02 * draw(m, N, seed=3), 0.001 * draw(m, seed=3))
+
+
+def inputs(spread, n_rows, seed=0):
+    u = np.random.default_rng(seed).uniform(-1, 1, (n_rows, N))
+    return CENTER + spread * HALF * u
+
+
+def assert_close_rows(found, expected, tol=1e-12):
+    """The largest error over the largest number; NaN at the same rows."""
+    assert_array_equal(np.isnan(found), np.isnan(expected))
+    scale = np.nanmax(np.abs(expected), initial=1e-12)
+    assert_allclose(found, expected, rtol=0, atol=tol * scale)
+
+
+def in_torch(module, q):
+    """Value, Jacobian, distance and its slope by torch."""
+    rows = torch.from_numpy(q).requires_grad_()
+    distance = module.domain_distance(rows)
+    total = distance.sum()
+    slope = torch.autograd.grad(total, rows)[0] if total.requires_grad else torch.zeros_like(rows)
+    with torch.no_grad():
+        x, J = module.forward_and_jacobian(rows)
+    return [part.detach().numpy() for part in (x, J, distance, slope)]
+
+
+def assert_as_in_torch(module, q, tol=1e-12):
+    """Batches and single rows; a row of NaN changes no other."""
+    program = program_of(module)
+    assert program is not None, backend(module)
+    expected = in_torch(module, q)
+    found = *program.evaluate(q, True, True), program.domain(q, slope=True)[1]
+    for ours, theirs in zip(found, expected, strict=True):
+        assert_close_rows(ours, theirs, tol)
+    assert_close_rows(program.evaluate(q)[0], expected[0], tol)
+    for k in range(0, len(q), 5):
+        row = *program.evaluate(q[k], True, True), program.domain(q[k], slope=True)[1]
+        for ours, theirs in zip(row, found, strict=True):
+            size = np.abs(theirs).max()
+            assert_allclose(ours, theirs[k], rtol=0, atol=tol * size)
+    broken = q.copy()
+    broken[3, 2] = np.nan
+    nan = *program.evaluate(broken, True, True), program.domain(broken, slope=True)[1]
+    assert np.isnan(nan[0][3]).all()
+    for ours, theirs in zip(nan, found, strict=True):
+        assert_array_equal(np.delete(ours, 3, 0), np.delete(theirs, 3, 0))
+
+
+def hybrid(kind, coupling="parallel", trust=None, drifting=False, weight=1.0):
+    mechanical = chain()
+    if coupling == "serial":
+        module = regressor(kind, 6)
+        correction = InnerCorrection(mechanical, module, guard(trust, module))
+    else:
+        module = regressor(kind)
+        correction = TipCorrection(module, guard(trust, module))
+    weights = torch.tensor([weight], dtype=torch.float64)
+    return HybridModule(mechanical, [correction], weights, drift() if drifting else None)
+
+
+ALL = [
+    *(("parallel", kind, trust) for kind in TIP for trust in (None, "box", "leverage")),
+    *(("parallel", kind, "own") for kind in NETWORKS),
+    *(("serial", kind, trust) for kind in INNER for trust in (None, "box", "leverage")),
+]
+
+
+@pytest.mark.parametrize(("coupling", "kind", "trust"), ALL)
+@pytest.mark.parametrize(("drifting", "weight"), [(False, 1.0), (True, 0.6)])
+def test_hybrids_are_those_of_torch(coupling, kind, trust, drifting, weight):
+    module = hybrid(kind, coupling, trust, drifting, weight)
+    for spread in (0.3, 1.2, 20.0):
+        assert_as_in_torch(module, inputs(spread, 19), tol=2e-12 if spread > 10 else 1e-12)
+
+
+@pytest.mark.parametrize("longest", [0.0, 1e-4])
+@pytest.mark.parametrize("coupling", ["parallel", "serial"])
+def test_corrections_that_are_too_long(coupling, longest):
+    module = hybrid("quadratic", coupling, "leverage")
+    (correction,) = module.corrections
+    correction.guard.largest.fill_(longest)
+    assert_as_in_torch(module, inputs(1.5, 19))
+
+
+def blend(weights, mechanical, drift):
+    """Four corrections in both couplings, two of whose guards share their leverage."""
+    tip = regressor("logistic"), regressor("kernel")
+    inner = regressor("quadratic", 6), regressor("pose", 6)
+    shared = guard("leverage", None)
+    wider = LeverageGuard(shared.model, 2.0 * shared.limit, shared.largest)
+    corrections = [
+        TipCorrection(tip[0], guard("own", tip[0])),
+        InnerCorrection(mechanical, inner[0], shared),
+        TipCorrection(tip[1], guard("box", tip[1])),
+        InnerCorrection(mechanical, inner[1], wider),
+    ]
+    return HybridModule(mechanical, corrections, torch.tensor(weights).double(), drift)
+
+
+@pytest.mark.parametrize("weights", [[0.2, 0.3, 0.1, 0.4], [0.0, 0.5, 0.0, 0.5]])
+@pytest.mark.parametrize("tip_at", [1.4, 2.0])
+def test_blends_are_those_of_torch(weights, tip_at):
+    for given in (None, drift()):
+        module = blend(weights, chain().with_tip(tip_at), given)
+        for spread in (0.3, 1.2, 20.0):
+            assert_as_in_torch(module, inputs(spread, 19), tol=2e-12)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (3, 2), (6, 3), (9, 3), (17, 64), (64, 5)])
+@pytest.mark.parametrize("n_hidden", [1, 4, 12, 101])
+def test_networks_of_any_size(n, m, n_hidden):
+    module = network("centred", m, n, n_hidden)
+    q = np.resize(CENTER, n) + 0.1 * draw(11, n)
+    program = program_of(module)
+    x, J = (part.numpy() for part in module.forward_and_jacobian(torch.from_numpy(q)))
+    for found, expected in zip(program.evaluate(q, True), (x, J), strict=False):
+        assert_close_rows(found, expected)
+    for found, expected in zip(program.evaluate(q[0], True), (x, J), strict=False):
+        assert_close_rows(found, expected[0])
+
+
+@pytest.mark.parametrize("kind", TIP)
+def test_hybrids_without_mechanical_model(kind):
+    module = regressor(kind, 5)
+    corrections = [TipCorrection(module, guard("leverage", module))]
+    both = HybridModule(None, corrections, torch.ones(1).double(), drift(5))
+    assert_as_in_torch(both, inputs(1.2, 19), tol=2e-12)
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
+def test_stored_models_of_every_kind(path):
+    model = load_model(path)
+    module = getattr(model, "module_", model).double()
+    with np.load(FOLDER / "predictions.npz") as said:
+        near, far = said[f"{path.stem}.q"]
+    rng = np.random.default_rng(0)
+    for spread in (0.1, 0.6, 3.0):
+        q = near + spread * np.abs(far - near) * rng.uniform(-1, 1, (19, len(near)))
+        program = program_of(module)
+        assert program is not None, backend(module)
+        x, J, distance = in_torch(module, q)[:3]
+        found = program.evaluate(q, True, True)
+        for ours, theirs in zip(found, (x, J, distance), strict=True):
+            assert_close_rows(ours, theirs, 2e-11)
+
+
+def test_saturated_units_far_away():
+    for kind in ("logistic", "tanh", "kernel"):
+        module = regressor(kind)
+        q = CENTER + 1e6 * draw(11, N)
+        x, J = (part.numpy() for part in module.forward_and_jacobian(torch.from_numpy(q)))
+        found = program_of(module).evaluate(q, True)
+        assert_close_rows(found[0], x)
+        assert_close_rows(found[1], J)
+
+
+def log():
+    rng = np.random.default_rng(0)
+    q = 0.25 + 0.05 * rng.uniform(-1, 1, (60, 3))
+    x = ConstantCurvatureChain([0.055])(torch.from_numpy(q)).numpy() + 0.01 * np.sin(20 * q)
+    return q, x
+
+
+def test_estimators_predict_what_their_modules_do():
+    q, x = log()
+    model = HybridForwardModel(ConstantCurvatureChain([0.05]), ELMRegressor(20, random_state=0))
+    model.fit(q[:40], x[:40])
+    wide = 0.25 + 2.0 * (q - 0.25)
+    rows = torch.from_numpy(wide)
+    for estimator, module in ((model, model.module_), (model.error_model_, None)):
+        module = estimator.module_ if module is None else module
+        assert backend(module) == "compiled"
+        with torch.no_grad():
+            expected = [part.numpy() for part in module.forward_and_jacobian(rows)]
+        both = estimator.predict_and_jacobian(wide)
+        for found, right in zip(both, expected, strict=True):
+            assert_close_rows(found, right)
+        assert_array_equal(estimator.predict(wide), both[0])
+        assert_array_equal(estimator.jacobian(wide), both[1])
+        single = estimator.predict_and_jacobian(wide.astype(np.float32))
+        assert [part.dtype for part in single] == [np.float32, np.float32]
+    inside = model.module_.in_domain(rows).numpy()
+    assert 0 < inside.sum() < len(inside)
+    assert_array_equal(model.in_domain(wide), inside)
+    mechanical = model.mechanical_model_(rows).numpy()
+    assert_allclose(model.predict_mechanical(wide), mechanical, rtol=0, atol=1e-14)
+
+
+def test_later_measurements_and_fits_change_the_answer():
+    q, x = log()
+    model = HybridForwardModel(ConstantCurvatureChain([0.05]), LinearRegression()).fit(q, x)
+    network = ELMRegressor(10, random_state=0).fit(q, x)
+    for estimator in (model, network):
+        before = estimator.predict(q)
+        assert_array_equal(estimator.predict(q), before)
+        estimator.partial_fit(q[:30], x[:30] + 0.02)
+        after = estimator.predict(q)
+        assert np.abs(after - before).max() > 1e-3
+        with torch.no_grad():
+            expected = estimator.module_(torch.from_numpy(q)).numpy()
+        assert_allclose(after, expected, rtol=0, atol=1e-13)
+    with torch.no_grad():
+        network.module_.intercept.add_(1.0)
+    assert_allclose(network.predict(q), after + 1.0, rtol=0, atol=1e-12)
+
+
+def test_parts_without_kernel_leave_the_model_to_torch():
+    large = network("full", n_hidden=3000, n=1)
+    corrections = [TipCorrection(large, LeverageGuard(large, torch.ones(()), torch.ones(())))]
+    module = HybridModule(None, corrections, torch.ones(1))
+    assert program_of(module) is None
+    assert "features" in backend(module)
+    q, x = log()
+    pose = np.hstack([x, 0.1 * x])
+    chain = ConstantCurvatureChain([0.05])
+    model = HybridForwardModel(chain, LinearRegression(), output="pose").fit(q, pose)
+    assert backend(model.module_).startswith("torch")
+    x, J = model.predict_and_jacobian(q)
+    assert x.shape == (60, 6)
+    assert J.shape == (60, 6, 3)
