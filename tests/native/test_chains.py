@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, PlayOperator, RigidChain
+from hybridkin.hybrid._features import PoseFeatures, Readout
 from hybridkin.native.library import Program
 from hybridkin.native.plan import NoKernel, Plan
 
@@ -117,7 +118,7 @@ def test_a_quarter_circle():
     assert np.abs(x - 0.2 / np.pi * np.array([1.0, 0.0, 1.0])).max() < 1e-16
 
 
-@pytest.mark.parametrize("bend", [0.0, 1e-9, 1.0, 3.1415, 3.1417, 6.3, 12.6, 1e6])
+@pytest.mark.parametrize("bend", [0.0, 1e-9, 1.0, 3.1415, 3.1417, 3.6, 6.3, 12.6, 1e6])
 def test_bends_of_any_size(bend):
     """Around a half turn, where the polynomial ends, and at several turns."""
     rng = np.random.default_rng(0)
@@ -179,6 +180,19 @@ def test_rigid_arms(n):
     q = rng.uniform(-7, 7, (203, n))
     check(arm, q)
     check_nan_row(arm, q)
+
+
+@pytest.mark.parametrize("counts", [[3], [3, 4, 3]])
+def test_readouts_of_pose_features(counts):
+    """The features see the whole robot, in the frame of its base."""
+    rng = np.random.default_rng(0)
+    plain, q = trunk(rng, counts, offsets=rng.uniform(0.0, 0.1, len(counts)), base=pose_of(rng))
+    soft, pulls = elastic(rng, counts, "base")
+    for chain, rows in ((plain, q), (soft, pulls)):
+        features = PoseFeatures.of_range(torch.from_numpy(rows), chain.with_tip(0.5))
+        size = features(torch.from_numpy(rows[:1])).shape[1]
+        weights = torch.from_numpy(rng.normal(size=(4, size)))
+        check(Readout(features, weights), rows, 1e-11)
 
 
 @settings(max_examples=20, deadline=None)

@@ -10,17 +10,6 @@ static inline __attribute__((always_inline)) void HK(affine)(
     }
 }
 
-/* J (3, n) += C (3, k) A (k, n). */
-static inline __attribute__((always_inline)) void HK(fold)(
-    int k, int n, const V *C, const real *A, V *J) {
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < n; j++) {
-            V sum = J[n * i + j];
-            for (int l = 0; l < k; l++) sum = sum + C[k * i + l] * A[n * l + j];
-            J[n * i + j] = sum;
-        }
-}
-
 /* J (3, n) = C (3, k) T (k, n), for a T that differs from row to row. */
 static inline __attribute__((always_inline)) void HK(multiply)(
     int k, int n, const V *C, const V *T, V *J) {
