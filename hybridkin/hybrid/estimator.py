@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
-from torch import Tensor, nn
+from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.digests import row_digests
@@ -353,14 +353,14 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
-        chain = self.mechanical_model_
-        if chain is None or self.output == "pose":
-            return self._evaluated(lambda m, q: _by_torch(m.mechanical_part, q), X, groups)[0]
+        chain = None if self.output == "pose" else self.mechanical_model_
+        if chain is None:
+            return self._evaluated(_method("mechanical_part"), X, groups)[0]
         return self._evaluated(lambda m, q: evaluate(chain, q), X, groups)[0]
 
     def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
-        return self._evaluated(lambda m, q: _by_torch(m.error_part, q), X, groups, warn=False)[0]
+        return self._evaluated(_method("error_part"), X, groups, warn=False)[0]
 
     def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
@@ -382,7 +382,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
-        return self._evaluated(lambda m, q: _by_torch(m.error_weight, q), X, groups, warn=False)[0]
+        return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
 
     def _checked_rows(
         self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
@@ -429,8 +429,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self, "module_")
         X = check_inputs(self, X)
         q = self._effective(X, groups).astype(np.float64)
-        chain = self.mechanical_model_
-        if warn and isinstance(chain, Chain):
+        if warn and isinstance(chain := self.mechanical_model_, Chain):
             rows = torch.from_numpy(q)  # finite; lengths below zero are extrapolation
             for message in (*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")):
                 if message is not None:
@@ -440,13 +439,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
+def _method(name: str) -> Callable[[HybridModule, NDArray], Sequence[NDArray]]:
+    """Return what computes a method of a module for rows q."""
+    return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
+
+
 def _with_domain(module: HybridModule, q: NDArray, value: bool = True) -> list[NDArray]:
     """Return x of rows q where asked for, and whether they lie within the domain."""
     *x, distance = evaluate(module, q, value, distance=True)
     return [*x, distance <= 1.0]
-
-
-def _by_torch(method: Callable[[Tensor], Tensor], q: NDArray) -> tuple[NDArray]:
-    """Return what a method of a module gives for rows q."""
-    with torch.no_grad():
-        return (method(torch.from_numpy(q)).numpy(),)
