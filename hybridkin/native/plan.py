@@ -200,14 +200,16 @@ def _units(
 def _lever(offset: NDArray, center: NDArray, factor: NDArray) -> tuple[int, list[NDArray]]:
     """Return whether a factor R (f, f) is full, and the numbers of |R' (phi - center)|^2 + offset.
 
-    R stands in blocks of columns, of an upper triangular one down to the diagonal.
+    R stands in blocks of columns, the first filled up by zeros in front; of an upper triangular R
+    the rows down to the diagonal.
     """
     f = len(center)
     Plan.limit("features", f)
     full = bool(np.tril(factor, -1).any())
-    padded = np.zeros((f, -(-f // GROUP) * GROUP))
-    padded[:, :f] = factor
-    blocks = [padded[: None if full else k + GROUP, k : k + GROUP] for k in range(0, f, GROUP)]
+    padded = np.pad(factor, ((0, 0), (-f % GROUP, 0)))
+    ends = range(f, 0, -GROUP)[::-1]
+    columns = np.split(padded, len(ends), axis=1)
+    blocks = [part[: f if full else end] for part, end in zip(columns, ends, strict=True)]
     return int(full), [offset, center, *blocks]
 
 

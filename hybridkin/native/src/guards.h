@@ -7,9 +7,14 @@ typedef struct {
     V phi[HK_MAX_F + HK_GROUP], white[HK_MAX_F + HK_GROUP];
 } HK(seen);
 
+/* How many rows the block of R that begins at white number `at` has. */
+static inline int HK(lever_rows)(int f, int full, int at) {
+    return full ? f : at + HK_GROUP - (HK_GROUP - f % HK_GROUP) % HK_GROUP;
+}
+
 /* The leverage |white|^2 + offset, white = R' (phi - center). `lever` holds offset, center (f) and
-   R (f, f) in blocks of HK_GROUP columns; of an upper triangular R only the rows down to the
-   diagonal of a block. */
+   R (f, f) in blocks of HK_GROUP columns, the first filled up by zeros in front; of an upper
+   triangular R only the rows down to the diagonal of a block. */
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
 static real hkr_leverage(int f, int full, const real *lever, const real *phi, real *white);
 #endif
@@ -18,7 +23,7 @@ static real hkr_leverage(int f, int full, const real *lever, const real *phi, re
     const real *block = lever + 1 + f;
     real sum = lever[0];
     for (int at = 0; at < f; at += HK_GROUP) {
-        const int rows = full || at + HK_GROUP > f ? f : at + HK_GROUP;
+        const int rows = HK(lever_rows)(f, full, at);
         for (int l = 0; l < HK_GROUP; l += HK_LANES) {
             V r = SPLAT(0.0), s = r, t = r, v = r;
             int i = 0;
@@ -47,7 +52,7 @@ static inline V HK(leverage)(int f, int full, const real *lever, V *phi, V *whit
     const real *block = lever + 1 + f;
     V sum = SPLAT(lever[0]);
     for (int at = 0; at < f; at += HK_GROUP) {
-        const int rows = full || at + HK_GROUP > f ? f : at + HK_GROUP;
+        const int rows = HK(lever_rows)(f, full, at);
         V r[HK_GROUP];
         for (int l = 0; l < HK_GROUP; l++) r[l] = SPLAT(0.0);
         for (int i = 0; i < rows; i++)
@@ -65,7 +70,7 @@ static inline void HK(leverage_slope)(int f, int full, const real *lever, const 
     const real *block = lever + 1 + f;
     for (int i = 0; i < f; i++) slope[i] = SPLAT(0.0);
     for (int at = 0; at < f; at += HK_GROUP) {
-        const int rows = full || at + HK_GROUP > f ? f : at + HK_GROUP;
+        const int rows = HK(lever_rows)(f, full, at);
         for (int i = 0; i < rows; i++) {
             V sum = white[at] * block[HK_GROUP * i];
             for (int l = 1; l < HK_GROUP; l++) sum = sum + white[at + l] * block[HK_GROUP * i + l];
