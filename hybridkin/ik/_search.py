@@ -113,8 +113,11 @@ class Search:
                 open_rows = self._cost(found)[some] > _DONE
                 self._try_again(found, some[open_rows], part[open_rows])
         if settings.has_posture:
-            self._descend(found, lambda p: settings.preferred(p) - p)
+            self._to_posture(found)
         return found
+
+    def _to_posture(self, found: Found) -> None:
+        self._descend(found, lambda q: self.settings.preferred(q) - q)
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
         """Return what one start leads to; from outside the models' domain slide towards it."""

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, as_tensor, check_shape, real_array
 from hybridkin._core.model import Portable
-from hybridkin.ik.tasks import Task, Tolerance
+from hybridkin._core.stored import Stored
+from hybridkin.ik.tasks import PositionTask, Task, Tolerance
 
 Array: TypeAlias = Numbers | Transform  # what comes in
 Posture: TypeAlias = Callable[[Tensor], Tensor]
@@ -119,6 +120,31 @@ class StepSettings(Portable):
     def has_posture(self) -> bool:
         """Whether there is a preferred configuration to go to."""
         return self.posture is not None and self.beta > 0.0
+
+    def stored(self) -> Stored:
+        """Return how the settings describe themselves, with the model as their part.
+
+        Raises
+        ------
+        TypeError
+            Where they could only be stored as code: other tasks than a `PositionTask`, or a posture
+            that is a function.
+        """
+        model, n = self.task.models[0], self.n_actuators
+        if type(self.task) is not PositionTask or callable(self.posture) or n is None:
+            raise TypeError("only a PositionTask with a fixed posture can be described as data")
+        nothing = torch.zeros(())
+        arrays = {
+            "q_min": self.q_min,
+            "q_max": self.q_max,
+            "dq_max": self.dq_max,
+            "posture": nothing if self.posture is None else self.posture,
+            "weights": nothing + 1.0 if self.weights is None else self.weights,
+        }
+        arrays = {name: a.double().expand(n).contiguous() for name, a in arrays.items()}
+        names = ("beta", "gain", "damping", "limits", "dt", "has_posture")
+        settings = {name: getattr(self, name) for name in names}
+        return Stored.of("inverse_kinematics", arrays, {"model": model.stored()}, **settings)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (N, ...) and J (N, m, n) at q of shape (N, n)."""

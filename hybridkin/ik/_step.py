@@ -34,7 +34,7 @@ def control_step(
     q: Tensor,
     J: Tensor,
     e: Tensor,
-    feed_forward: Tensor | float = 0.0,
+    feed_forward: Tensor | None = None,
     period: float | None = None,
 ) -> StepRows:
     """Return eq. (1) for one period, v = dx dt + gain dt e; rows that are not finite hold still.
@@ -49,8 +49,8 @@ def control_step(
         Jacobians of the task.
     e : Tensor of shape (N, m)
         Errors of the task, to be taken back by the gain [m].
-    feed_forward : Tensor of shape (N, m) or float, default=0.0
-        Motion of the targets in this period [m].
+    feed_forward : Tensor of shape (N, m), optional
+        Motion of the targets in this period [m]. Default: none.
     period : float, optional
         Time to the next step [s]. Default: `settings.dt`.
 
@@ -60,7 +60,7 @@ def control_step(
         With sigma_min NaN where a row held still.
     """
     gain, beta, seconds = settings.rates(period)
-    v = feed_forward + gain * e
+    v = gain * e if feed_forward is None else feed_forward + gain * e
     fine = torch.isfinite(q).all(-1) & torch.isfinite(J).all(-1).all(-1)
     fine = (fine & torch.isfinite(v).all(-1))[:, None]
     at = torch.where(fine, q, 0.0)
@@ -71,7 +71,7 @@ def control_step(
     J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
     step = limited_step(settings, J, v, posture, *bounds)
     return step._replace(
-        dq=torch.where(torch.isnan(q), 0.0, step.dq),
+        dq=torch.where(torch.isnan(step.dq), 0.0, step.dq),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
     )
 
@@ -116,9 +116,10 @@ def limited_step(
             problem = BoxProblem(J, v, z, low, high).take(over)
             clipped[over] = strict_box_step(problem, damping_sq[over])
         dq = clipped
+    held = (dq <= lower) | (dq >= upper)
     if settings.weights is not None:
         dq = torch.clamp(dq * unit, *box)
-    return StepRows(dq, gram.sigma_min, damping_sq.sqrt(), (dq <= box[0]) | (dq >= box[1]))
+    return StepRows(dq, gram.sigma_min, damping_sq.sqrt(), held)
 
 
 def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:

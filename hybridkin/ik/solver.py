@@ -20,6 +20,8 @@ from hybridkin._core.arrays import (
     number,
     rows_of,
 )
+from hybridkin._core.stored import Stored
+from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
@@ -154,7 +156,17 @@ class InverseKinematics:
                 parts.append(f"{name}={value!r}")
         return f"InverseKinematics({', '.join(parts)})"
 
-    @torch.no_grad()
+    def stored(self) -> Stored:
+        """Return how the solver describes itself, with its model as a part, for kernels.
+
+        Raises
+        ------
+        TypeError
+            Where it could only be stored as code: other tasks than the position of a tip, or a
+            posture that is a function.
+        """
+        return self.settings.stored()
+
     def step(
         self, q: Array, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
     ) -> Step:
@@ -176,19 +188,35 @@ class InverseKinematics:
         Step
             `dq` and what came with it. A row with a NaN or infinite input holds still.
         """
+        core = core_of(self.settings)
+        fields = None if core is None else core.step(q, x_target, dx, x_measured)
+        if fields is None:
+            return self._steps(core, q, x_target, dx, x_measured)
+        step = object.__new__(Step)  # its constructor takes longer than the step
+        vars(step).update(fields)
+        return step
+
+    @torch.no_grad()
+    def _steps(
+        self, core: Core | None, q: Array, x_target: Array, dx: Array | None, tip: Array | None
+    ) -> Step:
         settings, task = self.settings, self.settings.task
         as_numpy, axes = is_numpy(q), len(task.shape)
         rows = settings.configurations(q, "q")
         given = [(rows, 1), (settings.points(x_target, "x_target", rows), axes)]
-        if x_measured is not None:
-            given.append((settings.points(x_measured, "x_measured", rows), axes))
+        if tip is not None:
+            given.append((settings.points(tip, "x_measured", rows), axes))
         if dx is not None:
             given.append((settings.points(dx, "dx", rows, shape=(sum(task.parts),)), 1))
         lead = leading(given)
         rows, target, *others = (rows_of(a, lead, trailing) for a, trailing in given)
-        feed_forward = 0.0 if dx is None else settings.dt * others.pop()
+        feed_forward = None if dx is None else settings.dt * others.pop()
+        measured = others.pop() if others else None
+        if core is not None and as_numpy and rows.dtype == torch.float64:
+            parts = core.steps(rows, target, feed_forward, measured)
+            return Step(*give_back(parts, lead, as_numpy))
         x, J = settings.evaluate(rows)
-        e = task.difference(others.pop() if others else x, target)
+        e = task.difference(x if measured is None else measured, target)
         step = control_step(settings, rows, J, e, feed_forward)
         parts = (step.dq, x, e.norm(dim=-1), step.sigma_min, step.damping, step.saturated)
         return Step(*give_back(parts, lead, as_numpy))
@@ -260,7 +288,15 @@ class InverseKinematics:
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q, target = rows_of(q, lead), rows_of(target, lead, axes)
-        found = Search(settings, tolerance, max_iter).solve(q, target, q0 is None, restarts)
+        core = core_of(settings) if as_numpy and q.dtype == torch.float64 else None
+        search = Search(settings, tolerance, max_iter)
+        if core is not None:
+            search, settings, task = (
+                core.search(tolerance, max_iter),
+                core.settings,
+                core.settings.task,
+            )
+        found = search.solve(q, target, q0 is None, restarts)
         q = found.q
         if differentiable:
             with torch.enable_grad():

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from operator import attrgetter
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy
+from hybridkin.ik._compiled import Follower, Tick, core_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
@@ -18,6 +21,10 @@ from hybridkin.ik.results import IKStatus, statuses
 from hybridkin.ik.tasks import Tolerance
 
 Plant = Callable[["NDArray | Tensor"], Array]
+
+
+def _seen(name: str, text: str) -> Any:
+    return property(attrgetter(f"_robot.{name}"), doc=text)
 
 
 class Tracker:
@@ -28,6 +35,8 @@ class Tracker:
 
     Attributes
     ----------
+    q : array of shape (n,)
+        The present command: what the last `step` returned, or `reset` was given.
     x : array of shape (3,)
         The model's tip at the configuration that the last step started from [m], in the shape of
         the task.
@@ -41,7 +50,7 @@ class Tracker:
     damping : float
         Damping lambda of the last step, in the unit of `sigma_min`.
     backend : str
-        What computes: "torch".
+        What computes: "compiled", for NumPy and models that have kernels, or "torch".
 
     Examples
     --------
@@ -55,8 +64,6 @@ class Tracker:
     ('CONVERGED', 0)
     """
 
-    backend = "torch"
-
     def __init__(
         self, settings: StepSettings, q0: Array, tol: Tolerance, memory: float | None
     ) -> None:
@@ -68,13 +75,16 @@ class Tracker:
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
-        n = self._q.shape[1]
+        n = len(self.q)
         return f"Tracker({n} actuators, {self.status.name}, error {self.error:.3g} m)"
 
-    @property
-    def q(self) -> NDArray | Tensor:
-        """The present command, shape (n,): what the last `step` returned, or `reset` was given."""
-        return self._given_back(self._q)
+    backend = _seen("backend", 'What computes: "compiled", for NumPy and known models, or "torch".')
+    q = _seen("command", "The present command, shape (n,).")
+    x = _seen("x", "The model's tip before the last step [m], in the shape of the task.")
+    error = _seen("error", "Distance from the tip, measured or the model's, to the target [m].")
+    saturated = _seen("saturated", "Actuators that the last step held at a limit, bool (n,).")
+    sigma_min = _seen("sigma_min", "Smallest singular value of the Jacobian before the last step.")
+    damping = _seen("damping", "Damping lambda of the last step, in the unit of `sigma_min`.")
 
     @property
     def status(self) -> IKStatus:
@@ -85,11 +95,11 @@ class Tracker:
         MAX_ITER where it was free. INVALID_INPUT where the target, the measured tip or the model's
         answer was not finite, and before the first step.
         """
-        task, e, last = self._settings.task, self._e, self._last
-        error = e.norm(dim=-1) + 0.0 * last.sigma_min  # NaN where either is
-        parts = (task.reached(e, self._tol), last.saturated.any(-1), last.damping > 0.0)
+        task, (q, _, _, e, step) = self._robot.task, self._robot.last()
+        error = e.norm(dim=-1) + 0.0 * step.sigma_min  # NaN where either is
+        parts = (task.reached(e, self._tol), step.saturated.any(-1), step.damping > 0.0)
         with torch.no_grad():
-            return IKStatus(int(statuses(task, self._before, error, *parts)))
+            return IKStatus(int(statuses(task, q, error, *parts)))
 
     def reset(self, q: Array) -> None:
         """Start anew from an actuator vector, as read from the robot.
@@ -104,12 +114,13 @@ class Tracker:
         good = given.ndim == 1 and n in (None, len(given)) and torch.isfinite(given).all()
         need = f"finite and of shape ({n or 'n'},)"
         require(good, f"`q` must be {need}, got {given.tolist()}; read it from the robot.")
-        self._q = given.clone()[None]
-        with torch.no_grad():
-            x, _ = settings.evaluate(self._q)
-        self._offset = x.new_zeros(1, sum(settings.task.parts))  # of the model at the last reading
-        unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(self._q)
-        self._note(x, unknown, StepRows(none, unknown[:, 0], none[:, 0], none > 0.0))
+        core = core_of(settings) if self._as_numpy and given.dtype == torch.float64 else None
+        if core is not None:
+            self._robot = Follower(core, self._memory)
+        else:
+            self._robot = _InTorch(settings, self._memory, self._as_numpy)
+        self._like = given.clone()
+        self._robot.start(self._like[None])
 
     def step(
         self, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
@@ -134,59 +145,18 @@ class Tracker:
             The command, within the limits to the last bit; the caller's to keep. Where `x_target`
             or `dx` is not finite the robot holds still.
         """
-        settings, like = self._settings, self._q
+        settings, like, robot = self._settings, self._like, self._robot
+        if robot.tick(x_target, dx, x_measured):
+            return robot.command
         target = settings.points(x_target, "x_target", like, lead="")[None]
-        feed_forward, tip = 0.0, None
+        feed_forward, tip = None, None
         if dx is not None:
             rows = (sum(settings.task.parts),)
             feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)
         if x_measured is not None:
             tip = settings.points(x_measured, "x_measured", like, lead="")[None]
-        self._advance(target, feed_forward, tip)
-        return self.q
-
-    @torch.no_grad()
-    def _advance(
-        self,
-        target: Tensor | None,
-        feed_forward: Tensor | float,
-        tip: Tensor | None,
-        period: float | None = None,
-    ) -> Tensor:
-        """Take one step towards a target (1, ...), and return the Jacobian before it.
-
-        A tip of None stands for the model's. Without a target the step is feed-forward alone.
-        """
-        settings, task = self._settings, self._settings.task
-        x, J = settings.evaluate(self._q)
-        error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
-        if target is not None:
-            error = used = task.difference(x, target)
-            if tip is not None:
-                # Without a reading the model's error counts, moved by the offset that is
-                # remembered; without memory no error counts.
-                error = task.difference(tip, target)
-                offset = used - error
-                seen = torch.isfinite(offset).all(-1, keepdim=True)
-                remembered = used if self._memory is None else self._offset
-                used = torch.where(seen, error, used - remembered)
-                self._offset = torch.where(seen, offset, self._offset)
-        step = control_step(settings, self._q, J, used, feed_forward, period)
-        if self._memory is not None:
-            self._offset = math.exp(-(period or settings.dt) / self._memory) * self._offset
-        self._note(x, error, step)
-        self._q = self._q + step.dq
-        return J
-
-    def _note(self, x: Tensor, e: Tensor, step: StepRows) -> None:
-        """Keep what is known of the last step: what is shown to the user is their own copy."""
-        self._before, self._x, self._e, self._last = self._q, x, e, step
-        self.x, self.saturated = self._given_back(x), self._given_back(step.saturated)
-        self.error, self.sigma_min = float(e.norm(dim=-1)), float(step.sigma_min)
-        self.damping = float(step.damping)
-
-    def _given_back(self, row: Tensor) -> NDArray | Tensor:
-        return as_array(row[0]).copy() if self._as_numpy else row[0].clone()
+        robot.advance(None, target, feed_forward, tip)
+        return robot.command
 
     def follow(
         self,
@@ -213,12 +183,12 @@ class Tracker:
                 progress(i, n)
             tip = None if plant is None else self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
-            q = self._q
-            J = self._advance(target if known[i] else None, ahead[i : i + 1], used, periods[i])
-            seen = self._x if tip is None else tip
-            rows.append((q, self._x, seen, row_gram(J).sigma_min, held, damped))
-            held, damped = self._last.saturated.any(-1), self._last.damping > 0.0
-        return [torch.cat(parts) for parts in zip(*rows, strict=True)]
+            ahead_now, target = ahead[i : i + 1], target if known[i] else None
+            tick = self._robot.advance(periods[i], target, ahead_now, used)
+            rows.append((tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped))
+            held, damped = tick.step.saturated.any(-1), tick.step.damping > 0.0
+        q, x, seen, J, held, damped = (torch.cat(parts) for parts in zip(*rows, strict=True))
+        return [q, x, seen, row_gram(J).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
         """Return the plant's tip (1, ...), NaN where the plant raises.
@@ -227,9 +197,79 @@ class Tracker:
         the rows before it are not lost.
         """
         try:
-            return self._settings.points(plant(self.q), "tip", self._q, lead="")[None]
+            return self._settings.points(plant(self.q), "tip", self._like, lead="")[None]
         except Exception as error:
             warnings.warn(
                 f"`plant` failed at point {i}: {error!r}; it counts as NaN.", stacklevel=6
             )
-            return self._q.new_full((1, *self._settings.task.shape), math.nan)
+            return self._like.new_full((1, *self._settings.task.shape), math.nan)
+
+
+class _InTorch:
+    """A robot that follows targets of any task in torch; as `Follower`."""
+
+    backend = "torch"
+
+    def __init__(self, settings: StepSettings, memory: float | None, as_numpy: bool) -> None:
+        self._settings, self._memory, self._as_numpy = settings, memory, as_numpy
+        self.task = settings.task
+
+    @torch.no_grad()
+    def start(self, q: Tensor) -> None:
+        """Go to a configuration (1, n), where nothing is done yet."""
+        self._q, (x, J) = q, self._settings.evaluate(q)
+        self._offset = x.new_zeros(1, sum(self.task.parts))  # of the model at the last reading
+        unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(q)
+        step = StepRows(none, unknown[:, 0], none[:, 0], none > 0.0)
+        self._last = Tick(q, x, J, unknown, step)
+
+    def tick(self, target: Array, dx: Array | None, tip: Array | None) -> bool:
+        """Return False: all arguments need a closer look."""
+        return False
+
+    @torch.no_grad()
+    def advance(
+        self,
+        period: float | None,
+        target: Tensor | None,
+        feed_forward: Tensor | None,
+        tip: Tensor | None,
+    ) -> Tick:
+        """Take one step towards a target (1, ...), and return what is known of it.
+
+        A tip of None stands for the model's. Without a target the step is feed-forward alone.
+        """
+        settings, task = self._settings, self.task
+        x, J = settings.evaluate(self._q)
+        error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
+        if target is not None:
+            error = used = task.difference(x, target)
+            if tip is not None:
+                # Without a reading the model's error counts, moved by the offset that is
+                # remembered; without memory no error counts.
+                error = task.difference(tip, target)
+                offset = used - error
+                seen = torch.isfinite(offset).all(-1, keepdim=True)
+                remembered = used if self._memory is None else self._offset
+                used = torch.where(seen, error, used - remembered)
+                self._offset = torch.where(seen, offset, self._offset)
+        step = control_step(settings, self._q, J, used, feed_forward, period)
+        if self._memory is not None:
+            self._offset = math.exp(-(period or settings.dt) / self._memory) * self._offset
+        self._last = Tick(self._q, x, J, error, step)
+        self._q = self._q + step.dq
+        return self._last
+
+    def last(self) -> Tick:
+        """Return what is known of the last tick."""
+        return self._last
+
+    command = property(lambda self: self._given_back(self._q))
+    x = property(lambda self: self._given_back(self._last.x))
+    saturated = property(lambda self: self._given_back(self._last.step.saturated))
+    error = property(lambda self: float(self._last.e.norm(dim=-1)))
+    sigma_min = property(lambda self: float(self._last.step.sigma_min))
+    damping = property(lambda self: float(self._last.step.damping))
+
+    def _given_back(self, row: Tensor) -> NDArray | Tensor:
+        return as_array(row[0]).copy() if self._as_numpy else row[0].clone()

@@ -6,7 +6,7 @@ import ctypes
 import os
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from operator import attrgetter
@@ -179,20 +179,27 @@ class Program:
             self._in_chunks(rows, q.ctypes.data, results)
 
     def _in_chunks(self, rows: int, q: int, results: list[tuple[NDArray | None, int]]) -> None:
-        n, starts = self._sizes[0], range(0, rows, _CHUNK)
+        n = self._sizes[0]
         places = [(_address(a), 8 * width) for a, width in results]
 
-        def run(start: int) -> None:
+        def run(start: int, count: int) -> None:
             to = [None if place is None else place + start * step for place, step in places]
-            self._evaluate(*self._head, q + 8 * n * start, min(_CHUNK, rows - start), *to)
+            self._evaluate(*self._head, q + 8 * n * start, count, *to)
 
-        threads = min(len(starts), torch.get_num_threads())
-        if threads == 1:
-            for start in starts:
-                run(start)
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(run, starts))
+        in_chunks(rows, run)
+
+
+def in_chunks(rows: int, run: Callable[[int, int], None]) -> None:
+    """Call ``run(start, count)`` for chunks of rows, in the threads that torch may use."""
+    starts = range(0, rows, _CHUNK)
+    counts = [min(_CHUNK, rows - start) for start in starts]
+    threads = min(len(starts), torch.get_num_threads())
+    if threads < 2:
+        for start, count in zip(starts, counts, strict=True):
+            run(start, count)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run, starts, counts))
 
 
 def play(rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool) -> list[NDArray]:

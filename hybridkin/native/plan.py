@@ -15,7 +15,7 @@ from hybridkin._core.stored import Stored
 
 # Kinds of nodes, as src/plan.h numbers them.
 ARCS, ELASTIC, RIGID, AFFINE, ELM, POLYNOMIAL, KERNEL, READOUT = range(1, 9)
-LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID = range(9, 13)
+LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK = range(9, 14)
 GROUP = 8  # hidden units, or columns of a leverage, that stand together
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
 QUADRATIC, POSE = 1, 3  # features of a readout
@@ -336,6 +336,21 @@ def _hybrid(plan: Plan, stored: Stored) -> int:
     return plan.node(HYBRID, n, m, numbers, base, drift, len(inner), *places)
 
 
+def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
+    model = plan.node_of(stored.part("model"))
+    n, m = plan._code[model + 1 : model + 3]
+    if m != 3:
+        raise NoKernel(f"a step is computed for tips of 3 coordinates, got {m}")
+    names = ("q_min", "q_max", "dq_max", "posture")
+    vectors = [stored.array(name, [n], finite=False) for name in names]
+    gain, beta, dt, damping = (stored.settings[name] for name in ("gain", "beta", "dt", "damping"))
+    rates = [-1.0 if gain is None else gain, beta, dt, -1.0 if damping == "adaptive" else damping]
+    weights = stored.array("weights", [n])
+    flags = (stored.settings["limits"] == "saturate") + 2 * stored.settings["has_posture"]
+    flags += 4 * bool((weights != 1.0).any())
+    return plan.node(IK, n, 3, [*vectors, weights**-0.5, np.array(rates)], model, flags)
+
+
 WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
     "constant_curvature": _constant_curvature,
     "elastic_tendons": _elastic_tendons,
@@ -349,4 +364,5 @@ WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
     "leverage_guard": _leverage_guard,
     "box_guard": _box_guard,
     "hybrid_module": _hybrid,
+    "inverse_kinematics": _inverse_kinematics,
 }

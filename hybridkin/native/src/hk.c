@@ -17,6 +17,8 @@
 #define HK_LANES 2
 #endif
 #include "model.h"
+#include "ik_step.h"
+#include "ik_search.h"
 
 #if defined(_WIN32)
 #define HK_API __declspec(dllexport)
@@ -81,4 +83,52 @@ HK_API void hk_evaluate(const int32_t *code, const real *data, int32_t at, const
 HK_API void hk_play(int64_t rows, int32_t n, int32_t lead, const real *half, const real *given,
                     real *command, real *effective, real *found) {
     hk_play_rows(rows, n, lead, half, given, command, effective, found);
+}
+
+/* What follows targets: settings and the state of `ik_tick`. */
+typedef struct {
+    const int32_t *code;
+    const real *data;
+    int64_t at;
+    real *state;
+} ik_follower;
+
+HK_API void hk_ik_tick(const ik_follower *f) {
+    const ik_settings ik = ik_settings_of(f->code, f->data, (int)f->at);
+    ik_tick(&ik, f->state);
+}
+
+/* Single ticks for rows of q (rows, n), targets, and with the mode their motions and measured tips
+   (rows, 3). `out` (rows, n + 6) holds dq, x, |e|, sigma_min, damping; held (rows, n). */
+HK_API void hk_ik_steps(const int32_t *code, const real *data, int32_t at, int64_t rows, int32_t mode,
+                     const real *q, const real *target, const real *feed, const real *tip,
+                     real *out, unsigned char *held) {
+    const ik_settings ik = ik_settings_of(code, data, at);
+    const int n = ik.n;
+    real state[IK_STATE] = {mode, ik.dt};
+    for (int64_t r = 0; r < rows; r++, out += n + 6) {
+        for (int i = 0; i < 3; i++) {
+            state[IK_TARGET + i] = target[3 * r + i];
+            if (feed) state[IK_FEED + i] = feed[3 * r + i];
+            if (tip) state[IK_TIP + i] = tip[3 * r + i];
+        }
+        for (int j = 0; j < n; j++) state[IK_Q + j] = q[n * r + j];
+        ik_tick(&ik, state);
+        for (int j = 0; j < n; j++) {
+            out[j] = state[IK_Q + n + j];
+            held[n * r + j] = state[IK_Q + 3 * n + j] > 0.0;
+        }
+        for (int i = 0; i < 3; i++) out[n + i] = state[IK_X + i];
+        out[n + 3] = state[IK_DISTANCE];
+        out[n + 4] = state[IK_SIGMA_MIN];
+        out[n + 5] = state[IK_DAMPING];
+    }
+}
+
+/* The search, see ik_search.h. */
+HK_API void hk_ik_find(const int32_t *code, const real *data, int32_t at, int64_t rows, int32_t mode,
+                    int32_t max_iter, real tol, const real *target, real *q, real *J, real *e,
+                    int32_t *found, int32_t *n_iter) {
+    const ik_search_t search = {ik_settings_of(code, data, at), mode, max_iter, tol};
+    ik_search(&search, rows, target, q, J, e, found, n_iter);
 }

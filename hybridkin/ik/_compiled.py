@@ -1,0 +1,299 @@
+"""Steps, ticks and searches in the compiled core, for tasks that have kernels."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import math
+from struct import Struct
+from struct import error as StructError
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hybridkin.ik._search import Found, Point, Search
+from hybridkin.ik._settings import StepSettings
+from hybridkin.ik._step import StepRows
+from hybridkin.ik.tasks import PositionTask, Task, Tolerance
+from hybridkin.native.library import Program, in_chunks, library, program_of
+from hybridkin.native.plan import NoKernel, Plan
+
+# The state of `ik_tick`, see native/src/ik_step.h.
+_MODE, _PERIOD, _MEMORY, _SIGMA_MIN, _DAMPING, _DISTANCE = range(6)
+_TARGET, _FEED, _TIP, _OFFSET, _X, _ERROR, _Q = range(6, 25, 3)
+_HAS_TARGET, _HAS_FEED, _HAS_TIP, _MUST_SEE = 1, 2, 4, 8
+# What `hk_ik_find` does and finds, see native/src/ik_search.h.
+_LOWER, _TO_DOMAIN, _TO_POSTURE = 1, 2, 4
+_REACHED, _AT_REST, _HELD = 1, 2, 4
+_FLOAT64 = np.dtype(np.float64)
+_write_point = Struct("3d").pack_into
+
+
+class Tick(NamedTuple):
+    """What is known of a tick, in rows of one: q, the model there, the error, and the step."""
+
+    q: Tensor
+    x: Tensor
+    J: Tensor
+    e: Tensor
+    step: StepRows
+
+
+def core_of(settings: StepSettings) -> Core | None:
+    """Return the core of settings, None where a part of the task has no kernel.
+
+    It is kept with the settings, and made anew where the model has changed.
+    """
+    kept, model = vars(settings).get("_program"), program_of(settings.task.models[0])
+    if kept is None or kept[0] is not model:
+        try:
+            kept = model, None if model is None else Core(settings, model)
+        except (NoKernel, TypeError):
+            kept = model, None
+        object.__setattr__(settings, "_program", kept)
+    return kept[1]
+
+
+class Core:
+    """Inverse kinematics of one task in the compiled core.
+
+    Parameters
+    ----------
+    settings : StepSettings
+        Task, limits, posture and rates.
+    model : Program
+        The model of the task.
+
+    Attributes
+    ----------
+    settings : StepSettings
+        The settings, with a task that the core evaluates.
+    n : int
+        Number of actuators.
+    """
+
+    def __init__(self, settings: StepSettings, model: Program) -> None:
+        self._plan, self._made_of = Plan(settings.stored()), (settings, model)
+        self.n = self._plan.n_inputs
+        self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
+        self.head = self._plan.code.ctypes.data, self._plan.data.ctypes.data, self._plan.root
+        self._idle: list[Follower] = []  # one for every thread that is in `step`
+
+    def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, Program]]:
+        return Core, self._made_of
+
+    def step(self, q: Any, target: Any, dx: Any, tip: Any) -> dict[str, NDArray] | None:
+        """Return the fields of a `Step` for one row of plain arrays, None for anything else."""
+        if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
+            return None
+        follower = self._idle.pop() if self._idle else Follower(self, None, _MUST_SEE)
+        follower.q[...] = q
+        a, n = follower.state.copy() if follower.tick(target, dx, tip) else None, self.n
+        self._idle.append(follower)
+        if a is None:
+            return None
+        return {
+            "dq": a[_Q + n : _Q + 2 * n],
+            "x": a[_X:_ERROR],
+            "error": a[_DISTANCE, ...],
+            "sigma_min": a[_SIGMA_MIN, ...],
+            "damping": a[_DAMPING, ...],
+            "saturated": a[_Q + 3 * n : _Q + 4 * n].astype(bool),
+        }
+
+    def steps(self, q: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
+        """Return dq, x, error, sigma_min, damping and what is held, of rows q (N, n).
+
+        `given` is the target, its motion in a period, and the measured tip.
+        """
+        n, mode = self.n, _MUST_SEE
+        for bit, a in zip((_HAS_TARGET, _HAS_FEED, _HAS_TIP), given, strict=True):
+            mode += 0 if a is None else bit
+        out, held = np.empty((len(q), n + 6)), np.empty((len(q), n), dtype=bool)
+        arrays = [None if a is None else _plain(a) for a in (q, *given)]
+        self._run("hk_ik_steps", len(q), [ctypes.c_int32(mode)], [*arrays, out, held])
+        dq, x, numbers = torch.from_numpy(out).split([n, 3, 3], dim=1)
+        return dq, x, *numbers.unbind(1), torch.from_numpy(held)
+
+    def search(self, tol: Tolerance, max_iter: int) -> Search:
+        """Return the search for targets."""
+        return _CoreSearch(self.settings, tol, max_iter, self)
+
+    def find(self, mode: int, q: Tensor, target: Tensor, tol: float, max_iter: int) -> Found:
+        """Return what `hk_ik_find` makes of starts q (N, n)."""
+        best, rows = _plain(q).copy(), len(q)
+        J, e = np.empty((rows, 3, self.n)), np.empty((rows, 3))
+        found, n_iter = np.empty((2, rows), dtype=np.int32)
+        numbers = [ctypes.c_int32(mode), ctypes.c_int32(max_iter), ctypes.c_double(tol)]
+        self._run("hk_ik_find", rows, numbers, [_plain(target), best, J, e, found, n_iter])
+        at, J, e, found, n_iter = (torch.from_numpy(a) for a in (best, J, e, found, n_iter))
+        reached, at_rest, held = (found & bit > 0 for bit in (_REACHED, _AT_REST, _HELD))
+        ends = n_iter.long(), torch.ones(rows, dtype=torch.long)
+        return Found(at, target - e, J, e, target, reached, at_rest, held, *ends)
+
+    def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
+        """Call a function of the library for the rows of arrays."""
+        function, (code, data, root) = _function(name), self.head
+        head = ctypes.c_void_p(code), ctypes.c_void_p(data), ctypes.c_int32(root)
+        places = [None if a is None else (a.ctypes.data, a.strides[0]) for a in arrays]
+
+        def run(start: int, count: int) -> None:
+            at = [p if p is None else ctypes.c_void_p(p[0] + start * p[1]) for p in places]
+            function(*head, ctypes.c_int64(count), *numbers, *at)
+
+        in_chunks(rows, run)
+
+
+class Follower:
+    """A robot that follows targets in the core; its state is one array of numbers.
+
+    Parameters
+    ----------
+    core : Core
+        What computes.
+    memory : float, optional
+        Time constant of the measured offset [s].
+    mode : int, default=0
+        Of `ik_tick`, besides what is given.
+    state : ndarray, optional
+        Of a follower that goes on here.
+    """
+
+    backend = "compiled"
+
+    def __init__(
+        self, core: Core, memory: float | None, mode: int = 0, state: NDArray | None = None
+    ) -> None:
+        self.core, self._memory, self._least = core, memory, mode
+        self.task, n = core.settings.task, core.n
+        self.state = state = np.zeros(_Q + 7 * core.n) if state is None else state
+        self._dt = state[_PERIOD] = core.settings.dt
+        state[_MEMORY] = memory or 0.0
+        self.q, self._held = state[_Q : _Q + n], state[_Q + 3 * n : _Q + 4 * n]
+        self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
+        self._inputs = {at: state[at : at + 3] for at in (_TARGET, _FEED, _TIP)}
+        self._pointers = np.array([*core.head, state.ctypes.data])  # ik_follower
+        self._follow, self._mode = _function("hk_ik_tick"), -1
+        self._address = ctypes.c_void_p(self._pointers.ctypes.data)
+
+    def __reduce__(self) -> tuple[type[Follower], tuple]:
+        return Follower, (self.core, self._memory, self._least, self.state.copy())
+
+    def start(self, q: Tensor) -> None:
+        """Go to a configuration (1, n), where nothing is done yet."""
+        state, n = self.state, self.core.n
+        state[_SIGMA_MIN:] = 0.0
+        state[[_SIGMA_MIN, _DISTANCE, *range(_ERROR, _Q)]] = math.nan
+        state[_X:_ERROR] = self.core.settings.evaluate(q)[0][0]
+        self.q[:] = state[_Q + 2 * n : _Q + 3 * n] = q[0]
+
+    def tick(self, target: Any, dx: Any, tip: Any) -> bool:
+        """Take a tick with plain arrays: the target, its velocity, the measured tip.
+
+        Returns False, and does nothing, where one of them needs a closer look.
+        """
+        mode = self._least | _HAS_TARGET
+        if not self._put(_TARGET, target):
+            return False
+        if dx is not None:
+            if not self._put(_FEED, dx):
+                return False
+            self._inputs[_FEED] *= self._dt
+            mode |= _HAS_FEED
+        if tip is not None:
+            if not self._put(_TIP, tip):
+                return False
+            mode |= _HAS_TIP
+        if mode != self._mode:
+            self.state[_MODE] = self._mode = mode
+        self._follow(self._address)
+        return True
+
+    def _put(self, at: int, point: Any) -> bool:
+        """Write a point into the state, if it is an array or a list of three numbers."""
+        if type(point) is np.ndarray:
+            if point.dtype is not _FLOAT64 or point.shape != (3,):
+                return False
+            self._inputs[at][...] = point
+            return True
+        if type(point) is not list and type(point) is not tuple:
+            return False
+        try:
+            _write_point(self._bytes, 8 * at, *point)
+        except (StructError, OverflowError):
+            return False
+        return True
+
+    def advance(self, period: float | None, *given: Tensor | None) -> Tick:
+        """Take a tick with checked rows: the target, its motion in the period, the measured tip."""
+        mode, bits = self._least, (_HAS_TARGET, _HAS_FEED, _HAS_TIP)
+        for bit, place, a in zip(bits, self._inputs.values(), given, strict=True):
+            if a is not None:
+                place[...] = a.reshape(3).numpy()
+                mode += bit
+        self.state[_MODE] = self._mode = mode
+        self.state[_PERIOD] = period or self._dt
+        self._follow(self._address)
+        self.state[_PERIOD] = self._dt
+        return self.last()
+
+    command = property(lambda self: self.q.copy())
+    x = property(lambda self: self.state[_X:_ERROR].copy())
+    saturated = property(lambda self: self._held.astype(bool))
+    error = property(lambda self: float(self.state[_DISTANCE]))
+    sigma_min = property(lambda self: float(self.state[_SIGMA_MIN]))
+    damping = property(lambda self: float(self.state[_DAMPING]))
+
+    def last(self) -> Tick:
+        """Return what is known of the last tick."""
+        a, n = torch.from_numpy(self.state.copy())[None], self.core.n
+        _, dq, before, held, J = a[:, _Q:].split([n, n, n, n, 3 * n], dim=1)
+        step = StepRows(dq, a[:, _SIGMA_MIN], a[:, _DAMPING], held > 0.0)
+        return Tick(before, a[:, _X:_ERROR], J.view(1, 3, n), a[:, _ERROR:_Q], step)
+
+
+class _CoreTask(PositionTask):
+    """A position task that the core evaluates."""
+
+    def __init__(self, task: Task, program: Program) -> None:
+        vars(self).update(vars(task))
+        self._program = program
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        x, J, _ = self._program.evaluate(_plain(q), jacobian=True)
+        return torch.from_numpy(x), torch.from_numpy(J)
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        return torch.from_numpy(self._program.evaluate(_plain(q), distance=True)[2])
+
+
+@dataclasses.dataclass(frozen=True)
+class _CoreSearch(Search):
+    """A search whose loops run in the core."""
+
+    core: Core
+
+    def _attempt(self, q: Tensor, target: Tensor) -> Found:
+        return self._find(_LOWER + _TO_DOMAIN, q, target)
+
+    def _to_posture(self, found: Found) -> None:
+        rows = found.reached.nonzero()[:, 0]
+        slid = self._find(_TO_POSTURE, found.q[rows], found.target[rows])
+        found.put(rows, Point(slid.q, slid.x, slid.J, slid.e, slid.target))
+        found.n_iter[rows] += slid.n_iter
+
+    def _find(self, mode: int, q: Tensor, target: Tensor) -> Found:
+        tol = self.tol[0] if isinstance(self.tol, tuple) else self.tol
+        return self.core.find(mode, q, target, tol, self.max_iter)
+
+
+def _function(name: str) -> Any:
+    return getattr(library(), name)
+
+
+def _plain(a: Tensor) -> NDArray:
+    """Return rows as a contiguous array."""
+    return a.contiguous().numpy()

@@ -1,0 +1,226 @@
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, InverseKinematics, robots
+from hybridkin.ik.results import IKStatus
+from hybridkin.ik.tasks import PoseTask
+from hybridkin.native.plan import Plan
+
+pytestmark = pytest.mark.needs_core
+
+BHA = robots.bionic_handling_assistant()
+TENDONS = ConstantCurvatureChain([0.02] * 3, lengths=[0.1] * 3, routing="base")
+CHAINS = {
+    "trunk": (BHA, 0.1, 0.4),
+    "two segments": (ConstantCurvatureChain([0.1, 0.093]), 0.1, 0.4),
+    "one segment": (ConstantCurvatureChain([0.1]), 0.1, 0.4),
+    "four chambers": (ConstantCurvatureChain([0.1, 0.09, 0.08], n_actuators=4), 0.1, 0.4),
+    "tendons": (TENDONS, -0.02, 0.02),
+    "elastic tendons": (ElasticTendonChain([0.02] * 2, [0.1] * 2), -0.02, 0.02),
+}
+STEP = ("dq", "x", "error", "sigma_min", "damping", "saturated")
+# The singular values are good to the root of the precision.
+ATOL = {"dq": 1e-9, "x": 1e-12, "error": 1e-12, "sigma_min": 1e-5, "damping": 1e-5}
+
+
+def random_settings(draw, n, low, high):
+    span = high - low
+    chosen = {
+        "q_min": low + draw.choice([0.0, 0.3]) * span * draw.random(n),
+        "q_max": high - draw.choice([0.0, 0.3]) * span * draw.random(n),
+        "beta": float(draw.choice([0.0, 1.0, 100.0])),
+        "damping": "adaptive" if draw.random() < 0.7 else float(draw.choice([0.01, 0.1])),
+    }
+    more = {
+        "dq_max": span * 10.0 ** draw.uniform(-1, 2, n),
+        "weights": 10.0 ** draw.uniform(-1, 1, n),
+        "gain": 50.0,
+        "limits": "off",
+        "q_pref": draw.uniform(low, high, n),
+    }
+    return chosen | {name: value for name, value in more.items() if draw.random() < 0.3}
+
+
+def random_rows(draw, chain, low, high, rows, settings):
+    """Rows inside, outside and at the limits, bent and nearly straight, and some not finite."""
+    n = chain.n_actuators
+    q = draw.uniform(low, high, (rows, n))
+    q[::4] += 0.3 * (high - low) * draw.standard_normal((len(q[::4]), n))
+    q[1::4] = np.where(draw.random((len(q[1::4]), n)) < 0.4, settings["q_min"], q[1::4])
+    q[2::8] = q[2::8, :1] + 1e-4 * (high - low) * draw.standard_normal((len(q[2::8]), n))
+    near = torch.from_numpy(np.where(draw.random((rows, 1)) < 0.5, q, draw.uniform(low, high, n)))
+    x = chain(near).numpy() + 10.0 ** draw.uniform(-4, -1) * draw.standard_normal((rows, 3))
+    q[5, 0], q[13, 1], x[21, 2], x[29, 0] = np.nan, np.inf, np.nan, -np.inf
+    return q, x
+
+
+def in_torch(*arrays):
+    return [None if a is None else torch.from_numpy(a) for a in arrays]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHAINS)
+def test_steps_are_those_of_torch(name):
+    chain, low, high = CHAINS[name]
+    draw, held = np.random.default_rng(0), 0
+    for _ in range(12):
+        settings = random_settings(draw, chain.n_actuators, low, high)
+        ik = InverseKinematics(chain, **settings)
+        q, x = random_rows(draw, chain, low, high, 160, settings)
+        dx = draw.choice([0.0, 0.1]) * draw.standard_normal(x.shape)
+        tip = x + 0.01 * draw.standard_normal(x.shape) if draw.random() < 0.3 else None
+        ours = ik.step(q, x, dx, x_measured=tip)
+        q_torch, x_torch, dx_torch, tip_torch = in_torch(q, x, dx, tip)
+        theirs = ik.step(q_torch, x_torch, dx_torch, x_measured=tip_torch)
+        for field, atol in ATOL.items():
+            a, b = getattr(ours, field), getattr(theirs, field).numpy()
+            np.testing.assert_allclose(a, b, rtol=1e-7, atol=atol, err_msg=field)
+        # At a bound to the last bit or beside it.
+        assert (ours.saturated != theirs.saturated.numpy()).mean() < 2e-3
+        held += int(ours.saturated.sum())
+        ends = [settings[end] for end in ("q_min", "q_max")]
+        rows = ((q >= ends[0]) & (q <= ends[1])).all(1) & ("limits" not in settings)
+        new = q[rows] + ours.dq[rows]
+        assert ((new >= ends[0]) & (new <= ends[1])).all()
+    assert held > 800
+
+
+def test_a_row_is_a_tick_is_a_row_of_a_batch():
+    draw = np.random.default_rng(1)
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=5.0)
+    q, x = random_rows(draw, BHA, 0.1, 0.4, 40, {"q_min": 0.1})
+    dx, tip = draw.standard_normal((2, 40, 3))
+    for given in ((None, None), (dx, None), (None, tip), (dx, tip)):
+        batch = ik.step(q, x, given[0], x_measured=given[1])
+        for i in range(40):
+            row = [None if a is None else a[i] for a in given]
+            one = ik.step(q[i], x[i], row[0], x_measured=row[1])
+            for field in STEP:
+                np.testing.assert_array_equal(getattr(one, field), getattr(batch, field)[i])
+            if np.isfinite(q[i]).all():
+                tracker = ik.tracker(q[i])
+                new = tracker.step(list(x[i]), row[0], x_measured=row[1])
+                np.testing.assert_array_equal(new, q[i] + one.dq)
+                np.testing.assert_array_equal(tracker.saturated, one.saturated)
+                for field in ("x", "error", "sigma_min", "damping"):
+                    np.testing.assert_array_equal(getattr(tracker, field), getattr(one, field))
+
+
+@pytest.mark.parametrize("memory", [None, 0.05])
+def test_a_stream_is_that_of_torch(memory):
+    """With readings that come and go, and targets that are not known."""
+    draw = np.random.default_rng(2)
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=3.0, weights=np.arange(1.0, 10.0))
+    q = 0.25 + 0.05 * draw.standard_normal(9)
+    ours, theirs = ik.tracker(q, memory=memory), ik.tracker(torch.from_numpy(q), memory=memory)
+    assert (ours.backend, theirs.backend) == ("compiled", "torch")
+    seen = set()
+    for i in range(60):
+        x = np.array([0.1 * np.sin(0.1 * i), 0.05, 0.75]) * draw.choice([1.0, 1.0, np.nan, 1.6])
+        tip = ours.x + 0.01 if i % 3 else np.full(3, np.nan)
+        given = (x, np.full(3, 0.01 * (i % 2))), {"x_measured": tip if i % 4 else None}
+        np.testing.assert_allclose(
+            ours.step(*given[0], **given[1]), theirs.step(*given[0], **given[1]).numpy(), atol=1e-9
+        )
+        assert ours.status is theirs.status
+        assert ours.error == pytest.approx(theirs.error, abs=1e-9, nan_ok=True)
+        seen.add(ours.status)
+    assert seen >= {IKStatus.INVALID_INPUT, IKStatus.AT_LIMITS}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHAINS)
+def test_solutions_are_those_of_torch(name):
+    chain, low, high = CHAINS[name]
+    draw, n = np.random.default_rng(3), chain.n_actuators
+    q = draw.uniform(low, high, (500, n))
+    q[::2] = np.where(draw.random((250, n)) < 0.7, np.where(q[::2] < q.mean(), low, high), q[::2])
+    x = chain(torch.from_numpy(q)).numpy() * np.where(np.arange(500) % 10, 1.0, 2.5)[:, None]
+    x[7] = np.nan
+    ik = InverseKinematics(chain, q_min=low, q_max=high, weights=1.0 + np.arange(n) / n)
+    ours, theirs = ik.solve(x, restarts=8), ik.solve(torch.from_numpy(x), restarts=8)
+    np.testing.assert_array_equal(ours.status, theirs.status.numpy())
+    np.testing.assert_array_equal(ours.n_starts, theirs.n_starts.numpy())
+    far = ours.status != IKStatus.CONVERGED
+    np.testing.assert_allclose(ours.error[far], theirs.error.numpy()[far], rtol=1e-3, atol=1e-6)
+    assert (ours.error[~far] <= 1e-4).all()
+    known = np.arange(500) != 7
+    assert ((ours.q[known] >= low) & (ours.q[known] <= high)).all()
+    assert (far.sum() > 20) & ((~far).sum() > 300)
+
+
+def test_a_track_is_that_of_torch():
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=1.0, dt=0.02)
+    phase = np.linspace(0.0, 2.0 * np.pi, 60)
+    path = np.stack([0.1 * np.sin(phase), 0.06 * np.sin(2 * phase), 0.75 + 0 * phase], axis=1)
+    path[20], t = np.nan, np.cumsum(0.01 + 0.01 * (np.arange(60) % 2))
+
+    def plant(q):
+        reading = BHA(torch.as_tensor(1.02 * np.asarray(q))).numpy()
+        return reading if abs(q[0] - 0.26) > 0.002 else np.full(3, np.nan)
+
+    given = {"plant": plant, "feedback": "measured", "memory": 0.1}
+    ours = ik.track(path, t, q0=np.full(9, 0.25), **given)
+    theirs = ik.track(*in_torch(path, t), q0=torch.full((9,), 0.25).double(), **given)
+    for field in vars(ours):
+        a, b = getattr(ours, field), getattr(theirs, field).numpy()
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-8, err_msg=field)
+
+
+def test_what_has_no_kernel_runs_in_torch():
+    q, limits = np.full(9, 0.25), {"q_min": 0.1, "q_max": 0.4}
+    assert InverseKinematics(BHA, **limits).tracker(q).backend == "compiled"
+    others = [
+        InverseKinematics(BHA, q_pref=lambda q: 0.9 * q, **limits),
+        InverseKinematics(PoseTask(BHA), **limits),
+        InverseKinematics(lambda q: BHA(q), **limits),
+    ]
+    for ik in others:
+        assert ik.tracker(q).backend == "torch"
+        with pytest.raises(TypeError):
+            Plan(ik.stored())
+    assert InverseKinematics(BHA, **limits).tracker(q.astype(np.float32)).backend == "torch"
+
+
+def test_a_tracker_keeps_its_model_until_it_is_reset():
+    chain, q, x = copy.deepcopy(BHA), np.full(9, 0.25) + 0.01 * np.arange(9), [0.1, 0.0, 0.7]
+    ik = InverseKinematics(chain, q_min=0.1, q_max=0.4)
+    tracker, before = ik.tracker(q), ik.step(q, np.array(x))
+    chain.load_state_dict({k: 1.01 * v for k, v in chain.state_dict().items()}, strict=False)
+    after = ik.step(q, np.array(x))
+    assert np.abs(after.dq - before.dq).max() > 1e-5
+    np.testing.assert_array_equal(tracker.step(x), q + before.dq)
+    tracker.reset(q)
+    np.testing.assert_array_equal(tracker.step(x), q + after.dq)
+
+
+def test_copies_go_their_own_way():
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4)
+    tracker = ik.tracker(np.full(9, 0.25) + 0.01 * np.arange(9), memory=1.0)
+    tracker.step([0.1, 0.0, 0.7], x_measured=[0.11, 0.0, 0.7])
+    twins, nan = [copy.deepcopy(tracker), pickle.loads(pickle.dumps(tracker))], [np.nan] * 3
+    expected = [tracker.step([0.1, 0.0, 0.7], x_measured=nan) for _ in range(3)]
+    for twin in twins:
+        for q in expected:
+            np.testing.assert_array_equal(twin.step([0.1, 0.0, 0.7], x_measured=nan), q)
+
+
+def test_threads_do_not_change_results():
+    draw = np.random.default_rng(4)
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4)
+    q, few = draw.uniform(0.1, 0.4, (40_003, 9)), slice(39_990, None)
+    x = BHA(torch.from_numpy(q[::-1].copy())).numpy()
+    part, start = ik.step(q[few], x[few]).dq, torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        np.testing.assert_array_equal(ik.step(q, x).dq[few], part)
+    finally:
+        torch.set_num_threads(start)
+    with ThreadPoolExecutor(4) as pool:  # single rows at once, which share buffers in turn
+        rows = list(pool.map(lambda i: ik.step(q[i], x[i]).dq, range(39_990, 40_003)))
+    np.testing.assert_array_equal(rows, part)
