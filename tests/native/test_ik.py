@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, InverseKinematics, robots
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    ELMRegressor,
+    HybridForwardModel,
+    InverseKinematics,
+    datasets,
+    robots,
+)
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import PoseTask
 from hybridkin.native.plan import Plan
@@ -224,3 +232,23 @@ def test_threads_do_not_change_results():
     with ThreadPoolExecutor(4) as pool:  # single rows at once, which share buffers in turn
         rows = list(pool.map(lambda i: ik.step(q[i], x[i]).dq, range(39_990, 40_003)))
     np.testing.assert_array_equal(rows, part)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("guard", ["leverage", "box"])
+def test_a_search_slides_into_the_domain_as_in_torch(guard):
+    data, chain = datasets.load_trunk(), ConstantCurvatureChain([0.100, 0.093, 0.079])
+    hybrid = HybridForwardModel(chain, ELMRegressor(20, random_state=0), guard=guard)
+    model = hybrid.fit(data.q[:400], data.x[:400]).module_
+    low, high = data.q[:400].min(0) - 0.02, data.q[:400].max(0) + 0.02
+    draw = np.random.default_rng(5)
+    corners = np.where(draw.random((60, 9)) < 0.5, low, high)
+    q = data.q[:60] + np.linspace(0.0, 1.0, 60)[:, None] * (corners - data.q[:60])
+    x = model(torch.from_numpy(q)).detach().numpy()
+    ik = InverseKinematics(model, q_min=low, q_max=high)
+    assert ik.tracker(q[0]).backend == "compiled"
+    ours, theirs = ik.solve(x, q, restarts=4), ik.solve(*in_torch(x, q), restarts=4)
+    np.testing.assert_array_equal(ours.status, theirs.status.numpy())
+    np.testing.assert_array_equal(ours.n_starts, theirs.n_starts.numpy())
+    outside = ~model.in_domain(torch.from_numpy(q)).numpy()
+    assert (ours.status[outside] == IKStatus.CONVERGED).sum() > 5
