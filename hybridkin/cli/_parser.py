@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="hybridkin", **_help(parser))
     top.add_argument("--version", action="version", version=f"hybridkin {hybridkin.__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    for add_options in (_paper, _fit, _evaluate, _track, _animate, _describe):
+    for add_options in (_paper, _fit, _evaluate, _track, _animate, _export, _describe):
         text = _help(add_options)
         line = text["description"].partition("\n")[0].rstrip(".")
         command = commands.add_parser(add_options.__name__[1:], help=line, **text)
@@ -211,9 +211,7 @@ def _track(command: argparse.ArgumentParser) -> None:
     add("--duration", type=_positive, default=10.0, help="of the shape [s] (10)")
     add("--dt", type=_positive, help="time between points [s] (0.02 of a shape)")
     add("--unit", choices=METRES, help="of path and shape (the log's x)")
-    add("--q-min", type=_numbers, help="least q, in the unit and sign of the log")
-    add("--q-max", type=_numbers, help="largest q")
-    add("--dq-max", type=_numbers, help="largest speed of an actuator, per second")
+    _add_limits(command)
     add("--tol", type=_positive, default=0.1, help="error that is reached [mm] (0.1)")
     where, values = "where the robot stands (rest)", "rest|path|A,B,..."
     add("--from", type=_start, default="rest", dest="start", metavar=values, help=where)
@@ -237,6 +235,25 @@ def _animate(command: argparse.ArgumentParser) -> None:
     add("--frames", type=_count, default=150, help="at most (150)")
 
 
+def _export(command: argparse.ArgumentParser) -> None:
+    """Write a model as C code for a controller.
+
+    Header, source, test and a CMakeLists.txt, without any library but math.h. With --dt the step of
+    inverse kinematics is written too, within the limits of the robot description and of the fit.
+
+    Some examples:
+      hybridkin export model --out robot_c --name robot
+      hybridkin export model --out robot_c --name robot --dtype float32 --dt 0.001
+    """
+    add = command.add_argument
+    _add_model(command)
+    add("--out", type=Path, required=True, help="folder for the code")
+    add("--name", default="model", help="of files and functions (model)")
+    add("--dtype", choices=("float64", "float32"), default="float64", help="numbers (float64)")
+    add("--dt", type=_positive, help="control period [s], for the step (no step)")
+    _add_limits(command)
+
+
 def _describe(command: argparse.ArgumentParser) -> None:
     """Describe a model, or check a log.
 
@@ -250,6 +267,13 @@ def _describe(command: argparse.ArgumentParser) -> None:
     """
     _add_model(command, "log", "MODEL|ROBOT.toml|LOG")
     _add_log(command)
+
+
+def _add_limits(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("--q-min", type=_numbers, help="least q, in the unit and sign of the log")
+    add("--q-max", type=_numbers, help="largest q")
+    add("--dq-max", type=_numbers, help="largest speed of an actuator, per second")
 
 
 def _add_work(command: argparse.ArgumentParser) -> None:

@@ -24,7 +24,7 @@ from hybridkin.cli._parser import failed, parser
 if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.robots import LogFormat
-    from hybridkin.workflow import MeasuredLog
+    from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits
 
 _DT = 0.02
 # What the user can correct is printed without a traceback.
@@ -156,9 +156,7 @@ def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     log_format = loaded.log_format()
     if (arguments.path is None) == (arguments.shape is None):
         raise ValueError("give either a file of points or --shape, one of the two.")
-    # In the log's unit and sign, which may swap least and largest.
-    asked = hybridkin.robots.Limits(arguments.q_min, arguments.q_max, arguments.dq_max)
-    limits = workflow.path_limits(loaded, **vars(asked.scaled(log_format.q_factor)))
+    limits = _limits(arguments, loaded)
     unit = arguments.unit or log_format.x_unit
     if arguments.path is not None:
         path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
@@ -205,6 +203,19 @@ def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     return _Outcome(record, f"{record['frames']} frames, {speed}, {size}", [arguments.out])
 
 
+def _export(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    report, paths = hybridkin.workflow.export_model(
+        loaded,
+        arguments.out,
+        name=arguments.name,
+        dtype=arguments.dtype,
+        dt=arguments.dt,
+        limits=None if arguments.dt is None else _limits(arguments, loaded),
+    )
+    return _Outcome(report.record, report.plain(), paths)
+
+
 def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     if arguments.log.suffix.lower() not in hybridkin.workflow.LOG_SUFFIXES:
         loaded = hybridkin.workflow.open_model(arguments.log, arguments.robot)
@@ -218,8 +229,15 @@ def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     return _Outcome(found.to_dict(), str(found), code=0 if found.ok else 1)
 
 
-_COMMANDS = (_paper, _fit, _evaluate, _track, _animate, _describe)
+_COMMANDS = (_paper, _fit, _evaluate, _track, _animate, _export, _describe)
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
+
+
+def _limits(arguments: argparse.Namespace, loaded: LoadedModel) -> PathLimits:
+    """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
+    asked = hybridkin.robots.Limits(arguments.q_min, arguments.q_max, arguments.dq_max)
+    factor = loaded.log_format().q_factor
+    return hybridkin.workflow.path_limits(loaded, **vars(asked.scaled(factor)))
 
 
 def _read(

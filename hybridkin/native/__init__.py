@@ -1,5 +1,6 @@
 """The compiled core: kernels in C that compute models and inverse kinematics for NumPy arrays."""
 
+from hybridkin.native.export import export_c
 from hybridkin.native.library import available, backend
 
-__all__ = ["available", "backend"]
+__all__ = ["available", "backend", "export_c"]

@@ -3,6 +3,7 @@
 from hybridkin.workflow._describe import describe
 from hybridkin.workflow._domain import PathLimits, path_limits
 from hybridkin.workflow.evaluate import evaluate_log
+from hybridkin.workflow.export import export_model
 from hybridkin.workflow.fit import Comparison, FitSettings, compare_by_group, fit_log
 from hybridkin.workflow.log import LogError, MeasuredLog, read_log
 from hybridkin.workflow.model import LOG_SUFFIXES, LoadedModel, open_model
@@ -23,6 +24,7 @@ __all__ = [
     "compare_by_group",
     "describe",
     "evaluate_log",
+    "export_model",
     "fit_log",
     "json_text",
     "open_model",

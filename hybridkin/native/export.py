@@ -1,0 +1,259 @@
+"""C code of a model for a controller: the kernels that it needs and its numbers, in one file."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.stored import Stored
+from hybridkin._core.version import __version__
+from hybridkin.native._kernels import kernels_of
+from hybridkin.native.plan import NoKernel, Plan
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_REAL = {"float64": "double", "float32": "float"}
+_TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # of the test, relative to the largest numbers
+# Arrays with the middle and the half width of q in a description.
+_RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "half_width"))
+_STEPS, _MEMORY = 4, 5.0  # steps of a run of the test; memory in periods
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """Inverse kinematics of a model, as `InverseKinematics` is."""
+
+    model: Any
+
+    def stored(self) -> Stored:
+        """Return how it describes itself, with the part "model"."""
+        ...
+
+    def tracker(self, q0: Any, *, memory: float | None = None) -> Any:
+        """Return what follows targets step by step."""
+        ...
+
+
+def export_c(
+    model: object, folder: str | Path, *, name: str = "model", dtype: str = "float64"
+) -> list[Path]:
+    """Write a model, or inverse kinematics, as C99 code for a controller.
+
+    The code needs no library but math.h, allocates nothing, and every loop of it has a bound.
+
+    Parameters
+    ----------
+    model : ForwardModel, fitted HybridForwardModel or ELMRegressor, or InverseKinematics
+        What to write. Of inverse kinematics the model and a step of it are written. Play of a
+        hybrid is not: q are the values after it.
+    folder : str or Path
+        Where to write. Files of an earlier export are replaced, others are not.
+    name : str, default="model"
+        Of the files, and what all functions begin with.
+    dtype : {"float64", "float32"}, default="float64"
+        Numbers that the code computes with.
+
+    Returns
+    -------
+    list of Path
+        Header, source, test, CMakeLists.txt and README.md.
+
+    Raises
+    ------
+    NoKernel
+        Where a part of the model cannot be written; the message says which. A ValueError.
+    FileExistsError
+        Where the folder has a file of another origin under one of these names.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from hybridkin import native, robots
+    >>> folder = tempfile.mkdtemp()
+    >>> paths = native.export_c(robots.bionic_handling_assistant(), folder, name="trunk")
+    >>> [path.name for path in paths]
+    ['trunk.h', 'trunk.c', 'trunk_test.c', 'CMakeLists.txt', 'README.md']
+    """
+    if dtype not in _REAL:
+        raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
+    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+        raise ValueError(f"`name` must be a name in C, as in trunk_3, got {name!r}.")
+    controller = model if isinstance(model, Controller) else None
+    module = as_forward_model(model if controller is None else controller.model)
+    try:
+        plan = Plan((module if controller is None else controller).stored())
+    except (NoKernel, TypeError) as error:
+        way = "use it from Python, or fit an error model that has a kernel"
+        raise NoKernel(f"`model` cannot be written in C: {error}; {way}.") from None
+    files = {f"{name}.h": "model.h", f"{name}.c": "model.c", f"{name}_test.c": "test.c"}
+    files |= {file: file for file in ("CMakeLists.txt", "README.md")}
+    paths = [Path(folder) / file for file in files]
+    for path in paths:
+        if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
+            raise FileExistsError(f"`folder` has a {path.name} of another origin; take another.")
+    entries = {
+        **dict(NAME=name, GUARD=name.upper(), TITLE=type(model).__name__, VERSION=__version__),
+        **dict(REAL=_REAL[dtype], N=plan.n_inputs, M=plan.n_outputs, TOL=_TOLERANCE[dtype]),
+        **_code(plan, controller is not None, dtype),
+        **_vectors(module, plan, controller, dtype),
+    }
+    parts = dict(STEP_H="step.h", STEP_C="step.c", TICKS="ticks.c", STEP_README="step.md")
+    for key, template in parts.items():
+        entries[key] = "" if controller is None else _filled(template, entries)
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for path, template in zip(paths, files.values(), strict=True):
+        if template == "README.md":
+            entries["MEASURED"] = _measured(paths[1])
+        path.write_text(_filled(template, entries))
+    return paths
+
+
+def _filled(template: str, entries: dict[str, Any]) -> str:
+    text = (_TEMPLATES / template).read_text()
+    return re.sub(r"@(\w+)@", lambda found: str(entries[found[1]]), text)
+
+
+def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
+    """Return kernels, sizes and numbers of a plan as C, and what README.md says of them."""
+    at = int(plan.code[plan.root + 4]) if steps else plan.root
+    kernels = kernels_of(plan, at, steps, dtype == "float32")
+    found = {
+        "KERNELS": kernels,
+        "CODE": _literals(plan.code),
+        "DATA": _literals(plan.data.astype(dtype)),
+        "MODEL": at,
+        "ROOT": plan.root,
+        "MATH": ", ".join(sorted({*re.findall(r"HK_MATH\((\w+)\)\(", kernels)})),
+        "BYTES": len(plan.data) * (8 if dtype == "float64" else 4) + 4 * len(plan.code),
+        "CALL": "forward(q, x)",
+    }
+    if steps:
+        (low, high, fast), dt = _limits(plan)
+        words = (", ".join(f"{v:.6g}" for v in row) for row in (low, high, fast))
+        found |= zip(("Q_MIN", "Q_MAX", "DQ_MAX"), words, strict=True)
+        found |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
+    return found
+
+
+def _limits(plan: Plan) -> tuple[NDArray, float]:
+    """Return least, largest and fastest q, shape (3, n), and the period of inverse kinematics."""
+    n, numbers = plan.n_inputs, plan.data[plan.code[plan.root + 3] :]
+    return numbers[: 3 * n].reshape(3, n), float(numbers[5 * n + 2])
+
+
+def _literals(values: NDArray) -> str:
+    """Return numbers as the inside of a C array."""
+    single = "f" if values.dtype == np.float32 else ""
+    cast = "" if single else "(double)"
+    known = {"inf": f"{cast}INFINITY", "-inf": f"-{cast}INFINITY", "nan": f"{cast}NAN"}
+    words = [known.get(word, word + single) for word in map(str, values.ravel())]
+    lines = (", ".join(words[i : i + 6]) for i in range(0, len(words), 6))
+    return "\n    " + ",\n    ".join(lines) + ",\n"
+
+
+def _vectors(
+    module: ForwardModel, plan: Plan, controller: Controller | None, dtype: str
+) -> dict[str, Any]:
+    """Return what the test compares: inputs, and what torch computes of them."""
+    double = copy.deepcopy(module).double()
+    rows = _rows(double, plan, controller is not None).astype(dtype)
+    with torch.no_grad():
+        at = torch.from_numpy(rows.astype(float))
+        x, J = (a.numpy() for a in double.forward_and_jacobian(at))
+        distance = double.domain_distance(at).numpy()
+    arrays = {"Q": rows, "X": x, "J": J, "DISTANCE": distance, "HOME": rows[0]}
+    found = {f"{key}_SCALE": float(np.nanmax(abs(a[:8]))) for key, a in arrays.items()}
+    if controller is not None:
+        arrays |= _runs(controller, plan, rows[:8], x[:8], dtype)
+        found |= {"STEPS": _STEPS, "MEMORY": _MEMORY * _limits(plan)[1]}
+        found["COMPARED"] = 8 if dtype == "float64" else 4
+    return {"ROWS": len(rows), **found, **{key: _literals(a) for key, a in arrays.items()}}
+
+
+def _rows(module: ForwardModel, plan: Plan, steps: bool) -> NDArray:
+    """Return eight usual rows of q, then rows at the edge of the domain and outside; one is NaN."""
+    n, rng = plan.n_inputs, np.random.default_rng(0)
+    center, half = _range(module.stored(), n) or _nominal(module, n)
+    if steps and np.isfinite(_limits(plan)[0][:2]).all():
+        low, high = _limits(plan)[0][:2]
+        center, half = 0.5 * (low + high), 0.5 * (high - low)
+    inside = center + np.linspace(0.0, 0.7, 8)[:, None] * half * rng.uniform(-1.0, 1.0, (8, n))
+    out = inside[:4] + 4.0 * half * rng.choice([-1.0, 1.0], (4, n))
+    low, high = np.zeros((4, 1)), np.ones((4, 1))
+    for _ in range(40):  # bisection of the way out
+        middle = 0.5 * (low + high)
+        with torch.no_grad():
+            at = torch.from_numpy(inside[:4] + middle * (out - inside[:4]))
+            good = module.in_domain(at).numpy()[:, None]
+        low, high = np.where(good, middle, low), np.where(good, high, middle)
+    edge = inside[:4] + low * (out - inside[:4])
+    return np.concatenate([inside, edge, out, np.full((1, n), math.nan)])
+
+
+def _range(stored: Stored, n: int) -> tuple[NDArray, NDArray] | None:
+    """Return the middle and the half width of q that a learned part was fitted to."""
+    for pair in _RANGES:
+        if all(stored.arrays.get(name, np.empty(0)).shape == (n,) for name in pair):
+            return stored.array(pair[0]), stored.array(pair[1])
+    found = (_range(part, n) for part in stored.parts.values())
+    return next((one for one in found if one is not None), None)
+
+
+def _nominal(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
+    """Return a middle and a half width of q that suit a mechanical model."""
+    radii = module.robot.stored().arrays.get("radii", np.full(1, 2.0))
+    middle = 3.0 * radii.mean() if module.least_actuator == 0.0 else 0.0
+    return np.full(n, middle), np.full(n, 0.5 * radii.min())
+
+
+def _runs(
+    controller: Controller, plan: Plan, starts: NDArray, tips: NDArray, dtype: str
+) -> dict[str, NDArray]:
+    """Return runs of steps, from within the limits and from their edges, and what came out."""
+    rng, (limits, dt) = np.random.default_rng(1), _limits(plan)
+    low, high = limits[:2].astype(dtype)
+    starts = starts.clip(low, high)
+    starts[4:, ::2] = np.where(np.isfinite(high), high, starts[4:])[:, ::2]
+    # In single precision short ones: where limits and weak directions meet it has steps of its own.
+    far = np.array([0.2, 0.1, 0.01] if dtype == "float64" else [1e-4, 1e-3, 1e-4])
+    changes = (
+        far[:, None, None, None] * np.ptp(tips, axis=0) * rng.standard_normal((3, 8, _STEPS, 3))
+    )
+    changes[[0, 2]] += tips[:, None]
+    target, dx, measured = changes.astype(dtype)
+    measured[:, 2] = math.nan  # no reading
+    found = []
+    for q, *run in zip(starts, target, dx, measured, strict=True):
+        tracker = controller.tracker(torch.from_numpy(q.astype(float)), memory=_MEMORY * dt)
+        for i, rows in enumerate(zip(*run, strict=True)):
+            goal, speed, tip = (torch.from_numpy(a.astype(float)) for a in rows)
+            seen = tip if i < _STEPS - 1 else None  # as in the template
+            q = tracker.step(goal, speed, x_measured=seen).numpy()
+            found.append([*q, tracker.sigma_min**2])
+    command, squares = np.split(np.array(found), [plan.n_inputs], axis=1)
+    found = {"STARTS": starts, "LOW": low, "HIGH": high, "COMMAND": command, "SIGMA_SQ": squares}
+    return found | {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
+
+
+def _measured(source: Path) -> str:
+    """Return what the code and its stack take, as the compiler of this machine says."""
+    if shutil.which("cc") and shutil.which("size"):
+        with tempfile.TemporaryDirectory() as home:
+            built, usage = Path(home) / "a.o", Path(home) / "a.su"
+            options = ["-std=c99", "-Os", "-fstack-usage", "-c", source, "-o", built]
+            done = subprocess.run(["cc", *options], capture_output=True)
+            if done.returncode == 0 and usage.exists():
+                stack = sum(int(line.split("\t")[1]) for line in usage.read_text().splitlines())
+                text = subprocess.check_output(["size", built], text=True).split()[6]
+                return f"{text} and {stack} bytes where it was written, by `cc -Os`"
+    return "not measured where it was written, which had no C compiler"

@@ -1,0 +1,24 @@
+/* @TITLE@: written by hybridkin @VERSION@. Units and limits: README.md. */
+#include "@NAME@.h"
+@KERNELS@
+
+static const int32_t code[] = {@CODE@};
+
+static const real data[] = {@DATA@};
+
+const @REAL@ @NAME@_home[@N@] = {@HOME@};
+
+static const hk_plan plan = {code, data};
+
+void @NAME@_forward(const @REAL@ *q, @REAL@ *x) { hk_model(&plan, @MODEL@, q, x, NULL, NULL); }
+
+void @NAME@_jacobian(const @REAL@ *q, @REAL@ *x, @REAL@ *J) {
+    hk_model(&plan, @MODEL@, q, x, J, NULL);
+}
+
+@REAL@ @NAME@_domain(const @REAL@ *q) {
+    real x[HK_MAX_M], distance;
+    hk_model(&plan, @MODEL@, q, x, NULL, &distance);
+    return distance;
+}
+@STEP_C@
