@@ -46,6 +46,8 @@ class Plan:
         self._code: list[int] = []
         self._data: list[NDArray] = []
         self._length = 0
+        self.kinds: set[int] = set()  # that it has nodes of
+        self.largest: dict[str, int] = {}  # sizes, named as in MOST
         self._known: dict[tuple, int] = {}
         self.root = self.node_of(stored)
         self.code = np.array(self._code, dtype=np.int32)
@@ -81,6 +83,7 @@ class Plan:
         """Write a node with its numbers, and return its place; equal nodes have one place."""
         for what, size in (("actuators", n), ("outputs", m)):
             self.limit(what, size)
+        self.kinds.add(kind)
         flat = [np.asarray(part, dtype=np.float64).ravel() for part in numbers]
         key = (kind, n, m, *more, *(part.tobytes() for part in flat))
         if key not in self._known:
@@ -94,21 +97,21 @@ class Plan:
         """Return an entry of a node: 0 its kind, 1 and 2 its lengths, from 4 on what it adds."""
         return self._code[place + k]
 
-    @staticmethod
-    def limit(what: str, size: int) -> None:
-        """Raise where a size is larger than the kernels have room for."""
+    def limit(self, what: str, size: int) -> None:
+        """Note a size, and raise where it is larger than the kernels have room for."""
+        self.largest[what] = max(size, self.largest.get(what, 0))
         if size > MOST[what]:
             raise NoKernel(f"{size} {what}: the kernels have room for {MOST[what]}")
 
 
-def _frame(stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
+def _frame(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
     """Return the frame of a chain of arcs, and the shares (m,) of the m segments up to its tip.
 
     The frame is the rotation of the base, its position, the reach, and the rigid offsets.
     """
     base, at = stored.array("base"), stored.value("tip_at", float)
     offsets = stored.array("offsets")
-    Plan.limit("segments", len(offsets))
+    plan.limit("segments", len(offsets))
     m = math.ceil(at)
     share = np.append(np.ones(m - 1), at - m + 1)
     frame = [base[:3, :3].ravel(), base[:3, 3], [reach], offsets[:m] * (share == 1)]
@@ -123,7 +126,7 @@ def whole_chain(plan: Plan, stored: Stored) -> int:
 
 def _constant_curvature(plan: Plan, stored: Stored) -> int:
     given, radii = stored.arrays.get("lengths"), stored.array("radii")
-    frame, share = _frame(stored, 10.0 * radii.mean() if given is None else given.sum())
+    frame, share = _frame(plan, stored, 10.0 * radii.mean() if given is None else given.sum())
     m, S = len(share), len(radii)
     # Segment by segment: lengths, x-, y-bendings.
     matrix, zero = (
@@ -140,7 +143,7 @@ def _constant_curvature(plan: Plan, stored: Stored) -> int:
 
 def _elastic_tendons(plan: Plan, stored: Stored) -> int:
     lengths, radii, rest = (stored.array(name) for name in ("lengths", "radii", "rest_bends"))
-    frame, share = _frame(stored, lengths.sum())
+    frame, share = _frame(plan, stored, lengths.sum())
     counts, m, S = stored.list_of(int, "actuators_per_segment"), len(share), len(radii)
     share = np.append(share, np.zeros(S - m))[:, None]
     base = stored.value("routing", str) == "base"
@@ -191,20 +194,22 @@ def _units(
     n_features, full, numbers = 0, 0, []
     if lever:
         n_features = len(lever[1])
-        full, numbers = _lever(*lever)
+        full, numbers = _lever(plan, *lever)
     parts = [center, 1.0 / scale, intercept, direct, groups, *numbers]
     more = (H, ACTIVATIONS.index(kind[1]), n_features, full)
     return plan.node(kind[0], n, m, parts, *more)
 
 
-def _lever(offset: NDArray, center: NDArray, factor: NDArray) -> tuple[int, list[NDArray]]:
+def _lever(
+    plan: Plan, offset: NDArray, center: NDArray, factor: NDArray
+) -> tuple[int, list[NDArray]]:
     """Return whether a factor R (f, f) is full, and the numbers of |R' (phi - center)|^2 + offset.
 
     R stands in blocks of columns, the first filled up by zeros in front; of an upper triangular R
     the rows down to the diagonal.
     """
     f = len(center)
-    Plan.limit("features", f)
+    plan.limit("features", f)
     full = bool(np.tril(factor, -1).any())
     padded = np.pad(factor, ((0, 0), (-f % GROUP, 0)))
     ends = range(f, 0, -GROUP)[::-1]
@@ -285,7 +290,7 @@ def _quadratic_leverage(plan: Plan, stored: Stored) -> int:
     center, half_width = stored.array("center"), stored.array("half_width")
     # |L^-1 phi|^2 as the leverage of a network: R = L^-T is upper triangular.
     factor = solve_triangular(stored.array("factor"), np.eye(2 * len(center) + 1), lower=True).T
-    lever = _lever(np.zeros(1), np.zeros(len(factor)), np.triu(factor))[1]
+    lever = _lever(plan, np.zeros(1), np.zeros(len(factor)), np.triu(factor))[1]
     return plan.node(QUADRATIC_LEVERAGE, len(center), 0, [center, 1.0 / half_width, *lever])
 
 

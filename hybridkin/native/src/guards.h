@@ -98,7 +98,7 @@ static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *
     if (seen->white_of == at) return seen->leverage;
     if (seen->phi_of != at && p->code[at] == HK_ELM) {
         V x[HK_MAX_M];
-        HK(elm)(p, at, q, x, NULL, seen->phi);
+        HK(regress)(p, at, q, x, NULL, seen->phi);
     } else if (seen->phi_of != at) {
         seen->phi[0] = SPLAT(1.0);
         HK(scaled)(n, hk_numbers(p, at), q, seen->phi + 1);

@@ -80,7 +80,7 @@ static inline void HK(inner_correction)(
     HK(regress)(p, part[HK_REGRESSOR], q, z, sum->J ? turn : NULL, NULL);
     for (int i = 0; i < k; i++) z[i] = z[i] + sum->z[i];
     HK(from_coordinates)(p, base, z, x, sum->J ? C : NULL);
-    if (sum->J && n == 9 && k == 9)
+    if (HK_COMMON(sum->J && n == 9 && k == 9))
         HK(multiply)(9, 9, C, turn, J);
     else if (sum->J)
         HK(multiply)(k, n, C, turn, J);
@@ -135,7 +135,7 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
     if (inner && J) HK(pull)(p, base, &sum.in, sum.C, J);
     if (more[HK_DRIFT] >= 0) {
         V d[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N];
-        HK(elm)(p, more[HK_DRIFT], q, d, J ? slope : NULL, NULL);
+        HK(regress)(p, more[HK_DRIFT], q, d, J ? slope : NULL, NULL);
         if (J) HK(fade)(m, n, sum.trust, sum.fades ? sum.slope : NULL, d, slope);
         for (int i = 0; i < m; i++) sum.x[i] = sum.x[i] + d[i] * sum.trust;
         if (J) HK(add)(m * n, R(1.0), slope, J);

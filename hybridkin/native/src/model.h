@@ -19,6 +19,10 @@ static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V
     case HK_ELASTIC:
     case HK_RIGID: HK(chain)(p, at, q, x, J); break;
     case HK_HYBRID: HK(hybrid)(p, at, q, x, J, distance); break;
-    default: HK(regress)(p, at, q, x, J, NULL);
+    case HK_AFFINE:
+    case HK_ELM:
+    case HK_POLYNOMIAL:
+    case HK_KERNEL:
+    case HK_READOUT: HK(regress)(p, at, q, x, J, NULL);
     }
 }

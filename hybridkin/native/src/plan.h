@@ -21,6 +21,8 @@ typedef int64_t hk_bits;
 #define HK_TINY 2.2250738585072014e-308
 #endif
 #define R(c) ((real)(c))
+/* Common sizes have instances of their own, which keep all in registers. Exported code has none. */
+#define HK_COMMON(sizes) (sizes)
 
 /* Largest sizes that the kernels have room for on the stack; an exported model sets its own. */
 #ifndef HK_MAX_N

@@ -121,9 +121,9 @@ static inline void HK(units)(int n, int m, int units, int activation, const real
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
     hkr_units(n, m, units, activation, w, u, shift, x, J, features);
 #else
-    if (n == 9 && m == 3)
+    if (HK_COMMON(n == 9 && m == 3))
         HK(units_of)(9, 3, units, activation, w, u, shift, x, J, features);
-    else if (n == 6 && m == 3)
+    else if (HK_COMMON(n == 6 && m == 3))
         HK(units_of)(6, 3, units, activation, w, u, shift, x, J, features);
     else
         HK(units_of)(n, m, units, activation, w, u, shift, x, J, features);
@@ -207,7 +207,7 @@ static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J)
     V u[HK_MAX_N];
     HK(scaled)(n, center, q, u);
     if (more[0] == HK_QUADRATIC_FEATURES) {
-        if (n == 9)
+        if (HK_COMMON(n == 9))
             HK(quadratic_of)(9, m, c, inverse, u, x, J);
         else
             HK(quadratic_of)(n, m, c, inverse, u, x, J);
@@ -221,9 +221,12 @@ static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J)
 
 /* Any regressor. `features` is for networks alone. */
 static inline void HK(regress)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features) {
+    (void)features;
     switch (p->code[at]) {
     case HK_POLYNOMIAL: HK(polynomial)(p, at, q, x, J); break;
     case HK_READOUT: HK(readout)(p, at, q, x, J); break;
-    default: HK(elm)(p, at, q, x, J, features);
+    case HK_AFFINE:
+    case HK_KERNEL:
+    case HK_ELM: HK(elm)(p, at, q, x, J, features);
     }
 }
