@@ -71,20 +71,24 @@ def _decided(text: str, single: bool) -> str:
 
 
 def _without_cases(text: str, unused: set[str]) -> str:
-    """Return C text without the cases of kinds of nodes that are not used."""
-    lines, depth, block = [""], None, False
+    """Return C text without the cases of kinds of nodes that are not used.
+
+    A default that shares its statement with cases goes with the last of them.
+    """
+    lines, depth, block, bare = [""], None, False, False
     for line in text.splitlines():
         indent = len(line) - len(line.lstrip())
+        label = re.match(r" *(?:case (HK_\w+)|default):(.*)", line)
+        shared, bare = bare, bool(label and not label[2])  # its statement is that of the next label
         ends = block and indent == depth and line.strip() == "}"
-        if depth is not None and (not line or indent > depth or ends):
+        if depth is not None and not label and (not line or indent > depth or ends):
             continue
-        found, block = re.match(r" *case (HK_\w+):(.*)", line), line.endswith("{")
-        depth = indent if found and found[1] in unused else None
-        if depth is not None and found and re.match(r" *case \w+:$", lines[-1]):
-            line, depth = found[2], None  # a label before it is used
-            if not line:
-                continue
-        if depth is None:
+        kept = shared and re.match(r" *case \w+:$", lines[-1])
+        goes = label and (label[1] in unused or shared and not kept and not label[1])
+        depth, block = indent if goes else None, line.endswith("{")
+        if goes and kept:
+            depth, line = None, label[2] and " " * (indent + 3) + label[2]
+        if depth is None and (line or not goes):
             lines.append(line)
     # Of kinds that are all known the last one needs no label of its own.
     return re.sub(r"(?m)^( *)case HK_\w+: (.*;)\n\1\}", r"\1default: \2\n\1}", "\n".join(lines))

@@ -48,7 +48,8 @@ static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V 
     switch (p->code[at]) {
     case HK_RIGID: HK(rigid)(p->code[at + HK_N], more, hk_numbers(p, at), z, x, C); break;
     case HK_ARCS:
-    case HK_ELASTIC: HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
+    case HK_ELASTIC:
+    default: HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
     }
 }
 
