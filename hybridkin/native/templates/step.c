@@ -10,27 +10,27 @@ void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
 void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
     const @REAL@ *measured) {
     const ik_settings ik = ik_settings_of(code, data, @ROOT@);
-    real all[HK_STATE] = {0};
+    real all[IK_STATE] = {0};
     for (int i = 0; i < 3; i++) {
-        all[HK_TARGET + i] = target[i];
-        all[HK_FEED + i] = dx ? ik.dt * dx[i] : (real)0;
-        all[HK_TIP + i] = measured ? measured[i] : (real)0;
-        all[HK_OFFSET + i] = state->offset[i];
+        all[IK_TARGET + i] = target[i];
+        all[IK_FEED + i] = dx ? ik.dt * dx[i] : (real)0;
+        all[IK_TIP + i] = measured ? measured[i] : (real)0;
+        all[IK_OFFSET + i] = state->offset[i];
     }
-    for (int j = 0; j < @N@; j++) all[HK_Q + j] = state->q[j];
-    all[HK_MODE] = (real)(HK_HAS_TARGET + (dx ? HK_HAS_FEED : 0) + (measured ? HK_HAS_TIP : 0));
-    all[HK_PERIOD] = ik.dt;
-    all[HK_MEMORY] = state->memory;
+    for (int j = 0; j < @N@; j++) all[IK_Q + j] = state->q[j];
+    all[IK_MODE] = (real)(IK_HAS_TARGET + (dx ? IK_HAS_FEED : 0) + (measured ? IK_HAS_TIP : 0));
+    all[IK_PERIOD] = ik.dt;
+    all[IK_MEMORY] = state->memory;
     ik_tick(&ik, all);
     for (int i = 0; i < 3; i++) {
-        state->offset[i] = all[HK_OFFSET + i];
-        state->x[i] = all[HK_X + i];
+        state->offset[i] = all[IK_OFFSET + i];
+        state->x[i] = all[IK_X + i];
     }
-    state->error = all[HK_DISTANCE];
-    state->sigma_min = all[HK_SIGMA_MIN];
-    state->damping = all[HK_DAMPING];
+    state->error = all[IK_DISTANCE];
+    state->sigma_min = all[IK_SIGMA_MIN];
+    state->damping = all[IK_DAMPING];
     for (int j = 0; j < @N@; j++) {
-        state->q[j] = all[HK_Q + j];
-        state->held[j] = all[HK_Q + 3 * @N@ + j] > (real)0;
+        state->q[j] = all[IK_Q + j];
+        state->held[j] = all[IK_Q + 3 * @N@ + j] > (real)0;
     }
 }
