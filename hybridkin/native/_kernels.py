@@ -91,7 +91,8 @@ def _without_cases(text: str, unused: set[str]) -> str:
         if depth is None and (line or not goes):
             lines.append(line)
     # Of kinds that are all known the last one needs no label of its own.
-    return re.sub(r"(?m)^( *)case HK_\w+: (.*;)\n\1\}", r"\1default: \2\n\1}", "\n".join(lines))
+    last = r"(?m)^( *)case HK_\w+: (\{\n(?:\1 .*\n)*\1\}|.*;)\n\1\}"
+    return re.sub(last, r"\1default: \2\n\1}", "\n".join(lines))
 
 
 def _items(text: str) -> Iterator[str]:

@@ -37,6 +37,7 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, H
             HK(elastic_arcs)(e, q, in, z);
         break;
     }
+    case HK_RIGID:
     default:
         for (int i = 0; i < n; i++) z[i] = q[i];
     }
@@ -79,6 +80,7 @@ static inline __attribute__((always_inline)) void HK(pull_rows)(
             HK(pull_tendons)(e, in, rows, C, J);
         break;
     }
+    case HK_RIGID:
     default:
         for (int i = 0; i < rows * n; i++) J[i] = J[i] + C[i];
     }
