@@ -13,7 +13,7 @@ _SIZES = (("HK_MAX_N", "actuators"), ("HK_MAX_S", "segments"), ("HK_MAX_M", "out
 _SIZES += (("HK_MAX_F", "features"), ("HK_MAX_P", "powers"))
 # Instances for common sizes, by `switch` and by `if`: small code keeps the general one alone.
 _SWITCH = re.compile(r"switch \(.*?\) \{.*\n(?: *case (\d+): \w+\(\1\b.*\n)+ *default: (.*)\n *\}")
-_COMMON = re.compile(r"if \(HK_COMMON\(.*\)\)(?: \{\n(?:.*\n)*? *\}|\n[^;{]*;)\s+else\s+")
+_COMMON = re.compile(r"if \(HK_COMMON\(.*\)\)(?: \{\n(?:.*\n)*? *\}|\n[^;]*;)\s+else\s+")
 
 
 def kernels_of(plan: Plan, place: int, steps: bool, single: bool) -> str:

@@ -14,7 +14,6 @@ static inline int HK(n_coordinates)(const hk_plan *p, int at) {
 
 /* The inner coordinates z of q, and what `pull` needs. */
 static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, HK(inside) *in) {
-    const int n = p->code[at + HK_N];
     (void)in;
     switch (p->code[at]) {
     case HK_ARCS: {
@@ -39,7 +38,7 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, H
     }
     case HK_RIGID:
     default:
-        for (int i = 0; i < n; i++) z[i] = q[i];
+        for (int i = 0; i < p->code[at + HK_N]; i++) z[i] = q[i];
     }
 }
 
@@ -58,7 +57,7 @@ static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V 
 static inline __attribute__((always_inline)) void HK(pull_rows)(
     const hk_plan *p, int at, const HK(inside) *in, int rows, const V *C, V *J) {
     const int n = p->code[at + HK_N];
-    (void)in;
+    (void)in, (void)n;
     switch (p->code[at]) {
     case HK_ARCS: {
         HK(linear_arcs) a = HK(linear_arcs_of)(p, at);
