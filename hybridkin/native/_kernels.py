@@ -84,9 +84,9 @@ def _without_cases(text: str, unused: set[str]) -> str:
         if depth is not None and not label and (not line or indent > depth or ends):
             continue
         kept = shared and re.match(r" *case \w+:$", lines[-1])
-        goes = label and (label[1] in unused or shared and not kept and not label[1])
+        goes = label is not None and (label[1] in unused or (shared and not kept and not label[1]))
         depth, block = indent if goes else None, line.endswith("{")
-        if goes and kept:
+        if label and goes and kept:
             depth, line = None, label[2] and " " * (indent + 3) + label[2]
         if depth is None and (line or not goes):
             lines.append(line)
