@@ -105,4 +105,7 @@ class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssue
 
 
 if __name__ == "__main__":
-    compile_into(NATIVE / "lib", host(), sys.argv[1:])
+    try:
+        compile_into(NATIVE / "lib", host(), sys.argv[1:])
+    except OSError as error:
+        sys.exit(f"hybridkin: {error}")

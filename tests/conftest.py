@@ -4,14 +4,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from hybridkin.native import available
+from hybridkin import ForwardModel
+from hybridkin.native import available, backend
 
 torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items):
     if not available():
-        why = "the compiled core is not there: no C compiler at installation, or it is off"
+        why = f"needs the compiled core; {backend(ForwardModel())}"
         for item in items:
             if item.get_closest_marker("needs_core"):
                 item.add_marker(pytest.mark.skip(why))

@@ -171,12 +171,11 @@ class Program:
         n = self._sizes[0]
         if q.shape[-1] != n:
             raise ValueError(f"`q` must have shape (..., {n}), got {q.shape}.")
-        q = np.ascontiguousarray(q, dtype=np.float64)
-        rows = q.size // n
-        if rows == 1:
+        q = np.ascontiguousarray(q, np.float64)
+        if q.size == n:
             self._evaluate(*self._head, q.tobytes(), 1, *[_address(a) for a, _ in results])
-        elif rows:
-            self._in_chunks(rows, q.ctypes.data, results)
+        elif q.size:
+            self._in_chunks(q.size // n, q.ctypes.data, results)
 
     def _in_chunks(self, rows: int, q: int, results: list[tuple[NDArray | None, int]]) -> None:
         n = self._sizes[0]

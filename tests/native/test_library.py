@@ -1,0 +1,242 @@
+import copy
+import multiprocessing
+import os
+import pickle
+import shutil
+import threading
+
+import joblib
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, ForwardModel, as_forward_model
+from hybridkin.native import available, backend, library
+
+CHAIN = {"radii": [0.01, 0.012], "lengths": [0.1, 0.08], "routing": "base"}
+ROWS = np.random.default_rng(0).uniform(-0.01, 0.01, (45_001, 6))
+
+
+def chain(**options):
+    return ConstantCurvatureChain(**CHAIN, **options)
+
+
+def by_torch(model, q):
+    return [a.numpy() for a in model.forward_and_jacobian(torch.tensor(q, dtype=torch.float64))]
+
+
+def agree(found, expected):
+    for ours, right in zip(found, expected, strict=True):
+        assert_close(ours, right, rtol=1e-12, atol=1e-13)
+
+
+@pytest.fixture
+def reopened(monkeypatch):
+    """Search for the library anew, in this test alone."""
+    library._opened.cache_clear()
+    yield monkeypatch
+    monkeypatch.undo()
+    library._opened.cache_clear()
+
+
+@pytest.fixture
+def elsewhere(reopened, tmp_path):
+    """Let the library be searched for in a copy of its folder."""
+    shutil.copytree(library._FOLDER / "src", tmp_path / "src")
+    shutil.copytree(library._FOLDER / "lib", tmp_path / "lib")
+    reopened.setattr(library, "_FOLDER", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.needs_core
+@pytest.mark.parametrize("lead", [(), (1,), (7,), (0,), (3, 1, 2), (2, 0)])
+def test_results_are_those_of_torch(lead):
+    q, model = ROWS[: int(np.prod(lead))].reshape(*lead, 6), chain()
+    x, J, distance = library.program_of(model).evaluate(q, jacobian=True, distance=True)
+    agree((x, J), by_torch(model, q))
+    assert distance.shape == lead
+    assert not distance.any()
+    assert all(a.flags.c_contiguous and a.dtype == np.float64 for a in (x, J, distance))
+    x, J, distance = library.program_of(model).evaluate(q)
+    assert J is None
+    assert distance is None
+
+
+@pytest.mark.needs_core
+def test_any_array_is_read():
+    model, frozen = chain(), ROWS[:9].copy()
+    frozen.flags.writeable = False
+    for q in (frozen, frozen[0], ROWS[20:0:-3], np.asfortranarray(ROWS[:5]), ROWS[:4].astype("f4")):
+        agree(library.program_of(model).evaluate(q, jacobian=True)[:2], by_torch(model, q.copy()))
+    with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 6\), got \(4, 3\)"):
+        library.program_of(model).evaluate(ROWS[:4, :3])
+
+
+@pytest.mark.needs_core
+def test_the_number_of_threads_changes_nothing():
+    program, threads = library.program_of(chain()), torch.get_num_threads()
+    try:
+        found = []
+        for n in (1, 2, 5):
+            torch.set_num_threads(n)
+            found.append(program.evaluate(ROWS, jacobian=True, distance=True))
+    finally:
+        torch.set_num_threads(threads)
+    for one, other in [(0, 1), (0, 2)]:
+        assert all(np.array_equal(a, b) for a, b in zip(found[one], found[other], strict=True))
+    agree(found[0][:2], by_torch(chain(), ROWS))
+
+
+@pytest.mark.needs_core
+def test_threads_can_share_a_model():
+    model, found = chain(), {}
+
+    def work(k):
+        for _ in range(50):
+            found[k] = library.program_of(model).evaluate(ROWS[k : k + 9], jacobian=True)[:2]
+
+    workers = [threading.Thread(target=work, args=(k,)) for k in range(8)]
+    [worker.start() for worker in workers]
+    [worker.join() for worker in workers]
+    for k in range(8):
+        agree(found[k], by_torch(model, ROWS[k : k + 9]))
+
+
+@pytest.mark.needs_core
+@pytest.mark.parametrize("variant", ["v2", "v3", "v4", "generic"])
+def test_variants_agree(reopened, variant):
+    right = library.program_of(chain()).evaluate(ROWS[:9], jacobian=True)[:2]
+    library._opened.cache_clear()
+    reopened.setenv("HYBRIDKIN_NATIVE", variant)
+    if not available():
+        pytest.skip(f"this processor has no {variant}, or it is not compiled")
+    assert variant in library.library()._name
+    agree(library.program_of(chain()).evaluate(ROWS[:9], jacobian=True)[:2], right)
+
+
+def test_the_core_can_be_off(reopened):
+    reopened.setenv("HYBRIDKIN_NATIVE", "off")
+    assert not available()
+    assert library.program_of(chain()) is None
+    assert backend(chain()) == "torch: HYBRIDKIN_NATIVE=off"
+
+
+def test_without_a_library_torch_computes(reopened, tmp_path):
+    reopened.setattr(library, "_FOLDER", tmp_path)
+    assert backend(chain()).startswith("torch: hybridkin was installed without compiled kernels")
+    with pytest.raises(RuntimeError, match="reinstall it with a C compiler"):
+        library.Program(None)
+
+
+@pytest.mark.needs_core
+def test_a_library_of_other_sources_is_refused(elsewhere):
+    with open(elsewhere / "src" / "hk.c", "a") as source:
+        source.write("\n")
+    assert "was compiled from other sources" in backend(chain())
+
+
+@pytest.mark.needs_core
+def test_a_file_that_is_no_library_is_refused(elsewhere):
+    for path in (elsewhere / "lib").glob("*"):
+        path.unlink()
+        path.write_bytes(b"none")
+    assert backend(chain()).startswith("torch: the compiled library cannot be used (")
+
+
+@pytest.mark.needs_core
+def test_wrong_numbers_are_refused(elsewhere, monkeypatch):
+    evaluate = library.Program.evaluate
+
+    def wrong(self, q, *what):
+        x, J, distance = evaluate(self, q, *what)
+        x[..., 2] *= 1.0 + 1e-11
+        return x, J, distance
+
+    monkeypatch.setattr(library.Program, "evaluate", wrong)
+    assert backend(chain()).endswith("computes wrong numbers")
+
+
+@pytest.mark.needs_core
+def test_a_program_is_kept_until_the_model_changes():
+    model = chain()
+    first = library.program_of(model)
+    assert library.program_of(model) is first
+    for change in (
+        lambda: model.offsets.add_(0.01),
+        lambda: setattr(model, "base", torch.diag(torch.tensor([1.0, -1, -1, 1])).double()),
+        lambda: model.load_state_dict(chain().state_dict()),
+        lambda: model.float(),
+    ):
+        change()
+        program = library.program_of(model)
+        assert program is not first
+        assert library.program_of(model) is program
+        agree(program.evaluate(ROWS[:3], jacobian=True)[:2], by_torch(model, ROWS[:3]))
+        first = program
+
+
+@pytest.mark.needs_core
+def test_a_program_is_no_part_of_its_model():
+    model = chain()
+    pickled, hashed, names = pickle.dumps(model), joblib.hash(model), [*model.state_dict()]
+    program = library.program_of(model)
+    assert (pickle.dumps(model), joblib.hash(model)) == (pickled, hashed)
+    assert [*model.state_dict()] == names
+    for twin in (copy.deepcopy(model), copy.copy(model), pickle.loads(pickled)):
+        assert "_program" not in vars(twin)
+        twin.offsets = twin.offsets + 0.01
+        agree(library.program_of(twin).evaluate(ROWS[:3], True)[:2], by_torch(twin, ROWS[:3]))
+    assert library.program_of(model) is program
+
+
+@pytest.mark.needs_core
+def test_programs_travel():
+    program = library.program_of(chain())
+    sent = pickle.dumps(program)
+    assert len(sent) < 8 * len(program.plan.data) + 2000
+    there = pickle.loads(sent)
+    assert there.plan.digest == program.plan.digest
+    agree(there.evaluate(ROWS[:3], True)[:2], program.evaluate(ROWS[:3], True)[:2])
+
+
+def compute(model):
+    return backend(model), library.program_of(model).evaluate(ROWS, jacobian=True)[:2]
+
+
+@pytest.mark.needs_core
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_models_work_after_a_fork():
+    model = chain()
+    compute(model)
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        said, found = pool.apply_async(compute, (model,)).get(timeout=60)
+    assert said == "compiled"
+    agree(found, by_torch(model, ROWS))
+
+
+@pytest.mark.needs_core
+@pytest.mark.slow
+def test_models_work_in_workers():
+    model = chain()
+    compute(model)
+    (found,) = joblib.Parallel(2)([joblib.delayed(library.program_of(model).evaluate)(ROWS, True)])
+    agree(found[:2], by_torch(model, ROWS))
+
+
+class Longer(ConstantCurvatureChain):
+    def forward(self, q):
+        return 2.0 * super().forward(q)
+
+
+@pytest.mark.needs_core
+def test_what_has_no_kernel_says_so():
+    longer = Longer(**CHAIN)
+    assert library.program_of(longer) is None
+    assert backend(longer) == "torch: a Longer has no kernel"
+    assert backend(as_forward_model(lambda q: q)) == "torch: a FunctionModel has no kernel"
+    assert backend(ForwardModel()) == "torch: a ForwardModel has no kernel"
+    many = ConstantCurvatureChain(np.full(17, 0.01))
+    assert backend(many) == "torch: 17 segments: the kernels have room for 16"
+    assert backend(chain().to("meta")) == "torch: the compiled core needs a model on the CPU"
