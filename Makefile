@@ -7,18 +7,18 @@ TESTS := -q -n auto --maxprocesses 4 --dist worksteal
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test quick bench check docs clean dist oldest
+.PHONY: paper test quick bench check docs clean dist oldest native
 
-paper: $(VENV)/.installed
+paper: $(VENV)/.native
 	$(BIN)/python -m hybridkin paper --out $(OUT)
 
-test: $(VENV)/.installed
+test: $(VENV)/.native
 	$(BIN)/python -m pytest $(TESTS)
 
-quick: $(VENV)/.installed
+quick: $(VENV)/.native
 	$(BIN)/python -m pytest tests $(TESTS) -m "not slow"
 
-bench: $(VENV)/.bench
+bench: $(VENV)/.bench $(VENV)/.native
 	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet
 
 check: $(VENV)/.installed
@@ -26,9 +26,10 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-dist: $(VENV)/.installed
-	rm -rf dist
-	$(BIN)/python -m build --no-isolation
+native: $(VENV)/.native
+
+dist: $(VENV)/.wheels
+	PYTHON=$(abspath $(BIN)/python) .ci/wheels
 	$(BIN)/python -m twine check --strict dist/*
 
 oldest:
@@ -44,6 +45,15 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	touch $@
 
+# Without a C compiler torch computes everything.
+$(VENV)/.native: $(VENV)/.installed hatch_build.py $(wildcard hybridkin/native/src/*.[ch])
+	-$(BIN)/python hatch_build.py
+	touch $@
+
+$(VENV)/.wheels: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --group wheels
+	touch $@
+
 $(VENV)/.bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable ".[bench]"
 	touch $@
@@ -53,4 +63,4 @@ $(VENV)/.docs: $(VENV)/.installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(OUT) build dist
+	rm -rf $(VENV) $(OUT) build dist hybridkin/native/lib

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from hybridkin._core.version import __version__
 
 if TYPE_CHECKING:
-    from hybridkin import datasets, paper, plots, simulation, workflow
+    from hybridkin import datasets, native, paper, plots, simulation, workflow
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.calibration.play_fit import PlayFit, fit_play
@@ -49,6 +49,7 @@ __all__ = [
     "fit_play",
     "jacobian",
     "load_model",
+    "native",
     "paper",
     "plots",
     "robots",

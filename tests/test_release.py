@@ -1,6 +1,9 @@
 import ast
+import importlib.util
 import io
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -10,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import hybridkin
+from hybridkin.native import library
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -26,12 +30,37 @@ def built(tmp_path_factory):
     """Return the paths of sdist and wheel, built as `python -m build` does."""
     pytest.importorskip("hatchling")
     folder = tmp_path_factory.mktemp("dist")
-    code = (
-        "import hatchling.build as h, sys; h.build_sdist(sys.argv[1]); h.build_wheel(sys.argv[1])"
-    )
-    subprocess.run([sys.executable, "-c", code, folder], cwd=ROOT, check=True, capture_output=True)
+    build(folder, "h.build_sdist(sys.argv[1]); h.build_wheel(sys.argv[1])")
     (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
     return sdist, wheel
+
+
+def build(folder, what, root=ROOT, **environment):
+    """Return what is said on stderr."""
+    command = [sys.executable, "-c", f"import hatchling.build as h, sys; {what}", folder]
+    environment = {**os.environ, **environment}
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+def libraries(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    return sorted(name for name in names if name.startswith("hybridkin/native/lib/"))
+
+
+@pytest.fixture(scope="module")
+def hatch_build():
+    pytest.importorskip("hatchling")
+    spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler"
+)
 
 
 def name_of(requirement):
@@ -97,7 +126,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
     tops = {name.split("/")[0] for name in names}
     assert tops == {"hybridkin", f"hybridkin-{hybridkin.__version__}.dist-info"}
     assert not any("__pycache__" in name or "test" in name for name in names)
-    assert built[1].stat().st_size < 1_000_000
+    assert built[1].stat().st_size < 1_500_000
 
 
 @pytest.mark.slow
@@ -119,7 +148,7 @@ def test_the_sdist_builds_the_same_and_can_be_tested(built):
     assert {"pyproject.toml", "LICENSE", "CONTRIBUTING.md", "tests/conftest.py"} <= names
     stored = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests/models").rglob("*.*")}
     assert stored <= names
-    assert built[0].stat().st_size < 1_000_000
+    assert built[0].stat().st_size < 1_200_000
     wheel = zipfile.ZipFile(io.BytesIO(built[1].read_bytes()))
     package = {name for name in wheel.namelist() if name.startswith("hybridkin/")}
     assert {name for name in package if "/lib/hk_" not in name} <= names
@@ -133,3 +162,54 @@ def test_the_index_would_take_them(built):
     command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, built)]
     said = subprocess.run(command, capture_output=True, text=True)
     assert said.returncode == 0, said.stdout
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_the_wheel_holds_kernels_for_this_platform(built, hatch_build, tmp_path):
+    assert built[1].name.endswith(f"-py3-none-{hatch_build.host()}.whl")
+    zipfile.ZipFile(built[1]).extractall(tmp_path)
+    code = "import hybridkin; print(hybridkin.native.library.library()._name)"
+    command, environment = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": str(tmp_path)}
+    said = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert said.stdout.startswith(str(tmp_path)), said.stderr
+
+
+@pytest.mark.slow
+def test_without_a_compiler_the_wheel_is_pure(tmp_path):
+    pytest.importorskip("hatchling")
+    said = build(tmp_path, "h.build_wheel(sys.argv[1])", CC="/nonexistent/cc -O2")
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name.endswith("-py3-none-any.whl")
+    assert not libraries(wheel)
+    (line,) = said.strip().splitlines()
+    assert "without compiled kernels; no C compiler: /nonexistent/cc -O2 was not found" in line
+
+
+@needs_compiler
+def test_variants_that_a_compiler_does_not_know_are_left_out(hatch_build, tmp_path, monkeypatch):
+    monkeypatch.setattr(hatch_build, "X86", {"v2": "-O0", "v4": "-mno-such-option"})
+    (made,) = hatch_build.compile_into(tmp_path, "linux_x86_64", [])
+    assert made == tmp_path / "hk_v2.so"
+    assert [*tmp_path.iterdir()] == [made]
+    monkeypatch.setattr(hatch_build, "X86", {"v4": "-mno-such-option"})
+    with pytest.raises(OSError, match="no-such-option"):
+        hatch_build.compile_into(tmp_path, "linux_x86_64", [])
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_miscompiled_kernels_are_refused(hatch_build, tmp_path, monkeypatch):
+    native = tmp_path / "native"
+    shutil.copytree(ROOT / "hybridkin" / "native" / "src", native / "src")
+    arcs = native / "src" / "arcs.h"
+    arcs.write_text(arcs.read_text().replace("1.0 / 720.0", "1.0 / 721.0"))
+    monkeypatch.setattr(hatch_build, "NATIVE", native)
+    monkeypatch.setattr(library, "_FOLDER", native)
+    host = hatch_build.host()
+    hatch_build.compile_into(native / "lib", host, ["v2"] if host.endswith("x86_64") else [])
+    library._opened.cache_clear()
+    try:
+        assert library._opened()[1].endswith("computes wrong numbers")
+    finally:
+        library._opened.cache_clear()
