@@ -171,6 +171,7 @@ def test_the_wheel_holds_kernels_for_this_platform(built, hatch_build, tmp_path)
     zipfile.ZipFile(built[1]).extractall(tmp_path)
     code = "import hybridkin; print(hybridkin.native.library.library()._name)"
     command, environment = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": str(tmp_path)}
+    environment.pop("HYBRIDKIN_NATIVE", None)
     said = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
     assert said.stdout.startswith(str(tmp_path)), said.stderr
 
@@ -204,6 +205,7 @@ def test_miscompiled_kernels_are_refused(hatch_build, tmp_path, monkeypatch):
     shutil.copytree(ROOT / "hybridkin" / "native" / "src", native / "src")
     arcs = native / "src" / "arcs.h"
     arcs.write_text(arcs.read_text().replace("1.0 / 720.0", "1.0 / 721.0"))
+    monkeypatch.delenv("HYBRIDKIN_NATIVE", raising=False)
     monkeypatch.setattr(hatch_build, "NATIVE", native)
     monkeypatch.setattr(library, "_FOLDER", native)
     host = hatch_build.host()

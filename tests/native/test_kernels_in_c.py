@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.needs_core]
 SOURCES = Path(hybridkin.__file__).parent / "native" / "src"
 FLAGS = (
     "-std=c99 -O1 -g -Wall -Wextra -pedantic -Werror -fno-math-errno -fno-trapping-math "
-    "-fsanitize=address,undefined -fno-sanitize-recover=all -DHK_SOURCES=0u"
+    "-fsanitize=address,undefined -fno-sanitize-recover=all"
 ).split()
 
 

@@ -123,6 +123,7 @@ def test_the_core_can_be_off(reopened):
 
 
 def test_without_a_library_torch_computes(reopened, tmp_path):
+    reopened.delenv("HYBRIDKIN_NATIVE", raising=False)
     reopened.setattr(library, "_FOLDER", tmp_path)
     assert backend(chain()).startswith("torch: hybridkin was installed without compiled kernels")
     with pytest.raises(RuntimeError, match="reinstall it with a C compiler"):

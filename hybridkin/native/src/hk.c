@@ -44,7 +44,10 @@ HK_API int32_t hk_level(void) {
 HK_API int32_t hk_level(void) { return 0; }
 #endif
 
-/* A sum over the sources that this was compiled from. */
+#ifndef HK_SOURCES
+#define HK_SOURCES 0u
+#endif
+/* A checksum of the sources that this was compiled from. */
 HK_API uint32_t hk_sources(void) { return HK_SOURCES; }
 
 static void hk_block(const hk_plan *p, int at, const real *q, int rows, real *x, real *J,
