@@ -94,8 +94,8 @@ class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssue
         except OSError as error:
             sys.stderr.write(f"hybridkin: installed without compiled kernels; {error}\n")
             return
-        build_data.update(pure_python=False, tag=f"py3-none-{target}")
         if version != "editable":
+            build_data.update(pure_python=False, tag=f"py3-none-{target}")
             places = {str(path): f"hybridkin/native/lib/{path.name}" for path in made}
             build_data["force_include"].update(places)
 
