@@ -45,7 +45,7 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	touch $@
 
-# Without a C compiler torch computes everything.
+# Compiles what has changed since the installation. Without a C compiler torch computes everything.
 $(VENV)/.native: $(VENV)/.installed hatch_build.py $(wildcard hybridkin/native/src/*.[ch])
 	-$(BIN)/python hatch_build.py
 	touch $@
