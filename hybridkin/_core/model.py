@@ -80,9 +80,10 @@ class PortableModule(Portable, nn.Module):
         kind, arrays, settings, parts, derived = self.layout
         if not kind:
             raise TypeError(_only_code(self))
+        buffers = {name: None if a is None else a.detach() for name, a in self._buffers.items()}
         stored = Stored.of(
             kind,
-            {name: self._buffers[name] for name in arrays},
+            {name: buffers[name] for name in arrays},
             {name: _described(self._modules.get(name)) for name in parts},
             **{name: vars(self)[name] for name in settings},
         )

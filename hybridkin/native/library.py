@@ -243,12 +243,13 @@ class _Compiled:
         dicts = [d for m in modules for d in (m._modules, m._buffers, m._parameters)]
         self.dicts = [d for d in dicts if d]
         self.seen = [dict(d) for d in self.dicts]
-        self.tensors = [*model.buffers(), *model.parameters()]
-        self.versions = [*map(_version, self.tensors)]
+        self.tensors, self.versions = [], []
         try:
             _check_classes(modules)
-            if any(tensor.device.type != "cpu" for tensor in self.tensors):
-                raise NoKernel("the compiled core needs a model on the CPU")
+            tensors = [*model.buffers(), *model.parameters()]
+            if any(a.device.type != "cpu" or a.is_inference() for a in tensors):
+                raise NoKernel("the compiled core needs tensors on the CPU, no inference tensors")
+            self.tensors, self.versions = tensors, [*map(_version, tensors)]
             self.program = Program(Plan(model.stored()))
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]

@@ -74,6 +74,14 @@ def test_any_array_is_read():
 
 
 @pytest.mark.needs_core
+def test_models_that_carry_a_graph_are_computed():
+    offsets = torch.tensor([0.01, 0.02], dtype=torch.float64, requires_grad=True)
+    model = chain().with_geometry(offsets=offsets)
+    with torch.no_grad():
+        agree(library.program_of(model).evaluate(ROWS[:3], True)[:2], by_torch(model, ROWS[:3]))
+
+
+@pytest.mark.needs_core
 def test_the_number_of_threads_changes_nothing():
     program, threads = library.program_of(chain()), torch.get_num_threads()
     try:
@@ -240,4 +248,8 @@ def test_what_has_no_kernel_says_so():
     assert backend(ForwardModel()) == "torch: a ForwardModel has no kernel"
     many = ConstantCurvatureChain(np.full(17, 0.01))
     assert backend(many) == "torch: 17 segments: the kernels have room for 16"
-    assert backend(chain().to("meta")) == "torch: the compiled core needs a model on the CPU"
+    with torch.inference_mode():
+        frozen = chain()
+    for model in (chain().to("meta"), frozen):
+        assert backend(model) == backend(model)
+        assert backend(model).startswith("torch: the compiled core needs tensors on the CPU")
