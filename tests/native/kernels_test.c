@@ -1,8 +1,8 @@
 /* Runs the kernels on a plan from a file, rows one by one and in blocks, for sanitizers.
 
    The file holds int32 numbers: lengths of code and data, place of the root, rows of q; then code
-   (int32), data (float64) and q (float64). Prints the largest difference of x, J and the domain
-   distance between both ways, relative to the largest number of each. Every array is as long as
+   (int32), data (float64) and q (float64). Prints the largest difference of x, J, the domain
+   distance and its slope between both ways, relative to the largest number of each. Every array is as long as
    it must be, so that a sanitizer finds any access beside it. */
 
 #include "hk.c"
@@ -43,27 +43,30 @@ int main(int argc, char **argv) {
     const size_t n = (size_t)code[at + HK_N], m = (size_t)code[at + HK_M];
     double *q = filled(file, sizeof *q, (size_t)rows * n);
     fclose(file);
-    double worst[3] = {0.0, 0.0, 0.0};
+    double worst[4] = {0.0, 0.0, 0.0, 0.0};
     for (int count = 1; count <= rows; count++) { /* full and partial blocks */
         const size_t N = (size_t)count;
-        const size_t lengths[3] = {N * m, N * m * n, N};
-        double *one[3], *block[3];
-        for (int k = 0; k < 3; k++) {
+        const size_t lengths[4] = {N * m, N * m * n, N, N * n};
+        double *one[4], *block[4];
+        for (int k = 0; k < 4; k++) {
             one[k] = filled(NULL, sizeof **one, lengths[k]);
             block[k] = filled(NULL, sizeof **block, lengths[k]);
         }
-        for (size_t i = 0; i < N; i++)
+        for (size_t i = 0; i < N; i++) {
+            hk_evaluate(code, data, at, q + i * n, 1, NULL, one[3] + i * n, one[2] + i);
             hk_evaluate(code, data, at, q + i * n, 1, one[0] + i * m, one[1] + i * m * n, one[2] + i);
+        }
+        hk_evaluate(code, data, at, q, count, NULL, block[3], block[2]);
         hk_evaluate(code, data, at, q, count, block[0], NULL, NULL);
         worst[0] = fmax(worst[0], difference(one[0], block[0], lengths[0]));
         hk_evaluate(code, data, at, q, count, block[0], block[1], block[2]);
-        for (int k = 0; k < 3; k++) {
+        for (int k = 0; k < 4; k++) {
             worst[k] = fmax(worst[k], difference(one[k], block[k], lengths[k]));
             free(one[k]);
             free(block[k]);
         }
     }
-    printf("%.3e %.3e %.3e\n", worst[0], worst[1], worst[2]);
+    printf("%.3e %.3e %.3e %.3e\n", worst[0], worst[1], worst[2], worst[3]);
     free(q);
     free(data);
     free(code);
