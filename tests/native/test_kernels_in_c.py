@@ -14,7 +14,7 @@ from hybridkin.native.library import program_of
 pytestmark = [pytest.mark.slow, pytest.mark.needs_core]
 SOURCES = Path(hybridkin.__file__).parent / "native" / "src"
 FLAGS = (
-    "-std=c99 -O1 -g -Wall -Wextra -pedantic -Werror -fno-math-errno -fno-trapping-math "
+    "-std=c99 -O0 -g -Wall -Wextra -pedantic -Werror -fno-math-errno -fno-trapping-math "
     "-fsanitize=address,undefined -fno-sanitize-recover=all"
 ).split()
 
