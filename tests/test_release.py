@@ -142,6 +142,7 @@ def test_the_wheel_says_what_it_needs(built):
     assert about + "licenses/LICENSE" in wheel.namelist()
 
 
+@pytest.mark.slow
 def test_the_sdist_builds_the_same_and_can_be_tested(built):
     sdist = tarfile.open(built[0])
     names = {name.split("/", 1)[1] for name in sdist.getnames()}
