@@ -172,7 +172,7 @@ class PlayOperator:
         as_numpy = not isinstance(given, Tensor)
         rows = real_array(given, name) if as_numpy else given.to(as_tensor(given, name).dtype)
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
-        if not torch.as_tensor(rows).isfinite().all():
+        if not (rows.isfinite() if isinstance(rows, Tensor) else np.isfinite(rows)).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
             raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
@@ -186,7 +186,7 @@ class PlayOperator:
             if len(rows) and rows.dtype == np.float64 and available():
                 found, *last = play(rows, start, self.width / 2, wanted == 0)
                 return found, PlayState(*last)
-            rows = torch.tensor(rows)
+            rows = torch.tensor(rows, device="cpu")
         at = PlayState(*(torch.as_tensor(part, device=rows.device).to(rows) for part in start))
         found, half = [], as_tensor(self.width / 2, "width").to(rows)
         for row in rows:

@@ -131,7 +131,8 @@ class Core:
         self._run("hk_ik_find", rows, numbers, [_plain(target), best, J, e, found, n_iter])
         at, J, e, found, n_iter = (torch.from_numpy(a) for a in (best, J, e, found, n_iter))
         reached, at_rest, held = (found & bit > 0 for bit in (_REACHED, _AT_REST, _HELD))
-        ends = n_iter.long(), torch.ones(rows, dtype=torch.long)
+        n_iter = n_iter.long()
+        ends = n_iter, torch.ones_like(n_iter)
         return Found(at, target - e, J, e, target, reached, at_rest, held, *ends)
 
     def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:

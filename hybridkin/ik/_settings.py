@@ -11,7 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform, as_tensor, check_shape, real_array
+from hybridkin._core.arrays import (
+    Numbers,
+    Transform,
+    as_array,
+    as_tensor,
+    check_shape,
+    real_array,
+)
 from hybridkin._core.model import Portable
 from hybridkin._core.stored import Stored
 from hybridkin.ik.tasks import PositionTask, Task, Tolerance
@@ -133,15 +140,14 @@ class StepSettings(Portable):
         model, n = self.task.models[0], self.n_actuators
         if type(self.task) is not PositionTask or callable(self.posture) or n is None:
             raise TypeError("only a PositionTask with a fixed posture can be described as data")
-        nothing = torch.zeros(())
         arrays = {
             "q_min": self.q_min,
             "q_max": self.q_max,
             "dq_max": self.dq_max,
-            "posture": nothing if self.posture is None else self.posture,
-            "weights": nothing + 1.0 if self.weights is None else self.weights,
+            "posture": 0.0 if self.posture is None else self.posture,
+            "weights": 1.0 if self.weights is None else self.weights,
         }
-        arrays = {name: a.double().expand(n).contiguous() for name, a in arrays.items()}
+        arrays = {name: np.broadcast_to(as_array(a), n) for name, a in arrays.items()}
         names = ("beta", "gain", "damping", "limits", "dt", "has_posture")
         settings = {name: getattr(self, name) for name in names}
         return Stored.of("inverse_kinematics", arrays, {"model": model.stored()}, **settings)
