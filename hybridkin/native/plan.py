@@ -16,6 +16,7 @@ from hybridkin._core.stored import Stored
 # Kinds of nodes, as src/plan.h numbers them.
 ARCS, ELASTIC, RIGID, AFFINE, ELM, POLYNOMIAL, KERNEL, READOUT = range(1, 9)
 LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK = range(9, 14)
+GROUPED = (AFFINE, ELM, KERNEL, QUADRATIC_LEVERAGE)
 GROUP = 8  # hidden units, or columns of a leverage, that stand together
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
 QUADRATIC, POSE = 1, 3  # features of a readout
@@ -51,7 +52,10 @@ class Plan:
         self._known: dict[tuple, int] = {}
         self.root = self.node_of(stored)
         self.code = np.array(self._code, dtype=np.int32)
-        self.data = np.concatenate([*self._data, np.zeros(8)])
+        whole = np.zeros(self._length + 2 * GROUP)
+        start = -whole.ctypes.data // 8 % GROUP  # of a line of the cache
+        self.data = whole[start : start + self._length + GROUP]
+        self.data[:-GROUP] = np.concatenate(self._data)
         self._data = []  # not twice in pickles
         for array in (self.code, self.data):
             array.flags.writeable = False
@@ -88,9 +92,12 @@ class Plan:
         key = (kind, n, m, *more, *(part.tobytes() for part in flat))
         if key not in self._known:
             self._known[key] = len(self._code)
+            if kind in GROUPED:  # aligned after center, scale, intercept and direct link
+                self._data.append(np.zeros(-(self._length + 2 * n + m + m * n) % GROUP))
+                self._length += len(self._data[-1])
             self._code += [kind, n, m, self._length, *map(int, more)]
             self._data += flat
-            self._length += sum(len(part) for part in flat)
+            self._length += sum(map(len, flat))
         return self._known[key]
 
     def entry(self, place: int, k: int) -> int:
@@ -215,7 +222,7 @@ def _lever(
     ends = range(f, 0, -GROUP)[::-1]
     columns = np.split(padded, len(ends), axis=1)
     blocks = [part[: f if full else end] for part, end in zip(columns, ends, strict=True)]
-    return int(full), [offset, center, *blocks]
+    return int(full), [offset, center, np.zeros(-(1 + f) % GROUP), *blocks]
 
 
 def _elm(plan: Plan, stored: Stored, leverage: bool = False) -> int:

@@ -7,6 +7,9 @@ typedef struct {
     V phi[HK_MAX_F + HK_GROUP], white[HK_MAX_F + HK_GROUP];
 } HK(seen);
 
+/* Where R begins: offset and center are filled up, so that its blocks are aligned as their node. */
+#define HK_LEVER(f) ((1 + (f) + HK_GROUP - 1) / HK_GROUP * HK_GROUP)
+
 /* How many rows the block of R that begins at white number `at` has. */
 static inline int HK(lever_rows)(int f, int full, int at) {
     return full ? f : at + HK_GROUP - (HK_GROUP - f % HK_GROUP) % HK_GROUP;
@@ -20,7 +23,7 @@ static real hkr_leverage(int f, int full, const real *lever, const real *phi, re
 #endif
 #if HK_LANES > 1
 static real hkr_leverage(int f, int full, const real *lever, const real *phi, real *white) {
-    const real *block = lever + 1 + f;
+    const real *block = lever + HK_LEVER(f);
     real sum = lever[0];
     for (int at = 0; at < f; at += HK_GROUP) {
         const int rows = HK(lever_rows)(f, full, at);
@@ -49,7 +52,7 @@ static inline V HK(leverage)(int f, int full, const real *lever, V *phi, V *whit
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
     return hkr_leverage(f, full, lever, phi, white);
 #else
-    const real *block = lever + 1 + f;
+    const real *block = lever + HK_LEVER(f);
     V sum = SPLAT(lever[0]);
     for (int at = 0; at < f; at += HK_GROUP) {
         const int rows = HK(lever_rows)(f, full, at);
@@ -67,7 +70,7 @@ static inline V HK(leverage)(int f, int full, const real *lever, V *phi, V *whit
 
 /* The slope (n) of the leverage by the features, slope = 2 R white. */
 static inline void HK(leverage_slope)(int f, int full, const real *lever, const V *white, V *slope) {
-    const real *block = lever + 1 + f;
+    const real *block = lever + HK_LEVER(f);
     for (int i = 0; i < f; i++) slope[i] = SPLAT(0.0);
     for (int at = 0; at < f; at += HK_GROUP) {
         const int rows = HK(lever_rows)(f, full, at);

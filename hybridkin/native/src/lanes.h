@@ -57,8 +57,15 @@ static inline V hkv_sqrt(V x) {
     return r;
 }
 
-static inline V hkv_max(V a, V b) { return SELECT(a < b, b, a); } /* the NaN of an a stays */
-static inline V hkv_min(V a, V b) { return SELECT(b < a, b, a); }
+static inline V hkv_max(V a, V b) { /* the NaN of an a stays; one instruction where so written */
+    EACH(i) a[i] = a[i] < b[i] ? b[i] : a[i];
+    return a;
+}
+
+static inline V hkv_min(V a, V b) {
+    EACH(i) a[i] = b[i] < a[i] ? b[i] : a[i];
+    return a;
+}
 
 /* exp by x = k ln 2 + r and a minimax polynomial in r, right to 3e-16 up to ln 2 / 2. */
 static inline V hkv_exp(V x) {

@@ -84,25 +84,40 @@ static inline real HK(sum)(V v) {
     return sum;
 }
 
+#define HK_BLOCK 64 /* units whose weights stay in the first cache */
+
 static inline __attribute__((always_inline)) void hkr_units_of(
     int n, int m, int units, int activation, const real *w, const real *u, real shift, real *x,
     real *J, real *features) {
-    V value[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N];
+    const int each = HK_GROUP / HK_LANES, stride = HK_GROUP * (n + 1 + m);
+    V value[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N], s[HK_BLOCK / HK_LANES], d[HK_BLOCK / HK_LANES];
     for (int o = 0; o < m; o++) value[o] = SPLAT(0.0);
     for (int k = 0; J && k < m * n; k++) slope[k] = SPLAT(0.0);
-    for (int g = 0; HK_GROUP * g < units; g++, w += HK_GROUP * (n + 1 + m))
-        for (int at = 0; at < HK_GROUP; at += HK_LANES) {
-            V s = HK(load)(w + HK_GROUP * n + at) + shift, d;
-            for (int j = 0; j < n; j++) s = s + HK(load)(w + HK_GROUP * j + at) * u[j];
-            HK(activate)(activation, 1, &s, &d);
-            if (features) __builtin_memcpy(features + HK_GROUP * g + at, &s, sizeof s);
-            for (int o = 0; o < m; o++) {
-                const V out = HK(load)(w + HK_GROUP * (n + 1 + o) + at), t = d * out;
-                value[o] = value[o] + s * out;
-                for (int j = 0; J && j < n; j++)
-                    slope[n * o + j] = slope[n * o + j] + t * HK(load)(w + HK_GROUP * j + at);
-            }
+    for (; units > 0; units -= HK_BLOCK, w += HK_BLOCK / HK_GROUP * stride) {
+        const int count = ((units < HK_BLOCK ? units : HK_BLOCK) + HK_GROUP - 1) / HK_GROUP * each;
+        for (int i = 0; i < count; i++) {
+            const real *of = w + i / each * stride + i % each * HK_LANES;
+            s[i] = HK(load)(of + HK_GROUP * n) + shift;
+            for (int j = 0; j < n; j++) s[i] = s[i] + HK(load)(of + HK_GROUP * j) * u[j];
         }
+        HK(activate)(activation, count, s, d);
+        for (int i = 0; features && i < count; i++, features += HK_LANES)
+            __builtin_memcpy(features, s + i, sizeof(V));
+        for (int o = 0; o < m; o++) {
+            const real *out = w + HK_GROUP * (n + 1 + o);
+            V row[HK_MAX_N];
+            for (int i = 0; i < count; i++)
+                value[o] = value[o] + s[i] * HK(load)(out + i / each * stride + i % each * HK_LANES);
+            if (!J) continue;
+            for (int j = 0; j < n; j++) row[j] = slope[n * o + j];
+            for (int i = 0; i < count; i++) {
+                const int at = i / each * stride + i % each * HK_LANES;
+                const V t = d[i] * HK(load)(out + at);
+                for (int j = 0; j < n; j++) row[j] = row[j] + t * HK(load)(w + at + HK_GROUP * j);
+            }
+            for (int j = 0; j < n; j++) slope[n * o + j] = row[j];
+        }
+    }
     for (int o = 0; o < m; o++) x[o] += HK(sum)(value[o]);
     for (int k = 0; J && k < m * n; k++) J[k] += HK(sum)(slope[k]);
 }
