@@ -77,32 +77,32 @@ class Core:
 
     def __init__(self, settings: StepSettings, model: Program) -> None:
         self._plan, self._made_of = Plan(settings.stored()), (settings, model)
-        self.n = self._plan.n_inputs
+        self.n, self.program = self._plan.n_inputs, model
         self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
         self.head = self._plan.code.ctypes.data, self._plan.data.ctypes.data, self._plan.root
         self._idle: list[Follower] = []  # one for every thread that is in `step`
+        n = self.n
+        self._places = {
+            "dq": slice(_Q + n, _Q + 2 * n),
+            "x": slice(_X, _ERROR),
+            "error": (_DISTANCE, ...),
+            "sigma_min": (_SIGMA_MIN, ...),
+            "damping": (_DAMPING, ...),
+            "saturated": slice(_Q + 3 * n, _Q + 4 * n),
+        }
 
     def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, Program]]:
         return Core, self._made_of
 
-    def step(self, q: Any, target: Any, dx: Any, tip: Any) -> dict[str, NDArray] | None:
-        """Return the fields of a `Step` for one row of plain arrays, None for anything else."""
+    def step(self, q: Any, target: Any, dx: Any, tip: Any) -> tuple[NDArray, dict] | None:
+        """Return a `Step` of one row of plain arrays and where its fields are, None for others."""
         if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
             return None
         follower = self._idle.pop() if self._idle else Follower(self, None, _MUST_SEE)
         follower.q[...] = q
-        a, n = follower.state.copy() if follower.tick(target, dx, tip) else None, self.n
+        found = (follower.state.copy(), self._places) if follower.tick(target, dx, tip) else None
         self._idle.append(follower)
-        if a is None:
-            return None
-        return {
-            "dq": a[_Q + n : _Q + 2 * n],
-            "x": a[_X:_ERROR],
-            "error": a[_DISTANCE, ...],
-            "sigma_min": a[_SIGMA_MIN, ...],
-            "damping": a[_DAMPING, ...],
-            "saturated": a[_Q + 3 * n : _Q + 4 * n].astype(bool),
-        }
+        return found
 
     def steps(self, q: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
         """Return dq, x, error, sigma_min, damping and what is held, of rows q (N, n).
@@ -169,7 +169,7 @@ class Follower:
         self, core: Core, memory: float | None, mode: int = 0, state: NDArray | None = None
     ) -> None:
         self.core, self._memory, self._least = core, memory, mode
-        self.task, n = core.settings.task, core.n
+        n = core.n
         self.state = state = np.zeros(_Q + 7 * core.n) if state is None else state
         self._dt = state[_PERIOD] = core.settings.dt
         state[_MEMORY] = memory or 0.0
@@ -247,6 +247,15 @@ class Follower:
     error = property(lambda self: float(self.state[_DISTANCE]))
     sigma_min = property(lambda self: float(self.state[_SIGMA_MIN]))
     damping = property(lambda self: float(self.state[_DAMPING]))
+
+    def reached(self, tol: Tolerance) -> bool:
+        """Return whether the error is within the tolerance."""
+        return self.error <= (tol[0] if isinstance(tol, tuple) else tol)
+
+    def in_domain(self) -> bool:
+        """Return whether the last tick began in the domain of the model."""
+        n = self.core.n
+        return bool(self.core.program.domain(self.state[_Q + 2 * n : _Q + 3 * n])[0] <= 1.0)
 
     def last(self) -> Tick:
         """Return what is known of the last tick."""

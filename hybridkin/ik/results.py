@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -93,6 +93,13 @@ class Step(Generic[ArrayT]):
     sigma_min: ArrayT
     damping: ArrayT
     saturated: ArrayT
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a field of a step that the core took; it is cut out when asked for."""
+        row, places = vars(self).get("_row", (None, {}))
+        if name not in places:
+            raise AttributeError(name)
+        return row[places[name]] > 0.0 if name == "saturated" else row[places[name]]
 
     def __repr__(self) -> str:
         """Return a one-line summary."""

@@ -189,11 +189,11 @@ class InverseKinematics:
             `dq` and what came with it. A row with a NaN or infinite input holds still.
         """
         core = core_of(self.settings)
-        fields = None if core is None else core.step(q, x_target, dx, x_measured)
-        if fields is None:
+        found = None if core is None else core.step(q, x_target, dx, x_measured)
+        if found is None:
             return self._steps(core, q, x_target, dx, x_measured)
         step = object.__new__(Step)  # its constructor takes longer than the step
-        vars(step).update(fields)
+        vars(step)["_row"] = found
         return step
 
     @torch.no_grad()

@@ -17,7 +17,7 @@ from hybridkin.ik._compiled import Follower, Tick, core_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
-from hybridkin.ik.results import IKStatus, statuses
+from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import Tolerance
 
 Plant = Callable[["NDArray | Tensor"], Array]
@@ -95,11 +95,14 @@ class Tracker:
         MAX_ITER where it was free. INVALID_INPUT where the target, the measured tip or the model's
         answer was not finite, and before the first step.
         """
-        task, (q, _, _, e, step) = self._robot.task, self._robot.last()
-        error = e.norm(dim=-1) + 0.0 * step.sigma_min  # NaN where either is
-        parts = (task.reached(e, self._tol), step.saturated.any(-1), step.damping > 0.0)
-        with torch.no_grad():
-            return IKStatus(int(statuses(task, q, error, *parts)))
+        robot = self._robot
+        if not math.isfinite(robot.error + robot.sigma_min):
+            return IKStatus.INVALID_INPUT
+        if robot.reached(self._tol):
+            return IKStatus.CONVERGED if robot.in_domain() else IKStatus.OUT_OF_DOMAIN
+        if robot.saturated.any():
+            return IKStatus.AT_LIMITS
+        return IKStatus.SINGULAR if robot.damping > 0.0 else IKStatus.MAX_ITER
 
     def reset(self, q: Array) -> None:
         """Start anew from an actuator vector, as read from the robot.
@@ -260,9 +263,14 @@ class _InTorch:
         self._q = self._q + step.dq
         return self._last
 
-    def last(self) -> Tick:
-        """Return what is known of the last tick."""
-        return self._last
+    def reached(self, tol: Tolerance) -> bool:
+        """Return whether the error is within the tolerance."""
+        return bool(self.task.reached(self._last.e, tol))
+
+    @torch.no_grad()
+    def in_domain(self) -> bool:
+        """Return whether the last step began in the domain of the models."""
+        return bool(self.task.in_domain(self._last.q))
 
     command = property(lambda self: self._given_back(self._q))
     x = property(lambda self: self._given_back(self._last.x))

@@ -154,7 +154,14 @@ class Program:
         distance : bool, default=False
             Whether the domain distance is computed.
         """
-        lead, m, n = q.shape[:-1], self._sizes[1], self._sizes[0]
+        lead, (n, m) = q.shape[:-1], self._sizes
+        if q.shape == (n,):
+            a, size = np.empty(m + m * n + 1), m + m * n
+            at, row = _address(a), np.asarray(q, np.float64).tobytes()
+            places = at + 8 * m if jacobian else None, at + 8 * size if distance else None
+            self._evaluate(*self._head, row, 1, at, *places)
+            J = a[m:size].reshape(m, n) if jacobian else None
+            return a[:m], J, a[size, ...] if distance else None
         x = np.empty((*lead, m))
         J = np.empty((*lead, m, n)) if jacobian else None
         d = np.empty(lead) if distance else None
@@ -172,9 +179,7 @@ class Program:
         if q.shape[-1] != n:
             raise ValueError(f"`q` must have shape (..., {n}), got {q.shape}.")
         q = np.ascontiguousarray(q, np.float64)
-        if q.size == n:
-            self._evaluate(*self._head, q.tobytes(), 1, *[_address(a) for a, _ in results])
-        elif q.size:
+        if q.size:
             self._in_chunks(q.size // n, q.ctypes.data, results)
 
     def _in_chunks(self, rows: int, q: int, results: list[tuple[NDArray | None, int]]) -> None:
@@ -275,10 +280,10 @@ def program_of(model: ForwardModel) -> Program | None:
 
     It is kept on the model until a buffer or a submodule is changed.
     """
-    if library() is None:
-        return None
     compiled = model.__dict__.get("_program")
     if compiled is None or not compiled.holds():
+        if library() is None:
+            return None
         compiled = model.__dict__["_program"] = _Compiled(model)
     return compiled.program
 
