@@ -79,9 +79,9 @@ static inline V HK(load)(const real *a) {
 }
 
 static inline real HK(sum)(V v) {
-    real sum = v[0];
-    for (int i = 1; i < HK_LANES; i++) sum += v[i];
-    return sum;
+    for (int half = HK_LANES / 2; half > 0; half /= 2)
+        for (int i = 0; i < half; i++) v[i] += v[i + half];
+    return v[0];
 }
 
 #define HK_BLOCK 64 /* units whose weights stay in the first cache */
@@ -124,6 +124,7 @@ static inline __attribute__((always_inline)) void hkr_units_of(
 
 static void hkr_units(int n, int m, int units, int activation, const real *w, const real *u,
                       real shift, real *x, real *J, real *features) {
+    if (units == 0) return; /* affine */
     if (n == 9 && m == 3)
         hkr_units_of(9, 3, units, activation, w, u, shift, x, J, features);
     else
