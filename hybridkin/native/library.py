@@ -157,7 +157,7 @@ class Program:
         lead, (n, m) = q.shape[:-1], self._sizes
         if q.shape == (n,):
             a, size = np.empty(m + m * n + 1), m + m * n
-            at, row = _address(a), np.asarray(q, np.float64).tobytes()
+            at, row = _address(a) or 0, np.asarray(q, np.float64).tobytes()
             places = at + 8 * m if jacobian else None, at + 8 * size if distance else None
             self._evaluate(*self._head, row, 1, at, *places)
             J = a[m:size].reshape(m, n) if jacobian else None
