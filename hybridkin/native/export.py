@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.stored import Stored
 from hybridkin._core.version import __version__
-from hybridkin.native._kernels import kernels_of
 from hybridkin.native.plan import NoKernel, Plan
 
-_TEMPLATES = Path(__file__).parent / "templates"
+_FOLDER = Path(__file__).parent
 _REAL = {"float64": "double", "float32": "float"}
 _TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # of the test, relative to the largest numbers
 # Arrays with the middle and the half width of q in a description.
 _RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "half_width"))
+_SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
 _STEPS, _MEMORY = 4, 5.0  # steps of a run of the test; memory in periods
 
 
@@ -114,26 +114,39 @@ def export_c(
     for path, template in zip(paths, files.values(), strict=True):
         if template == "README.md":
             entries["MEASURED"] = _measured(paths[1])
-        path.write_text(_filled(template, entries))
+        path.write_text(_with_headers(_filled(template, entries)))
     return paths
 
 
 def _filled(template: str, entries: dict[str, Any]) -> str:
-    text = (_TEMPLATES / template).read_text()
+    text = (_FOLDER / "templates" / template).read_text()
     return re.sub(r"@(\w+)@", lambda found: str(entries[found[1]]), text)
 
 
+def _with_headers(text: str) -> str:
+    """Return C text with the headers of the kernels in place."""
+    files = {path.name: path for path in (_FOLDER / "src").glob("*.h")}
+    return re.sub(
+        '^#include "(.+)"$',
+        lambda found: _with_headers(files[found[1]].read_text()) if found[1] in files else found[0],
+        text,
+        flags=re.MULTILINE,
+    )
+
+
 def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
-    """Return kernels, sizes and numbers of a plan as C, and what README.md says of them."""
+    """Return sizes and numbers of a plan as C, and what README.md says of them."""
     at = int(plan.code[plan.root + 4]) if steps else plan.root
-    kernels = kernels_of(plan, at, steps, dtype == "float32")
+    # Of arrays of length 1 gcc warns where it cannot see that loops over them begin.
+    sizes = {f"HK_MAX_{s}": max(plan.largest.get(what, 0), 2) for s, what in _SIZES.items()}
+    sizes["HK_KINDS"] = f"{sum(1 << kind for kind in plan.kinds)}u"
+    lines = [f"#define {macro} {number}" for macro, number in sizes.items()]
     found = {
-        "KERNELS": kernels,
+        "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
         "CODE": _literals(plan.code),
         "DATA": _literals(plan.data.astype(dtype)),
         "MODEL": at,
         "ROOT": plan.root,
-        "MATH": ", ".join(sorted({*re.findall(r"HK_MATH\((\w+)\)\(", kernels)})),
         "BYTES": len(plan.data) * (8 if dtype == "float64" else 4) + 4 * len(plan.code),
         "CALL": "forward(q, x)",
     }

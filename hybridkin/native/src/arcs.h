@@ -48,7 +48,7 @@ static inline HK(stumpff_t) HK(stumpff)(V s) {
 /* The tip x (3) of arcs z (3 S) in the measuring frame, and its derivative C (3, 3 S) if asked for.
    `frame` holds the rotation of the base (3, 3), its position (3), the robot's reach and the rigid
    offsets (S). */
-static inline __attribute__((always_inline)) void HK(arcs_tip_of)(
+HK_INLINE void HK(arcs_tip_of)(
     int S, const real *frame, const V *z, V *x, V *C) {
     const real *turn = frame, *origin = frame + 9, *offsets = frame + HK_FRAME;
     HK(stumpff_t) arc[HK_MAX_S];
@@ -101,7 +101,7 @@ static inline __attribute__((always_inline)) void HK(arcs_tip_of)(
 }
 
 static inline void HK(arcs_tip)(int S, const real *frame, const V *z, V *x, V *C) {
-    switch (S) { /* loops of known length keep all in registers */
+    switch (HK_COMMON(S)) { /* loops of known length keep all in registers */
     case 1: HK(arcs_tip_of)(1, frame, z, x, C); break;
     case 2: HK(arcs_tip_of)(2, frame, z, x, C); break;
     case 3: HK(arcs_tip_of)(3, frame, z, x, C); break;
@@ -117,7 +117,7 @@ typedef struct {
 } HK(linear_arcs);
 
 /* The arcs z (3 S) of q. */
-static inline __attribute__((always_inline)) void HK(arcs_of)(
+HK_INLINE void HK(arcs_of)(
     HK(linear_arcs) a, const V *q, V *z) {
     for (int k = 0; k < a.S; k++)
         for (int part = 0; part < 3; part++) {
@@ -129,7 +129,7 @@ static inline __attribute__((always_inline)) void HK(arcs_of)(
 }
 
 /* J (rows, n) += C dz/dq, for C (rows, 3 S). */
-static inline __attribute__((always_inline)) void HK(pull_arcs)(
+HK_INLINE void HK(pull_arcs)(
     HK(linear_arcs) a, int rows, int n, const V *C, V *J) {
     for (int i = 0; i < rows; i++, J += n, C += 3 * a.S)
         for (int k = 0; k < a.S; k++) {

@@ -9,14 +9,23 @@ static inline HK(linear_arcs) HK(linear_arcs_of)(const hk_plan *p, int at) {
 }
 
 static inline int HK(n_coordinates)(const hk_plan *p, int at) {
-    return p->code[at] == HK_RIGID ? p->code[at + HK_N] : 3 * p->code[at + HK_MORE];
+    return HK_CHAIN_IS(p, at, HK_RIGID) ? p->code[at + HK_N] : 3 * p->code[at + HK_MORE];
 }
 
 /* The inner coordinates z of q, and what `pull` needs. */
 static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, HK(inside) *in) {
     (void)in;
-    switch (p->code[at]) {
-    case HK_ARCS: {
+    if (HK_CHAIN_IS(p, at, HK_RIGID))
+        for (int i = 0; i < p->code[at + HK_N]; i++) z[i] = q[i];
+    else if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
+        HK(elastic_t) e = HK(elastic_of)(p, at);
+        if (HK_COMMON(e.S == 3 && e.same == 3)) {
+            e.S = e.same = 3;
+            e.n = 9;
+            HK(elastic_arcs)(e, q, in, z);
+        } else
+            HK(elastic_arcs)(e, q, in, z);
+    } else if (HK_USES(HK_ARCS)) {
         HK(linear_arcs) a = HK(linear_arcs_of)(p, at);
         if (HK_COMMON(a.S == 3 && a.width == 3))
             HK(arcs_of)((HK(linear_arcs)){3, 3, 3, a.matrix, a.zero}, q, z);
@@ -24,42 +33,34 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, H
             HK(arcs_of)((HK(linear_arcs)){3, 0, 9, a.matrix, a.zero}, q, z);
         else
             HK(arcs_of)(a, q, z);
-        break;
-    }
-    case HK_ELASTIC: {
-        HK(elastic_t) e = HK(elastic_of)(p, at);
-        if (HK_COMMON(e.S == 3 && e.same == 3)) {
-            e.S = e.same = 3;
-            e.n = 9;
-            HK(elastic_arcs)(e, q, in, z);
-        } else
-            HK(elastic_arcs)(e, q, in, z);
-        break;
-    }
-    case HK_RIGID:
-    default:
-        for (int i = 0; i < p->code[at + HK_N]; i++) z[i] = q[i];
     }
 }
 
 /* The tip x (3) of inner coordinates z, and its derivative C (3, k) where not NULL. */
 static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V *x, V *C) {
     const int32_t *more = p->code + at + HK_MORE;
-    switch (p->code[at]) {
-    case HK_RIGID: HK(rigid)(p->code[at + HK_N], more, hk_numbers(p, at), z, x, C); break;
-    case HK_ARCS:
-    case HK_ELASTIC:
-    default: HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
-    }
+    if (HK_CHAIN_IS(p, at, HK_RIGID))
+        HK(rigid)(p->code[at + HK_N], more, hk_numbers(p, at), z, x, C);
+    else if (HK_USES(HK_ARCS) || HK_USES(HK_ELASTIC))
+        HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
 }
 
 /* J (rows, n) += C dz/dq, for C (rows, k). */
-static inline __attribute__((always_inline)) void HK(pull_rows)(
+HK_INLINE void HK(pull_rows)(
     const hk_plan *p, int at, const HK(inside) *in, int rows, const V *C, V *J) {
     const int n = p->code[at + HK_N];
     (void)in, (void)n;
-    switch (p->code[at]) {
-    case HK_ARCS: {
+    if (HK_CHAIN_IS(p, at, HK_RIGID))
+        for (int i = 0; i < rows * n; i++) J[i] = J[i] + C[i];
+    else if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
+        HK(elastic_t) e = HK(elastic_of)(p, at);
+        if (HK_COMMON(e.S == 3 && e.same == 3)) {
+            e.S = e.same = 3;
+            e.n = 9;
+            HK(pull_tendons)(e, in, rows, C, J);
+        } else
+            HK(pull_tendons)(e, in, rows, C, J);
+    } else if (HK_USES(HK_ARCS)) {
         HK(linear_arcs) a = HK(linear_arcs_of)(p, at);
         if (HK_COMMON(a.S == 3 && a.width == 3 && n == 9))
             HK(pull_arcs)((HK(linear_arcs)){3, 3, 3, a.matrix, a.zero}, rows, 9, C, J);
@@ -67,21 +68,6 @@ static inline __attribute__((always_inline)) void HK(pull_rows)(
             HK(pull_arcs)((HK(linear_arcs)){3, 0, 9, a.matrix, a.zero}, rows, 9, C, J);
         else
             HK(pull_arcs)(a, rows, n, C, J);
-        break;
-    }
-    case HK_ELASTIC: {
-        HK(elastic_t) e = HK(elastic_of)(p, at);
-        if (HK_COMMON(e.S == 3 && e.same == 3)) {
-            e.S = e.same = 3;
-            e.n = 9;
-            HK(pull_tendons)(e, in, rows, C, J);
-        } else
-            HK(pull_tendons)(e, in, rows, C, J);
-        break;
-    }
-    case HK_RIGID:
-    default:
-        for (int i = 0; i < rows * n; i++) J[i] = J[i] + C[i];
     }
 }
 
@@ -93,7 +79,7 @@ static inline void HK(pull)(const hk_plan *p, int at, const HK(inside) *in, cons
 static inline void HK(chain)(const hk_plan *p, int at, const V *q, V *x, V *J) {
     V z[HK_MAX_Z], C[3 * HK_MAX_Z];
     HK(inside) in;
-    if (p->code[at] == HK_RIGID) { /* q are its coordinates */
+    if (HK_CHAIN_IS(p, at, HK_RIGID)) { /* q are its coordinates */
         HK(from_coordinates)(p, at, q, x, J);
         return;
     }

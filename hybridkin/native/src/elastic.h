@@ -37,7 +37,7 @@ static inline HK(elastic_t) HK(elastic_of)(const hk_plan *p, int at) {
 }
 
 /* The inverse of a symmetric, positive definite D (xx, xy, xz, yy, yz, zz), by D = L diag L'. */
-static inline __attribute__((always_inline)) void HK(invert)(const V *D, V *inverse) {
+HK_INLINE void HK(invert)(const V *D, V *inverse) {
     const V r0 = R(1.0) / D[0], a = D[1] * r0, b = D[2] * r0;
     const V r1 = R(1.0) / (D[3] - a * D[1]), yz = D[4] - a * D[2], c = yz * r1;
     const V r2 = R(1.0) / (D[5] - b * D[2] - c * yz), d = a * c - b, cr = c * r2, dr = d * r2;
@@ -50,7 +50,7 @@ static inline __attribute__((always_inline)) void HK(invert)(const V *D, V *inve
 }
 
 /* y (3) = A x for a symmetric A. */
-static inline __attribute__((always_inline)) void HK(symmetric)(const V *A, const V *x, V *y) {
+HK_INLINE void HK(symmetric)(const V *A, const V *x, V *y) {
     const V a = x[0], b = x[1], c = x[2];
     y[0] = A[0] * a + A[1] * b + A[2] * c;
     y[1] = A[1] * a + A[3] * b + A[4] * c;
@@ -59,7 +59,7 @@ static inline __attribute__((always_inline)) void HK(symmetric)(const V *A, cons
 
 /* What tendons with the stiffness A are behind springs E: E D^-1 A for D = E + A, which takes no
    difference of large numbers. */
-static inline __attribute__((always_inline)) void HK(in_series)(
+HK_INLINE void HK(in_series)(
     const real *E, const V *inverse, const V *A, V *passed) {
     V y[3];
     HK(symmetric)(inverse, (const V[3]){A[0], A[1], A[2]}, y);
@@ -72,7 +72,7 @@ static inline __attribute__((always_inline)) void HK(in_series)(
 }
 
 /* Solve the system in place: t (3 S) comes as its right-hand side. */
-static inline __attribute__((always_inline)) void HK(balance)(
+HK_INLINE void HK(balance)(
     HK(elastic_t) e, const HK(inside) *in, V *t) {
     for (int k = e.S - 1; k > 0; k--) {
         V moved[3];
@@ -89,7 +89,7 @@ static inline __attribute__((always_inline)) void HK(balance)(
 }
 
 /* Factor the system of the taut tendons, and solve it: t (3 S). */
-static inline __attribute__((always_inline)) void HK(shape)(
+HK_INLINE void HK(shape)(
     HK(elastic_t) e, const V *q, HK(inside) *in, V *t) {
     int first = e.n;
     V passed[6] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
@@ -133,7 +133,7 @@ static inline M HK(first_wrong)(M found, M was, V stretch, V size, M *none) {
 
 /* Find the taut tendons by block principal pivoting from all taut (Murty 1974, Judice & Pires 1994),
    and the shape t (3 S) at balance. */
-static inline __attribute__((always_inline)) void HK(settle)(
+HK_INLINE void HK(settle)(
     HK(elastic_t) e, const V *q, HK(inside) *in, V *t) {
     const int most = HK_WHOLE_STEPS + (1 << (e.n < HK_MOST_TURNS ? e.n : HK_MOST_TURNS));
     for (int i = 0; i < e.n; i++) in->taut[i] = SPLAT(1.0);
@@ -160,7 +160,7 @@ static inline __attribute__((always_inline)) void HK(settle)(
 }
 
 /* The arcs z (3 tip) of q. */
-static inline __attribute__((always_inline)) void HK(elastic_arcs)(
+HK_INLINE void HK(elastic_arcs)(
     HK(elastic_t) e, const V *q, HK(inside) *in, V *z) {
     V t[3 * HK_MAX_S];
     HK(settle)(e, q, in, t);
@@ -173,7 +173,7 @@ static inline __attribute__((always_inline)) void HK(elastic_arcs)(
 }
 
 /* J (rows, n) += C dz/dq, for C (rows, 3 tip): one balance of forces per row. */
-static inline __attribute__((always_inline)) void HK(pull_tendons)(
+HK_INLINE void HK(pull_tendons)(
     HK(elastic_t) e, const HK(inside) *in, int rows, const V *C, V *J) {
     for (int row = 0; row < rows; row++, J += e.n, C += 3 * e.tip) {
         V t[3 * HK_MAX_S];

@@ -86,7 +86,7 @@ static inline void HK(leverage_slope)(int f, int full, const real *lever, const 
 /* Where the numbers of a model's leverage begin, how many features it has, and whether R is full. */
 static inline const real *HK(lever)(const hk_plan *p, int at, int *f, int *full) {
     const int32_t *node = p->code + at, *more = node + HK_MORE;
-    const int n = node[HK_N], m = node[HK_M], network = node[HK_KIND] == HK_ELM;
+    const int n = node[HK_N], m = node[HK_M], network = HK_IS(p, at, HK_ELM);
     const int groups = network ? (more[0] + HK_GROUP - 1) / HK_GROUP : 0;
     *f = network ? more[2] : 2 * n + 1;
     *full = network && more[3];
@@ -99,7 +99,7 @@ static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *
     int f, full;
     const real *lever = HK(lever)(p, at, &f, &full);
     if (seen->white_of == at) return seen->leverage;
-    if (seen->phi_of != at && p->code[at] == HK_ELM) {
+    if (seen->phi_of != at && HK_IS(p, at, HK_ELM)) {
         V x[HK_MAX_M];
         HK(regress)(p, at, q, x, NULL, seen->phi);
     } else if (seen->phi_of != at) {
@@ -124,7 +124,7 @@ static inline void HK(leverage_slope_at)(
     const real *lever = HK(lever)(p, at, &f, &full);
     HK(leverage_slope)(f, full, lever, seen->white, back);
     HK(scaled)(n, center, q, u);
-    if (node[HK_KIND] == HK_ELM) {
+    if (HK_IS(p, at, HK_ELM)) {
         const int n_hidden = node[HK_MORE];
         for (int j = 0; j < n; j++) slope[j] = f > n_hidden ? back[n_hidden + j] : SPLAT(0.0);
         for (int h = 0; h < n_hidden; h++) {
@@ -144,7 +144,7 @@ static inline void HK(leverage_slope_at)(
 static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen) *seen) {
     const int n = p->code[at + HK_N];
     const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
-    if (p->code[at] == HK_LEVERAGE_GUARD)
+    if (HK_IS(p, at, HK_LEVERAGE_GUARD))
         return HK(leverage_at)(p, p->code[at + HK_MORE], q, seen) / numbers[1];
     V sum = SPLAT(1.0);
     for (int j = 0; j < n; j++) {
@@ -160,7 +160,7 @@ static inline void HK(guard_slope)(
     const hk_plan *p, int at, const V *q, HK(seen) *seen, V *slope) {
     const int n = p->code[at + HK_N];
     const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
-    if (p->code[at] == HK_LEVERAGE_GUARD) {
+    if (HK_IS(p, at, HK_LEVERAGE_GUARD)) {
         HK(leverage_slope_at)(p, p->code[at + HK_MORE], q, seen, slope);
         for (int j = 0; j < n; j++) slope[j] = slope[j] / numbers[1];
         return;

@@ -5,20 +5,18 @@
 
 #define HK_ROW_LANES /* one row of a network has lanes over the hidden units */
 
-#define HK_LANES 1
+#include "row.h"
 #include "model.h"
-#undef HK_LANES
 
-#if defined(__AVX512F__)
-#define HK_LANES 8
-#elif defined(__AVX__)
-#define HK_LANES 4
-#else
-#define HK_LANES 2
-#endif
+#include "lanes.h"
 #include "model.h"
 #include "ik_step.h"
 #include "ik_search.h"
+
+static HK_NOINLINE void ik_model(const ik_settings *ik, const real *q, real *x, real *J,
+                                 real *distance) {
+    hk_model(&ik->plan, ik->model, q, x, J, distance);
+}
 
 #if defined(_WIN32)
 #define HK_API __declspec(dllexport)

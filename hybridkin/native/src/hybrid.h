@@ -51,7 +51,7 @@ static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, H
 static inline void HK(tip_correction)(
     const hk_plan *p, const int32_t *part, const V *q, int m, real w, HK(total) *sum) {
     const int at = part[HK_REGRESSOR], guard = part[HK_GUARD], n = p->code[at + HK_N];
-    const int own = guard >= 0 && p->code[guard] == HK_LEVERAGE_GUARD && p->code[guard + HK_MORE] == at;
+    const int own = guard >= 0 && HK_IS(p, guard, HK_LEVERAGE_GUARD) && p->code[guard + HK_MORE] == at;
     V x[HK_MAX_M], J[HK_MAX_M * HK_MAX_N], g, slope[HK_MAX_N];
     HK(shortening) how;
     HK(regress)(p, at, q, x, sum->J ? J : NULL, own ? sum->seen.phi : NULL);
@@ -147,7 +147,7 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
 /* The largest distance of any guard, and its slope (n) by q where not NULL. */
 static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
     const int32_t *node = p->code + at, *part = node + HK_MORE + HK_FIRST;
-    const int n = node[HK_N], count = node[HK_KIND] == HK_HYBRID ? node[HK_MORE + HK_COUNT] : 0;
+    const int n = node[HK_N], count = HK_IS(p, at, HK_HYBRID) ? node[HK_MORE + HK_COUNT] : 0;
     HK(seen) seen;
     seen.phi_of = seen.white_of = -1;
     *distance = SPLAT(0.0);

@@ -6,7 +6,6 @@
 
 enum { IK_NEWTON = 60, IK_PROXIMAL = 2 };
 #define IK_HEALTHY R(0.02) /* sigma_min / sigma_max above which no damping is needed */
-#define IK_INLINE static inline __attribute__((always_inline))
 
 enum { IK_LIMITED = 1, IK_POSTURE = 2, IK_WEIGHTS = 4 };
 
@@ -54,7 +53,7 @@ static inline real ik_norm(int n, const real *a) {
 }
 
 /* r (3) = J step. */
-IK_INLINE void ik_rows_of(int n, const real *J, const real *step, real *r) {
+HK_INLINE void ik_rows_of(int n, const real *J, const real *step, real *r) {
     real a = R(0.0), b = R(0.0), c = R(0.0);
     for (int j = 0; j < n; j++) {
         a += J[j] * step[j];
@@ -65,13 +64,13 @@ IK_INLINE void ik_rows_of(int n, const real *J, const real *step, real *r) {
 }
 
 /* y (n) = z + J^T mu. */
-IK_INLINE void ik_columns_of(int n, const real *J, const real *mu, const real *z, real *y) {
+HK_INLINE void ik_columns_of(int n, const real *J, const real *mu, const real *z, real *y) {
     for (int j = 0; j < n; j++)
         y[j] = z[j] + (J[j] * mu[0] + J[n + j] * mu[1] + J[2 * n + j] * mu[2]);
 }
 
 /* g = the entries 11, 21, 31, 22, 32, 33 of the sum over actuators of keep J J^T. */
-IK_INLINE void ik_products(int n, const real *J, const real *keep, real *g) {
+HK_INLINE void ik_products(int n, const real *J, const real *keep, real *g) {
     for (int i = 0; i < 6; i++) g[i] = R(0.0);
     for (int j = 0; j < n; j++) {
         const real b = J[n + j], c = J[2 * n + j], k = keep ? keep[j] : R(1.0);
@@ -128,7 +127,7 @@ static inline void ik_solve3(const ik_factors *f, const real *v, real *mu) {
 }
 
 /* step <- (1 - J+ J) step, undamped; twice, which takes the rounding out again. */
-IK_INLINE void ik_null_projection(int n, const real *J, const real *g, real *step) {
+HK_INLINE void ik_null_projection(int n, const real *J, const real *g, real *step) {
     const ik_factors f = ik_factor(g, R(0.0));
     for (int twice = 0; twice < 2; twice++) {
         real moved[3], mu[3];
@@ -143,7 +142,7 @@ IK_INLINE void ik_null_projection(int n, const real *J, const real *g, real *ste
 
    It grows with t, is linear between the points where a coordinate meets a bound, negative at 0
    and positive (`end`) at 1. These points are halved until none is left between the two sides. */
-IK_INLINE real ik_line_search(int n, const real *y, const real *dq, const real *slope,
+HK_INLINE real ik_line_search(int n, const real *y, const real *dq, const real *slope,
                               const real *lower, const real *upper, real start, real curvature,
                               real end) {
     real points[2 * HK_MAX_N], t0 = R(0.0), t1 = R(1.0), f0 = start, f1 = end;
@@ -179,7 +178,7 @@ IK_INLINE real ik_line_search(int n, const real *y, const real *dq, const real *
 
    dq(mu) = clip(z + J^T mu) with F(mu) = J dq(mu) + lambda^2 mu - v = 0: Newton's method on the
    active pieces with an exact line search; `mu` holds its start. */
-IK_INLINE void ik_box_of(int n, const real *J, const real *v, const real *z, const real *lower,
+HK_INLINE void ik_box_of(int n, const real *J, const real *v, const real *z, const real *lower,
                          const real *upper, real damping_sq, real *mu, real *dq) {
     real y[HK_MAX_N], slope[HK_MAX_N], free[HK_MAX_N];
     int settled = 0;
@@ -230,7 +229,7 @@ IK_INLINE void ik_box_of(int n, const real *J, const real *v, const real *z, con
 
 static void ik_box(int n, const real *J, const real *v, const real *z, const real *lower,
                    const real *upper, real damping_sq, real *mu, real *dq) {
-    switch (n) { /* loops of known length */
+    switch (HK_COMMON(n)) { /* loops of known length */
     case 6: ik_box_of(6, J, v, z, lower, upper, damping_sq, mu, dq); break;
     case 9: ik_box_of(9, J, v, z, lower, upper, damping_sq, mu, dq); break;
     default: ik_box_of(n, J, v, z, lower, upper, damping_sq, mu, dq);
@@ -283,7 +282,7 @@ static inline real ik_damping_sq(const ik_settings *ik, real low, real high) {
 
 /* Fill in a step for the task v within its bounds; `slides`: with its posture step. `trust` is
    lambda^2 / sigma_max^2 in place of the settings' damping, NULL where that counts. */
-IK_INLINE void ik_limited_step_of(int n, const ik_settings *ik, const real *J, const real *v, int slides,
+HK_INLINE void ik_limited_step_of(int n, const ik_settings *ik, const real *J, const real *v, int slides,
                                   const real *trust, ik_step_t *s) {
     real own[5 * HK_MAX_N], z[HK_MAX_N], mu[3], g[6], low = R(0.0), high, damping_sq, *dq = s->dq;
     const real *lower = s->lower, *upper = s->upper;
@@ -321,10 +320,9 @@ IK_INLINE void ik_limited_step_of(int n, const ik_settings *ik, const real *J, c
     s->damping = HK_MATH(sqrt)(damping_sq);
 }
 
-static __attribute__((noinline)) void ik_limited_step(const ik_settings *ik, const real *J, const real *v,
-                                                      int slides, const real *trust,
-                                                      ik_step_t *s) {
-    switch (ik->n) {
+static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, const real *v,
+                                        int slides, const real *trust, ik_step_t *s) {
+    switch (HK_COMMON(ik->n)) {
     case 6: ik_limited_step_of(6, ik, J, v, slides, trust, s); break;
     case 9: ik_limited_step_of(9, ik, J, v, slides, trust, s); break;
     default: ik_limited_step_of(ik->n, ik, J, v, slides, trust, s);
@@ -352,8 +350,8 @@ static inline void ik_step_bounds(const ik_settings *ik, const real *q, real sec
 
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
    taken back. What is not finite holds still. */
-static __attribute__((noinline)) void ik_control(const ik_settings *ik, const real *q, const real *J, const real *e,
-                       const real *feed, real seconds, ik_step_t *s) {
+static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *J,
+                                   const real *e, const real *feed, real seconds, ik_step_t *s) {
     const int n = ik->n;
     real v[3], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds, beta = ik->beta * seconds;
     gain = gain > R(1.0) ? R(1.0) : gain;
@@ -371,11 +369,9 @@ static __attribute__((noinline)) void ik_control(const ik_settings *ik, const re
     s->sigma_min = R(NAN);
 }
 
-/* The model at one configuration. Every step and tick calls this one, and gets the same bits. */
-static __attribute__((noinline)) void ik_model(const ik_settings *ik, const real *q, real *x, real *J,
-                                                  real *distance) {
-    hk_model(&ik->plan, ik->model, q, x, J, distance);
-}
+/* The model at one configuration. Every step and tick calls this one, and gets the same bits; who
+   includes this file writes it. */
+static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance);
 
 /* The state of a robot that follows targets, one array: what goes in, what comes out, and what is
    kept from tick to tick, the offset of the measured tip and q. */

@@ -1,39 +1,21 @@
-/* The type V that the kernels compute in: one row, or HK_LANES rows side by side.
+/* The type V that the kernels compute in, for HK_LANES rows side by side: instead of row.h. */
 
-   Included once for each. M is the result of a comparison. A name HK(f) stands for f of this V. */
-
+#undef HK_LANES
 #undef V
 #undef M
 #undef HK
 #undef SPLAT
 #undef NOT
 #undef SELECT
-#undef EACH
-#undef LANE
 
-#if HK_LANES == 1
-#define V real
-#define M int
-#define HK(f) hk_##f
-#define SPLAT(c) ((real)(c))
-#define NOT(m) (!(m))
-#define SELECT(m, a, b) ((m) ? (a) : (b))
-#define EACH(i)
-#define LANE(v, i) (v)
-
-static inline int hk_any(int m) { return m; }
-static inline real hk_sqrt(real x) { return HK_MATH(sqrt)(x); }
-static inline real hk_exp(real x) { return HK_MATH(exp)(x); }
-static inline real hk_logistic(real x) { return R(1.0) / (R(1.0) + hk_exp(-x)); }
-static inline real hk_tanh(real x) { return HK_MATH(tanh)(x); }
-static inline real hk_max(real a, real b) { return b > a ? b : a; }
-static inline real hk_min(real a, real b) { return b < a ? b : a; }
-static inline void hk_sincos(real x, real *s, real *c) {
-    *s = HK_MATH(sin)(x);
-    *c = HK_MATH(cos)(x);
-}
-
+#if defined(__AVX512F__)
+#define HK_LANES 8
+#elif defined(__AVX__)
+#define HK_LANES 4
 #else
+#define HK_LANES 2
+#endif
+
 typedef real hk_lanes __attribute__((vector_size(HK_LANES * sizeof(real))));
 typedef hk_bits hk_mask __attribute__((vector_size(HK_LANES * sizeof(real))));
 #define V hk_lanes
@@ -43,7 +25,6 @@ typedef hk_bits hk_mask __attribute__((vector_size(HK_LANES * sizeof(real))));
 #define NOT(m) (~(m))
 #define SELECT(m, a, b) ((V)(((M)(a) & (m)) | ((M)(b) & ~(m))))
 #define EACH(i) for (int i = 0; i < HK_LANES; i++)
-#define LANE(v, i) ((v)[i])
 
 static inline int hkv_any(M m) {
     hk_bits any = 0;
@@ -126,4 +107,3 @@ static inline void hkv_sincos(V x, V *s, V *c) {
             (*c)[i] = cos(x[i]);
         }
 }
-#endif

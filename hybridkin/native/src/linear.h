@@ -1,7 +1,7 @@
 /* Small dense products with constant matrices. */
 
 /* y (m) = A (m, n) x (n) + b (m). */
-static inline __attribute__((always_inline)) void HK(affine)(
+HK_INLINE void HK(affine)(
     int m, int n, const real *A, const real *b, const V *x, V *y) {
     for (int i = 0; i < m; i++) {
         V sum = SPLAT(b[i]);
@@ -11,7 +11,7 @@ static inline __attribute__((always_inline)) void HK(affine)(
 }
 
 /* J (3, n) = C (3, k) T (k, n), for a T that differs from row to row. */
-static inline __attribute__((always_inline)) void HK(multiply)(
+HK_INLINE void HK(multiply)(
     int k, int n, const V *C, const V *T, V *J) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < n; j++) {

@@ -21,11 +21,22 @@ typedef int64_t hk_bits;
 #define HK_TINY 2.2250738585072014e-308
 #endif
 #define R(c) ((real)(c))
-/* Common sizes have instances of their own, which keep all in registers. Exported code has none. */
-#define HK_COMMON(sizes) (sizes)
 
-/* Largest sizes that the kernels have room for on the stack; an exported model sets its own. */
-#ifndef HK_MAX_N
+/* Code exported for one model sets HK_KINDS, one bit per kind of its nodes, and its own sizes. */
+#ifdef HK_KINDS
+#define HK_USES(kind) ((HK_KINDS >> (kind)) % 2u)
+#define HK_IS_ONLY_CHAIN(kind) ((HK_KINDS & 14u) == 1u << (kind)) /* of the first three kinds */
+#define HK_COMMON(sizes) 0
+#define HK_INLINE static inline
+#define HK_NOINLINE
+#else
+#define HK_USES(kind) 1
+#define HK_IS_ONLY_CHAIN(kind) 0
+#define HK_COMMON(sizes) (sizes) /* have instances of their own, which keep all in registers */
+#define HK_INLINE static inline __attribute__((always_inline))
+#define HK_NOINLINE __attribute__((noinline))
+
+/* Largest sizes that the kernels have room for on the stack. */
 #define HK_MAX_N 64 /* actuators */
 #define HK_MAX_S 16 /* segments */
 #define HK_MAX_M 64 /* outputs of a regressor, or inner coordinates */
@@ -38,6 +49,10 @@ typedef int64_t hk_bits;
 /* A node of a plan: code[at] is its kind, then the lengths of its input and output, where its
    numbers begin in `data`, and what else its kind needs: sizes, and where its parts stand. */
 enum { HK_KIND, HK_N, HK_M, HK_DATA, HK_MORE };
+
+/* Whether the node at a place, or the chain, is of a kind. */
+#define HK_IS(p, at, kind) (HK_USES(kind) && (p)->code[at] == (kind))
+#define HK_CHAIN_IS(p, at, kind) (HK_IS_ONLY_CHAIN(kind) || HK_IS(p, at, kind))
 
 enum {
     HK_ARCS = 1,

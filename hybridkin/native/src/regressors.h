@@ -1,7 +1,7 @@
 /* Learned models q (n) -> x (m) with their Jacobians J (m, n). */
 
 /* sigma(a) of `count` hidden units in place of a, and sigma'(a) in d. */
-static inline __attribute__((always_inline)) void HK(activate)(
+HK_INLINE void HK(activate)(
     int activation, int count, V *a, V *d) {
     switch (activation) {
     case HK_LOGISTIC:
@@ -30,7 +30,7 @@ static inline __attribute__((always_inline)) void HK(activate)(
 
 /* Adds the share of `count` hidden units in x (m) and in its slope J (m, n) by u (n), where not
    NULL, and writes their sigma into `features`, where not NULL. */
-static inline __attribute__((always_inline)) void HK(group_of)(
+HK_INLINE void HK(group_of)(
     int n, int m, int count, int activation, const real *w, const V *u, V shift, V *x, V *J,
     V *features) {
     const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
@@ -56,7 +56,7 @@ static inline __attribute__((always_inline)) void HK(group_of)(
 
 /* All hidden units. The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP),
    b (HK_GROUP), output weights (m, HK_GROUP). */
-static inline __attribute__((always_inline)) void HK(units_of)(
+HK_INLINE void HK(units_of)(
     int n, int m, int units, int activation, const real *w, const V *u, V shift, V *x, V *J,
     V *features) {
     for (; units > HK_GROUP / 2; units -= HK_GROUP, w += HK_GROUP * (n + 1 + m)) {
@@ -86,7 +86,7 @@ static inline real HK(sum)(V v) {
 
 #define HK_BLOCK 64 /* units whose weights stay in the first cache */
 
-static inline __attribute__((always_inline)) void hkr_units_of(
+HK_INLINE void hkr_units_of(
     int n, int m, int units, int activation, const real *w, const real *u, real shift, real *x,
     real *J, real *features) {
     const int each = HK_GROUP / HK_LANES, stride = HK_GROUP * (n + 1 + m);
@@ -202,7 +202,7 @@ static inline void HK(polynomial)(const hk_plan *p, int at, const V *q, V *x, V 
 }
 
 /* value = c + D u + u' A u / 2 with symmetric A, output by output; its slope by u is D + A u. */
-static inline __attribute__((always_inline)) void HK(quadratic_of)(
+HK_INLINE void HK(quadratic_of)(
     int n, int m, const real *c, const real *inverse, const V *u, V *x, V *J) {
     for (int o = 0; o < m; o++, c += 1 + n + n * n) {
         V slope[HK_MAX_N], sum = SPLAT(0.0);
@@ -237,12 +237,10 @@ static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J)
 
 /* Any regressor. `features` is for networks alone. */
 static inline void HK(regress)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features) {
-    (void)features;
-    switch (p->code[at]) {
-    case HK_POLYNOMIAL: HK(polynomial)(p, at, q, x, J); break;
-    case HK_READOUT: HK(readout)(p, at, q, x, J); break;
-    case HK_AFFINE:
-    case HK_KERNEL:
-    case HK_ELM: HK(elm)(p, at, q, x, J, features);
-    }
+    if (HK_IS(p, at, HK_POLYNOMIAL))
+        HK(polynomial)(p, at, q, x, J);
+    else if (HK_IS(p, at, HK_READOUT))
+        HK(readout)(p, at, q, x, J);
+    else if (HK_USES(HK_ELM) || HK_USES(HK_AFFINE) || HK_USES(HK_KERNEL))
+        HK(elm)(p, at, q, x, J, features);
 }

@@ -1,6 +1,10 @@
 /* @TITLE@: written by hybridkin @VERSION@. Units and limits: README.md. */
 #include "@NAME@.h"
-@KERNELS@
+
+@DEFINES@
+#include "plan.h"
+#include "row.h"
+#include "model.h"
 
 static const int32_t code[] = {@CODE@};
 
@@ -17,8 +21,8 @@ void @NAME@_jacobian(const @REAL@ *q, @REAL@ *x, @REAL@ *J) {
 }
 
 @REAL@ @NAME@_domain(const @REAL@ *q) {
-    real x[HK_MAX_M], distance;
-    hk_model(&plan, @MODEL@, q, x, NULL, &distance);
+    real distance;
+    hk_domain(&plan, @MODEL@, q, &distance, NULL);
     return distance;
 }
 @STEP_C@

@@ -1,4 +1,11 @@
 
+#include "ik_step.h"
+
+static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance) {
+    (void)ik;
+    hk_model(&plan, @MODEL@, q, x, J, distance);
+}
+
 void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
     const @NAME@_state none = {0};
     *state = none;
