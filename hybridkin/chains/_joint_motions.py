@@ -12,8 +12,6 @@ import itertools
 import torch
 from torch import Tensor, nn
 
-_FEW_ROWS = 64  # up to here the number of calls decides, not the work
-
 
 def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
     """Return B_0, B_1, B_2 of every joint, its origin included, shape (n, 3, 4, 4)."""
@@ -30,7 +28,7 @@ def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
 
 
 def column_carriers(motions: Tensor, origins: Tensor, axes: Tensor) -> Tensor:
-    """Return what `_by_columns` multiplies a frame by at every joint, shape (n, 13, 4).
+    """Return what `last_frame_and_joints` multiplies a frame by at every joint, shape (n, 13, 4).
 
     From the columns of one frame to those of the next, times 1, u_1 and u_2, and to the axis.
     """
@@ -65,22 +63,12 @@ def frames(u1: Tensor, u2: Tensor, motions: Tensor) -> Tensor:
 
 
 def last_frame_and_joints(
-    u1: Tensor, u2: Tensor, motions: Tensor, axes: Tensor, carriers: Tensor
+    u1: Tensor, u2: Tensor, carriers: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the last moving frame (4, 3, N), joint axes and joint positions (n, 3, N).
 
     Of the frame these are its three axes and its origin.
     """
-    if len(u1) > _FEW_ROWS:
-        return _by_columns(u1, u2, carriers)
-    # Fewer calls than by columns, but more work in each row.
-    moving = frames(u1, u2, motions)[..., :3, :]
-    directions = (moving[..., :3] @ axes[..., None])[..., 0]
-    points = moving[..., 3].permute(1, 2, 0)
-    return moving[:, -1].permute(2, 1, 0), directions.permute(1, 2, 0), points
-
-
-def _by_columns(u1: Tensor, u2: Tensor, carriers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     n_rows, n = u1.shape
     # Three coordinates of every row side by side, so that a joint costs one small product.
     u1, u2 = (part.T.repeat(1, 3) for part in (u1, u2))

@@ -389,8 +389,8 @@ class RigidChain(Chain):
         All are in the base frame; of the last joint's moving frame (4, 3, N) these are the three
         axes and the origin.
         """
-        buffers = (part.to(q) for part in (self.motions, self.axes, self.carriers))
-        frame, axes, points = _joint_motions.last_frame_and_joints(*self._shares(q), *buffers)
+        shares, carriers = self._shares(q), self.carriers.to(q)
+        frame, axes, points = _joint_motions.last_frame_and_joints(*shares, carriers)
         tip = (self._end(q) @ frame.flatten(1)).unflatten(0, (3, -1))
         columns = torch.linalg.cross(axes, tip - points, dim=1)
         if "prismatic" in self.kinds:

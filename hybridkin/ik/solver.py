@@ -291,11 +291,8 @@ class InverseKinematics:
         core = core_of(settings) if as_numpy and q.dtype == torch.float64 else None
         search = Search(settings, tolerance, max_iter)
         if core is not None:
-            search, settings, task = (
-                core.search(tolerance, max_iter),
-                core.settings,
-                core.settings.task,
-            )
+            search, settings = core.search(tolerance, max_iter), core.settings
+            task = settings.task
         found = search.solve(q, target, q0 is None, restarts)
         q = found.q
         if differentiable:

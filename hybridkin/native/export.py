@@ -18,30 +18,30 @@ from numpy.typing import NDArray
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.stored import Stored
 from hybridkin._core.version import __version__
-from hybridkin.native.plan import NoKernel, Plan
+from hybridkin.native.plan import ARCS, ELASTIC, HYBRID, RIGID, NoKernel, Plan
 
 _FOLDER = Path(__file__).parent
 _REAL = {"float64": "double", "float32": "float"}
 _TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # of the test, relative to the largest numbers
-# Arrays with the middle and the half width of q in a description.
+# Buffers with the middle and the half width of the rows that a learned part was fitted to.
 _RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "half_width"))
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
 _STEPS, _MEMORY = 4, 5.0  # steps of a run of the test; memory in periods
+# Operations of a node with a numbers, n inputs and m outputs in a model of S segments.
+_OPERATIONS = {
+    ARCS: lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
+    ELASTIC: lambda a, n, m, S: (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S,
+    RIGID: lambda a, n, m, S: 10 * a + 15 * n,
+    HYBRID: lambda a, n, m, S: a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2)),
+}
 
 
 @runtime_checkable
-class Controller(Protocol):
-    """Inverse kinematics of a model, as `InverseKinematics` is."""
-
+class _Controller(Protocol):
     model: Any
 
-    def stored(self) -> Stored:
-        """Return how it describes itself, with the part "model"."""
-        ...
-
-    def tracker(self, q0: Any, *, memory: float | None = None) -> Any:
-        """Return what follows targets step by step."""
-        ...
+    def stored(self) -> Stored: ...
+    def tracker(self, q0: Any, *, memory: float | None = None) -> Any: ...
 
 
 def export_c(
@@ -88,7 +88,7 @@ def export_c(
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"`name` must be a name in C, as in trunk_3, got {name!r}.")
-    controller = model if isinstance(model, Controller) else None
+    controller = model if isinstance(model, _Controller) else None
     module = as_forward_model(model if controller is None else controller.model)
     try:
         plan = Plan((module if controller is None else controller).stored())
@@ -114,23 +114,21 @@ def export_c(
     for path, template in zip(paths, files.values(), strict=True):
         if template == "README.md":
             entries["MEASURED"] = _measured(paths[1])
-        path.write_text(_with_headers(_filled(template, entries)))
+        path.write_text(_filled(template, entries))
     return paths
 
 
 def _filled(template: str, entries: dict[str, Any]) -> str:
-    text = (_FOLDER / "templates" / template).read_text()
+    text = _with_headers(_FOLDER / "templates" / template)
     return re.sub(r"@(\w+)@", lambda found: str(entries[found[1]]), text)
 
 
-def _with_headers(text: str) -> str:
-    """Return C text with the headers of the kernels in place."""
-    files = {path.name: path for path in (_FOLDER / "src").glob("*.h")}
+def _with_headers(path: Path) -> str:
+    """Return the text of a file with the headers of the kernels in place."""
     return re.sub(
-        '^#include "(.+)"$',
-        lambda found: _with_headers(files[found[1]].read_text()) if found[1] in files else found[0],
-        text,
-        flags=re.MULTILINE,
+        r'(?m)^#include "(\w+\.h)"$',
+        lambda found: _with_headers(_FOLDER / "src" / found[1]),
+        path.read_text(),
     )
 
 
@@ -139,16 +137,15 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
     at = int(plan.code[plan.root + 4]) if steps else plan.root
     # Of arrays of length 1 gcc warns where it cannot see that loops over them begin.
     sizes = {f"HK_MAX_{s}": max(plan.largest.get(what, 0), 2) for s, what in _SIZES.items()}
-    sizes["HK_KINDS"] = f"{sum(1 << kind for kind in plan.kinds)}u"
+    sizes["HK_KINDS"] = f"{sum(1 << kind for kind in {*plan.code[plan.places].tolist()})}u"
     lines = [f"#define {macro} {number}" for macro, number in sizes.items()]
     found = {
         "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
         "CODE": _literals(plan.code),
         "DATA": _literals(plan.data.astype(dtype)),
-        "MODEL": at,
-        "ROOT": plan.root,
+        **dict(MODEL=at, ROOT=plan.root, CALL="forward(q, x)"),
         "BYTES": len(plan.data) * (8 if dtype == "float64" else 4) + 4 * len(plan.code),
-        "CALL": "forward(q, x)",
+        "OPERATIONS": f"{_operations(plan):,}",
     }
     if steps:
         (low, high, fast), dt = _limits(plan)
@@ -156,6 +153,15 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
         found |= zip(("Q_MIN", "Q_MAX", "DQ_MAX"), words, strict=True)
         found |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
     return found
+
+
+def _operations(plan: Plan) -> int:
+    """Return about how many operations x and J take at most."""
+    kinds, n, m, begin = (plan.code[np.add(plan.places, k)].tolist() for k in range(4))
+    numbers, S = np.diff([*begin, len(plan.data)]).tolist(), plan.largest.get("segments", 0)
+    nodes = zip(kinds, numbers, n, m, strict=True)
+    # Learned parts use every number once for x, and at most m times for J.
+    return sum(_OPERATIONS.get(k, lambda a, n, m, S: 2 * (m + 1) * a)(*own, S) for k, *own in nodes)
 
 
 def _limits(plan: Plan) -> tuple[NDArray, float]:
@@ -175,11 +181,18 @@ def _literals(values: NDArray) -> str:
 
 
 def _vectors(
-    module: ForwardModel, plan: Plan, controller: Controller | None, dtype: str
+    module: ForwardModel, plan: Plan, controller: _Controller | None, dtype: str
 ) -> dict[str, Any]:
     """Return what the test compares: inputs, and what torch computes of them."""
-    double = copy.deepcopy(module).double()
-    rows = _rows(double, plan, controller is not None).astype(dtype)
+    double, rng = copy.deepcopy(module).double(), np.random.default_rng(0)
+    center, half = _usual(double, plan.n_inputs)
+    if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
+        low, high, _ = _limits(plan)[0]
+        center, half = 0.5 * (low + high), 0.5 * (high - low)
+    # Eight usual rows, then rows further and further out; the last one is NaN.
+    far = np.concatenate([np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]])
+    rows = center + half * far[:, None] * rng.uniform(-1.0, 1.0, (17, len(half)))
+    rows = rows.astype(dtype)
     with torch.no_grad():
         at = torch.from_numpy(rows.astype(float))
         x, J = (a.numpy() for a in double.forward_and_jacobian(at))
@@ -193,55 +206,30 @@ def _vectors(
     return {"ROWS": len(rows), **found, **{key: _literals(a) for key, a in arrays.items()}}
 
 
-def _rows(module: ForwardModel, plan: Plan, steps: bool) -> NDArray:
-    """Return eight usual rows of q, then rows at the edge of the domain and outside; one is NaN."""
-    n, rng = plan.n_inputs, np.random.default_rng(0)
-    center, half = _range(module.stored(), n) or _nominal(module, n)
-    if steps and np.isfinite(_limits(plan)[0][:2]).all():
-        low, high = _limits(plan)[0][:2]
-        center, half = 0.5 * (low + high), 0.5 * (high - low)
-    inside = center + np.linspace(0.0, 0.7, 8)[:, None] * half * rng.uniform(-1.0, 1.0, (8, n))
-    out = inside[:4] + 4.0 * half * rng.choice([-1.0, 1.0], (4, n))
-    low, high = np.zeros((4, 1)), np.ones((4, 1))
-    for _ in range(40):  # bisection of the way out
-        middle = 0.5 * (low + high)
-        with torch.no_grad():
-            at = torch.from_numpy(inside[:4] + middle * (out - inside[:4]))
-            good = module.in_domain(at).numpy()[:, None]
-        low, high = np.where(good, middle, low), np.where(good, high, middle)
-    edge = inside[:4] + low * (out - inside[:4])
-    return np.concatenate([inside, edge, out, np.full((1, n), math.nan)])
-
-
-def _range(stored: Stored, n: int) -> tuple[NDArray, NDArray] | None:
-    """Return the middle and the half width of q that a learned part was fitted to."""
+def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
+    """Return a middle and a half width of q: of the training rows, else by the robot's radii."""
+    buffers = {name.rpartition(".")[2]: a.numpy() for name, a in module.named_buffers()}
     for pair in _RANGES:
-        if all(stored.arrays.get(name, np.empty(0)).shape == (n,) for name in pair):
-            return stored.array(pair[0]), stored.array(pair[1])
-    found = (_range(part, n) for part in stored.parts.values())
-    return next((one for one in found if one is not None), None)
-
-
-def _nominal(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
-    """Return a middle and a half width of q that suit a mechanical model."""
-    radii = module.robot.stored().arrays.get("radii", np.full(1, 2.0))
+        center, half = (buffers.get(name, np.empty(0)) for name in pair)
+        if center.shape == half.shape == (n,):
+            return center, half
+    radii = buffers.get("radii", np.full(1, 2.0))
     middle = 3.0 * radii.mean() if module.least_actuator == 0.0 else 0.0
     return np.full(n, middle), np.full(n, 0.5 * radii.min())
 
 
 def _runs(
-    controller: Controller, plan: Plan, starts: NDArray, tips: NDArray, dtype: str
+    controller: _Controller, plan: Plan, starts: NDArray, tips: NDArray, dtype: str
 ) -> dict[str, NDArray]:
     """Return runs of steps, from within the limits and from their edges, and what came out."""
-    rng, (limits, dt) = np.random.default_rng(1), _limits(plan)
-    low, high = limits[:2].astype(dtype)
+    rng, ((low, high, _), dt) = np.random.default_rng(1), _limits(plan)
+    low, high = low.astype(dtype), high.astype(dtype)
     starts = starts.clip(low, high)
     starts[4:, ::2] = np.where(np.isfinite(high), high, starts[4:])[:, ::2]
     # In single precision short ones: where limits and weak directions meet it has steps of its own.
     far = np.array([0.2, 0.1, 0.01] if dtype == "float64" else [1e-4, 1e-3, 1e-4])
-    changes = (
-        far[:, None, None, None] * np.ptp(tips, axis=0) * rng.standard_normal((3, 8, _STEPS, 3))
-    )
+    changes = rng.standard_normal((3, 8, _STEPS, 3)) * np.ptp(tips, axis=0)
+    changes *= far[:, None, None, None]
     changes[[0, 2]] += tips[:, None]
     target, dx, measured = changes.astype(dtype)
     measured[:, 2] = math.nan  # no reading

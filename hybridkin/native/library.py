@@ -90,18 +90,12 @@ def _fault(opened: ctypes.CDLL) -> str:
 
 
 def _is_right(opened: ctypes.CDLL) -> bool:
-    """Return whether a library computes circles as their closed form does."""
+    """Return whether a library computes circles as their closed form does, and their slopes."""
     # Two equal segments make one arc of length r [m] that turns by t, in the direction a.
-    r, a, t, o = 0.7, 0.3, np.array([0.5, 2.0, 3.0, 5.0, 9.0]), np.zeros(5)
-    sine, versine, c, s = np.sin(t) / t, (1.0 - np.cos(t)) / t, np.cos(a), np.sin(a)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    q, x = (np.stack(v, 1) @ turn.T for v in ([t, o, o + r], [r * versine, o, r * sine]))
-    slopes = [
-        [r * (sine - versine / t), o, versine],
-        [o, r * versine / t, o],
-        [r * (np.cos(t) - sine) / t, o, sine],
-    ]
-    J = turn @ np.moveaxis(np.array(slopes), 2, 0) @ turn.T
+    r, a, t = 0.7, 0.3, np.array([0.5, 2.0, 3.0, 5.0, 9.0])
+    side = r * (1.0 - np.cos(t)) / t
+    x = np.stack([side * np.cos(a), side * np.sin(a), r * np.sin(t) / t], 1)
+    q = np.stack([t * np.cos(a), t * np.sin(a), 0.0 * t + r], 1)
     halves = 0.5 * np.repeat(np.eye(3)[[2, 0, 1]], 2, axis=0)
     circles = Stored(
         "constant_curvature",
@@ -110,10 +104,12 @@ def _is_right(opened: ctypes.CDLL) -> bool:
         derived={"arc_matrix": halves, "arc_offset": np.zeros(6)},
     )
     program = Program(Plan(circles), opened)
-    block, ones = program.evaluate(q, True)[:2], [program.evaluate(row, True)[:2] for row in q]
-    found = [*block, *map(np.array, zip(*ones, strict=True))]
-    pairs = zip(found, (x, J, x, J), strict=True)
-    return all(np.abs(ours - right).max() < 1e-12 for ours, right in pairs)
+    beside = q[:, None, None] + 1e-5 * np.stack([np.eye(3), -np.eye(3)])
+    ahead, behind = program.evaluate(beside)[0].swapaxes(0, 1)
+    slopes = np.swapaxes(ahead - behind, 1, 2) / 2e-5
+    ones = zip(*(program.evaluate(row, True)[:2] for row in q), strict=True)
+    pairs = (program.evaluate(q, True)[:2], map(np.array, ones))
+    return all(abs(y - x).max() < 1e-12 and abs(J - slopes).max() < 1e-8 for y, J in pairs)
 
 
 class Program:
@@ -303,7 +299,7 @@ def evaluate(
     if program is not None and not (value or jacobian):
         return (program.domain(q)[0],)
     if program is not None:
-        return _present(program.evaluate(q, jacobian, distance))
+        return tuple(a for a in program.evaluate(q, jacobian, distance) if a is not None)
     rows, found = torch.from_numpy(q), ()
     with torch.no_grad():
         if jacobian:
@@ -313,7 +309,3 @@ def evaluate(
         if distance:
             found = *found, model.domain_distance(rows)
     return tuple(part.numpy() for part in found)
-
-
-def _present(results: Sequence[NDArray | None]) -> tuple[NDArray, ...]:
-    return tuple(part for part in results if part is not None)

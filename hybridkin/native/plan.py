@@ -39,42 +39,38 @@ class Plan:
         the places of parts.
     data : ndarray of float64
         All numbers.
+    n_inputs, n_outputs : int
+        Lengths of q and of x.
     root : int
         Place in `code` of the node that is the whole model.
+    places : list of int
+        Places of all nodes, their numbers in the same order.
+    largest : dict
+        Largest sizes, named as in MOST.
     """
 
     def __init__(self, stored: Stored) -> None:
         self._code: list[int] = []
         self._data: list[NDArray] = []
         self._length = 0
-        self.kinds: set[int] = set()  # that it has nodes of
-        self.largest: dict[str, int] = {}  # sizes, named as in MOST
+        self.largest: dict[str, int] = {}
         self._known: dict[tuple, int] = {}
         self.root = self.node_of(stored)
+        self.n_inputs, self.n_outputs = self._code[self.root + 1 : self.root + 3]
         self.code = np.array(self._code, dtype=np.int32)
         whole = np.zeros(self._length + 2 * GROUP)
         start = -whole.ctypes.data // 8 % GROUP  # of a line of the cache
         self.data = whole[start : start + self._length + GROUP]
         self.data[:-GROUP] = np.concatenate(self._data)
-        self._data = []  # not twice in pickles
+        self.places = [*self._known.values()]
+        self._data, self._known = [], {}  # not twice in pickles
         for array in (self.code, self.data):
             array.flags.writeable = False
 
     @property
-    def n_inputs(self) -> int:
-        """Length of q."""
-        return int(self.code[self.root + 1])
-
-    @property
-    def n_outputs(self) -> int:
-        """Length of x."""
-        return int(self.code[self.root + 2])
-
-    @property
     def digest(self) -> str:
         """SHA-256 of the plan: equal for models that compute the same."""
-        whole = self.code.tobytes() + self.root.to_bytes(4, "little") + self.data.tobytes()
-        return hashlib.sha256(whole).hexdigest()
+        return hashlib.sha256(self.code.tobytes() + self.data.tobytes()).hexdigest()
 
     def node_of(self, stored: Stored) -> int:
         """Write the node of a description, its parts first, and return its place."""
@@ -87,7 +83,6 @@ class Plan:
         """Write a node with its numbers, and return its place; equal nodes have one place."""
         for what, size in (("actuators", n), ("outputs", m)):
             self.limit(what, size)
-        self.kinds.add(kind)
         flat = [np.asarray(part, dtype=np.float64).ravel() for part in numbers]
         key = (kind, n, m, *more, *(part.tobytes() for part in flat))
         if key not in self._known:

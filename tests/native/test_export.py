@@ -89,17 +89,21 @@ def test_the_loop_of_the_docs_runs(tmp_path):
     assert "worst: command after" in last
 
 
+@needs_cc
 def test_the_code_holds_what_the_model_needs_and_no_more(tmp_path):
+    source = export_c(load_model(FOLDER / "rigid.safetensors"), tmp_path)[1]
+    assert not any(word in source.read_text() for word in ("malloc", "hkv_", "ik_tick", "@"))
+    options = ["-std=c99", "-O1", "-fno-inline", "-c", source, "-o", tmp_path / "model.o"]
+    subprocess.run([CC, *options], check=True)
+    names = (tmp_path / "model.o").read_bytes()
+    assert b"hk_rigid" in names
+    assert not any(name in names for name in (b"hk_stumpff", b"hk_settle", b"hk_elm"))
+
+
+def test_only_files_of_an_export_are_replaced(tmp_path):
     rigid = load_model(FOLDER / "rigid.safetensors")
-    header, source, *_, readme = export_c(rigid, tmp_path, name="arm_3")
-    text = source.read_text()
+    header, *_, readme = export_c(rigid, tmp_path, name="arm_3")
     assert "arm_3_jacobian" in header.read_text()
-    assert "hk_rigid(" in text
-    assert not any(
-        word in text for word in ("hk_stumpff", "hk_settle", "ik_tick", "malloc", "hkv_")
-    )
-    assert "(cos, sin)" in readme.read_text()
-    # Files of an earlier export are replaced, those of others are not.
     text = readme.read_text()
     readme.write_text("hybridkin, an earlier one")
     export_c(rigid, tmp_path, name="arm_3")

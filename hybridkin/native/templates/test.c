@@ -6,7 +6,7 @@
 
 enum { ROWS = @ROWS@, N = @N@, M = @M@ };
 
-/* Rows inside the domain, at its edge, outside, and one of NaN. */
+/* Rows inside the domain, then further and further out, and one of NaN. */
 static const @REAL@ q[ROWS * N] = {@Q@};
 static const double x[ROWS * M] = {@X@};
 static const double J[ROWS * M * N] = {@J@};
