@@ -22,16 +22,9 @@ def in_blocks(
     if q.ndim == 0:
         return function(q)  # which raises
     blocks = q.reshape(-1, q.shape[-1]).split(size)
-    first = function(blocks[0])
-    if len(blocks) == 1 or any(part.requires_grad for part in first):  # writes grow a graph
-        parts = zip(first, *(function(rows) for rows in blocks[1:]), strict=True)
-        whole = [torch.cat([a.flatten(1) for a in part]) for part in parts]
-    else:
-        whole = [part.new_empty(q.shape[:-1].numel(), part.shape[1:].numel()) for part in first]
-        for k, rows in enumerate(blocks):
-            for result, part in zip(whole, function(rows) if k else first, strict=True):
-                result[k * size : k * size + len(part)].copy_(part.flatten(1))
-    pairs = zip(whole, first, strict=True)
+    found = [function(rows) for rows in blocks]
+    whole = [torch.cat([a.flatten(1) for a in part]) for part in zip(*found, strict=True)]
+    pairs = zip(whole, found[0], strict=True)
     return tuple(result.reshape(*q.shape[:-1], *part.shape[1:]) for result, part in pairs)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -38,13 +38,8 @@ class Inside:
         return self.mechanical.from_coordinates_and_jacobian(self.z)[1] @ self.slope
 
 
-class Fading(NamedTuple):
-    """The weight of a correction, where it may be less than one."""
-
-    weight: Tensor  # g(q), (N, 1)
-    slope: Tensor  # dg/dq, (N, 1, n)
-
-
+# The weight g(q) of a correction (N, 1), where it may be less than one, and dg/dq (N, 1, n).
+Fading = tuple[Tensor, Tensor]
 Guarded = tuple[Tensor, Tensor, Fading | None]  # a correction, its derivative, how it fades
 
 
@@ -300,7 +295,7 @@ class HybridModule(ForwardModel):
 def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
     """Return how a correction fades at rows q (N, n), None where all are inside the domain."""
     inside = bool((distance <= 1.0).all())  # a NaN is not
-    return None if inside else Fading(*guard.weight_and_jacobian(q))
+    return None if inside else guard.weight_and_jacobian(q)
 
 
 def _plus(

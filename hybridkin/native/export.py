@@ -152,6 +152,7 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
         words = (", ".join(f"{v:.6g}" for v in row) for row in (low, high, fast))
         found |= zip(("Q_MIN", "Q_MAX", "DQ_MAX"), words, strict=True)
         found |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
+        found["NEWTON"] = f"{10 * len(low) ** 2 + 80 * len(low):,}"
     return found
 
 

@@ -309,13 +309,9 @@ def _box_guard(plan: Plan, stored: Stored) -> int:
     return plan.node(BOX_GUARD, len(low), 0, [stored.array("largest"), low, high, 1.0 / width])
 
 
-def _equal(a: Stored | None, b: Stored) -> bool:
-    """Return whether two descriptions without parts are the same."""
-    return (
-        a is not None
-        and (a.kind, a.settings) == (b.kind, b.settings)
-        and all(np.array_equal(array, b.arrays[name]) for name, array in a.arrays.items())
-    )
+def _content(stored: Stored) -> tuple:
+    """Return what two descriptions without parts must share to be the same."""
+    return stored.kind, stored.settings, {k: a.tobytes() for k, a in stored.arrays.items()}
 
 
 def _hybrid(plan: Plan, stored: Stored) -> int:
@@ -331,7 +327,8 @@ def _hybrid(plan: Plan, stored: Stored) -> int:
         inner.append(part.kind == "inner_correction")
         regressor, guard = part.part("readout" if inner[-1] else "module"), part.parts.get("guard")
         trust = -1 if guard is None else plan.node_of(guard)
-        if guard is not None and _equal(guard.parts.get("model"), regressor):
+        own = [] if guard is None else [*map(_content, guard.parts.values())]
+        if own == [_content(regressor)]:
             places += [0, plan.entry(trust, 4), trust]  # value and leverage share the features
         else:
             places += [inner[-1], plan.node_of(regressor), trust]
