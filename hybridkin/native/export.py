@@ -136,9 +136,9 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
     """Return sizes and numbers of a plan as C, and what README.md says of them."""
     at = int(plan.code[plan.root + 4]) if steps else plan.root
     # Of arrays of length 1 gcc warns where it cannot see that loops over them begin.
-    sizes = {f"HK_MAX_{s}": max(plan.largest.get(what, 0), 2) for s, what in _SIZES.items()}
-    sizes["HK_KINDS"] = f"{sum(1 << kind for kind in {*plan.code[plan.places].tolist()})}u"
-    lines = [f"#define {macro} {number}" for macro, number in sizes.items()]
+    sizes = {f"MAX_{s}": max(plan.largest.get(what, 0), 2) for s, what in _SIZES.items()}
+    kinds = sum(1 << kind for kind in {*plan.code[plan.places].tolist()})
+    lines = [f"#define HK_{a} {number}" for a, number in {**sizes, "KINDS": f"{kinds}u"}.items()]
     found = {
         "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
         "CODE": _literals(plan.code),
@@ -158,11 +158,13 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
 
 def _operations(plan: Plan) -> int:
     """Return about how many operations x and J take at most."""
-    kinds, n, m, begin = (plan.code[np.add(plan.places, k)].tolist() for k in range(4))
+    *columns, begin = (plan.code[np.add(plan.places, k)].tolist() for k in range(4))
     numbers, S = np.diff([*begin, len(plan.data)]).tolist(), plan.largest.get("segments", 0)
-    nodes = zip(kinds, numbers, n, m, strict=True)
-    # Learned parts use every number once for x, and at most m times for J.
-    return sum(_OPERATIONS.get(k, lambda a, n, m, S: 2 * (m + 1) * a)(*own, S) for k, *own in nodes)
+    work = 0
+    for kind, n, m, a in zip(*columns, numbers, strict=True):
+        # Learned parts use every number once for x, and at most m times for J.
+        work += _OPERATIONS[kind](a, n, m, S) if kind in _OPERATIONS else 2 * (m + 1) * a
+    return work
 
 
 def _limits(plan: Plan) -> tuple[NDArray, float]:
