@@ -95,7 +95,7 @@ def export_c(
     except (NoKernel, TypeError) as error:
         way = "use it from Python, or fit an error model that has a kernel"
         raise NoKernel(f"`model` cannot be written in C: {error}; {way}.") from None
-    files = {f"{name}.h": "model.h", f"{name}.c": "model.c", f"{name}_test.c": "test.c"}
+    files = {f"{name}.h": "model.h", f"{name}.c": "model.c", f"{name}_test.c": "check.c"}
     files |= {file: file for file in ("CMakeLists.txt", "README.md")}
     paths = [Path(folder) / file for file in files]
     for path in paths:
