@@ -67,7 +67,7 @@ def trunk_cases() -> list[Case]:
 
 
 def best_time(job: Callable[[], object], seconds: float) -> float:
-    """Return the least CPU time of a run [s]; the first one, which may build things, is left out."""
+    """Return the least CPU time of a run [s]; the first, which may build things, is left out."""
     job()
     start = time.process_time()
     job()
