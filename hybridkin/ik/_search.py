@@ -101,7 +101,8 @@ class Search:
             # A straight backbone: motions that cancel to first order would be missed.
             at_start = self._start(q, target)
             nudged = settings.inside(self._nudged(at_start))
-            q = torch.where(at_start.reached[:, None], q, nudged)
+            stay = at_start.reached | ~torch.isfinite(at_start.error)
+            q = torch.where(stay[:, None], q, nudged)
         found = self._attempt(q, target)
         rows = (~found.reached & row_gram(found.J).is_singular).nonzero()[:, 0]
         self._try_again(found, rows, self._nudged(found)[rows, None])

@@ -90,7 +90,7 @@ def _fault(opened: ctypes.CDLL) -> str:
 
 
 def _is_right(opened: ctypes.CDLL) -> bool:
-    """Return whether a library computes circles as their closed form does, and their slopes."""
+    """Return whether circles and logistic units are as their closed forms, and their slopes."""
     # Two equal segments make one arc of length r [m] that turns by t, in the direction a.
     r, a, t = 0.7, 0.3, np.array([0.5, 2.0, 3.0, 5.0, 9.0])
     side = r * (1.0 - np.cos(t)) / t
@@ -103,13 +103,19 @@ def _is_right(opened: ctypes.CDLL) -> bool:
         {"base": np.eye(4), "offsets": np.zeros(2), "radii": np.ones(2)},
         derived={"arc_matrix": halves, "arc_offset": np.zeros(6)},
     )
-    program = Program(Plan(circles), opened)
+    names = ("input_weights", "output_weights", "input_bias", "intercept", "input_center")
+    arrays = dict(zip(names, [np.eye(3)] * 2 + [np.zeros(3)] * 3, strict=True))
+    units = Stored("elm", {"activation": "logistic"}, {**arrays, "input_scale": np.ones(3)})
     beside = q[:, None, None] + 1e-5 * np.stack([np.eye(3), -np.eye(3)])
-    ahead, behind = program.evaluate(beside)[0].swapaxes(0, 1)
-    slopes = np.swapaxes(ahead - behind, 1, 2) / 2e-5
-    ones = zip(*(program.evaluate(row, True)[:2] for row in q), strict=True)
-    pairs = (program.evaluate(q, True)[:2], map(np.array, ones))
-    return all(abs(y - x).max() < 1e-12 and abs(J - slopes).max() < 1e-8 for y, J in pairs)
+    for model, right in ((circles, x), (units, 1.0 / (1.0 + np.exp(-q)))):
+        program = Program(Plan(model), opened)
+        ahead, behind = program.evaluate(beside)[0].swapaxes(0, 1)
+        slopes = np.swapaxes(ahead - behind, 1, 2) / 2e-5
+        ones = zip(*(program.evaluate(row, True)[:2] for row in q), strict=True)
+        for y, J in (program.evaluate(q, True)[:2], map(np.array, ones)):
+            if not (abs(y - right).max() < 1e-12 and abs(J - slopes).max() < 1e-8):
+                return False
+    return True
 
 
 class Program:

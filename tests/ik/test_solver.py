@@ -447,6 +447,22 @@ def test_a_nan_target_marks_only_its_row(rng):
     assert torch.isnan(step.error[[1, 3]]).all()
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_a_target_that_is_not_finite_returns_the_start_within_the_limits(bad, kind):
+    # The start is straight, where starts beside it are tried for good targets.
+    chain = ConstantCurvatureChain([0.02] * 2, lengths=[0.1] * 2, routing="base")
+    ik = InverseKinematics(chain, q_min=-0.02, q_max=0.02)
+    bent = chain(torch.tensor([0.01, -0.005, -0.005, 0.015, -0.0075, -0.0075]).double()).tolist()
+    target = kind(np.array([bent, [0.05, bad, 0.15]]))
+    outside = kind(np.array([0.01, 0.0, -0.01, 0.03, 0.0, 0.0]))
+    for q0, expected in ((None, np.zeros(6)), (outside, [0.01, 0.0, -0.01, 0.02, 0.0, 0.0])):
+        solution = ik.solve(target, q0, restarts=1)
+        assert solution.status.tolist() == [IKStatus.CONVERGED, IKStatus.INVALID_INPUT]
+        np.testing.assert_array_equal(solution.q[1], expected)
+        assert np.isfinite(np.asarray(solution.x)).all()
+
+
 def test_a_model_may_be_out_of_its_domain(rng):
     class Guarded(torch.nn.Module):
         def forward(self, q):
