@@ -18,18 +18,27 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from compiled_cases import CASES, Case
+from compiled_report import (
+    FAR,
+    MORE_RUNS,
+    RUNS,
+    Ticks,
+    agreement_report,
+    solve_report,
+    steps_report,
+    ticks_report,
+)
 from numpy.typing import NDArray
 from reachable_targets import KINDS, ROBOTS, STARTS, Robot, draw
 
 from hybridkin import InverseKinematics, as_forward_model
 from hybridkin.ik.results import IKStatus
 from hybridkin.native.library import program_of
-from hybridkin.plots import new_figure
 from hybridkin.workflow.report import Report
 
 PARTS = ("agreement", "steps", "solve", "ticks")
@@ -43,19 +52,17 @@ TICKED = (
 )
 """Cases whose ticks are timed."""
 
-_FAR = 20.0  # times half the range: the farthest rows
 _BLOCK = 20_000  # rows of a model in torch at a time
 _SETTINGS = 20  # of inverse kinematics, drawn at random
-_RUNS, _MORE_RUNS, _SLOWEST = 3, 100, 10
+_SLOWEST = 10  # ticks under every setting, run again
 _STAY = 10  # ticks from one random configuration to the next
-_QUANTILES = (0.5, 0.999, 0.9999)
 
 
 def rows_of(case: Case, n: int, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
     """Return rows q (n, n_actuators), 1 % with a NaN, and which fifth of them lies far out."""
     middle, half = 0.5 * (case.low + case.high), 0.5 * (case.high - case.low)
     far = rng.random(n) < 0.2
-    spread = np.where(far, np.exp(rng.uniform(0.0, np.log(_FAR), n)), 1.0)
+    spread = np.where(far, np.exp(rng.uniform(0.0, np.log(FAR), n)), 1.0)
     q = middle + spread[:, None] * half * rng.uniform(-1.0, 1.0, (n, len(half)))
     broken = np.flatnonzero(rng.random(n) < 0.01)
     q[broken, rng.integers(0, len(half), len(broken))] = np.nan
@@ -158,13 +165,14 @@ def steps(robot: Robot, n: int, rng: np.random.Generator) -> dict[str, Any]:
     Returns
     -------
     dict
-        For limits="saturate", and "off": the largest difference of J dq [m] and of dq, relative to
-        the span of the limits; "flags": `saturated` flags that differ; "outside": actuators of
-        q + dq beyond their limits, from starts within them.
+        For limits="saturate", and "off": the largest difference of J dq [m] ("move") and of dq,
+        relative to the span of the limits; "control_off": that of dq between torch and torch with q
+        moved by its last bit; "flags": `saturated` flags that differ; "outside": rows q + dq beyond
+        the limits, from starts within them.
     """
     low, high = robot.q_min.numpy(), robot.q_max.numpy()
     forward = as_forward_model(robot.model)
-    names = ("move", "dq", "move_off", "dq_off")
+    names = ("move", "dq", "control", "move_off", "dq_off", "control_off")
     found: dict[str, Any] = {"n": n, "flags": 0, "outside": 0, **dict.fromkeys(names, 0.0)}
     for _ in range(_SETTINGS):
         given = _random_settings(low, high, rng)
@@ -174,18 +182,24 @@ def steps(robot: Robot, n: int, rng: np.random.Generator) -> dict[str, Any]:
             x, J = forward(torch.from_numpy(goal)), forward.jacobian(torch.from_numpy(q)).numpy()
         x = x.numpy() + 10.0 ** rng.uniform(-4.0, -1.0, (len(q), 1)) * rng.standard_normal(x.shape)
         dx = rng.choice([0.0, 0.1]) * rng.standard_normal(x.shape)
-        ours, theirs = ik.step(q, x, dx), ik.step(*map(torch.from_numpy, (q, x, dx)))
+        near = np.nextafter(q, 0.5 * (low + high))
+        ours = ik.step(q, x, dx)
+        theirs, control = (ik.step(*map(torch.from_numpy, (at, x, dx))) for at in (q, near))
         apart = ours.dq - theirs.dq.numpy()
         ending = "_off" if "limits" in given else ""
-        moved = np.linalg.norm(np.einsum("bij,bj->bi", J, apart), axis=1).max()
-        found[f"move{ending}"] = max(found[f"move{ending}"], moved)
-        found[f"dq{ending}"] = max(found[f"dq{ending}"], (np.abs(apart) / (high - low)).max())
+        seen = {
+            "move": np.linalg.norm(np.einsum("bij,bj->bi", J, apart), axis=1),
+            "dq": np.abs(apart) / (high - low),
+            "control": np.abs((control.dq - theirs.dq).numpy()) / (high - low),
+        }
+        for name, values in seen.items():
+            found[name + ending] = max(found[name + ending], values.max())
         if not ending:
             found["flags"] += int((ours.saturated != theirs.saturated.numpy()).sum())
             ends = given["q_min"], given["q_max"]
             held = ((q >= ends[0]) & (q <= ends[1])).all(1)
             new = q[held] + ours.dq[held]
-            found["outside"] += int(((new < ends[0]) | (new > ends[1])).sum())
+            found["outside"] += int(((new < ends[0]) | (new > ends[1])).any(1).sum())
     return found
 
 
@@ -196,14 +210,22 @@ def solve(robot: Robot, n: int, n_beyond: int, random_state: int = 0) -> dict[st
     -------
     dict
         "statuses": pairs that differ with their number; "error": largest difference of the errors
-        of targets with equal statuses [m], "error_reached" of those within the tolerance; "other
-        q": share of rows with another q (1e-6 of the limits); "seconds" and "seconds_torch" of CPU
-        time; "moved": rows of other statuses where both errors are equal to 1e-9 m.
+        of targets with equal statuses [m], "error_reached" of those within the tolerance; "moved":
+        rows of other statuses where both errors are equal to 1e-9 m; "other_q": rows with another q
+        (1e-6 of the limits), "control" those of torch where the target moves by its last bit;
+        "seconds" and "seconds_torch" of CPU time.
     """
     generator = torch.Generator().manual_seed(random_state)
     ik = InverseKinematics(robot.model, q_min=robot.q_min, q_max=robot.q_max)
     forward = as_forward_model(robot.model)
-    found: dict[str, Any] = {"n": 0, "differ": 0, "statuses": {}, "moved": 0, "other_q": 0}
+    found: dict[str, Any] = {
+        "n": 0,
+        "differ": 0,
+        "statuses": {},
+        "moved": 0,
+        "other_q": 0,
+        "control": 0,
+    }
     found |= dict.fromkeys(("error", "error_reached", "seconds", "seconds_torch"), 0.0)
     span = (robot.q_max - robot.q_min).numpy()
     jobs = [(kind, start, n) for kind in KINDS for start in STARTS]
@@ -229,23 +251,14 @@ def solve(robot: Robot, n: int, n_beyond: int, random_state: int = 0) -> dict[st
         found["moved"] += int((other & (apart < 1e-9)).sum())
         found["error"] = max(found["error"], apart[~other & ~reached].max(initial=0.0))
         found["error_reached"] = max(found["error_reached"], apart[reached].max(initial=0.0))
-        far = (np.abs(ours.q - theirs.q.numpy()) / span).max(axis=1) > 1e-6
-        found["other_q"] += int(far.sum())
+        control = ik.solve(torch.nextafter(x, torch.zeros_like(x)), q0)
+        for key, q in (("other_q", ours.q), ("control", control.q.numpy())):
+            far = (np.abs(q - theirs.q.numpy()) / span).max(axis=1) > 1e-6
+            found[key] += int(far.sum())
         pairs = zip(ours.status[other], theirs.status.numpy()[other], strict=True)
         for pair in (f"{IKStatus(a).name}, torch {IKStatus(b).name}" for a, b in pairs):
             found["statuses"][pair] = found["statuses"].get(pair, 0) + 1
     return found
-
-
-class Ticks(NamedTuple):
-    """Times of all ticks [us]: the first run, and the shortest of a few runs of the same tick.
-
-    `slowest` is the longest among the shortest of many runs, of the slowest ticks.
-    """
-
-    once: NDArray
-    least: NDArray
-    slowest: float
 
 
 def ticks(case: Case, n: int, rng: np.random.Generator) -> Ticks:
@@ -275,7 +288,7 @@ def ticks(case: Case, n: int, rng: np.random.Generator) -> Ticks:
         once.append(times[:, 0])
         least.append(times.min(axis=1))
         worst = np.argsort(least[-1])[-_SLOWEST:]
-        again, _ = _timed(ik, at[worst].repeat(_MORE_RUNS, 0), x[worst].repeat(_MORE_RUNS, 0), 1)
+        again, _ = _timed(ik, at[worst].repeat(MORE_RUNS, 0), x[worst].repeat(MORE_RUNS, 0), 1)
         slowest = max(slowest, int(again.reshape(len(worst), -1).min(axis=1).max()))
     gc.enable()
     return Ticks(1e-3 * np.concatenate(once), 1e-3 * np.concatenate(least), 1e-3 * slowest)
@@ -288,109 +301,19 @@ def _timed(ik: InverseKinematics, q: NDArray, x: NDArray, stay: int = _STAY) -> 
     # The call alone: `tracker.step` adds Python around it.
     call, address, at = robot._follow, robot._address, robot.q
     target = robot._inputs[min(robot._inputs)]
-    times, starts = np.empty((len(q), _RUNS), dtype=np.int64), np.empty_like(q)
+    times, starts = np.empty((len(q), RUNS), dtype=np.int64), np.empty_like(q)
     clock = time.perf_counter_ns
     for i in range(len(q)):
         if i % stay == 0:
             at[:] = q[i]
         target[:] = x[i]
         starts[i] = at
-        for run in range(_RUNS):
+        for run in range(RUNS):
             at[:] = starts[i]
             began = clock()
             call(address)
             times[i, run] = clock() - began
     return times, starts
-
-
-Found = dict[str, dict[str, Any]]
-
-
-def _table(report: Report, header: list[str], rows: list[list[Any]]) -> None:
-    report.table(header, [[str(cell) for cell in row] for row in rows])
-
-
-def agreement_report(report: Report, found: Found) -> None:
-    """Add the table of `agreement` by case."""
-    report.text(
-        f"Largest differences between core and torch, of x and J relative to the largest value: "
-        f"within the limits, and up to {_FAR:g} times as far out."
-    )
-    names = ("x", "J", "distance")
-    columns = [*names, *(f"{name}_far" for name in names), "single"]
-    heads = [*names, *(f"{name}, far" for name in names), "row or batch"]
-    rows = [
-        [name, one["n"], *(f"{one[c]:.1g}" for c in columns), one["decisions"], one["nan"]]
-        for name, one in found.items()
-    ]
-    _table(report, ["model", "rows", *heads, "other in_domain", "other NaN"], rows)
-
-
-def steps_report(report: Report, found: Found) -> None:
-    """Add the table of `steps` by robot."""
-    report.text("Steps: differences of J dq [m], and of dq relative to the limits.")
-    columns = ("move", "dq", "move_off", "dq_off")
-    heads = ["J dq [m]", "dq", 'J dq, limits="off"', 'dq, limits="off"']
-    rows = [
-        [name, one["n"], *(f"{one[c]:.1g}" for c in columns), one["flags"], one["outside"]]
-        for name, one in found.items()
-    ]
-    _table(report, ["robot", "steps", *heads, "other `saturated`", "beyond limits"], rows)
-
-
-def solve_report(report: Report, found: Found) -> None:
-    """Add the table of `solve` by robot."""
-    report.text("Solutions: statuses that differ, and the differences of errors where they agree.")
-    heads = ["targets", "other status", "of these of equal error", "error, reached [m]"]
-    heads += ["error, not reached [m]", "other q [%]", "CPU time, core [s]", "torch [s]"]
-    rows = []
-    for name, one in found.items():
-        errors = [f"{one[key]:.1g}" for key in ("error_reached", "error")]
-        share = f"{100.0 * one['other_q'] / one['n']:.2g}"
-        seconds = [f"{one[key]:.3g}" for key in ("seconds", "seconds_torch")]
-        counts = [one[key] for key in ("n", "differ", "moved")]
-        rows.append([name, *counts, *errors, share, *seconds])
-    _table(report, ["robot", *heads], rows)
-    for name, one in found.items():
-        for pair, count in one["statuses"].items():
-            report.text(f"- {name}: {count} x {pair}")
-
-
-def ticks_report(report: Report, found: dict[str, Ticks]) -> Any:
-    """Add the table and the figure of `ticks` by case, and return the figure."""
-    report.text(
-        "Times of single calls of `hk_ik_tick` [us], clock and ctypes call included; every tick "
-        f"once, and the shortest of {_RUNS} runs of it, which leaves out most interruptions by the "
-        f"system. Last: of the slowest ticks the shortest of {_MORE_RUNS} runs."
-    )
-    rows = []
-    for name, one in found.items():
-        values = [[*np.quantile(a, _QUANTILES), a.max()] for a in (one.once, one.least)]
-        numbers = (f"{value:.2f}" for value in (*values[0], *values[1], one.slowest))
-        rows.append([name, str(len(one.once)), *numbers])
-    report.record["ticks"] = rows
-    heads = ["median", "99.9 %", "99.99 %", "worst"]
-    heads += [f"{head} of {_RUNS}" for head in heads]
-    report.table(["model", "ticks", *heads, f"worst of {_MORE_RUNS}"], rows)
-    figure = _figure(found)
-    caption = "Times of ticks: the shortest of three runs of each, and every one by itself."
-    report.figure("ticks", figure, caption)
-    return figure
-
-
-def _figure(found: dict[str, Ticks]) -> Any:
-    figure, axes = new_figure(8.0, 3.4, 1, 2, sharey=True)
-    edges = 10.0 ** np.arange(-1.0, 4.01, 0.05)
-    titles = (f"Shortest of {_RUNS} runs of a tick", "Every tick by itself")
-    for axis, title, what in zip(axes, titles, ("least", "once"), strict=True):
-        for k, (name, one) in enumerate(found.items()):
-            counts = np.histogram(getattr(one, what), edges)[0]
-            axis.stairs(counts, edges, color=f"C{k}", linewidth=1.2, label=name)
-        axis.set(xscale="log", yscale="log", xlim=(0.3, 3e3), ylim=(0.5, None), title=title)
-        axis.set_xlabel("time of a tick [µs]")
-    axes[0].set_ylabel("ticks")
-    axes[0].legend(loc="upper right", fontsize="small")
-    return figure
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
