@@ -60,15 +60,21 @@ def _arm() -> Case:
 def _hybrid(error_model: Any = None, *, drifts: bool = False, **options: Any) -> Case:
     """Return a hybrid of the simulated trunk, within the range of its training rows."""
     data = datasets.load_trunk()
-    rows = len(data.q) if error_model == "auto" else _TRAINING_ROWS
     order = np.random.default_rng(0).permutation(len(data.q))
-    q, x = data.q[order[:rows]], data.x[order[:rows]]
+    rows = order[:_TRAINING_ROWS] if error_model != "auto" else np.arange(len(data.q))
+    q, x = data.q[rows], data.x[rows]
     chain = robots.bionic_handling_assistant()
     model = HybridForwardModel(chain, error_model, random_state=0, **options).fit(q, x)
     if drifts:
         new = order[-_NEW_ROWS:]
         model.partial_fit(data.q[new], data.x[new] + 0.01)
     return Case(model.module_, q.min(0), q.max(0))
+
+
+def _data_alone() -> Case:
+    data = datasets.load_trunk()
+    model = HybridForwardModel(None, random_state=0).fit(data.q[:600], data.x[:600])
+    return Case(model.module_, data.q.min(0), data.q.max(0))
 
 
 def _polynomial() -> Any:
@@ -93,14 +99,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "serial pose features": lambda: _hybrid("pose", coupling="serial"),
     "kernel ridge": lambda: _hybrid("kernel"),
     "polynomial of degree 3": lambda: _hybrid(_polynomial()),
-    "data alone, ELM": lambda: _data_alone(),
+    "data alone, ELM": _data_alone,
     "blend": lambda: _hybrid("auto", calibrate="default"),
     "blend, drift": lambda: _hybrid("auto", calibrate="default", drifts=True),
 }
 """Models by name; the blends take half a minute each to fit."""
-
-
-def _data_alone() -> Case:
-    data = datasets.load_trunk()
-    model = HybridForwardModel(None, random_state=0).fit(data.q[:600], data.x[:600])
-    return Case(model.module_, data.q.min(0), data.q.max(0))
