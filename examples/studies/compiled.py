@@ -321,8 +321,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--cases", nargs="+", choices=CASES, help="of agreement and ticks")
-    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=[*ROBOTS])
+    parser.add_argument(
+        "--cases", nargs="+", choices=CASES, metavar="CASE", help="of agreement and ticks"
+    )
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, metavar="ROBOT", default=[*ROBOTS])
     parser.add_argument("--rows", type=int, default=100_000, help="of each model (100000)")
     parser.add_argument("--steps", type=int, default=10_000, help="of each robot (10000)")
     parser.add_argument("--targets", type=int, default=10_000, help="in reach, each robot (10000)")

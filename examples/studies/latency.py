@@ -136,7 +136,7 @@ def _figure(found: dict[str, Latencies]) -> Any:
         axis.set(xscale="log", yscale="log", xlim=(1.0, 1e4), ylim=(0.5, None), title=title)
         axis.set_xlabel("time [µs]; dashed: the worst tick")
     axes[0].set_ylabel("ticks")
-    axes[1].legend(loc="upper right")
+    axes[0].legend(loc="upper right")
     return figure
 
 

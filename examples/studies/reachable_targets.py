@@ -178,12 +178,14 @@ def reached_targets(
         target = forward(draw(robot, kind, n, rng)).detach()
         anywhere = draw(robot._replace(rows=None), "inside", n, rng)
         for start in STARTS:
+            q0 = None if start == "rest" else anywhere.numpy()
             began = time.process_time()
-            solution = ik.solve(target, None if start == "rest" else anywhere, tol=TOL, **options)
+            solution = ik.solve(target.numpy(), q0, tol=TOL, **options)
             seconds = time.process_time() - began
+            q = torch.from_numpy(solution.q)
             with torch.no_grad():
-                error = (forward(solution.q) - target).norm(dim=-1)
-            beyond = ((solution.q < robot.q_min) | (solution.q > robot.q_max)).any(-1)
+                error = (forward(q) - target).norm(dim=-1).numpy()
+            beyond = ((q < robot.q_min) | (q > robot.q_max)).any(-1)
             statuses = [IKStatus(code).name for code in solution.status.tolist()]
             entries.append(
                 {
@@ -195,7 +197,7 @@ def reached_targets(
                     "false": int((solution.converged & (error > TOL)).sum()),
                     "violated": int(beyond.sum()),
                     "largest": float(error.max()),
-                    "starts": float(solution.n_starts.double().mean()),
+                    "starts": float(solution.n_starts.mean()),
                     "seconds": seconds,
                 }
             )
