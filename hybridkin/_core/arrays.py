@@ -138,8 +138,8 @@ def leading(pairs: Sequence[tuple[Tensor, int]]) -> tuple[int, ...]:
     """Return the common batch shape of tensors, each with its number of trailing axes."""
     shapes = [tuple(a.shape[: a.ndim - trailing]) for a, trailing in pairs]
     try:
-        return tuple(torch.broadcast_shapes(*shapes))
-    except RuntimeError as error:
+        return np.broadcast_shapes(*shapes)  # torch's loads half a second of modules first
+    except ValueError as error:
         need = "configurations and targets must agree in their batch shapes"
         raise ValueError(f"{need}, got {shapes}.") from error
 
