@@ -124,7 +124,7 @@ def test_against_quadratic_programs(race, seven_joints, peer, limits):
     ours, theirs = ik.tracker(START), peer(seven_joints)
 
     def tip(q):
-        return chain(torch.from_numpy(q)).numpy()
+        return chain(torch.tensor(q)).numpy()
 
     center = tip(START)
     goal = center + np.array([0.02, 0.05, -0.03])
