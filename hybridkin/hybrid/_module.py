@@ -294,8 +294,12 @@ class HybridModule(ForwardModel):
 
 def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
     """Return how a correction fades at rows q (N, n), None where all are inside the domain."""
-    inside = bool((distance <= 1.0).all())  # a NaN is not
-    return None if inside else guard.weight_and_jacobian(q)
+    rows = (~(distance <= 1.0)).nonzero()[:, 0]  # those outside, where NaN is one
+    if not len(rows):
+        return None
+    weight, slope = guard.weight_and_jacobian(q[rows])
+    whole, flat = q.new_ones(len(q), 1), q.new_zeros(len(q), 1, q.shape[1])
+    return whole.index_copy(0, rows, weight), flat.index_copy(0, rows, slope)
 
 
 def _plus(
