@@ -125,7 +125,7 @@ def _sizes(right: NDArray, far: NDArray, own: bool) -> NDArray:
     return np.where(far, size[far].max(initial=0.0), size[~far].max())
 
 
-def _random_settings(low: NDArray, high: NDArray, rng: np.random.Generator) -> dict[str, Any]:
+def random_settings(low: NDArray, high: NDArray, rng: np.random.Generator) -> dict[str, Any]:
     """Return settings of inverse kinematics."""
     n, span, narrower = len(low), high - low, 0.3 * rng.integers(0, 2, 2)
     chosen: dict[str, Any] = {
@@ -175,7 +175,7 @@ def steps(robot: Robot, n: int, rng: np.random.Generator) -> dict[str, Any]:
     names = ("move", "dq", "control", "move_off", "dq_off", "control_off")
     found: dict[str, Any] = {"n": n, "flags": 0, "outside": 0, **dict.fromkeys(names, 0.0)}
     for _ in range(_SETTINGS):
-        given = _random_settings(low, high, rng)
+        given = random_settings(low, high, rng)
         ik = InverseKinematics(robot.model, **given)
         q, goal = _starts_of_steps(given["q_min"], given["q_max"], -(-n // _SETTINGS), rng)
         with torch.no_grad():

@@ -16,8 +16,7 @@ from hybridkin._core.stored import Layout
 from hybridkin.hybrid._features import Readout
 from hybridkin.hybrid._guards import Guard, LeverageGuard
 from hybridkin.learning.regressor_modules import AffineModule
-
-_ROUNDING = 1e-7  # of weights that sum to one
+from hybridkin.native.plan import ROUNDING
 
 
 class Inside:
@@ -265,7 +264,7 @@ class HybridModule(ForwardModel):
             # Inner corrections bring f along. df/dq is needed where their weights leave a share.
             inner = (weight for weight, c in self._parts() if isinstance(c, InnerCorrection))
             share = 1.0 - sum(inner)
-            if share > _ROUNDING:
+            if share > ROUNDING:
                 total = share * inside.x, share * inside.jacobian
         elif self.mechanical is not None:
             total = self.mechanical.forward_and_jacobian(q)

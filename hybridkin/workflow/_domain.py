@@ -118,8 +118,7 @@ class Domain:
         if self.has_tendons:
             candidates.insert(0 if trained is None else 1, np.zeros(self.loaded.n_actuators))
         q = np.clip(candidates, limits.q_min, limits.q_max)
-        with torch.no_grad():
-            distance = self.loaded.module.domain_distance(torch.from_numpy(q)).numpy()
+        distance = self.loaded.domain_distance(q)
         return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
 
     @property
@@ -143,7 +142,7 @@ class Domain:
             q[:] = self.preferred
             for _ in range(_STEPS):
                 ahead = q + _STEP * (high - low) * rng.standard_normal(q.shape) @ self.bending
-                inside = self.loaded.module.in_domain(torch.from_numpy(ahead)).numpy()
+                inside = self.loaded.domain_distance(ahead) <= 1.0
                 inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
                 q[inside] = ahead[inside]
             # Beside the preferred one, which may be exactly straight.

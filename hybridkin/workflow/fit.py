@@ -28,6 +28,7 @@ from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.regressor_modules import error_module
+from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import save_model
 from hybridkin.workflow._fit_report import (
     auto_entry,
@@ -398,8 +399,7 @@ def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
     """Return the errors (N,) on test rows of a model, fitted to training rows; it does not warn."""
     model.fit_with_messages(train.q, train.x, groups=train.groups)
     q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
-    with torch.no_grad():
-        return distance(model.module_(torch.from_numpy(np.array(q, dtype=float))).numpy(), test.x)
+    return distance(evaluate(model.module_, np.array(q, dtype=float))[0], test.x)
 
 
 def _choose(rows: _Rows, *, hybrid: bool) -> tuple[float | None, str | None]:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from hybridkin._core.digests import row_digests
@@ -17,6 +16,7 @@ from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
+from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import load_model, model_header
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
@@ -106,8 +106,11 @@ class LoadedModel:
 
     def tips(self, q: NDArray) -> NDArray:
         """Return tips (N, 3) [m] where the actuators do q (N, n), whatever the play."""
-        with torch.no_grad():
-            return self.module(torch.from_numpy(np.ascontiguousarray(q))).numpy()
+        return evaluate(self.module, np.array(q, dtype=float))[0]
+
+    def domain_distance(self, q: NDArray) -> NDArray:
+        """Return how far rows q (N, n) are from those of the fit, at most 1 in the domain."""
+        return evaluate(self.module, np.array(q, dtype=float), value=False, distance=True)[0]
 
     def was_fitted(self, q: NDArray, x: NDArray, motions: NDArray) -> NDArray[np.bool_] | None:
         """Return whether rows were fitted (N,): themselves, to a micrometre, or half their motion.

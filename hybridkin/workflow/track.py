@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.units import METRES
@@ -107,7 +106,7 @@ def track_path(
     whole, n_lead = _with_lead_in(track, stands, domain)
     sent = whole.q if loaded.play is None else loaded.play.command(whole.q)[0]
     speeds = np.abs(np.diff(whole.q, axis=0) / np.diff(whole.t)[:, None])
-    inside = loaded.module.in_domain(torch.from_numpy(track.q)).double().mean()
+    inside = (loaded.domain_distance(track.q) <= 1.0).mean()
     report = Report(f"{loaded.name}: a path of {len(path)} points")
     report.record.update(
         model=str(loaded.path),

@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from compiled import random_settings
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -36,24 +37,6 @@ STEP = ("dq", "x", "error", "sigma_min", "damping", "saturated")
 ATOL = {"dq": 1e-9, "x": 1e-12, "error": 1e-12, "sigma_min": 1e-5, "damping": 1e-5}
 
 
-def random_settings(draw, n, low, high):
-    span = high - low
-    chosen = {
-        "q_min": low + draw.choice([0.0, 0.3]) * span * draw.random(n),
-        "q_max": high - draw.choice([0.0, 0.3]) * span * draw.random(n),
-        "beta": float(draw.choice([0.0, 1.0, 100.0])),
-        "damping": "adaptive" if draw.random() < 0.7 else float(draw.choice([0.01, 0.1])),
-    }
-    more = {
-        "dq_max": span * 10.0 ** draw.uniform(-1, 2, n),
-        "weights": 10.0 ** draw.uniform(-1, 1, n),
-        "gain": 50.0,
-        "limits": "off",
-        "q_pref": draw.uniform(low, high, n),
-    }
-    return chosen | {name: value for name, value in more.items() if draw.random() < 0.3}
-
-
 def random_rows(draw, chain, low, high, rows, settings):
     """Rows inside, outside and at the limits, bent and nearly straight, and some not finite."""
     n = chain.n_actuators
@@ -77,7 +60,9 @@ def test_steps_are_those_of_torch(name):
     chain, low, high = CHAINS[name]
     draw, held = np.random.default_rng(0), 0
     for _ in range(12):
-        settings = random_settings(draw, chain.n_actuators, low, high)
+        limits = (np.full(chain.n_actuators, bound) for bound in (low, high))
+        settings = random_settings(*limits, draw)
+        settings["damping"] = settings["damping"] or 0.01  # without any, rounding is as large
         ik = InverseKinematics(chain, **settings)
         q, x = random_rows(draw, chain, low, high, 160, settings)
         dx = draw.choice([0.0, 0.1]) * draw.standard_normal(x.shape)
