@@ -1,0 +1,135 @@
+"""What a fitted hybrid model answers: tips, Jacobians, their parts and their domain."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils.validation import check_is_fitted
+
+from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin.chains.chain import Chain
+from hybridkin.chains.play import PlayOperator
+from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._radius import Radius
+from hybridkin.learning.hidden_layer import check_inputs
+from hybridkin.native.library import evaluate
+
+
+class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """The methods of a `HybridForwardModel` that answer from what `fit` found."""
+
+    output: str
+    module_: HybridModule
+    mechanical_model_: ForwardModel | None
+    play_: PlayOperator | None
+    radius_: Radius | None
+    _single_output: bool
+
+    def predict(self, X: Any, return_radius: bool = False, groups: ArrayLike | None = None) -> Any:
+        """Return tip positions f_mech(q) + w(q) eps(q).
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n)
+            Actuator vectors; with `play` those of a motion in the order of time.
+        return_radius : bool, default=False
+            Whether to return the estimated error radius as well; needs `coverage`.
+        groups : array-like of shape (N,), optional
+            Motion of every row; only `play` depends on it. Default: one motion.
+
+        Returns
+        -------
+        x : ndarray of shape (N, m), or (N,) as in `fit`
+            Tips [m]; of poses also rotation vectors up to pi long [rad].
+        radius : ndarray of shape (N,)
+            Only if `return_radius`: a share `coverage` of the tips lies within [m], if the groups
+            of the fit and the new ones are exchangeable. Infinite where no radius is known: outside
+            the domain (`in_domain`), and everywhere if the fit had too few groups.
+        """
+        if not return_radius:
+            return self._evaluated(evaluate, X, groups)[0]
+        check_is_fitted(self)
+        if self.radius_ is None:
+            raise ValueError(
+                "`return_radius` needs a model that was fitted with `coverage`, for example "
+                "HybridForwardModel(..., coverage=0.9)."
+            )
+        x, inside = self._evaluated(_with_domain, X, groups)
+        return x, self.radius_.at(inside).astype(x.dtype)
+
+    def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+        """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
+        chain = None if self.output == "pose" else self.mechanical_model_
+        if chain is None:
+            return self._evaluated(_method("mechanical_part"), X, groups)[0]
+        return self._evaluated(lambda m, q: evaluate(chain, q), X, groups)[0]
+
+    def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+        """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
+        return self._evaluated(_method("error_part"), X, groups, warn=False)[0]
+
+    def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+        """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
+
+        Of poses the last three rows give the angular velocity in the measuring frame.
+        """
+        return self._evaluated(partial(evaluate, jacobian=True), X, groups)[1]
+
+    def predict_and_jacobian(
+        self, X: ArrayLike, groups: ArrayLike | None = None
+    ) -> tuple[NDArray, NDArray]:
+        """Return `predict(X)` and `jacobian(X)` in one pass."""
+        x, J = self._evaluated(partial(evaluate, jacobian=True), X, groups)
+        return x, J
+
+    def in_domain(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
+        """Return whether eps is fully trusted at each row, shape (N,)."""
+        return self._evaluated(partial(_with_domain, value=False), X, groups, warn=False)[0]
+
+    def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+        """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
+        return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
+
+    def _effective(self, X: NDArray, groups: ArrayLike | None) -> NDArray:
+        """Return the motion of the actuators, where there is play."""
+        if self.play_ is None or not len(X):
+            return X
+        return self.play_.apply_by_group(X, np.zeros(len(X)) if groups is None else groups)
+
+    def _evaluated(
+        self,
+        function: Callable[[HybridModule, NDArray], Sequence[NDArray]],
+        X: Any,
+        groups: ArrayLike | None,
+        warn: bool = True,
+    ) -> list[NDArray]:
+        """Return what a function of the module gives for the rows of X, in the dtype of X."""
+        check_is_fitted(self, "module_")
+        X = check_inputs(self, X)
+        q = self._effective(X, groups).astype(np.float64)
+        if warn and isinstance(chain := self.mechanical_model_, Chain):
+            rows = torch.from_numpy(q)  # finite; lengths below zero are extrapolation
+            for message in (*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")):
+                if message is not None:
+                    warnings.warn(message, stacklevel=3)
+        arrays = function(self.module_.rows(), q)
+        arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
+        return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
+
+
+def _method(name: str) -> Callable[[HybridModule, NDArray], Sequence[NDArray]]:
+    """Return what computes a method of a module for rows q."""
+    return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
+
+
+def _with_domain(module: HybridModule, q: NDArray, value: bool = True) -> list[NDArray]:
+    """Return x of rows q where asked for, and whether they lie within the domain."""
+    *x, distance = evaluate(module, q, value, distance=True)
+    return [*x, distance <= 1.0]
