@@ -20,8 +20,8 @@ _AS_IF = 0.1  # of the range: the spread that is assumed in such a direction
 class Guard(PortableModule):
     """Trust in a correction: a weight g(q), and a length that no correction exceeds by far.
 
-    The weight is 1 where `domain_distance` is at most 1, and fades outside. Weight and shortening
-    are twice continuously differentiable, so the full Jacobian is continuous.
+    The weight is 1 where `domain_distance` is at most `FULL`, and fades outside. Weight and
+    shortening are twice continuously differentiable, so the full Jacobian is continuous.
 
     Parameters
     ----------
@@ -31,6 +31,7 @@ class Guard(PortableModule):
     """
 
     MOST = 1.5
+    FULL = 1.0
 
     def __init__(self, largest: Tensor) -> None:
         super().__init__()
@@ -42,7 +43,7 @@ class Guard(PortableModule):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return g(q), shape (..., 1)."""
-        excess = (self.domain_distance(q) - 1.0).clamp(min=0.0)
+        excess = (self.domain_distance(q) / self.FULL - 1.0).clamp(min=0.0)
         return (1.0 / (1.0 + excess**3))[..., None]
 
     def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -88,6 +89,9 @@ class Guard(PortableModule):
 class LeverageGuard(Guard):
     """Distance from the training rows by the leverage phi^T (G + lambda 1)^-1 phi of a model.
 
+    Errors outside the domain are not known, but up to `FULL` times its limit a correction still
+    removes more error than it adds: the radius ends at the domain, the correction later.
+
     Parameters
     ----------
     model : LeverageModule
@@ -100,6 +104,7 @@ class LeverageGuard(Guard):
     """
 
     layout = Layout("leverage_guard", {"limit": "", "largest": ""}, parts=("model",))
+    FULL = 3.0
 
     def __init__(self, model: LeverageModule, limit: Tensor, largest: Tensor) -> None:
         super().__init__(largest)

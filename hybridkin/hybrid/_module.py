@@ -292,8 +292,8 @@ class HybridModule(ForwardModel):
 
 
 def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
-    """Return how a correction fades at rows q (N, n), None where all are inside the domain."""
-    rows = (~(distance <= 1.0)).nonzero()[:, 0]  # those outside, where NaN is one
+    """Return how a correction fades at rows q (N, n), None where all count in full."""
+    rows = (~(distance <= guard.FULL)).nonzero()[:, 0]  # the others, where NaN is one
     if not len(rows):
         return None
     weight, slope = guard.weight_and_jacobian(q[rows])

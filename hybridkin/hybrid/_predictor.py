@@ -90,7 +90,22 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return x, J
 
     def in_domain(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
-        """Return whether eps is fully trusted at each row, shape (N,)."""
+        """Return whether each row lies in the domain, as close to the training rows as these are.
+
+        Errors of rows outside it are not known, even where eps still counts in full.
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n)
+            Actuator vectors.
+        groups : array-like of shape (N,), optional
+            Motion of every row; only `play` depends on it.
+
+        Returns
+        -------
+        inside : ndarray of bool of shape (N,)
+            True everywhere where nothing guards the error model.
+        """
         return self._evaluated(partial(_with_domain, value=False), X, groups, warn=False)[0]
 
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:

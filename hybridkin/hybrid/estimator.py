@@ -73,11 +73,12 @@ class HybridForwardModel(HybridPredictor):
         Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
         in every fold of a cross-validation. "default": the chain's own list.
     guard : {"leverage", "box", None}, default="leverage"
-        Where eps is trusted. "leverage": where the inputs are as close to the training rows as
-        these are to each other, in the hidden features of a network at the tip, for other error
-        models in the inputs and their squares; "box": within the training range;
-        None: everywhere. Outside, eps fades out and f_mech remains. With a guard f_hyb is nowhere
-        farther from f_mech than 1.5 times the longest correction of a training row.
+        Where eps is trusted. "leverage": the domain is where the inputs are as close to the
+        training rows as these are to each other, in the hidden features of a network at the tip,
+        for other error models in the inputs and their squares; eps fades out from three times this
+        distance on, and f_mech remains. "box": the domain is the training range, and eps fades out
+        from its edge on. None: everywhere. With a guard f_hyb is nowhere farther from f_mech than
+        1.5 times the longest correction of a training row.
     play : float, array-like of shape (n,) or "auto", optional
         Play (backlash) of the actuators [unit of q]: rows are commands in the order of time, and
         the model maps the motion of the actuators, see `PlayOperator`. "auto" takes the width with

@@ -175,6 +175,25 @@ def test_hybrids_are_those_of_torch(coupling, kind, trust, drifting, weight):
         assert_as_in_torch(module, inputs(spread, 19), tol=2e-12 if spread > 10 else 1e-12)
 
 
+@pytest.mark.parametrize("coupling", ["parallel", "serial"])
+def test_corrections_beside_the_limits_of_domain_and_weight(coupling):
+    """Rows within the domain, outside it but in full, and faded, also side by side in a block."""
+    module = hybrid("quadratic", coupling, "leverage", drifting=True)
+    module.corrections[0].guard.largest.fill_(1.0)
+    q = inputs(1.5, 200)
+    distance = module.domain_distance(torch.from_numpy(q)).detach().numpy()
+    inside, full = distance <= 1.0, (distance > 1.0) & (distance <= 3.0)
+    faded = (distance > 3.0) & (distance < 6.0)
+    assert min(inside.sum(), full.sum(), faded.sum()) > 5
+    free = hybrid("quadratic", coupling, None, drifting=True)
+    whole, found = (program_of(m).evaluate(q, True) for m in (free, module))
+    for ours, theirs in zip(found[:2], whole[:2], strict=True):
+        assert_close_rows(ours[inside | full], theirs[inside | full], 1e-12)
+        assert np.abs(ours[faded] - theirs[faded]).max() > 1e-4
+    for rows in (inside, full, faded, inside | faded):
+        assert_as_in_torch(module, q[rows])
+
+
 @pytest.mark.parametrize("longest", [0.0, 1e-4])
 @pytest.mark.parametrize("coupling", ["parallel", "serial"])
 def test_corrections_that_are_too_long(coupling, longest):

@@ -171,17 +171,19 @@ static inline void HK(guard_slope)(
     }
 }
 
-/* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. Returns whether
-   any row fades; else g is 1 and the slope is not written. */
+/* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. By a leverage the
+   excess begins at three times the limit of the domain. Returns whether any row fades; else g is 1
+   and the slope is not written. */
 static inline int HK(fading)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *distance,
                              V *g, V *slope) {
+    const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? R(3.0) : R(1.0);
     *g = SPLAT(1.0);
     *distance = HK(guard_distance)(p, at, q, seen);
-    if (!HK(any)(NOT(*distance <= SPLAT(1.0)))) return 0;
-    const V excess = HK(max)(*distance - R(1.0), SPLAT(0.0));
+    if (!HK(any)(NOT(*distance <= SPLAT(full)))) return 0;
+    const V excess = HK(max)(*distance / full - R(1.0), SPLAT(0.0));
     *g = R(1.0) / (R(1.0) + excess * excess * excess);
     if (!slope) return 1;
-    const V along = -(*g * *g) * (R(3.0) * excess * excess);
+    const V along = -(*g * *g) * (R(3.0) * excess * excess) / full;
     HK(guard_slope)(p, at, q, seen, slope);
     for (int j = 0; j < p->code[at + HK_N]; j++) slope[j] = slope[j] * along;
     return 1;
