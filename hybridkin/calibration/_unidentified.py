@@ -31,7 +31,7 @@ def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
     to_steps = problem.prior_std * units / np.array([size for size, _ in steps])
     columns = 1e3 * fit.jacobian * problem.prior_std / np.sqrt(n_rows)  # [mm] of tip
     found = []
-    for move in _few_terms(directions):
+    for move in few_terms(directions):
         # Led by the first with a fair share, which moves one step.
         lead = int(np.argmax(np.abs(move) > _FAIR * np.abs(move).max()))
         move = move / (move[lead] * to_steps[lead])
@@ -72,7 +72,7 @@ def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float
     return [term for *_, term in sorted(terms)]
 
 
-def _few_terms(directions: NDArray) -> NDArray:
+def few_terms(directions: NDArray) -> NDArray:
     """Return a basis (K, P) of the span of orthonormal rows, each of few entries.
 
     The least sum of absolute entries for each entry held, then the shortest that are independent.

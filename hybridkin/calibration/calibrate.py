@@ -18,22 +18,18 @@ from hybridkin._core.arrays import Numbers, as_tensor, check_shape, labels
 from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
-from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import LOSSES, Fit, Rows, solve
-from hybridkin.calibration._parameters import ALIASES, Problem, parameter_names
+from hybridkin.calibration._parameters import ALIASES, parameter_names
+from hybridkin.calibration._search import Start, search
 from hybridkin.calibration._unidentified import sentences
 from hybridkin.calibration.measured import check_finite, folds
 from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
 
-_WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
 # Identified below this share of the prior: k parameters that share one unidentified direction
 # narrow to 1 / sqrt(k) by the prior alone.
 _IDENTIFIED = 0.1
-_EQUAL = 1.0 - 1e-4  # of guesses that explain the tips alike the given chain counts
-_BETTER = 0.8  # another handedness than the given one must lower the error to this share,
-_FAR_BETTER = 0.5  # and to this share where the user has not asked for it
 _FEW, _LEFT = 10, 0.5  # a quarter of the variance
 _MEASURED = ("radii", "lengths")  # sizes that a ruler measures:
 _UNPHYSICAL = 1.75  # a change by this factor is a warning
@@ -213,8 +209,12 @@ def fit_geometry(
     prior: float | Mapping[str, float] = 0.5,
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
+    start: Start | None = None,
 ) -> tuple[CalibrationResult, list[str]]:
-    """Return what `calibrate` returns, and the messages of its warnings; nothing is issued."""
+    """Return what `calibrate` returns, and the messages of its warnings; nothing is issued.
+
+    A `start`, as `search` finds it for the same chain and parameters, replaces the search.
+    """
     if not isinstance(chain, Chain):
         raise TypeError(
             "`chain` must be a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain or "
@@ -232,20 +232,13 @@ def fit_geometry(
     first, counts, _ = distinct_rows(q, x, weights, groups)
     weights = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
     rows = Rows(q[first], x[first], weights)
-    stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
-    stds = {name: min(float(stds.get(name, 0.5)), _WIDEST) for name in names}
-    with torch.no_grad():
-        guesses = initial_guesses(chain, rows, names)
-    fits = []
-    for guess in guesses:
-        problem = Problem.of(guess.chain, names, bounds or {}, stds)
-        start = problem.start(guess.scale)
-        fits.append(solve(problem, rows, start, loss, roughly=len(guesses) > 1))
-    best, message = _best(fits, guesses, bool({"angles", "turns"} & {*names}))
-    if len(guesses) > 1:
-        best = solve(best.problem, rows, best.theta, loss)
+    if start is None:
+        stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
+        stds = {name: float(stds.get(name, 0.5)) for name in names}
+        start = search(chain, rows, names, loss, bounds or {}, stds)
+    best = solve(start.problem, rows, start.theta, loss)
     unphysical, left = _unphysical(best)
-    messages += [message, _few(best, rows), left, best.chain().contradiction(q)]
+    messages += [start.message, _few(best, rows), left, best.chain().contradiction(q)]
     if not any(messages[:-4]):  # of the units
         messages.append(_unexplained(best, rows))
     cv_rmse = None
@@ -254,28 +247,6 @@ def fit_geometry(
     result = _result(best, rows, cv_rmse, unphysical, torch_given)
     result.chain.to(device)
     return result, [message for message in messages if message is not None]
-
-
-def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit, str | None]:
-    """Return the best fit, and a warning where it is a mirror image that nobody asked for.
-
-    Of equals the first is the best, a mirror image only where it is clearly better.
-    """
-    best, image = fits[0], None
-    for fit, guess in zip(fits[1:], guesses[1:], strict=True):
-        if not any(guess.mirrored):
-            best = fit if fit.rmse < _EQUAL * best.rmse else best
-        elif image is None or fit.rmse < image.rmse:
-            image = fit
-    if image is None or image.rmse >= (_BETTER if free_angles else _FAR_BETTER) * best.rmse:
-        return best, None
-    if free_angles:
-        return image, None
-    return image, (
-        f"the actuators run the other way round than in `chain`: its mirror image leaves "
-        f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
-        "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`."
-    )
 
 
 def _few(fit: Fit, rows: Rows) -> str | None:

@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold, KFold
 
+_INNER, _BEYOND = 0.4, 0.65  # of rows by distance: the inner ones, where the outer ones begin
+_EXCITED = 0.01  # of the largest spread
+
 
 def check_finite(**arrays: ArrayLike) -> None:
     """Raise where rows of numbers hold NaN or infinity."""
@@ -55,3 +58,15 @@ def folds(
         return [*KFold(n_folds, shuffle=True, random_state=0).split(X)]
     splitter = GroupKFold(n_folds, shuffle=shuffle, random_state=0 if shuffle else None)
     return [*splitter.split(X, groups=groups)]
+
+
+def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the inner 40 % and the outer 35 % of rows by Mahalanobis distance from the mean.
+
+    The rows between are left out, so that the outer ones are an extrapolation. Directions that are
+    not excited do not count.
+    """
+    axes, spread, _ = np.linalg.svd(X - X.mean(axis=0), full_matrices=False)
+    excited = spread > _EXCITED * spread.max(initial=0.0)
+    order = np.argsort(np.linalg.norm(axes[:, excited], axis=1), kind="stable")
+    return np.sort(order[: int(_INNER * len(X))]), np.sort(order[int(_BEYOND * len(X)) :])

@@ -1,0 +1,81 @@
+"""Where the least squares of a calibration start: the best of rough fits from several guesses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridkin.calibration._initial_guesses import Guess, initial_guesses
+from hybridkin.calibration._least_squares import Fit, Rows, solve
+from hybridkin.calibration._parameters import Problem
+from hybridkin.chains.chain import Chain
+
+_WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
+_EQUAL = 1.0 - 1e-4  # of guesses that explain the tips alike the given chain counts
+_BETTER = 0.8  # another handedness than the given one must lower the error to this share,
+_FAR_BETTER = 0.5  # and to this share where the user has not asked for it
+
+
+class Start(NamedTuple):
+    """Where a search ended roughly, and a warning where the robot is mirrored."""
+
+    problem: Problem
+    theta: NDArray
+    message: str | None = None
+
+
+def search(
+    chain: Chain,
+    rows: Rows,
+    names: tuple[str, ...],
+    loss: str,
+    bounds: Mapping[str, tuple[float, float]],
+    prior: Mapping[str, float],
+) -> Start:
+    """Return the best start of a fit of the parameters with these names."""
+    stds = {name: min(std, _WIDEST) for name, std in prior.items()}
+    with torch.no_grad():
+        guesses = initial_guesses(chain, rows, names)
+    problems = [Problem.of(guess.chain, names, bounds, stds) for guess in guesses]
+    thetas = [problem.start(g.scale) for problem, g in zip(problems, guesses, strict=True)]
+    if len(guesses) == 1:
+        return Start(problems[0], thetas[0])
+    pairs = zip(problems, thetas, strict=True)
+    fits = [solve(problem, rows, theta, loss, roughly=True) for problem, theta in pairs]
+    best, message = _best(fits, guesses, bool({"angles", "turns"} & {*names}))
+    return Start(best.problem, best.theta, message)
+
+
+def widened(start: Start, names: tuple[str, ...], prior: Mapping[str, float]) -> Start:
+    """Return the start of a fit of more parameters, from where one of fewer ended."""
+    problem = Problem.of(start.problem.chain, names, {}, prior)
+    known = zip(start.problem.parameters, start.problem.parts(start.theta), strict=True)
+    found = {part.name: theta for part, theta in known}
+    theta = [found.get(part.name, np.zeros(part.size)) for part in problem.parameters]
+    return Start(problem, np.concatenate(theta), start.message)
+
+
+def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit, str | None]:
+    """Return the best fit, and a warning where it is a mirror image that nobody asked for.
+
+    Of equals the first is the best, a mirror image only where it is clearly better.
+    """
+    best, image = fits[0], None
+    for fit, guess in zip(fits[1:], guesses[1:], strict=True):
+        if not any(guess.mirrored):
+            best = fit if fit.rmse < _EQUAL * best.rmse else best
+        elif image is None or fit.rmse < image.rmse:
+            image = fit
+    if image is None or image.rmse >= (_BETTER if free_angles else _FAR_BETTER) * best.rmse:
+        return best, None
+    if free_angles:
+        return image, None
+    return image, (
+        f"the actuators run the other way round than in `chain`: its mirror image leaves "
+        f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
+        "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`."
+    )

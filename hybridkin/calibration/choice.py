@@ -1,0 +1,279 @@
+"""Which parameters of a chain to calibrate: chosen by errors inside and outside the fitted rows."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from hybridkin._core.arrays import Numbers, as_tensor
+from hybridkin.calibration._least_squares import Rows, solve
+from hybridkin.calibration._search import Start, search, widened
+from hybridkin.calibration._unidentified import few_terms
+from hybridkin.calibration.measured import folds, inner_and_outer
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+
+_MOST, _FEW, _FOLDS = 400, 40, 3  # rows for the scores, rows for a choice
+_EQUAL = 0.02  # of the score: then the smaller set is taken
+_EXACT = 1e-6  # of the reach: smaller errors are equal
+_TIED = 0.01  # of the largest spread of q: not excited
+_MOVES = 0.05  # of the largest move of the tip
+
+_STIFF = ("bending_stiffness", "axial_stiffness")
+_EXTENSIBLE = (
+    ("radii", "base"),
+    ("radii", "rest_bends", "base"),
+    ("radii", "turns", "offsets", "rest_bends", "base"),
+    ("radii", "angles", "rest_bends", "offsets", "actuator_zeros", "base"),
+)
+_TENDONS = (
+    ("radii", "base"),
+    ("radii", "turns", "rest_bends", "base"),
+    ("radii", "turns", "rest_bends", "lengths", "tool", "base"),
+)
+_ELASTIC = (
+    ("base", *_STIFF),
+    ("turns", "rest_bends", "tool", "base", *_STIFF, "tendon_zeros"),
+    ("turns", "rest_bends", "tool", "base", *_STIFF, "tendon_zeros", "radii", "lengths"),
+)
+
+
+class Errors(NamedTuple):
+    """Mean tip distances of a set of parameters [m]; NaN where they were not needed."""
+
+    cv: float  # held-out motions, or rows
+    io: float  # the outer rows, after a fit to the inner ones
+
+    @property
+    def score(self) -> float:
+        """What the choice minimises: `cv` times the square of `io`, or `cv` alone."""
+        return self.cv if np.isnan(self.io) else self.cv * self.io**2
+
+
+@dataclass(frozen=True)
+class GeometryChoice:
+    """What to calibrate, and where its search starts.
+
+    Attributes
+    ----------
+    chain : Chain
+        The given chain, or elastic tendons of its geometry.
+    parameters : tuple of str
+        What to calibrate; empty: nothing.
+    start : Start or None
+        Where the search for these starts, for `fit_geometry`; None without parameters.
+    name : str
+        The set, as in `errors`.
+    errors : dict of str to Errors
+        Errors of all sets that were tried; empty where there was nothing to choose.
+    messages : tuple of str
+        Warnings about the log.
+    """
+
+    chain: Chain
+    parameters: tuple[str, ...]
+    start: Start | None
+    name: str
+    errors: dict[str, Errors]
+    messages: tuple[str, ...] = ()
+
+
+class _Rung(NamedTuple):
+    """One set of parameters."""
+
+    name: str
+    chain: Chain
+    parameters: tuple[str, ...]
+
+
+def choose_geometry(
+    chain: Chain,
+    q: Numbers,
+    x: Numbers,
+    *,
+    groups: ArrayLike | None = None,
+    weights: Numbers | None = None,
+    loss: str = "linear",
+    outside: bool = True,
+    parameters: Sequence[str] | None = None,
+) -> GeometryChoice:
+    """Return the set of parameters to calibrate that errs least on new motions, and outside.
+
+    The sets grow from nothing, the base, the radii to the whole geometry; where tendons of a
+    `ConstantCurvatureChain` contradict each other, elastic tendons of the same geometry follow. A
+    set has the score ``cv * io**2``: `cv` is the mean tip distance on held-out motions, `io` that
+    on the outer 35 % of the rows after a fit to the inner 40 %. The smallest set with nearly the
+    least score is taken.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal chain; it is not changed.
+    q : array or Tensor of shape (N, n_actuators)
+        Actuator vectors [m or rad].
+    x : array or Tensor of shape (N, 3)
+        Measured tip positions [m].
+    groups : array-like of shape (N,), optional
+        Motion of every row. Of one motion stretches are held out, without groups rows.
+    weights : array-like of shape (N,), optional
+        How many times each row counts.
+    loss : str, default="linear"
+        As in `calibrate`.
+    outside : bool, default=True
+        Whether `io` counts; without it the score is `cv`.
+    parameters : sequence of str, optional
+        The set to calibrate. Then the only choice is whether the tendons are elastic.
+
+    Returns
+    -------
+    GeometryChoice
+        What to calibrate, and the errors of all sets.
+    """
+    given, chain = chain, copy.deepcopy(chain).cpu()
+    dtype = chain.geometry()["base"].dtype
+    q, x = (as_tensor(part, name).to("cpu", dtype) for part, name in ((q, "q"), (x, "x")))
+    kept = np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
+    kept = np.sort(kept[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)])
+    counts = q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
+    rows = Rows(q[kept], x[kept], counts[kept])
+    with torch.no_grad():
+        rungs = _rungs(chain, q, parameters)
+        tied = () if parameters is not None else _tied(chain, q)
+    starts = _starts(rungs, rows, loss)
+    best, errors = 0, {}
+    if len(rungs) > 1:
+        motions = None if groups is None else np.asarray(groups)[kept]
+        splits = [(1, *split) for split in _splits(rows, motions)]
+        if outside and len(kept) >= _FEW:
+            splits.append((0, *inner_and_outer(rows.q.numpy())))
+        found = [_errors(rung, at, rows, splits, loss) for rung, at in zip(rungs, starts, strict=True)]
+        least = _EXACT * float(chain.reach)
+        scores = np.array([Errors(*np.maximum(one, least)).score for one in found])
+        best = int(np.argmax(scores <= (1.0 + _EQUAL) * scores.min()))
+        errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
+    name, chosen, names = rungs[best]
+    return GeometryChoice(
+        given if chosen is chain else chosen, names, starts[best], name, errors, tied
+    )
+
+
+def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_Rung]:
+    """Return the sets to choose from, the smaller ones first."""
+    elastic = None
+    if isinstance(chain, ConstantCurvatureChain) and chain.lengths is not None:
+        if chain.contradictory(q).any():
+            elastic = ElasticTendonChain.from_chain(chain)
+    if parameters is not None:
+        names = tuple(parameters)
+        rungs = [_rung(chain, names)]
+        if elastic is not None:
+            own = elastic.default_parameters
+            # A plain chain's lengths and radii compensate slack; elastic tendons need no change.
+            kept = [name for name in names if name not in ("radii", "lengths", "actuator_zeros")]
+            if names != chain.default_parameters:
+                own = (*kept, *(name for name in own if name not in ("radii", "lengths", *kept)))
+            rungs.append(_rung(elastic, own))
+        return rungs
+    if not isinstance(chain, ArcChain):
+        sets = ((), chain.default_parameters)
+    elif isinstance(chain, ElasticTendonChain):
+        sets = ((), ("base",), *_ELASTIC)
+    else:
+        sets = ((), ("base",), *(_EXTENSIBLE if chain.lengths is None else _TENDONS))
+    if len(q) < _FEW:
+        return [_rung(chain, ("radii", "base") if isinstance(chain, ArcChain) else sets[-1])]
+    rungs = [_rung(chain, names) for names in sets]
+    return rungs + ([] if elastic is None else [_rung(elastic, names) for names in _ELASTIC])
+
+
+def _rung(chain: Chain, names: tuple[str, ...]) -> _Rung:
+    words = [name for name in names if name not in _STIFF]
+    words += ["stiffnesses"] if len(words) < len(names) else []
+    kind = "elastic tendons: " if isinstance(chain, ElasticTendonChain) else ""
+    return _Rung(kind + (" + ".join(words) or "nothing"), chain, names)
+
+
+def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]:
+    """Return where the search of every set starts; a larger one starts from a smaller one."""
+    starts: list[Start | None] = []
+    for rung in rungs:
+        names = set(rung.parameters)
+        before = None
+        for one, start in zip(rungs, starts, strict=False):
+            ring = {"radii", "turns", "angles"} & names <= {*one.parameters} | (
+                {"angles"} if "turns" in one.parameters else set()
+            )
+            if start is not None and one.chain is rung.chain and ring:
+                before = start
+        stds = dict.fromkeys(rung.parameters, 0.5)
+        if not names:
+            starts.append(None)
+        elif before is None:
+            starts.append(search(rung.chain, rows, rung.parameters, loss, {}, stds))
+        else:
+            at = widened(before, rung.parameters, stds)
+            fit = solve(at.problem, rows, at.theta, loss, roughly=True)
+            starts.append(at._replace(theta=fit.theta))
+    return starts
+
+
+def _splits(rows: Rows, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
+    """Return folds of motions or rows; of a single motion stretches of it."""
+    n = len(rows.q)
+    if groups is not None and len(np.unique(groups)) < 2:
+        groups = np.arange(n) * 10 // n
+    return folds(rows.q, groups, _FOLDS, shuffle=True)
+
+
+def _errors(
+    rung: _Rung,
+    start: Start | None,
+    rows: Rows,
+    splits: list[tuple[int, NDArray, NDArray]],
+    loss: str,
+) -> Errors:
+    totals = np.zeros((2, 2))  # of io and cv: weights, and weighted distances
+    for kind, train, test in splits:
+        chain, held_out = rung.chain, Rows(*(part[test] for part in rows))
+        if start is not None:
+            known = Rows(*(part[train] for part in rows))
+            chain = solve(start.problem, known, start.theta, loss, roughly=True).chain()
+        distance = np.linalg.norm(held_out.residual(chain), axis=1)
+        weight = held_out.weight.numpy()
+        totals[kind] += weight.sum(), weight @ distance
+    with np.errstate(invalid="ignore"):
+        io, cv = totals[:, 1] / totals[:, 0]
+    return Errors(float(cv), float(io))
+
+
+def _tied(chain: Chain, q: Tensor) -> tuple[str, ...]:
+    """Return a warning where q leaves directions that move the tip unexcited."""
+    n = chain.n_actuators
+    if len(q) <= n:
+        return ()
+    _, spread, axes = torch.linalg.svd(q - q.mean(dim=0), full_matrices=False)
+    still = axes[spread <= _TIED * spread[0]]
+    J = chain.forward_and_jacobian(q[:: max(1, len(q) // 50)])[1].flatten(0, 1)
+    if not len(still):
+        return ()
+    _, moves, turned = torch.linalg.svd(J @ still.mT, full_matrices=False)
+    moving = moves > _MOVES * torch.linalg.svdvals(J)[0]
+    if not moving.any():
+        return ()
+    words = []
+    for move in few_terms((turned[moving] @ still).numpy()):
+        move = move / move[np.argmax(np.abs(move))]
+        words.append(" ".join(f"{at:+.2g} q[{k}]" for k, at in enumerate(move) if abs(at) > 0.05))
+    return (
+        f"the log never moves {'; '.join(words)} (directions of q that move the tip): the model "
+        "extrapolates there. Record rows that move the actuators independently.",
+    )
