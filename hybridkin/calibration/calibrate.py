@@ -225,7 +225,7 @@ def fit_geometry(
         raise ValueError(f"`loss` must be one of {[*LOSSES]}, got {loss!r}.")
     torch_given, device = isinstance(q, Tensor), chain.geometry()["base"].device
     chain = copy.deepcopy(chain).cpu()  # where the solver works, without a graph
-    q, x, messages = _check_data(chain, q, x)
+    q, x, messages = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))
     weights = _check_weights(sample_weight, q)
@@ -379,7 +379,7 @@ def _check_parameters(
     return names
 
 
-def _check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str | None]]:
+def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str | None]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q, x = as_tensor(q, "q").to("cpu", dtype), as_tensor(x, "x").to("cpu", dtype)

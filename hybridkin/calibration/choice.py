@@ -16,6 +16,7 @@ from hybridkin._core.arrays import Numbers, as_tensor
 from hybridkin.calibration._least_squares import Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration._unidentified import few_terms
+from hybridkin.calibration.calibrate import check_data
 from hybridkin.calibration.measured import folds, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -28,6 +29,7 @@ _EXACT = 1e-6  # of the reach: smaller errors are equal
 _TIED = 0.01  # of the largest spread of q: not excited
 _MOVES = 0.05  # of the largest move of the tip
 
+_RIVAL = "elastic tendons: "  # names of sets that take the place of those of a plain chain
 _STIFF = ("bending_stiffness", "axial_stiffness")
 _EXTENSIBLE = (
     ("radii", "base"),
@@ -139,8 +141,7 @@ def choose_geometry(
         What to calibrate, and the errors of all sets.
     """
     given, chain = chain, copy.deepcopy(chain).cpu()
-    dtype = chain.geometry()["base"].dtype
-    q, x = (as_tensor(part, name).to("cpu", dtype) for part, name in ((q, "q"), (x, "x")))
+    q, x, _ = check_data(chain, q, x)
     kept = np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
     kept = np.sort(kept[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)])
     counts = q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
@@ -155,7 +156,9 @@ def choose_geometry(
         splits = [(1, *split) for split in _splits(rows, motions)]
         if outside and len(kept) >= _FEW:
             splits.append((0, *inner_and_outer(rows.q.numpy())))
-        found = [_errors(rung, at, rows, splits, loss) for rung, at in zip(rungs, starts, strict=True)]
+        found = [
+            _errors(rung, at, rows, splits, loss) for rung, at in zip(rungs, starts, strict=True)
+        ]
         least = _EXACT * float(chain.reach)
         scores = np.array([Errors(*np.maximum(one, least)).score for one in found])
         best = int(np.argmax(scores <= (1.0 + _EQUAL) * scores.min()))
@@ -174,14 +177,14 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
             elastic = ElasticTendonChain.from_chain(chain)
     if parameters is not None:
         names = tuple(parameters)
-        rungs = [_rung(chain, names)]
+        rungs = [_Rung(_name(names), chain, names)]
         if elastic is not None:
             own = elastic.default_parameters
             # A plain chain's lengths and radii compensate slack; elastic tendons need no change.
             kept = [name for name in names if name not in ("radii", "lengths", "actuator_zeros")]
             if names != chain.default_parameters:
                 own = (*kept, *(name for name in own if name not in ("radii", "lengths", *kept)))
-            rungs.append(_rung(elastic, own))
+            rungs.append(_Rung(_RIVAL + _name(own), elastic, own))
         return rungs
     if not isinstance(chain, ArcChain):
         sets = ((), chain.default_parameters)
@@ -190,16 +193,17 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
     else:
         sets = ((), ("base",), *(_EXTENSIBLE if chain.lengths is None else _TENDONS))
     if len(q) < _FEW:
-        return [_rung(chain, ("radii", "base") if isinstance(chain, ArcChain) else sets[-1])]
-    rungs = [_rung(chain, names) for names in sets]
-    return rungs + ([] if elastic is None else [_rung(elastic, names) for names in _ELASTIC])
+        sets, elastic = [("radii", "base") if isinstance(chain, ArcChain) else sets[-1]], None
+    rungs = [_Rung(_name(names), chain, names) for names in sets]
+    if elastic is not None:
+        rungs += [_Rung(_RIVAL + _name(names), elastic, names) for names in _ELASTIC]
+    return rungs
 
 
-def _rung(chain: Chain, names: tuple[str, ...]) -> _Rung:
+def _name(names: tuple[str, ...]) -> str:
     words = [name for name in names if name not in _STIFF]
     words += ["stiffnesses"] if len(words) < len(names) else []
-    kind = "elastic tendons: " if isinstance(chain, ElasticTendonChain) else ""
-    return _Rung(kind + (" + ".join(words) or "nothing"), chain, names)
+    return " + ".join(words) or "nothing"
 
 
 def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]:

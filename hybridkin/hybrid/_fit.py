@@ -17,6 +17,7 @@ from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._features import Features, HiddenFeatures, PoseFeatures, QuadraticFeatures
@@ -93,12 +94,13 @@ class Spec:
 
     mechanical: ForwardModel | None
     parts: tuple[Part, ...]  # empty: not chosen yet, see `select`
-    calibrate: tuple[str, ...] = ()  # geometry that is still to be calibrated
+    calibrate: tuple[str, ...] | str = ()  # geometry that is still to be calibrated, or "auto"
     guard: str | None = "leverage"
     output: str = "position"
     random_state: int | np.random.RandomState | None = None
+    geometry: GeometryChoice | None = None  # how `calibrate` was chosen
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
-    messages: tuple[str, ...] = ()  # warnings of that calibration
+    messages: tuple[str, ...] = ()  # warnings of that choice and calibration
 
 
 class FittedHybrid(NamedTuple):
@@ -157,18 +159,56 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
     ]
 
 
+def with_geometry_chosen(spec: Spec, rows: Rows, geometry: GeometryChoice | None = None) -> Spec:
+    """Return the specification with what to calibrate chosen on the rows, or before.
+
+    Of a list the choice is between a plain chain and elastic tendons, for error_model="auto".
+    """
+    if not spec.calibrate or (spec.parts and spec.calibrate != "auto"):
+        return spec
+    if geometry is None:
+        geometry = choose_geometry(
+            cast(Chain, spec.mechanical),
+            rows.q,
+            _positions(spec, rows),
+            groups=rows.groups,
+            weights=rows.weights,
+            outside=not spec.parts or spec.parts[0].error_model != "drop",
+            parameters=None if spec.calibrate == "auto" else spec.calibrate,
+        )
+    return replace(
+        spec,
+        mechanical=geometry.chain,
+        calibrate=geometry.parameters,
+        geometry=geometry,
+        messages=geometry.messages,
+    )
+
+
 def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
     """Return the specification with the calibrated mechanical model; `groups` for its `cv_rmse`."""
     if not spec.calibrate:
         return spec
-    tips = rows.tips[:, :3] if spec.output == "pose" else rows.tips
-    chain, x = cast(Chain, spec.mechanical), torch.from_numpy(tips)
+    if spec.calibrate == "auto":
+        return calibrated(with_geometry_chosen(spec, rows), rows, groups)
     result, messages = fit_geometry(
-        chain, rows.q, x, spec.calibrate, groups=groups, sample_weight=rows.weights
+        cast(Chain, spec.mechanical),
+        rows.q,
+        _positions(spec, rows),
+        spec.calibrate,
+        groups=groups,
+        sample_weight=rows.weights,
+        start=None if spec.geometry is None else spec.geometry.start,
     )
+    messages = (*spec.messages, *messages)
     return replace(
-        spec, mechanical=result.chain, calibrate=(), calibration=result, messages=tuple(messages)
+        spec, mechanical=result.chain, calibrate=(), calibration=result, messages=messages
     )
+
+
+def _positions(spec: Spec, rows: Rows) -> Tensor:
+    """Return the tip positions (N, 3) of rows that may be poses [m]."""
+    return torch.from_numpy(rows.tips[:, :3] if spec.output == "pose" else rows.tips)
 
 
 def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str) -> NDArray:
@@ -280,7 +320,8 @@ def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
     chain = fitted.mechanical
     if fitted.calibration is not None or not isinstance(chain, Chain):
         return fitted.messages
-    found = [*chain.check_actuators(rows.q, "X"), chain.contradiction(rows.q, "X")]
+    found = [*fitted.messages, *chain.check_actuators(rows.q, "X")]
+    found.append(chain.contradiction(rows.q, "X"))
     tips = torch.from_numpy(rows.tips[:, :3])
     found.append(motion_message("y", tips, chain(rows.q), float(chain.reach)))
     return tuple(message for message in found if message is not None)

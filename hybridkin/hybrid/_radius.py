@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin.calibration.measured import folds
-from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid
+from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid, with_geometry_chosen
 from hybridkin.hybrid._kernel import distance
-from hybridkin.hybrid._selection import choose_mechanics, select
+from hybridkin.hybrid._selection import select
 
 _ROUNDING = 1e-9  # of shares
 
@@ -54,7 +54,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
     inside, errors = np.zeros(len(y), dtype=bool), np.full(len(y), np.nan)
     for train, test in folds(X, rows.groups):
         part = given.take(np.isin(place, train))
-        chosen = spec if spec.parts else select(choose_mechanics(spec, part), part)[0]
+        chosen = spec if spec.parts else select(with_geometry_chosen(spec, part), part, part)[0]
         module = fit_hybrid(chosen, part).module
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():

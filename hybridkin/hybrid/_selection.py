@@ -1,4 +1,4 @@
-"""Which mechanical model and which error models: chosen by errors on held-out motions."""
+"""Which error models: chosen by errors on held-out motions, and outside the fitted rows."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
 
-from hybridkin._core.model import ForwardModel
+from hybridkin.calibration.choice import Errors
+from hybridkin.calibration.measured import inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.hybrid._fit import NamedFeatures, Part, Rows, Spec, calibrated, fit_hybrid
 from hybridkin.hybrid._kernel import distance, folds_of
 from hybridkin.hybrid._readout_fit import ReadoutFit
@@ -22,54 +21,24 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _PICKS = 10  # of a blend
+_OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with their cube
 
 
-class Mechanics(NamedTuple):
-    """A mechanical model for error_model="auto", and its errors on held-out rows."""
-
-    spec: Spec  # with this model
-    chains: list[ForwardModel | None]  # calibrated without each fold
-    scores: dict[str, float]  # mean held-out distance of all models that were tried [m]
-
-    @classmethod
-    def of(cls, spec: Spec, rows: Rows) -> Mechanics:
-        """Return the model of a specification, calibrated without each fold of the rows."""
-        held_out, chains = np.empty(len(rows.X)), []
-        alone = replace(spec, parts=(Part(1.0, "parallel", "drop"),))
-        weighed = rows._replace(weights=rows.counts, groups=None)
-        for train, test in folds_of(rows.X, rows.groups):
-            fitted = fit_hybrid(alone, weighed.take(train))
-            held_out[test] = distance(fitted.predict(rows.X[test]), rows.tips[test])
-            chains.append(fitted.mechanical)
-        score = float(np.average(held_out, weights=rows.counts))
-        return cls(spec, chains, {type(spec.mechanical).__name__: score})
-
-
-def choose_mechanics(spec: Spec, rows: Rows) -> Mechanics:
-    """Return the mechanical model of least held-out distance.
-
-    Tendons that contradict each other on a `ConstantCurvatureChain` may be slack: then elastic
-    tendons of the same geometry are tried, where the geometry is to be calibrated.
-    """
-    tried = [Mechanics.of(one, rows) for one in _rivals(spec, rows)]
-    scores = {name: score for one in tried for name, score in one.scores.items()}
-    return min(tried, key=lambda one: min(one.scores.values()))._replace(scores=scores)
-
-
-def select(mechanics: Mechanics, rows: Rows) -> tuple[Spec, dict[str, Any]]:
-    """Return the specification with the error model of least held-out distance, or a blend.
+def select(spec: Spec, rows: Rows, given: Rows) -> tuple[Spec, dict[str, Any]]:
+    """Return the specification with the error model of least error on new motions, or a blend.
 
     Every candidate is fitted to all rows, which settles its penalties; then to all but one fold,
-    on the mechanical model calibrated without that fold. The held-out predictions of the
-    candidates give the weights of their blend, which may be a single one.
+    and to the inner rows, each time on the mechanical model calibrated on the same rows. The
+    predictions for the held-out and the outer rows give the weights of the blend, which may be a
+    single candidate.
 
     Parameters
     ----------
-    mechanics : Mechanics
-        The mechanical model, on the same rows.
-    rows : Rows
-        Measured rows.
+    spec : Spec
+        With the geometry chosen and not yet calibrated.
+    rows, given : Rows
+        The different rows, and all as they were given.
 
     Returns
     -------
@@ -78,7 +47,6 @@ def select(mechanics: Mechanics, rows: Rows) -> tuple[Spec, dict[str, Any]]:
     results : dict
         The errors of all candidates, see `HybridForwardModel.cv_results_`.
     """
-    spec = calibrated(mechanics.spec, rows)
     y, counts, folds = rows.tips, rows.counts, folds_of(rows.X, rows.groups)
     fold_of = np.empty(len(y), dtype=int)
     for k, (_, test) in enumerate(folds):
@@ -86,82 +54,115 @@ def select(mechanics: Mechanics, rows: Rows) -> tuple[Spec, dict[str, Any]]:
     weighed = rows._replace(weights=counts, groups=None)
     # A single held-out motion has similar ones in training; folds of motions judge more strictly.
     by_fold = weighed._replace(groups=None if rows.groups is None else fold_of)
+    splits = [*folds, inner_and_outer(rows.X)]
+    parts = [weighed.take(train) for train, _ in splits]
+    alone = [calibrated(spec, part) for part in parts]
+    geometry, spec = spec.geometry, calibrated(spec, given)  # its warnings count the rows given
     candidates = _candidates(spec)
     if len(y) > _MOST:
         del candidates["parallel kernel"]
     settled: list[Part] = []
-    held_out = np.empty((len(candidates), *y.shape))
+    tests = np.concatenate([test for _, test in splits])
+    predicted = np.empty((len(candidates), len(tests), y.shape[1]))
     for i, (coupling, error_model) in enumerate(candidates.values()):
         fitted = fit_hybrid(replace(spec, parts=(Part(1.0, coupling, error_model),)), by_fold)
         part = Part(1.0, coupling, _settled(error_model, fitted.error_model))
         settled.append(part)
-        for (train, test), chain in zip(folds, mechanics.chains, strict=True):
-            alone = replace(spec, mechanical=chain, parts=(part,))
-            held_out[i, test] = fit_hybrid(alone, weighed.take(train)).predict(rows.X[test])
-    shares = _shares(held_out, y, counts)
-    parts = [part._replace(weight=float(w)) for w, part in zip(shares, settled, strict=True)]
-    results = _results([*candidates], held_out, shares, fold_of, rows)
-    results["mechanical_model"] = mechanics.scores
-    return replace(spec, parts=tuple(part for part in parts if part.weight > 0.0)), results
+        predicted[i] = np.concatenate(
+            [
+                fit_hybrid(replace(one, parts=(part,)), known).predict(rows.X[test])
+                for one, known, (_, test) in zip(alone, parts, splits, strict=True)
+            ]
+        )
+    # Held-out rows first, in the order of the log; then the outer ones.
+    order = np.concatenate([np.argsort(tests[: len(y)]), np.arange(len(y), len(tests))])
+    held_out = _HeldOut.of(predicted[:, order], rows, fold_of, splits[-1][1])
+    shares, results = _chosen([*candidates], held_out, rows)
+    name, errors = ("nothing", {}) if geometry is None else (geometry.name, geometry.errors)
+    own = {name: Errors(*(float(results[key][0]) for key in ("mean_distance", "io_distance")))}
+    results["parameters"] = name
+    results["mechanical_model"] = {n: one._asdict() for n, one in (errors or own).items()}
+    blend = [part._replace(weight=float(w)) for w, part in zip(shares, settled, strict=True)]
+    return replace(spec, parts=tuple(part for part in blend if part.weight > 0.0)), results
 
 
-def _results(
-    names: list[str], held_out: NDArray, shares: NDArray, fold_of: NDArray, rows: Rows
-) -> dict[str, Any]:
-    """Return the held-out errors of all candidates and of their blend."""
-    y, counts = rows.tips, rows.counts
+class _HeldOut(NamedTuple):
+    """Predictions for the N held-out rows, then for the outer ones, of all candidates."""
+
+    predicted: NDArray  # (K, N + M, m)
+    y: NDArray  # (N + M, m)
+    weights: NDArray  # (N + M,), of the distances in the score of a blend
+    counts: NDArray
+    fold: NDArray  # (N + M,), the fold of the row
+    n: int
+
+    @classmethod
+    def of(cls, predicted: NDArray, rows: Rows, fold_of: NDArray, outer: NDArray) -> _HeldOut:
+        """Weigh both kinds of rows, relative to the first candidate, the mechanical model."""
+        n, at = len(rows.X), np.concatenate([np.arange(len(rows.X)), outer])
+        y, counts = rows.tips[at], rows.counts[at]
+        weights = counts.copy()
+        for part, share in ((slice(0, n), 1.0 - _OUTSIDE), (slice(n, None), _OUTSIDE)):
+            total = counts[part] @ distance(predicted[0, part], y[part])
+            weights[part] *= share / max(total, np.finfo(float).tiny)
+        return cls(predicted, y, weights, counts, fold_of[at], n)
+
+    def shares(self, rows: NDArray) -> NDArray:
+        """Return the weights (K,) of the candidates, multiples of a tenth that sum to one.
+
+        Ten times the candidate that lowers the score most is added, the same one again too.
+
+        References
+        ----------
+        Caruana et al., Ensemble selection from libraries of models, ICML 2004.
+        """
+        predicted, y, weights = self.predicted[:, rows], self.y[rows], self.weights[rows]
+        picks, total = np.zeros(len(predicted)), np.zeros_like(y)
+        for k in range(1, _PICKS + 1):
+            means = [weights @ distance((total + x) / k, y) for x in predicted]
+            best = int(np.argmin(means))
+            picks[best] += 1
+            total += predicted[best]
+        return picks / _PICKS
+
+
+def _chosen(names: list[str], found: _HeldOut, rows: Rows) -> tuple[NDArray, dict[str, Any]]:
+    """Return the weights of the candidates, and the errors of all and of their blend.
+
+    A blend whose gain over the mechanical model, paired by motion or fold, is within its standard
+    error is not taken.
+    """
+    n, counts = found.n, found.counts
     # The blend is judged by weights that were chosen without the fold.
-    blend = np.empty_like(y)
-    tests = [fold_of == fold for fold in np.unique(fold_of)]
-    for test in tests:
-        own = _shares(held_out[:, ~test], y[~test], counts[~test])
-        blend[test] = np.tensordot(own, held_out[:, test], 1)
-    distances = np.array([distance(x, y) for x in (*held_out, blend)])
-    by_fold = np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in tests]).T
-    means = np.average(distances, axis=1, weights=counts)
-    return {
+    blend = np.empty_like(found.y)
+    for fold in np.unique(found.fold):
+        test = found.fold == fold
+        blend[test] = np.tensordot(found.shares(~test), found.predicted[:, test], 1)
+    distances = np.array([distance(x, found.y) for x in (*found.predicted, blend)])
+    held_out, outer = distances[:, :n], distances[:, n:]
+    by_fold = _means_by(found.fold[:n], held_out, counts[:n])
+    shares = found.shares(np.ones(len(blend), dtype=bool))
+    units = by_fold if rows.groups is None else _means_by(rows.groups, held_out, counts[:n])
+    gains = units[0] - units[-1]
+    if gains.mean() <= gains.std(ddof=1) / np.sqrt(len(gains)):
+        shares = np.eye(len(shares))[0]
+    means = np.average(held_out, axis=1, weights=counts[:n])
+    return shares, {
         "candidate": [*names, "blend"],
         "mean_distance": means,
         "std_distance": by_fold.std(axis=1, ddof=1),
         "fold_distance": by_fold,
+        "io_distance": np.average(outer, axis=1, weights=counts[n:]),
         "rank": means.argsort().argsort() + 1,
         "chosen": "blend" if (shares < 1.0).all() else names[int(shares.argmax())],
         "weights": dict(zip(names, shares.tolist(), strict=True)),
     }
 
 
-def _shares(held_out: NDArray, y: NDArray, weights: NDArray) -> NDArray:
-    """Return the weights (K,) of the candidates, multiples of a tenth that sum to one.
-
-    Ten times the candidate that lowers the mean distance most is added, the same one again too.
-
-    References
-    ----------
-    Caruana et al., Ensemble selection from libraries of models, ICML 2004.
-    """
-    picks, total = np.zeros(len(held_out)), np.zeros_like(y)
-    for k in range(1, _PICKS + 1):
-        means = [weights @ distance((total + x) / k, y) for x in held_out]
-        best = int(np.argmin(means))
-        picks[best] += 1
-        total += held_out[best]
-    return picks / _PICKS
-
-
-def _rivals(spec: Spec, rows: Rows) -> list[Spec]:
-    """Return the specifications of the mechanical models to choose from."""
-    mechanical, names = spec.mechanical, spec.calibrate
-    if not (isinstance(mechanical, ConstantCurvatureChain) and names):
-        return [spec]
-    if mechanical.lengths is None or not mechanical.contradictory(rows.q).any():
-        return [spec]
-    elastic = ElasticTendonChain.from_chain(mechanical)
-    own = elastic.default_parameters
-    if names != mechanical.default_parameters:
-        # A plain chain's lengths and radii compensate slack; elastic tendons need no such change.
-        kept = [name for name in names if name not in ("radii", "lengths", "actuator_zeros")]
-        own = (*kept, *(name for name in own if name not in ("angles", *kept)))
-    return [spec, replace(spec, mechanical=elastic, calibrate=own)]
+def _means_by(labels: NDArray, distances: NDArray, counts: NDArray) -> NDArray:
+    """Return the mean distances (K, L) of K models for each of L labels of the rows."""
+    parts = [labels == label for label in np.unique(labels)]
+    return np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in parts]).T
 
 
 def _candidates(spec: Spec) -> dict[str, tuple[str, Any]]:

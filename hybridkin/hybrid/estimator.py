@@ -16,6 +16,7 @@ from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import as_forward_model
 from hybridkin._core.units import motion_message
+from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
@@ -24,16 +25,16 @@ from hybridkin.hybrid._fit import (
     Part,
     Rows,
     Spec,
-    calibrated,
     few_rows,
     fit_hybrid,
     fit_messages,
     residuals,
+    with_geometry_chosen,
 )
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
-from hybridkin.hybrid._selection import choose_mechanics, select
+from hybridkin.hybrid._selection import select
 from hybridkin.hybrid._settings import check_settings, resolved_error_model
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
@@ -148,7 +149,7 @@ class HybridForwardModel(HybridPredictor):
         error_model: Any = None,
         *,
         coupling: str = "parallel",
-        calibrate: Sequence[str] | str = (),
+        calibrate: Sequence[str] | str | None = None,
         guard: str | None = "leverage",
         play: ArrayLike | str | None = None,
         coverage: float | None = None,
@@ -225,28 +226,27 @@ class HybridForwardModel(HybridPredictor):
         y: Any,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
+        geometry: GeometryChoice | None = None,
     ) -> list[str]:
-        """Fit as `fit` does and return the messages of its warnings; none is issued."""
+        """Fit as `fit` does and return the messages of its warnings; none is issued.
+
+        `geometry`, chosen before, replaces the choice of what to calibrate.
+        """
         check_settings(self)
         given = self._checked_rows(X, y, sample_weight, groups)
-        asked = spec = self._spec(given)
+        asked = self._spec(given)
         rows = given.distinct()[0]
-        few = few_rows(rows, spec, self.coverage)
+        few = few_rows(rows, asked, self.coverage)
         self._fitted_rows: NDArray | None = np.unique(row_digests(rows.X, rows.tips))
-        mechanics, self.cv_results_ = None, None
-        if not asked.parts:
-            mechanics = choose_mechanics(spec, rows)
-            spec = mechanics.spec
+        spec = with_geometry_chosen(asked, rows, geometry)
         self.play_, said = play_of(self.play, spec, given.distinct(runs=True)[0])
         self._play_state: PlayState | None = None
         if self.play_ is not None:
             given = given._replace(X=self._effective(given.X, given.groups))
             rows = given.distinct()[0]
-            if mechanics is not None:  # the scores stay those of all models, without play
-                mechanics = mechanics.of(spec, rows)._replace(scores=mechanics.scores)
-        if mechanics is not None:
-            spec = calibrated(mechanics.spec, given)  # its warnings count the rows given
-            spec, self.cv_results_ = select(mechanics._replace(spec=spec), rows)
+        self.cv_results_ = None
+        if not asked.parts:
+            spec, self.cv_results_ = select(spec, rows, given)
         fitted = fit_hybrid(spec, given)
         self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
         self.error_model_, self.module_ = fitted.error_model, fitted.module
@@ -336,8 +336,12 @@ class HybridForwardModel(HybridPredictor):
             check_unscaled("X", rows.X, "actuator vectors [m or rad]")
             check_unscaled("y", rows.tips, "tip positions [m]")
             mechanical.check_actuators(rows.q, "X")
-            names = self.calibrate
-            names = mechanical.default_parameters if isinstance(names, str) else tuple(names)
+            asked = self.calibrate
+            if asked is None:
+                asked = "auto" if self.error_model == "auto" else ()
+            if asked == "default":
+                asked = mechanical.default_parameters
+            names = asked if isinstance(asked, str) else tuple(asked)
         parts = ()
         if self.error_model != "auto":
             model = resolved_error_model(self.error_model, self.random_state)
