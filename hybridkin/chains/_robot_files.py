@@ -64,7 +64,12 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("file", "name", *_TEXT),
     ("file", "model", *_among(_PLAIN, _ELASTIC)),
     ("file", "routing", *_among("segment", "base")),
-    ("file", "calibrate", "be a list of names", lambda v: v == [] or _many(_is_text)(v)),
+    (
+        "file",
+        "calibrate",
+        'be a list of names, "auto" or "default"',
+        lambda v: v in ([], "auto", "default") or _many(_is_text)(v),
+    ),
     ("file", "segment", "hold tables, each under the heading [[segment]]", _many(_TABLE[1])),
     ("file", "base log limits", *_TABLE),
     ("segment", "radius length " + " ".join(_STIFFNESS), "be a positive number", _is_positive),

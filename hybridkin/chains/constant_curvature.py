@@ -113,7 +113,9 @@ class ConstantCurvatureChain(ArcChain):
     @property
     def default_parameters(self) -> tuple[str, ...]:
         """The geometry that a calibration fits by default."""
-        return ("radii", "base") if self.lengths is None else ("radii", "lengths", "base")
+        if self.lengths is None:
+            return ("radii", "base")
+        return ("radii", "turns", "rest_bends", "lengths", "base")
 
     def consistency(self, q: Tensor) -> Tensor:
         """Return how far the actuator readings of each segment contradict each other.

@@ -177,7 +177,8 @@ class ElasticTendonChain(ArcChain):
     def default_parameters(self) -> tuple[str, ...]:
         """The geometry that a calibration fits by default."""
         stiffness = ("bending_stiffness", "axial_stiffness")
-        return ("base", "angles", "rest_bends", *stiffness, "tendon_zeros")
+        geometry = ("radii", "turns", "rest_bends", "lengths", "tool", "base")
+        return (*geometry, *stiffness, "tendon_zeros")
 
     def tensions(self, q: Tensor) -> Tensor:
         """Return how far every tendon is stretched.

@@ -155,8 +155,8 @@ class RobotDescription:
         What to call it.
     chain : ConstantCurvatureChain, ElasticTendonChain or None
         Its nominal kinematics; None of a robot without segments, for models of data alone.
-    calibrate : tuple of str
-        Geometry that should be fitted to data.
+    calibrate : tuple of str or "auto"
+        Geometry that should be fitted to data; "auto": chosen by errors on the data.
     log : LogFormat or None
         How its logs are written.
     limits : Limits
@@ -167,7 +167,7 @@ class RobotDescription:
 
     name: str
     chain: ConstantCurvatureChain | ElasticTendonChain | None
-    calibrate: tuple[str, ...]
+    calibrate: tuple[str, ...] | str
     log: LogFormat | None
     limits: Limits = Limits()
     path: Path | None = None
@@ -178,6 +178,11 @@ class RobotDescription:
         if self.chain is not None:
             return self.chain.n_actuators
         return 0 if self.log is None else len(self.log.q)
+
+    @property
+    def base_is_free(self) -> bool:
+        """Whether the pose of the base is fitted to data."""
+        return self.calibrate == "auto" or "base" in self.calibrate
 
 
 def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
@@ -229,7 +234,8 @@ def read_description(path: str | Path) -> RobotDescription:
             name = "my trunk"
             model = "constant-curvature"    # the default, or "elastic-tendon"
             routing = "base"                # or "segment", the default; of elastic tendons "base"
-            calibrate = ["radii", "base"]   # optional, else the chain's own list
+            calibrate = ["radii", "base"]   # optional, else "auto": chosen by errors on the log;
+                                            # "default": the chain's own list
 
             [[segment]]                     # base to tip
             radius = 0.0045                 # of the actuator circle [m]
@@ -302,11 +308,16 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
             "data alone give [log], and none of `model`, `routing`, `calibrate` and `base`."
         )
     log = _log_format(tables["log"], chain) if "log" in tables else None
-    names = () if chain is None else tables.get("calibrate", chain.default_parameters)
+    names = () if chain is None else tables.get("calibrate", "auto")
     known = () if chain is None else (*chain.geometry(), *ALIASES)
-    if not {*names} <= {*known} or len({*names}) < len(names):
-        raise ValueError(f"`calibrate` must name different ones of {known}, got {names}.")
-    robot = RobotDescription(tables.get("name", stem), chain, tuple(names), log)
+    if names == "default" and chain is not None:
+        names = chain.default_parameters
+    if names != "auto" and (not {*names} <= {*known} or len({*names}) < len(names)):
+        raise ValueError(
+            f'`calibrate` must name different ones of {known}, or be "auto" or "default", got {names}.'
+        )
+    names = names if isinstance(names, str) else tuple(names)
+    robot = RobotDescription(tables.get("name", stem), chain, names, log)
     return replace(robot, limits=_limits(tables.get("limits", {}), robot))
 
 

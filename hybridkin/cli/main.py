@@ -119,7 +119,7 @@ def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
     )
-    log = _read(arguments, log_format, robot.chain, "base" in robot.calibrate)
+    log = _read(arguments, log_format, robot.chain, robot.base_is_free)
     print(f"{log.report}\n", file=sys.stderr)
     report, paths = hybridkin.workflow.fit_log(
         log,
@@ -225,7 +225,7 @@ def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         raise ValueError(f"{arguments.log} is a log; name its robot: --robot ROBOT.toml.")
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
-    found = _read(arguments, log_format, robot.chain, "base" in robot.calibrate).report
+    found = _read(arguments, log_format, robot.chain, robot.base_is_free).report
     return _Outcome(found.to_dict(), str(found), code=0 if found.ok else 1)
 
 

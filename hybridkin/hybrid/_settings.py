@@ -43,9 +43,9 @@ def check_settings(estimator: BaseEstimator) -> None:
     if model.coverage is not None and not 0.0 < model.coverage < 1.0:
         raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}.")
     wanted = model.calibrate
-    named = wanted is None or wanted in ("auto", "default")
-    if not named and (isinstance(wanted, str) or not isinstance(wanted, Iterable)):
-        need = "None, 'auto', 'default' or a sequence of names, such as ['radii', 'base']"
+    by_word = wanted is None or (isinstance(wanted, str) and wanted in ("auto", "default"))
+    if not by_word and (isinstance(wanted, str) or not isinstance(wanted, Iterable)):
+        need = "a sequence of names, such as ['radii', 'base'], 'auto', 'default' or None"
         raise ValueError(f"`calibrate` must be {need}, got {wanted!r}.")
     if isinstance(model.play, str) and model.play != "auto":
         raise ValueError(f"`play` must be a width or n widths, 'auto' or None, got {model.play!r}.")
@@ -74,7 +74,7 @@ def check_settings(estimator: BaseEstimator) -> None:
             "`mechanical_model` must be a torch module q -> x or None, got "
             f"{type(mechanical).__name__}; wrap a function in an nn.Module."
         )
-    elif not isinstance(mechanical, Chain) and not named and [*wanted]:
+    elif not isinstance(mechanical, Chain) and not by_word and [*wanted]:
         raise TypeError(
             f"`mechanical_model` must be a chain, with a geometry, to `calibrate` {wanted!r}, got "
             f"{type(mechanical).__name__}."

@@ -339,9 +339,10 @@ class HybridForwardModel(HybridPredictor):
             asked = self.calibrate
             if asked is None:
                 asked = "auto" if self.error_model == "auto" else ()
-            if asked == "default":
-                asked = mechanical.default_parameters
-            names = asked if isinstance(asked, str) else tuple(asked)
+            if isinstance(asked, str):
+                names = mechanical.default_parameters if asked == "default" else asked
+            else:
+                names = tuple(asked)
         parts = ()
         if self.error_model != "auto":
             model = resolved_error_model(self.error_model, self.random_state)

@@ -60,12 +60,14 @@ def describe(loaded: LoadedModel) -> Report:
 
 
 def _of_hybrid(model: HybridForwardModel) -> dict[str, Any]:
-    calibrated = [model.calibrate] if isinstance(model.calibrate, str) else list(model.calibrate)
+    asked = model.calibrate
+    calibrated = [asked] if isinstance(asked, str) else list(asked or ())
     auto, kind = None, "none" if model.error_model_ is None else type(model.error_model_).__name__
     error = {"kind": kind, "coupling": model.coupling}
     if model.cv_results_ is not None:
         auto = auto_entry(model)
         error = {"kind": auto_in_short(auto), "coupling": None}
+        calibrated = calibrated or [auto["taken"]]
     error |= {"guard": model.guard, "calibrated": calibrated}
     return {"error_model": error, "radius": radius_entry(model), "auto": auto}
 

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -35,6 +36,7 @@ from hybridkin.workflow._fit_report import (
     auto_in_short,
     write_calibration,
     write_check,
+    write_choice,
     write_comparison,
     write_model,
 )
@@ -126,22 +128,39 @@ class _Rows(NamedTuple):
     groups: NDArray
     robot: robots.RobotDescription
     settings: FitSettings
+    geometry: GeometryChoice | None = None
 
     def of(self, rows: NDArray) -> _Rows:
         return self._replace(q=self.q[rows], x=self.x[rows], groups=self.groups[rows])
 
-    def calibrated(
-        self, chain: Chain, parameters: Sequence[str] | None = None
-    ) -> tuple[CalibrationResult, list[str]]:
-        """Return the calibration, by default of all that the robot asks for, and its warnings."""
-        names = self.robot.calibrate if parameters is None else parameters
-        return fit_geometry(chain, self.q, self.x, names, self.settings.loss)
+    def with_geometry_chosen(self) -> _Rows:
+        """Return the rows with what to calibrate, where the robot leaves that open."""
+        robot = self.robot
+        if robot.chain is None or robot.calibrate != "auto":
+            return self
+        chosen = choose_geometry(
+            robot.chain, self.q, self.x, groups=self.groups, loss=self.settings.loss
+        )
+        return self._replace(geometry=chosen)
+
+    def calibrated(self) -> tuple[Chain | None, CalibrationResult | None, list[str]]:
+        """Return the chain before its calibration, what that found, and its warnings."""
+        geometry, chain, names = self.geometry, self.robot.chain, self.robot.calibrate
+        start, messages = None, []
+        if geometry is not None:
+            chain, names, start = geometry.chain, geometry.parameters, geometry.start
+            messages = [*geometry.messages]
+        if chain is None or not names:
+            return chain, None, messages
+        result, more = fit_geometry(chain, self.q, self.x, names, self.settings.loss, start=start)
+        return chain, result, messages + more
 
     def mechanical(self) -> ForwardModel:
         """Return the calibrated chain; of a robot without segments a linear model of the rows."""
-        if self.robot.chain is not None:
-            return self.calibrated(self.robot.chain)[0].chain
-        return error_module(linear().fit(self.q, self.x), torch.from_numpy(self.q))
+        chain, result, _ = self.calibrated()
+        if chain is None:
+            return error_module(linear().fit(self.q, self.x), torch.from_numpy(self.q))
+        return chain if result is None else result.chain
 
     def auto_model(self, calibrated: ForwardModel) -> HybridForwardModel:
         """Return the hybrid that chooses for itself.
@@ -192,7 +211,7 @@ def compare_by_group(
     Comparison
         Errors [m] by model and row, the fold of each row, and what was chosen in each fold.
     """
-    log = checked(log, robot.chain, "base" in robot.calibrate)
+    log = checked(log, robot.chain, robot.base_is_free)
     n_folds = min(settings.n_folds, len(np.unique(log.motions)))
     folds = list(GroupKFold(n_folds).split(log.q, groups=log.motions))
     rows = _Rows(log.q, log.x, log.motions, robot, settings)
@@ -260,11 +279,11 @@ def fit_log(
     check_out(out)
     if robot.chain is None and settings.play is not None:
         raise ValueError("`play` requires a robot with segments: its width is a length.")
-    whole = checked(log, robot.chain, "base" in robot.calibrate)
+    whole = checked(log, robot.chain, robot.base_is_free)
     _check(whole, settings, force)
     data = whole.thinned(settings.max_rows)
-    rows = _Rows(data.q, data.x, data.motions, robot, settings)
-    result, messages = (None, []) if robot.chain is None else rows.calibrated(robot.chain)
+    rows = _Rows(data.q, data.x, data.motions, robot, settings).with_geometry_chosen()
+    start, result, messages = rows.calibrated()
     messages += [] if result is None else whole.misread(result.chain)
     for message in messages:
         warnings.warn(message, stacklevel=2)
@@ -277,7 +296,7 @@ def fit_log(
     # The linear model of a robot without segments is what stands for its mechanical one.
     model = _models(CALIBRATED if saved == _DATA_LINEAR else saved, rows, mechanical)[0]
     model.set_params(coverage=settings.coverage)
-    model.fit_with_messages(rows.q, rows.x, groups=rows.groups)
+    model.fit_with_messages(rows.q, rows.x, groups=rows.groups, geometry=rows.geometry)
     progress(f"fitting {saved} to all motions", 1, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
     report.record.update(
@@ -296,8 +315,11 @@ def fit_log(
     write_check(report, whole)
     write_comparison(report, compared.errors, compared.fold, data)
     write_model(report, model)
-    if robot.chain is not None and result is not None:
-        write_calibration(report, robot.chain, result, messages)
+    if rows.geometry is not None:
+        write_choice(report, rows.geometry)
+    if start is not None and result is not None:
+        write_calibration(report, start, result, messages)
+    if robot.chain is not None and rows.geometry is None:
         _write_elastic_calibration(report, robot.chain, model)
     _add_model(report, model, robot, whole)
     return report, report.write(out)
@@ -352,6 +374,7 @@ def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, 
     names = _MODELS if train.settings.auto else _MODELS[:-1]
     if train.robot.chain is None:
         names = [name for name in names if name not in _OF_CHAINS]
+    train = train.with_geometry_chosen()
     mechanical = train.mechanical()
     models = {name: _models(name, train, mechanical) for name in names}
     errors = {
@@ -372,8 +395,9 @@ def _models(name: str, rows: _Rows, mechanical: ForwardModel) -> list[HybridForw
         return [_elm(base, *choice, seed) for seed in range(rows.settings.n_seeds)]
     chain = rows.robot.chain
     if chain is not None and learner == "nominal":
-        free = "base" in rows.robot.calibrate
-        base = rows.calibrated(chain, ("base",))[0].chain if free else chain
+        base = chain
+        if rows.robot.base_is_free:
+            base = fit_geometry(chain, rows.q, rows.x, ("base",), rows.settings.loss)[0].chain
     learners = {"linear": linear, "quadratic": quadratic}
     return [HybridForwardModel(base, learners[learner]() if learner in learners else "drop")]
 
@@ -397,7 +421,7 @@ def _chosen(model: HybridForwardModel) -> str:
 
 def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
     """Return the errors (N,) on test rows of a model, fitted to training rows; it does not warn."""
-    model.fit_with_messages(train.q, train.x, groups=train.groups)
+    model.fit_with_messages(train.q, train.x, groups=train.groups, geometry=train.geometry)
     q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
     return distance(evaluate(model.module_, np.array(q, dtype=float))[0], test.x)
 

@@ -160,7 +160,8 @@ def test_elastic_tendons(write):
     assert isinstance(robot.chain, ElasticTendonChain)
     assert_close(robot.chain.geometry(), expected.geometry(), rtol=1e-15, atol=1e-15)
     assert robot.chain.routing == "base"
-    assert robot.calibrate == expected.default_parameters
+    assert robot.calibrate == "auto"
+    assert robot.base_is_free
     q = 1e-3 * torch.arange(-4, 4, dtype=torch.float64)
     assert_close(robots.from_toml(write(ELASTIC))(q), expected(q), rtol=1e-13, atol=1e-15)
 
@@ -209,7 +210,9 @@ def test_defaults_are_chambers_named_after_the_file(write):
     assert robot.name == "robot"
     assert robot.chain.lengths is None
     assert robot.log is None
-    assert robot.calibrate == ("radii", "base")
+    assert robot.calibrate == "auto"
+    by_list = robots.read_description(write("calibrate = 'default'\n[[segment]]\nradius = 0.1\n"))
+    assert by_list.calibrate == ("radii", "base")
 
 
 @pytest.mark.parametrize(
