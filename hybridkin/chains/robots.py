@@ -314,7 +314,8 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
         names = chain.default_parameters
     if names != "auto" and (not {*names} <= {*known} or len({*names}) < len(names)):
         raise ValueError(
-            f'`calibrate` must name different ones of {known}, or be "auto" or "default", got {names}.'
+            f'`calibrate` must name different ones of {known}, or be "auto" or "default", got '
+            f"{names}."
         )
     names = names if isinstance(names, str) else tuple(names)
     robot = RobotDescription(tables.get("name", stem), chain, names, log)

@@ -104,7 +104,7 @@ class _HeldOut(NamedTuple):
         weights = counts.copy()
         for part, share in ((slice(0, n), 1.0 - _OUTSIDE), (slice(n, None), _OUTSIDE)):
             total = counts[part] @ distance(predicted[0, part], y[part])
-            weights[part] *= share / max(total, np.finfo(float).tiny)
+            weights[part] *= share / max(total, np.finfo(float).eps)
         return cls(predicted, y, weights, counts, fold_of[at], n)
 
     def shares(self, rows: NDArray) -> NDArray:

@@ -23,6 +23,9 @@ from hybridkin import (
 )
 
 
+ELASTIC_SET = "base + turns + rest_bends + tool + tendon_zeros + stiffnesses"
+
+
 def bha():
     return robots.bionic_handling_assistant()
 
@@ -68,7 +71,11 @@ def test_it_says_what_it_chose(chosen):
     assert abs(sum(shares.values()) - 1.0) < 1e-12
     taken = [name for name, share in shares.items() if share > 0.0]
     assert results["chosen"] == (taken[0] if len(taken) == 1 else "blend")
-    assert results["mechanical_model"].keys() == {"ConstantCurvatureChain"}
+    assert results["parameters"] == "radii + base"
+    assert results["mechanical_model"].keys() == {"radii + base"}
+    own = results["mechanical_model"]["radii + base"]
+    assert own == {"cv": results["mean_distance"][0], "io": results["io_distance"][0]}
+    assert results["io_distance"].shape == (n,)
     assert results["fold_distance"].shape == (n, 5)
     assert_allclose(results["fold_distance"].std(1, ddof=1), results["std_distance"])
     assert results["rank"][results["mean_distance"].argmin()] == 1
@@ -107,7 +114,8 @@ def test_slack_tendons_get_elastic_ones(tmp_path):
         warnings.simplefilter("error")  # that the plain chain cannot know slack is no news here
         model.fit(q[:80], x[:80])
     scores = model.cv_results_["mechanical_model"]
-    assert scores["ElasticTendonChain"] < 0.2 * scores["ConstantCurvatureChain"]
+    assert model.cv_results_["parameters"] == "elastic tendons: " + ELASTIC_SET
+    assert scores["elastic tendons: " + ELASTIC_SET]["cv"] < 0.2 * scores["radii + base"]["cv"]
     assert isinstance(model.mechanical_model_, ElasticTendonChain)
     assert isinstance(model.mechanical_model, ConstantCurvatureChain)
     assert np.linalg.norm(model.predict(q[80:]) - x[80:], axis=1).mean() < 1e-3

@@ -281,13 +281,11 @@ def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
         report, _ = fit(path, robot, tmp_path / "m", groups="motion", auto=True)
     assert report.record["saved"] == "hybrid, auto"
     chosen = report.record["auto"]
-    assert chosen["taken"] == "ElasticTendonChain"
+    assert chosen["taken"].startswith("elastic tendons: ")
     errors = chosen["mechanical_models"]
-    assert errors["ElasticTendonChain"] < 0.5 * errors["ConstantCurvatureChain"]
-    assert "on ElasticTendonChain" in report.record["chosen"]
-    assert any(
-        sentence.startswith("Auto compared two mechanical models") for sentence in chosen["words"]
-    )
+    assert errors[chosen["taken"]]["cv"] < 0.5 * errors["radii"]["cv"]
+    assert "on elastic tendons" in report.record["chosen"]
+    assert any(sentence.startswith("Of 2 sets of parameters") for sentence in chosen["words"])
     text = (tmp_path / "m" / "report.md").read_text()
     assert "## Calibration of the elastic tendons that auto took" in text
     names = [entry["name"] for entry in report.record["calibration_of_saved"]["entries"]]
