@@ -23,8 +23,11 @@ from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
-_MOST, _FEW, _FOLDS = 400, 40, 3  # rows for the scores, rows for a choice
-_EQUAL = 0.02  # of the score: then the smaller set is taken
+_MOST, _FOLDS = 400, 3  # rows and folds for the scores
+_FEW = 40  # rows, below which `io` says little
+_ROWS, _CLEARLY = 8, 0.7  # rows for each parameter; a larger set must be clearly better
+_USUAL = ((), ("base",), ("radii", "base"))  # sets that are calibrated from few rows, too
+_EQUAL = 0.007  # of the score: then the smaller set is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
 _TIED = 0.01  # of the largest spread of q: not excited
 _MOVES = 0.05  # of the largest move of the tip
@@ -57,8 +60,8 @@ class Errors(NamedTuple):
 
     @property
     def score(self) -> float:
-        """What the choice minimises: `cv` times the square of `io`, or `cv` alone."""
-        return self.cv if np.isnan(self.io) else self.cv * self.io**2
+        """What the choice minimises: the geometric mean of `cv` and twice `io`, or `cv` alone."""
+        return self.cv if np.isnan(self.io) else (self.cv * self.io**2) ** (1.0 / 3.0)
 
 
 @dataclass(frozen=True)
@@ -112,9 +115,10 @@ def choose_geometry(
 
     The sets grow from nothing, the base, the radii to the whole geometry; where tendons of a
     `ConstantCurvatureChain` contradict each other, elastic tendons of the same geometry follow. A
-    set has the score ``cv * io**2``: `cv` is the mean tip distance on held-out motions, `io` that
-    on the outer 35 % of the rows after a fit to the inner 40 %. The smallest set with nearly the
-    least score is taken.
+    set has the score ``(cv * io**2)**(1/3)``: `cv` is the mean tip distance on held-out motions,
+    `io` that on the outer 35 % of the rows after a fit to the inner 40 %. The smallest set with
+    nearly the least score is taken. A set with more than one parameter in 8 rows must be clearly
+    better, unless it is the base and the radii; below 40 rows the score is `cv`.
 
     Parameters
     ----------
@@ -161,6 +165,9 @@ def choose_geometry(
         ]
         least = _EXACT * float(chain.reach)
         scores = np.array([Errors(*np.maximum(one, least)).score for one in found])
+        free = np.array([0 if at is None else at.theta.size for at in starts])
+        known = (free <= len(kept) / _ROWS) | [rung.parameters in _USUAL for rung in rungs]
+        scores[~known] /= _CLEARLY
         best = int(np.argmax(scores <= (1.0 + _EQUAL) * scores.min()))
         errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
     name, chosen, names = rungs[best]
@@ -192,8 +199,6 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
         sets = ((), ("base",), *_ELASTIC)
     else:
         sets = ((), ("base",), *(_EXTENSIBLE if chain.lengths is None else _TENDONS))
-    if len(q) < _FEW:
-        sets, elastic = [("radii", "base") if isinstance(chain, ArcChain) else sets[-1]], None
     rungs = [_Rung(_name(names), chain, names) for names in sets]
     if elastic is not None:
         rungs += [_Rung(_RIVAL + _name(names), elastic, names) for names in _ELASTIC]

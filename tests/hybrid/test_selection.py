@@ -22,7 +22,6 @@ from hybridkin import (
     save_model,
 )
 
-
 ELASTIC_SET = "base + turns + rest_bends + tool + tendon_zeros + stiffnesses"
 
 
