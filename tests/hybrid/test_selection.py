@@ -118,7 +118,7 @@ def test_slack_tendons_get_elastic_ones(tmp_path):
     assert isinstance(model.mechanical_model_, ElasticTendonChain)
     assert isinstance(model.mechanical_model, ConstantCurvatureChain)
     assert np.linalg.norm(model.predict(q[80:]) - x[80:], axis=1).mean() < 1e-3
-    as_given = HybridForwardModel(plain, "auto", random_state=0)  # nothing is to be calibrated
+    as_given = HybridForwardModel(plain, "auto", calibrate=(), random_state=0)
     with pytest.warns(UserWarning, match="ElasticTendonChain") as said:
         as_given.fit(q[:80], x[:80])
     assert len(said) == 1  # of all rows, not of every fold and candidate again
