@@ -37,11 +37,17 @@ PLANTS: dict[str, dict[str, Any]] = {
 NOMINAL, CALIBRATED = "mechanical, nominal", "mechanical, calibrated"
 PAPER, AUTO, AUTO_PLAY = "parallel, the paper's ELM", "auto", 'auto, play="auto"'
 DATA_ONLY = ("data alone, quadratic", "data alone, kernel ridge")
-COUPLINGS, READOUTS = ("parallel", "serial"), ("linear", "quadratic", "pose")
+AUTO_MECHANICS = "mechanical, as auto took it"
+COUPLINGS, READOUTS = ("parallel", "serial"), ("quadratic", "pose")
+INNER = (0.6, 0.8)
+"""Parts of the range of every actuator of the trunks that are learned from; the rest is tested."""
 
 _CABLE_NOISE, _MOCAP_NOISE = 1e-3, 5e-4  # as the defaults of `make_trunk` [m]
-_LOW, _HIGH, _INNER = 0.19, 0.31, 0.6  # the range of `paper_protocol` [m]; its inner part
+_LOW, _HIGH = 0.19, 0.31  # the range of `paper_protocol` [m]
 _NEAR = 6.05e-3  # cables of the inner part of armlab_3cable [m]
+_PULLED = 0.6  # of the largest pull of every tendon of ftdcr_v4: its inner part
+_PAIRS = ((2, 3), (1, 4), (0, 5))  # motors of asl_trunk_static by segment, base to tip
+_SPOOL = 0.05  # tendon per unit of their commands, a guess [m]
 
 
 class Case(NamedTuple):
@@ -51,7 +57,7 @@ class Case(NamedTuple):
     draw: int
     chain: Any
     frame: tuple[str, ...]  # calibrated even in the nominal model: where the frame is unknown
-    calibrate: tuple[str, ...] | str
+    calibrate: tuple[str, ...] | str  # of all models but auto, which chooses for itself
     q: NDArray
     x: NDArray
     groups: NDArray | None
@@ -77,8 +83,14 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
                 results = model.cv_results_
                 scores = zip(results["candidate"], results["mean_distance"].tolist(), strict=True)
                 entry |= {"chosen": results["chosen"], "scores": dict(scores)}
-            entry["errors"] = {test: _errors(model, *rows) for test, rows in case.tests.items()}
-            entries.append(entry)
+                entry["mechanics"] = results["mechanical_model"]
+            errors = {test: _errors(model, *rows) for test, rows in case.tests.items()}
+            entries.append({**entry, "errors": errors})
+            if name == AUTO:
+                alone = HybridForwardModel(model.mechanical_model_, "drop").fit(case.q, case.x)
+                errors = {test: _errors(alone, *rows) for test, rows in case.tests.items()}
+                parts = {key: entry[key] for key in ("case", "draw", "n")}
+                entries.append({**parts, "model": AUTO_MECHANICS, "errors": errors})
     return entries
 
 
@@ -115,14 +127,11 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     for coupling in COUPLINGS:
         for kind in READOUTS:
             learners[f"{coupling}, {kind}"] = partial(hybrid, kind, coupling=coupling)
-    for kind in READOUTS:
-        free = partial(hybrid, kind, coupling="serial", guard=None)
-        learners[f"serial, {kind}, no guard"] = free
-    auto = partial(HybridForwardModel, case.chain, AUTO, calibrate=case.calibrate)
-    auto = partial(auto, coverage=case.coverage, random_state=seed)
-    learners[AUTO] = auto
+    learners["serial, pose, no guard"] = partial(hybrid, "pose", coupling="serial", guard=None)
+    auto = partial(HybridForwardModel, case.chain, AUTO, random_state=seed)
+    learners[AUTO] = partial(auto, coverage=case.coverage)
     if case.in_time:
-        learners[AUTO_PLAY] = partial(auto, play="auto", coverage=None)
+        learners[AUTO_PLAY] = partial(auto, play="auto")
     return learners
 
 
@@ -147,20 +156,22 @@ def trunk_cases(
     n_test: int,
     folder: Any,
     n_jobs: int | None,
-    inner: bool = False,
+    inner: float | None = None,
 ) -> list[Case]:
-    """Return the cases of the simulated trunks; `inner` trains within part of the range."""
+    """Return the cases of the simulated trunks; `inner` trains within that part of the range."""
     cases, largest = [], max(sizes)
     for seed, name in enumerate(PLANTS):
         make = partial(_without_noise, name, folder, n_jobs)
-        rows = make(n_random=n_test + (0 if inner else n_draws * largest))
+        rows = make(n_random=n_test + (n_draws * largest if inner is None else 0))
         test, data = (rows[0][:n_test], rows[1][:n_test]), (rows[0][n_test:], rows[1][n_test:])
-        if inner:
-            middle, half = 0.5 * (_LOW + _HIGH), 0.5 * _INNER * (_HIGH - _LOW)
-            unit = np.random.default_rng([seed, 60]).random((n_draws * largest, 9))
+        if inner is not None:
+            middle, half = 0.5 * (_LOW + _HIGH), 0.5 * inner * (_HIGH - _LOW)
+            unit = np.random.default_rng([seed, round(100 * inner)])
+            unit = unit.random((n_draws * largest, 9))
             data = make(q_target=middle + half * (2.0 * unit - 1.0))
             beyond = (np.abs(test[0] - middle) > half).any(1)
             test = test[0][beyond], test[1][beyond]
+            name = f"{name}, inner {100 * inner:.0f} %"
         tests = {"without noise": test, "with noise": _noisy(*test, [seed, 1])}
         for draw in range(n_draws):
             drawn = slice(draw * largest, (draw + 1) * largest)
@@ -207,6 +218,7 @@ def armlab_cases(
     turns = -2.0 * np.pi / 3.0 * np.arange(3)[None]
     chain = ConstantCurvatureChain([0.003], angles=turns, lengths=[0.15])
     parameters, cases = ("radii", "lengths", "base", "tool"), []
+    name = f"armlab_3cable{', pulls up to 6 mm' if inner else ''}"
     lines, near = np.unique(data.groups), (data.q >= -_NEAR).all(1)
     for draw in range(n_draws):
         rng = np.random.default_rng(draw)
@@ -216,17 +228,12 @@ def armlab_cases(
         tests = {"measured": (data.q[test[:n_test]], data.x[test[:n_test]])}
         for n in sizes:
             some = data.q[rows[:n]], data.x[rows[:n]], data.groups[rows[:n]]
-            cases.append(Case("armlab_3cable", draw, chain, ("base",), parameters, *some, tests))
+            cases.append(Case(name, draw, chain, ("base",), parameters, *some, tests))
     return cases
 
 
-def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case]:
-    """Return the cases of ftdcr_v4, none where the recording is absent."""
-    try:
-        data = datasets.load_ftdcr(data_home)
-    except FileNotFoundError as missing:
-        warnings.warn(f"Left out: {missing}", stacklevel=3)
-        return []
+def _nine_tendons() -> dict[str, tuple[Any, tuple[str, ...]]]:
+    """Return the mechanical models of ftdcr_v4 by name, and what to calibrate of each."""
     radii, turns = np.full(3, 0.0045), 2.0 * np.pi / 3.0 * np.arange(3)
     geometry: dict[str, Any] = {
         "lengths": (0.06, 0.0625, 0.064),
@@ -238,10 +245,57 @@ def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case
         radii, **geometry, bending_stiffness=0.15 * radii**2, axial_stiffness=10.0
     )
     stiff = ("rest_bends", "bending_stiffness", "axial_stiffness", "tendon_zeros")
-    chains = {
+    return {
         "plain chain": (plain, ("base", "tool", "radii", "lengths")),
         "elastic tendons": (elastic, ("base", "tool", *stiff)),
     }
+
+
+def pull_cases(data_home: Any, thin: int) -> list[Case]:
+    """Return the cases of ftdcr_v4 that are learned from small pulls; none without the data."""
+    try:
+        data = datasets.load_ftdcr(data_home)
+    except FileNotFoundError as missing:
+        warnings.warn(f"Left out: {missing}", stacklevel=3)
+        return []
+    near = (data.q >= _PULLED * data.q.min(0)).all(1)
+    rows = np.flatnonzero(near)[::thin]
+    tests = {"measured": (data.q[~near], data.x[~near])}
+    part = data.q[rows], data.x[rows], data.groups[rows]
+    return [
+        Case(f"ftdcr_v4, {name}", 0, chain, ("base",), parameters, *part, tests)
+        for name, (chain, parameters) in _nine_tendons().items()
+    ]
+
+
+def run_cases(data_home: Any, thin: int) -> list[Case]:
+    """Return the cases of asl_trunk_static, whole runs in five folds; none without the data.
+
+    Each motor pulls one tendon of its segment and releases the opposite one.
+    """
+    try:
+        data = datasets.load_asl_trunk(data_home)
+    except FileNotFoundError as missing:
+        warnings.warn(f"Left out: {missing}", stacklevel=3)
+        return []
+    q = np.hstack([_SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)])
+    chain = ConstantCurvatureChain(np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12))
+    cases = []
+    for k, (train, test) in enumerate(GroupKFold(5).split(q, groups=data.groups)):
+        rows = train[::thin]
+        part = q[rows], data.x[rows], data.groups[rows]
+        tests = {"5 folds": (q[test], data.x[test], data.groups[test])}
+        cases.append(Case("asl_trunk_static", k, chain, ("base",), "default", *part, tests))
+    return cases
+
+
+def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case]:
+    """Return the cases of ftdcr_v4, none where the recording is absent."""
+    try:
+        data = datasets.load_ftdcr(data_home)
+    except FileNotFoundError as missing:
+        warnings.warn(f"Left out: {missing}", stacklevel=3)
+        return []
     families = np.array([label.split("_")[1] for label in data.groups])
     single, pair = (np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair"))
     folds = list(GroupKFold(5).split(data.q, groups=data.groups))
@@ -256,7 +310,7 @@ def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case
         "the same, groups: segments": ([(single, pair)], families),
     }
     cases = []
-    for name, (chain, parameters) in chains.items():
+    for name, (chain, parameters) in _nine_tendons().items():
         for way, (splits, groups) in ways.items():
             for k, (train, test) in enumerate(splits):
                 rows = train[::thin]

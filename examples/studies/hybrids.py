@@ -23,12 +23,15 @@ from hybrid_cases import (
     AUTO,
     CALIBRATED,
     DATA_ONLY,
+    INNER,
     NOMINAL,
     PAPER,
     Case,
     armlab_cases,
     examined,
     motion_cases,
+    pull_cases,
+    run_cases,
     trunk_cases,
 )
 from joblib import Parallel, delayed
@@ -37,6 +40,8 @@ from hybridkin import plots
 from hybridkin.workflow.report import Report
 
 SIZES = (25, 50, 100, 200, 400, 800, 1600)
+
+_PANELS = 4  # in a line of a figure
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
@@ -109,9 +114,9 @@ def extrapolation(
 ) -> list[dict[str, Any]]:
     """Return the errors of all models outside their training range.
 
-    The trunks: trained within the inner 60 % of the range of every length, tested on rows of the
-    whole range that leave this box. armlab_3cable: trained where no cable is shortened by more than
-    6 mm, tested where one is.
+    The trunks: trained within the inner 60 and 80 % of the range of every length, tested on rows
+    of the whole range that leave this box. armlab_3cable: trained where no cable is shortened by
+    more than 6 mm, tested where one is. ftdcr_v4: the same with 60 % of the pull of every tendon.
 
     Parameters
     ----------
@@ -125,8 +130,10 @@ def extrapolation(
     list of dict
         One entry per case and model, as in `learning_curves`.
     """
-    cases = trunk_cases([n], n_draws, n_test, folder, n_jobs, inner=True)
+    trunks = (trunk_cases([n], n_draws, n_test, folder, n_jobs, inner=part) for part in INNER)
+    cases = [case for one in trunks for case in one]
     cases += armlab_cases([n], n_draws, n_test, data_home, inner=True)
+    cases += pull_cases(data_home, thin=2)
     return examine(cases, models, n_jobs, progress)
 
 
@@ -139,12 +146,13 @@ def held_out_motions(
     n_jobs: int | None = 1,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Return the errors of all models on held-out motions of ftdcr_v4.
+    """Return the errors of all models on held-out motions of ftdcr_v4 and asl_trunk_static.
 
     Whole motions in five folds; all motions of a pair of segments held out, three times; and the
     motions of two segments, learned from those of a single one, where groups are the motions or the
     segments that move. Mechanical models: a constant-curvature chain, and one of elastic tendons.
-    `auto, play="auto"` fits backlash as well; its predictions use the motion so far.
+    `auto, play="auto"` fits backlash as well; its predictions use the motion so far. Of
+    asl_trunk_static whole runs are held out, in five folds.
 
     Parameters
     ----------
@@ -163,7 +171,8 @@ def held_out_motions(
         its "errors" have "radius" [m], "known", the share of rows with a radius, which lie in the
         domain, and "within", the share of these whose tips are inside it.
     """
-    return examine(motion_cases(data_home, coverage, thin), models, n_jobs, progress)
+    cases = motion_cases(data_home, coverage, thin) + run_cases(data_home, thin)
+    return examine(cases, models, n_jobs, progress)
 
 
 def examine(
@@ -289,16 +298,21 @@ def _curves_figure(curves: list[dict[str, Any]]) -> Any:
 
 def _outside_figure(outside: list[dict[str, Any]]) -> Any:
     cases = [(case, test) for case, test in _tests(outside) if test != "with noise"]
-    figure, axes = plots.new_figure(8.0, 4.2, 1, len(cases), sharey=True, squeeze=False)
-    names = [name for name in dict.fromkeys(entry["model"] for entry in outside) if name != NOMINAL]
-    for ax, case in zip(axes[0], cases, strict=True):
+    n_lines = -(-len(cases) // _PANELS)
+    shape = n_lines, -(-len(cases) // n_lines)
+    figure, axes = plots.new_figure(9.0, 3.6 * n_lines, *shape, sharey=True, squeeze=False)
+    for ax in axes.flat[len(cases) :]:
+        ax.set_axis_off()
+    names = list(dict.fromkeys(entry["model"] for entry in outside))
+    for ax, case in zip(axes.flat, cases, strict=False):
         means = _means(outside, *case)
         shown = [name for name in names if name in means]
         places = [len(names) - names.index(name) for name in shown]
         for k, label, mark, color in ((0, "mean", "o", "#0072B2"), (2, "largest", "x", "#D55E00")):
             values = [1e3 * means[name][k] for name in shown]
             ax.plot(values, places, mark, color=color, label=label)
-            ax.axvline(1e3 * means[CALIBRATED][k], color="0.7", linewidth=1.0, linestyle="--")
+            least = min((NOMINAL, CALIBRATED), key=lambda name: means.get(name, [np.inf])[0])
+            ax.axvline(1e3 * means[least][k], color="0.7", linewidth=1.0, linestyle="--")
         ax.set(xscale="log", xlabel="tip error [mm]", title=case[0])
         _plain_ticks(ax.xaxis)
         ax.set_yticks(range(len(names), 0, -1), names)

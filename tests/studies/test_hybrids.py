@@ -10,7 +10,7 @@ from hybridkin import ConstantCurvatureChain
 from hybridkin.datasets._recordings import FTDCR_FILES, FTDCR_SERVOS
 
 PAPER, NOMINAL, CALIBRATED = cases.PAPER, cases.NOMINAL, cases.CALIBRATED
-SHOWN = (NOMINAL, CALIBRATED, PAPER, "serial, linear", "serial, quadratic", "auto")
+SHOWN = (NOMINAL, CALIBRATED, PAPER, "serial, quadratic", "auto")
 
 pytestmark = pytest.mark.slow
 
@@ -102,7 +102,7 @@ def mean(table, model, n):
 
 def test_one_entry_for_every_model_and_size(curves):
     assert {(e["model"], e["n"]) for e in curves} == {
-        (model, n) for model in (*SHOWN, *cases.DATA_ONLY) for n in (25, 120)
+        (model, n) for model in (*SHOWN, *cases.DATA_ONLY, cases.AUTO_MECHANICS) for n in (25, 120)
     }
     for e in curves:
         assert list(e["errors"]) == ["without noise", "with noise"]
@@ -137,7 +137,7 @@ def test_the_same_again_and_fewer_rows_are_part_of_more(curves, one_plant, folde
 
 
 def test_inner_rows_teach_and_outer_ones_examine(one_plant, recordings, folder):
-    trunk = cases.trunk_cases((20,), 1, 20, folder, 1, inner=True)[0]
+    trunk = cases.trunk_cases((20,), 1, 20, folder, 1, inner=0.6)[0]
     assert np.abs(trunk.q - 0.25).max() < 0.036 + 0.005
     assert (np.abs(trunk.tests["without noise"][0] - 0.25).max(1) > 0.0359).all()
     inner, outer = cases.armlab_cases((100,), 2, 100, recordings, inner=True)
@@ -177,14 +177,21 @@ def test_lines_and_motions_are_held_out_whole(recordings):
 
 
 def test_report_of_all_three(curves, one_plant, recordings, folder, tmp_path):
-    models = (NOMINAL, CALIBRATED, cases.DATA_ONLY[0], "serial, linear", "auto")
+    models = (NOMINAL, CALIBRATED, cases.DATA_ONLY[0], "serial, pose", "auto")
     outside = extrapolation(
         20, 1, n_test=20, models=models[:-1], data_home=recordings, folder=folder
     )
-    assert {e["case"] for e in outside} == {"trunk 1", "armlab_3cable"}
+    trunks = {f"trunk 1, inner {part} %" for part in (60, 80)}
+    assert {e["case"] for e in outside} == {
+        *trunks,
+        "armlab_3cable, pulls up to 6 mm",
+        "ftdcr_v4, plain chain",
+        "ftdcr_v4, elastic tendons",
+    }
     pairs = cases.motion_cases(recordings, 0.9, 4)[8]
     motions = cases.examined(pairs._replace(calibrate=()), (CALIBRATED, "auto", cases.AUTO_PLAY))
-    assert [entry["model"] for entry in motions] == [CALIBRATED, "auto", cases.AUTO_PLAY]
+    names = [CALIBRATED, "auto", cases.AUTO_MECHANICS, cases.AUTO_PLAY]
+    assert [entry["model"] for entry in motions] == names
     assert 0.0 <= motions[1]["errors"]["pairs from single segments"]["within"] <= 1.0
     report = hybrids_report(curves, outside, motions)
     paths = {path.name for path in report.write(tmp_path / "hybrids")}
@@ -194,6 +201,17 @@ def test_report_of_all_three(curves, one_plant, recordings, folder, tmp_path):
     assert "| plain chain | 0 | " in text
 
 
+def test_small_pulls_teach_and_large_ones_examine(recordings):
+    case = cases.pull_cases(recordings, 1)[0]
+    q = np.vstack([case.q, case.tests["measured"][0]])
+    assert (case.q >= 0.6 * q.min(0)).all()
+    assert (case.tests["measured"][0] < 0.6 * q.min(0)).any(1).all()
+    assert len(q) == 24 * 6
+
+
 def test_absent_recordings_are_left_out(tmp_path):
-    with pytest.warns(UserWarning, match="Left out: ftdcr_v4"):
+    with (
+        pytest.warns(UserWarning, match="Left out: ftdcr_v4"),
+        pytest.warns(UserWarning, match="Left out: asl_trunk_static"),
+    ):
         assert held_out_motions(data_home=tmp_path) == []
