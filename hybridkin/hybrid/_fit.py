@@ -21,7 +21,7 @@ from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._features import Features, HiddenFeatures, PoseFeatures, QuadraticFeatures
-from hybridkin.hybrid._guards import fit_guard
+from hybridkin.hybrid._guards import GroupDistance, fit_guard
 from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._linearised import Pair
 from hybridkin.hybrid._module import Correction, HybridModule, InnerCorrection, TipCorrection
@@ -133,7 +133,10 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     shares = [w for w, (_, found) in zip(weights, fits, strict=True) if found is not None]
     corrections = [found for _, found in fits if found is not None]
     kind = PoseHybridModule if spec.output == "pose" else HybridModule
-    module = kind(spec.mechanical, corrections, rows.q.new_tensor(shares))
+    tested = None
+    if errors.groups is not None and any(found.guard is not None for found in corrections):
+        tested = GroupDistance.fit(errors.q, errors.groups)
+    module = kind(spec.mechanical, corrections, rows.q.new_tensor(shares), None, tested)
     return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
 
 

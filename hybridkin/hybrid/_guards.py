@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -15,6 +16,8 @@ from hybridkin.learning.network import LeverageModule
 GUARDS = ("leverage", "box", None)
 _STILL = 1e-3  # of the largest spread: the log does not move in such a direction
 _AS_IF = 0.1  # of the range: the spread that is assumed in such a direction
+_ROWS = 128  # that stand for the training rows
+_STEP = 0.2  # the least distance to be tested, where the range of an actuator is 2
 
 
 class Guard(PortableModule):
@@ -227,6 +230,60 @@ def fit_guard(
         return LeverageGuard.fit(model, q, largest, times)
 
 
+class GroupDistance(PortableModule):
+    """Distance from the training rows, at most 1 as far as held-out groups have tested it.
+
+    Errors on held-out groups hold for rows that are no farther from the training rows than these
+    are from the rows of other groups. A leverage does not know this: single actuators span all of
+    its features [1, u, u^2], but no row shows how their motions act together.
+
+    Parameters
+    ----------
+    rows : Tensor of shape (R, n)
+        Training rows that stand for all of them.
+    axes : Tensor of shape (n, k)
+        Directions in which the rows move, per range of each actuator.
+    farthest : Tensor of shape ()
+        The largest distance of a training row from the rows of other groups, along these axes.
+    """
+
+    layout = Layout("group_distance", {"rows": "rn", "axes": "nk", "farthest": ""})
+
+    def __init__(self, rows: Tensor, axes: Tensor, farthest: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("rows", rows)
+        self.register_buffer("axes", axes)
+        self.register_buffer("farthest", farthest)
+
+    @classmethod
+    def fit(cls, q: Tensor, groups: NDArray) -> GroupDistance | None:
+        """Return the distance of training rows q (N, n) in groups (N,), None of a single one."""
+        of = torch.from_numpy(np.unique(groups, return_inverse=True)[1])
+        if not of.any():
+            return None
+        axes = _directions(q)[0] / center_and_scale(q)[1][:, None]
+        y = (q - q.mean(0)) @ axes
+        # Each row that is added is the farthest from those before.
+        picked, gap = [y.square().sum(1).argmax()], y.new_full((len(y),), torch.inf)
+        while True:
+            gap = torch.minimum(gap, (y - y[picked[-1]]).square().sum(1))
+            if len(picked) == _ROWS or not gap.any():
+                break
+            picked.append(gap.argmax())
+        rows = torch.stack(picked)
+        apart = torch.cdist(y[rows], y).masked_fill(of[rows, None] == of, torch.inf).amin(1)
+        # All training rows are within a gap of the picked ones, and so are their distances.
+        # Where every motion was repeated, the step keeps the domain from being empty.
+        return cls(q[rows], axes, (apart.max() + gap.max().sqrt()).clamp(min=_STEP))
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return the squared distance of rows q (N, n) from the nearest row, relative, (N,)."""
+        rows, axes = self.rows.to(q), self.axes.to(q) / self.farthest.to(q)
+        with torch.no_grad():
+            nearest = torch.cdist(q @ axes, rows @ axes).argmin(1)
+        return ((q - rows[nearest]) @ axes).square().sum(1)
+
+
 def _unexcited(q: Tensor) -> Tensor:
     """Return the directions (n, k) of q, over its range, in which rows (N, n) do not move.
 
@@ -234,6 +291,12 @@ def _unexcited(q: Tensor) -> Tensor:
     about it, but the mechanical model does. If every small step along it left the domain, inverse
     kinematics could use the fading of the error model as a way to move the tip.
     """
+    return _directions(q)[1]
+
+
+def _directions(q: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the directions of q, over its range, in which rows (N, n) move, and the others."""
     spread = (q - q.mean(0)) / center_and_scale(q)[1]
     axes, variances, _ = torch.linalg.svd(spread.mT @ spread)
-    return axes[:, variances < _STILL**2 * variances[0]]
+    still = variances < _STILL**2 * variances[0]
+    return axes[:, ~still], axes[:, still]

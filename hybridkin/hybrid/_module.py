@@ -14,7 +14,7 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.stored import Layout
 from hybridkin.hybrid._features import Readout
-from hybridkin.hybrid._guards import Guard, LeverageGuard
+from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard
 from hybridkin.learning.regressor_modules import AffineModule
 from hybridkin.native.plan import ROUNDING
 
@@ -156,9 +156,13 @@ class HybridModule(ForwardModel):
         w_k.
     drift : AffineModule or None
         d, how the robot has changed since the fit.
+    tested : GroupDistance or None
+        How far held-out groups have tested the corrections, where the rows have groups.
     """
 
-    layout = Layout("hybrid_module", {"weights": "k"}, parts=("mechanical", "corrections", "drift"))
+    layout = Layout(
+        "hybrid_module", {"weights": "k"}, parts=("mechanical", "corrections", "drift", "tested")
+    )
 
     def __init__(
         self,
@@ -166,12 +170,14 @@ class HybridModule(ForwardModel):
         corrections: Sequence[Correction],
         weights: Tensor,
         drift: AffineModule | None = None,
+        tested: GroupDistance | None = None,
     ) -> None:
         super().__init__()
         self.mechanical = mechanical
         self.corrections = nn.ModuleList(corrections)
         self.register_buffer("weights", weights)
         self.drift = drift
+        self.tested = tested
         if mechanical is not None:
             self.n_actuators, self.n_outputs = mechanical.n_actuators, mechanical.n_outputs
 
@@ -182,7 +188,8 @@ class HybridModule(ForwardModel):
 
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this one stays as it is."""
-        return type(self)(self.mechanical, [c for _, c in self._parts()], self.weights, drift)
+        corrections = [c for _, c in self._parts()]
+        return type(self)(self.mechanical, corrections, self.weights, drift, self.tested)
 
     def rows(self) -> HybridModule:
         """Return the module whose outputs are the columns of measured y: for tips the same."""
@@ -210,7 +217,7 @@ class HybridModule(ForwardModel):
         return in_blocks(lambda rows: (self._trust(rows),), q)[0][..., 0]
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return the largest distance from the training rows of any guard, shape (...)."""
+        """Return the largest distance from the training rows of guards and groups, (...)."""
         return in_blocks(lambda rows: (self._distance(rows),), q)[0][..., 0]
 
     def _parts(self) -> list[tuple[float, Correction]]:
@@ -253,8 +260,9 @@ class HybridModule(ForwardModel):
         return q.new_ones(len(q), 1) - sum(weight * (1.0 - guard(q)) for weight, guard in guards)
 
     def _distance(self, q: Tensor) -> Tensor:
-        """Return the largest distance of any guard at rows q, shape (N, 1)."""
+        """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
         guards = [c.guard for _, c in self._parts() if c.guard is not None]
+        guards += [] if self.tested is None else [self.tested]
         distances = [guard.domain_distance(q) for guard in guards] or [q.new_zeros(len(q))]
         return torch.stack(distances, 1).amax(1, keepdim=True)
 

@@ -39,6 +39,7 @@ _MODULES: dict[str, type[PortableModule]] = {
         *(_features.Features, _features.QuadraticFeatures),
         *(_features.HiddenFeatures, _features.PoseFeatures),
         *(_guards.BoxGuard, _guards.LeverageGuard, _guards.QuadraticLeverage),
+        _guards.GroupDistance,
         *(_module.TipCorrection, _module.InnerCorrection),
         *(_module.HybridModule, PoseHybridModule),
     )

@@ -15,7 +15,7 @@ from hybridkin._core.stored import Stored
 
 # Kinds of nodes, as src/plan.h numbers them.
 ARCS, ELASTIC, RIGID, AFFINE, ELM, POLYNOMIAL, KERNEL, READOUT = range(1, 9)
-LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK = range(9, 14)
+LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK, GROUP_DISTANCE = range(9, 15)
 GROUPED = (AFFINE, ELM, KERNEL, QUADRATIC_LEVERAGE)
 GROUP = 8  # hidden units, or columns of a leverage, that stand together
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
@@ -309,19 +309,29 @@ def _box_guard(plan: Plan, stored: Stored) -> int:
     return plan.node(BOX_GUARD, len(low), 0, [stored.array("largest"), low, high, 1.0 / width])
 
 
+def _group_distance(plan: Plan, stored: Stored) -> int:
+    rows, axes = stored.array("rows"), stored.array("axes") / stored.array("farthest")
+    center = rows.mean(0)
+    placed = np.pad((rows - center) @ axes, ((0, -len(rows) % GROUP), (0, 0)), mode="edge")
+    groups = placed.reshape(-1, GROUP, axes.shape[1]).swapaxes(1, 2)
+    return plan.node(GROUP_DISTANCE, len(center), 0, [center, axes.T, groups], *groups.shape[:2])
+
+
 def _content(stored: Stored) -> tuple:
     """Return what two descriptions without parts must share to be the same."""
     return stored.kind, stored.settings, {k: a.tobytes() for k, a in stored.arrays.items()}
 
 
 def _hybrid(plan: Plan, stored: Stored) -> int:
-    base = drift = -1
+    base = drift = tested = -1
     if "mechanical" in stored.parts:
         base = plan.node_of(stored.part("mechanical"))
         if plan.entry(base, 0) not in (ARCS, ELASTIC, RIGID):
             raise NoKernel(f"the mechanical part {stored.part('mechanical').kind!r} is no chain")
     if "drift" in stored.parts:
         drift = plan.node_of(stored.part("drift"))
+    if "tested" in stored.parts:
+        tested = plan.node_of(stored.part("tested"))
     places, inner = [], []
     for part in stored.part("corrections").parts.values():
         inner.append(part.kind == "inner_correction")
@@ -337,7 +347,7 @@ def _hybrid(plan: Plan, stored: Stored) -> int:
     numbers = [weights, np.array([share * (share > ROUNDING), any(inner)])]
     sized = base if base >= 0 else int(places[1])
     n, m = plan.entry(sized, 1), plan.entry(sized, 2)
-    return plan.node(HYBRID, n, m, numbers, base, drift, len(inner), *places)
+    return plan.node(HYBRID, n, m, numbers, base, drift, tested, len(inner), *places)
 
 
 def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
@@ -367,6 +377,7 @@ WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
     "quadratic_leverage": _quadratic_leverage,
     "leverage_guard": _leverage_guard,
     "box_guard": _box_guard,
+    "group_distance": _group_distance,
     "hybrid_module": _hybrid,
     "inverse_kinematics": _inverse_kinematics,
 }

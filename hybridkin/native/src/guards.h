@@ -225,3 +225,36 @@ static inline void HK(shorten)(const HK(shortening) *how, int m, int k, V *J) {
             J[k * i + j] = J[k * i + j] * how->factor + along * how->along[i];
     }
 }
+
+/* The squared distance of q from the nearest of the rows that stand for the training rows, and its
+   slope (n) where not NULL. After the center (n) and the axes (k, n) these rows stand in groups of
+   HK_GROUP columns (k). */
+static inline V HK(group_distance)(const hk_plan *p, int at, const V *q, V *slope) {
+    const int n = p->code[at + HK_N], count = p->code[at + HK_MORE], k = p->code[at + HK_MORE + 1];
+    const real *center = hk_numbers(p, at), *axes = center + n, *rows = axes + k * n;
+    V y[HK_MAX_N], to[HK_MAX_N], nearest = SPLAT(0.0);
+    for (int i = 0; i < k; i++) {
+        y[i] = to[i] = SPLAT(0.0);
+        for (int j = 0; j < n; j++) y[i] = y[i] + axes[n * i + j] * (q[j] - center[j]);
+    }
+    for (int g = 0; g < count; g++, rows += HK_GROUP * k) {
+        V s[HK_GROUP];
+        for (int l = 0; l < HK_GROUP; l++) s[l] = SPLAT(0.0);
+        for (int i = 0; i < k; i++)
+            for (int l = 0; l < HK_GROUP; l++) {
+                const V d = y[i] - rows[HK_GROUP * i + l];
+                s[l] = s[l] + d * d;
+            }
+        for (int l = 0; l < HK_GROUP; l++) {
+            const M closer = g + l ? s[l] < nearest : NOT(s[l] < SPLAT(0.0)); /* the first, or NaN */
+            nearest = SELECT(closer, s[l], nearest);
+            for (int i = 0; slope && i < k; i++)
+                to[i] = SELECT(closer, y[i] - rows[HK_GROUP * i + l], to[i]);
+        }
+    }
+    for (int j = 0; slope && j < n; j++) {
+        slope[j] = SPLAT(0.0);
+        for (int i = 0; i < k; i++) slope[j] = slope[j] + R(2.0) * axes[n * i + j] * to[i];
+    }
+    return nearest;
+}

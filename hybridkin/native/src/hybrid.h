@@ -141,10 +141,14 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
         if (J) HK(add)(m * n, R(1.0), slope, J);
     }
     for (int i = 0; i < m; i++) x[i] = sum.x[i];
-    if (distance) *distance = sum.farthest;
+    if (!distance) return;
+    *distance = sum.farthest;
+    if (more[HK_TESTED] < 0) return;
+    const V here = HK(group_distance)(p, more[HK_TESTED], q, NULL);
+    *distance = SELECT(NOT(here <= *distance), here, *distance);
 }
 
-/* The largest distance of any guard, and its slope (n) by q where not NULL. */
+/* The largest distance of any guard and of the groups, and its slope (n) by q where not NULL. */
 static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
     const int32_t *node = p->code + at, *part = node + HK_MORE + HK_FIRST;
     const int n = node[HK_N], count = HK_IS(p, at, HK_HYBRID) ? node[HK_MORE + HK_COUNT] : 0;
@@ -161,5 +165,12 @@ static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance,
         if (!slope || !HK(any)(farther)) continue;
         HK(guard_slope)(p, part[HK_GUARD], q, &seen, own);
         for (int j = 0; j < n; j++) slope[j] = SELECT(farther, own[j], slope[j]);
+    }
+    if (HK_IS(p, at, HK_HYBRID) && node[HK_MORE + HK_TESTED] >= 0) {
+        V own[HK_MAX_N];
+        const V here = HK(group_distance)(p, node[HK_MORE + HK_TESTED], q, slope ? own : NULL);
+        const M farther = NOT(here <= *distance);
+        *distance = SELECT(farther, here, *distance);
+        for (int j = 0; slope && j < n; j++) slope[j] = SELECT(farther, own[j], slope[j]);
     }
 }

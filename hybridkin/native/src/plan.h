@@ -67,15 +67,16 @@ enum {
     HK_BOX_GUARD,
     HK_QUADRATIC_LEVERAGE,
     HK_HYBRID,
-    HK_IK
+    HK_IK,
+    HK_GROUP_DISTANCE
 };
 
 enum { HK_LOGISTIC, HK_TANH, HK_SIN, HK_GAUSSIAN };
 enum { HK_QUADRATIC_FEATURES = 1, HK_POSE_FEATURES = 3 };
 
-/* A hybrid adds the places of mechanical model and drift, the number of corrections, and of each
-   whether it acts inside, its regressor and its guard; -1 stands for none. */
-enum { HK_BASE, HK_DRIFT, HK_COUNT, HK_FIRST };
+/* A hybrid adds the places of mechanical model, drift and distance from other groups, the number of
+   corrections, and of each whether it acts inside, its regressor and its guard; -1 stands for none. */
+enum { HK_BASE, HK_DRIFT, HK_TESTED, HK_COUNT, HK_FIRST };
 enum { HK_INNER, HK_REGRESSOR, HK_GUARD, HK_STRIDE };
 
 typedef struct {
