@@ -15,7 +15,7 @@ from hybridkin.hybrid._features import (
     QuadraticFeatures,
     Readout,
 )
-from hybridkin.hybrid._guards import BoxGuard, LeverageGuard, QuadraticLeverage
+from hybridkin.hybrid._guards import BoxGuard, GroupDistance, LeverageGuard, QuadraticLeverage
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
 from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import AffineModule, KernelModule, PolynomialModule
@@ -192,6 +192,25 @@ def test_corrections_beside_the_limits_of_domain_and_weight(coupling):
         assert np.abs(ours[faded] - theirs[faded]).max() > 1e-4
     for rows in (inside, full, faded, inside | faded):
         assert_as_in_torch(module, q[rows])
+
+
+@pytest.mark.parametrize("n_rows", [2, 8, 21, 400])
+@pytest.mark.parametrize("trust", ["box", "leverage"])
+def test_distance_from_other_groups(trust, n_rows):
+    """Rows where the guard decides beside rows where the groups do; also for balanced tendons."""
+    module = hybrid("quadratic", "serial", trust, drifting=True)
+    rows, groups = torch.from_numpy(inputs(1.0, n_rows, seed=7)), np.arange(n_rows) % 7
+    q = inputs(1.2, 38)
+    at = torch.from_numpy(q)
+    for balance in (torch.eye(N), torch.eye(N) - 1 / N):
+        module.tested = tested = GroupDistance.fit(rows @ balance.double(), groups)
+        own = tested.domain_distance(at)
+        middle = (own / module.corrections[0].guard.domain_distance(at)).median()
+        tested.farthest *= 1.01 * middle.sqrt()  # no row in between
+        decided = (module.domain_distance(at) == tested.domain_distance(at)).sum()
+        assert 0 < decided < len(q)
+        for spread in (0.3, 1.2, 20.0):
+            assert_as_in_torch(module, inputs(spread, 38))
 
 
 @pytest.mark.parametrize("longest", [0.0, 1e-4])

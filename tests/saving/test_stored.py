@@ -43,7 +43,7 @@ def test_a_description_describes_the_same_model(fitted):
     module = fitted["parallel_elm"][0].module_
     stored = module.stored()
     assert stored.kind == "hybrid_module"
-    assert {*stored.parts} == {"mechanical", "corrections"}
+    assert {*stored.parts} == {"mechanical", "corrections", "tested"}
     (correction,) = stored.parts["corrections"].parts.values()
     network = module.corrections[0].module
     assert_array_equal(correction.parts["module"].arrays["input_weights"], network.input_weights)
