@@ -110,13 +110,18 @@ class Domain:
         """A configuration (n,) in the domain of the model, within the limits.
 
         It is the middle of the fit's range or, where that lies outside the domain, no tendon
-        pulled; without a fit the second, else the middle of the limits.
+        pulled, or else the fitted row nearest to the middle; without a fit the second, else the
+        middle of the limits.
         """
         trained, limits = self.loaded.trained_range, self.limits
         low, high = (vars(trained or limits)[name] for name in ("q_min", "q_max"))
         candidates = [0.5 * (low + high) @ self.bending]
         if self.has_tendons:
             candidates.insert(0 if trained is None else 1, np.zeros(self.loaded.n_actuators))
+        hybrid = self.loaded.hybrid
+        if hybrid is not None and hybrid.module_.tested is not None:
+            rows = hybrid.module_.tested.rows.numpy()
+            candidates.append(rows[np.linalg.norm(rows - candidates[0], axis=1).argmin()])
         q = np.clip(candidates, limits.q_min, limits.q_max)
         distance = self.loaded.domain_distance(q)
         return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain

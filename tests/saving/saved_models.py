@@ -151,6 +151,7 @@ def models() -> dict[str, tuple[Any, Any]]:
         ),
         "blend": _hybrid("auto", calibrate=("radii",)),
         "play": _hybrid("linear", play=[0.01, 0.02, 0.0]),
+        "tested_by_groups": _hybrid("linear", coupling="serial", guard="box"),
         "drift_and_radius": _drifting(),
         "rigid_hybrid": _rigid_hybrid(),
         "elastic_hybrid": _elastic_hybrid(),

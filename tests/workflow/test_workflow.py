@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -327,6 +328,23 @@ def test_an_actuator_that_never_moved_is_held_where_it_was():
     assert limits.q_max == pytest.approx(q.max(axis=0))
     assert limits.source == "range of the fit"
     assert model.module_.in_domain(torch.from_numpy(Domain(loaded, limits).sample[0])).all()
+
+
+def test_the_domain_of_few_lines_is_found_from_its_rows():
+    """Single actuators from the shortest: the middle of the range is far from all motions."""
+    q = np.full((9, 20, 3), 0.16)
+    q[np.arange(9), :, np.arange(9) % 3] += np.linspace(0.0, 0.1, 20)
+    q, groups = q.reshape(-1, 3), np.arange(180) // 20
+    chain = ConstantCurvatureChain([0.05])
+    x = chain(torch.from_numpy(q)).numpy() + 0.01 * q
+    model = HybridForwardModel(chain, LinearRegression()).fit(q, x, groups=groups)
+    loaded = workflow.LoadedModel("lines", Path("lines"), model)
+    domain = Domain(loaded, workflow.path_limits(loaded))
+    assert not model.in_domain(0.5 * (q.min(0) + q.max(0))[None])
+    assert model.in_domain(domain.preferred[None])
+    commands = domain.sample[0]
+    assert model.in_domain(commands).all()
+    assert (np.ptp(commands, axis=0) > 0.05).all()
 
 
 @pytest.mark.slow
