@@ -17,6 +17,7 @@ GUARDS = ("leverage", "box", None)
 _STILL = 1e-3  # of the largest spread: the log does not move in such a direction
 _AS_IF = 0.1  # of the range: the spread that is assumed in such a direction
 _ROWS = 128  # that stand for the training rows
+_TESTED = 0.98  # share of these rows, whose distances from other groups count as tested
 _STEP = 0.2  # the least distance to be tested, where the range of an actuator is 2
 
 
@@ -244,7 +245,7 @@ class GroupDistance(PortableModule):
     axes : Tensor of shape (n, k)
         Directions in which the rows move, per range of each actuator.
     farthest : Tensor of shape ()
-        The largest distance of a training row from the rows of other groups, along these axes.
+        How far all but a few training rows are from the rows of other groups, along these axes.
     """
 
     layout = Layout("group_distance", {"rows": "rn", "axes": "nk", "farthest": ""})
@@ -274,7 +275,7 @@ class GroupDistance(PortableModule):
         apart = torch.cdist(y[rows], y).masked_fill(of[rows, None] == of, torch.inf).amin(1)
         # All training rows are within a gap of the picked ones, and so are their distances.
         # Where every motion was repeated, the step keeps the domain from being empty.
-        return cls(q[rows], axes, (apart.max() + gap.max().sqrt()).clamp(min=_STEP))
+        return cls(q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP))
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the squared distance of rows q (N, n) from the nearest row, relative, (N,)."""
