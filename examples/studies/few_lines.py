@@ -156,8 +156,9 @@ def write(entries: list[dict[str, Any]], seconds: float) -> Report:
     seeds = sorted({entry["seed"] for entry in entries})
     report.text(
         f"{len(seeds)} logs, seeds {seeds[0]} to {seeds[-1]}; {seconds:.0f} s. Harmed: in the "
-        "domain, and a larger error than without correction; by 1 mm: larger by that. Shares of all rows, by the guard "
-        "alone -> with the distance that held-out motions have tested, in per cent."
+        "domain, and a larger error than without correction; by 1 mm: larger by that. Shares of "
+        "all rows, by the guard alone -> with the distance that held-out motions have tested, in "
+        "per cent."
     )
     parts = [(f"{test}: {what}", test, what) for test in TESTS for what in SHARES]
     for name in dict.fromkeys(entry["model"] for entry in entries):

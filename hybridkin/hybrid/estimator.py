@@ -78,8 +78,9 @@ class HybridForwardModel(HybridPredictor):
         training rows as these are to each other, in the hidden features of a network at the tip,
         for other error models in the inputs and their squares; eps fades out from three times this
         distance on, and f_mech remains. "box": the domain is the training range, and eps fades out
-        from its edge on. None: everywhere. With a guard f_hyb is nowhere farther from f_mech than
-        1.5 times the longest correction of a training row.
+        from its edge on. None: everywhere. With `groups` the domain (`in_domain`) ends as well
+        where no held-out group has tested the model. With a guard f_hyb is nowhere farther from
+        f_mech than 1.5 times the longest correction of a training row.
     play : float, array-like of shape (n,) or "auto", optional
         Play (backlash) of the actuators [unit of q]: rows are commands in the order of time, and
         the model maps the motion of the actuators, see `PlayOperator`. "auto" takes the width with
@@ -195,6 +196,7 @@ class HybridForwardModel(HybridPredictor):
         groups : array-like of shape (N,), optional
             Motion of every row, which is held out as a whole: by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
+            Rows farther from the log than its groups are from each other are not `in_domain`.
 
         Returns
         -------
