@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.play import PlayOperator, PlayState
     from hybridkin.chains.rigid import RigidChain
+    from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.estimator import HybridForwardModel
     from hybridkin.ik import tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
@@ -45,6 +46,7 @@ __all__ = [
     "__version__",
     "as_forward_model",
     "calibrate",
+    "choose_rows",
     "datasets",
     "fit_play",
     "jacobian",
@@ -68,6 +70,7 @@ _NAMES_OF = {
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.play": ("PlayOperator", "PlayState"),
     "chains.rigid": ("RigidChain",),
+    "hybrid.choose_rows": ("choose_rows",),
     "hybrid.estimator": ("HybridForwardModel",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),
     "ik.solver": ("InverseKinematics",),

@@ -30,6 +30,7 @@ def parser() -> argparse.ArgumentParser:
     model alone.
 
     Some examples:
+      hybridkin next robot.toml -n 50 --out plan
       hybridkin fit log.csv --robot robot.toml --groups motion --out model
       hybridkin evaluate model other_log.csv
       hybridkin track model --shape figure-eight --size 40,20 --unit mm --out track
@@ -38,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="hybridkin", **_help(parser))
     top.add_argument("--version", action="version", version=f"hybridkin {hybridkin.__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    for add_options in (_paper, _fit, _evaluate, _track, _animate, _export, _describe):
+    for add_options in (_paper, _next, _fit, _evaluate, _track, _animate, _export, _describe):
         text = _help(add_options)
         line = text["description"].partition("\n")[0].rstrip(".")
         command = commands.add_parser(add_options.__name__[1:], help=line, **text)
@@ -85,6 +86,35 @@ def _paper(command: argparse.ArgumentParser) -> None:
     add("--splits", type=_count, default=20, help="random test sets (20)")
     add("--points", type=_count, default=151, help="time steps per path (151)")
     _add_work(command)
+
+
+def _next(command: argparse.ArgumentParser) -> None:
+    """Choose the configurations to measure next.
+
+    Those that leave a hybrid model the least expected error, everywhere within the limits or along
+    a path. They go to next.csv in the units, names and sign of the robot's logs, in the order
+    chosen, with the expected error that remains after each.
+
+    Some examples:
+      hybridkin next robot.toml -n 50 --out plan
+      hybridkin next model -n 20 --measured log.csv --out plan
+      hybridkin next model -n 20 --path path.csv --unit mm --out plan
+      hybridkin next robot.toml --q-min 0 --q-max 8 --out plan
+
+    --q-min and --q-max are in the unit and sign of the robot's logs. By default the limits are
+    those of the robot description, else the range that the model was fitted on. Tendons of a
+    segment do not pull against each other. A path file is as for `track`.
+    """
+    add = command.add_argument
+    _add_model(command)
+    add("--out", type=Path, required=True, help="folder for next.csv")
+    add("-n", type=_count, default=50, help="configurations (50)")
+    add("--measured", type=Path, dest="log", metavar="LOG", help="log of what is measured already")
+    add("--path", type=Path, metavar="PATH.csv", help="where the error is to be small (everywhere)")
+    add("--dt", type=_positive, help="time between points of the path [s]")
+    add("--unit", choices=METRES, help="of the path (the log's x)")
+    _add_limits(command)
+    _add_log(command)
 
 
 def _fit(command: argparse.ArgumentParser) -> None:

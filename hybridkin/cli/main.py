@@ -109,6 +109,30 @@ def _paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     return _Outcome(report.record, report.plain(), paths)
 
 
+def _next(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+    workflow = hybridkin.workflow
+    loaded = workflow.open_model(arguments.model, arguments.robot)
+    measured, path = None, arguments.path
+    if arguments.log is not None:
+        known = None if loaded.description is None else loaded.description.log
+        log_format = _log_format(arguments, known, arguments.model)
+        measured = _read(arguments, log_format, loaded.chain, False)
+        measured.check(arguments.force)
+    if path is not None:
+        unit = arguments.unit or loaded.log_format().x_unit
+        path = workflow.read_path(path, unit=unit, dt=arguments.dt)
+    report, paths = workflow.next_rows(
+        loaded,
+        arguments.out,
+        n=arguments.n,
+        limits=_limits(arguments, loaded, within_fit=False),
+        measured=measured,
+        path=path,
+        progress=bars,
+    )
+    return _Outcome(report.record, report.plain(), paths)
+
+
 def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
@@ -229,15 +253,18 @@ def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     return _Outcome(found.to_dict(), str(found), code=0 if found.ok else 1)
 
 
-_COMMANDS = (_paper, _fit, _evaluate, _track, _animate, _export, _describe)
+_COMMANDS = (_paper, _next, _fit, _evaluate, _track, _animate, _export, _describe)
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 
-def _limits(arguments: argparse.Namespace, loaded: LoadedModel) -> PathLimits:
+def _limits(
+    arguments: argparse.Namespace, loaded: LoadedModel, within_fit: bool = True
+) -> PathLimits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
     asked = hybridkin.robots.Limits(arguments.q_min, arguments.q_max, arguments.dq_max)
     factor = loaded.log_format().q_factor
-    return hybridkin.workflow.path_limits(loaded, **vars(asked.scaled(factor)))
+    limits = vars(asked.scaled(factor))
+    return hybridkin.workflow.path_limits(loaded, **limits, within_fit=within_fit)
 
 
 def _read(

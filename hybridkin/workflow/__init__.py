@@ -7,6 +7,7 @@ from hybridkin.workflow.export import export_model
 from hybridkin.workflow.fit import Comparison, FitSettings, compare_by_group, fit_log
 from hybridkin.workflow.log import LogError, MeasuredLog, read_log
 from hybridkin.workflow.model import LOG_SUFFIXES, LoadedModel, open_model
+from hybridkin.workflow.next_rows import next_rows
 from hybridkin.workflow.path import read_path, scaled_path, shape_path
 from hybridkin.workflow.report import Report, json_text
 from hybridkin.workflow.track import animate_track, track_path
@@ -27,6 +28,7 @@ __all__ = [
     "export_model",
     "fit_log",
     "json_text",
+    "next_rows",
     "open_model",
     "path_limits",
     "read_log",

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from hybridkin._core.arrays import as_array
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -45,6 +46,8 @@ def path_limits(
     q_min: ArrayLike | None = None,
     q_max: ArrayLike | None = None,
     dq_max: ArrayLike | None = None,
+    *,
+    within_fit: bool = True,
 ) -> PathLimits:
     """Return the limits of the actuators: those given, else the description's within the fit's.
 
@@ -56,6 +59,8 @@ def path_limits(
         The model, as from `open_model`.
     q_min, q_max, dq_max : float or array-like of shape (n,), optional
         Limits of the commands [m], and of their speed [m/s].
+    within_fit : bool, default=True
+        Whether to stay within the range of the fit also where the description gives limits.
 
     Returns
     -------
@@ -69,7 +74,8 @@ def path_limits(
     """
     half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
     described = robots.Limits() if loaded.description is None else loaded.description.limits
-    trained = loaded.trained_range or robots.Limits()
+    open_end = described.q_min is None or described.q_max is None
+    trained = (loaded.trained_range if within_fit or open_end else None) or robots.Limits()
     given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
     asked = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
     overrides = vars(robots.Limits(**asked).narrowed(half_play))
@@ -156,6 +162,23 @@ class Domain:
         tips = self.loaded.tips(q)
         finite = np.isfinite(tips).all(axis=1)
         return q[finite], tips[finite]
+
+    def postures(self, n: int) -> NDArray:
+        """Return at most n commands from all over the limits, of tendons balanced ones.
+
+        The tendons of a segment do not pull against each other. Where none can be slackened by what
+        another one pulls, the slackest is at its upper limit.
+        """
+        low, high, chain = self.limits.q_min, self.limits.q_max, self.loaded.chain
+        q = np.random.default_rng(0).uniform(low, high, (n, len(low)))
+        if not isinstance(chain, ArcChain) or chain.lengths is None:
+            return q
+        ends, angles = np.cumsum(chain.actuators_per_segment), as_array(chain.angles.detach())
+        for own in np.split(np.arange(len(low)), ends[:-1]):
+            axes = np.stack([np.cos(angles[own]), np.sin(angles[own])], axis=1)
+            q[:, own] = q[:, own] @ axes @ np.linalg.pinv(axes)
+            q[:, own] -= (q[:, own] - high[own]).max(axis=1, keepdims=True).clip(min=0.0)
+        return q[((q >= low) & (q <= high)).all(axis=1)]
 
     @cached_property
     def bending(self) -> NDArray:

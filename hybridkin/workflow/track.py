@@ -101,7 +101,7 @@ def track_path(
     domain = Domain(loaded, limits)
     stands = _start(domain, start)
     check_reach(domain, path, tol, force, progress)
-    track = _best_track(domain, path, tol, progress)
+    track = best_track(domain, path, tol, progress)
     names = [IKStatus(int(code)).name for code in track.status]
     whole, n_lead = _with_lead_in(track, stands, domain)
     sent = whole.q if loaded.play is None else loaded.play.command(whole.q)[0]
@@ -169,7 +169,7 @@ def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[
     return replace(track, t=t, **rows), n
 
 
-def _best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress) -> Track:
+def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress) -> Track:
     """Return of several attempts the track that reaches most points within the domain."""
     commands, tips = domain.sample
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)

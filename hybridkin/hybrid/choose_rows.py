@@ -1,0 +1,219 @@
+"""Which configurations to measure next: those that leave the least expected error of the tip."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from hybridkin._core.arrays import identity, shaped
+from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.rotations import cross_matrix
+from hybridkin.calibration.measured import check_finite
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.hybrid import _linearised
+from hybridkin.hybrid._features import PoseFeatures, QuadraticFeatures
+from hybridkin.hybrid.estimator import HybridForwardModel
+
+# Prior standard deviations at the tip, in reaches of the robot: of a weight of linear features, of
+# one of other features, of a shift of the base; of its turn [rad]. Noise of a measured tip.
+_LINEAR, _OTHER, _SHIFT, _TURN, _NOISE = 0.055, 0.0165, 0.033, 0.1, 0.0055
+_LARGEST, _MOST = 1000, 5000  # parameters: directions of features are kept up to; ever
+_BLOCK = 1000  # rows whose design is held at once
+
+
+def choose_rows(
+    model: Any,
+    candidates: ArrayLike,
+    n: int,
+    *,
+    measured: ArrayLike | None = None,
+    target: ArrayLike | None = None,
+) -> tuple[NDArray[np.intp], NDArray]:
+    """Return which candidates to measure next, in order, and the error expected after each.
+
+    Greedy Bayesian I-optimality: every row is the one that takes most off the expected error over
+    the target. The error of the mechanical model is taken as linear in unknown parameters, the
+    weights of pose features (of models other than chains of arcs: quadratic ones) that act inside
+    the robot, and a small move of its base. What matters is where the rows lie, not what was
+    measured there, so all can be chosen before the first measurement.
+
+    Rows chosen for learning make a calibration without learning worse, because they lie where the
+    mechanical model errs most.
+
+    Parameters
+    ----------
+    model : ForwardModel, HybridForwardModel or callable
+        A chain, any other model as for `as_forward_model`, or a fitted hybrid, whose mechanical
+        part is used.
+    candidates : array-like of shape (N, n_actuators)
+        Actuator vectors that can be measured, a few thousand from all over the range for example
+        [unit of q]. With play those of the actuators, not the commands.
+    n : int
+        How many to choose.
+    measured : array-like of shape (M, n_actuators), optional
+        Actuator vectors measured already; of a fitted hybrid hand over those of its fit.
+    target : array-like of shape (K, n_actuators), optional
+        Where the error is to be small, the actuator vectors along a path for example. Default: all
+        candidates.
+
+    Returns
+    -------
+    indices : ndarray of int of shape (n,)
+        Rows of `candidates`, in the order chosen: the first k are the choice for k.
+    expected_error : ndarray of shape (n,)
+        Root mean square error of the tip over the target that is expected to be left after each
+        row [m]. Where it falls slowly more rows pay little. It comes from the size of the robot,
+        not from data: compare rows by it, do not promise it.
+
+    Raises
+    ------
+    TypeError
+        If `model` is no model.
+    ValueError
+        For a wrong shape, NaN, more rows than candidates, or a robot with too many parameters:
+        matrices of float64 are kept below 200 MB.
+
+    Warns
+    -----
+    UserWarning
+        For a hybrid with ``error_model="drop"``, which learns nothing.
+
+    References
+    ----------
+    Chaloner and Verdinelli, Bayesian Experimental Design: A Review, Statistical Science 10 (1995),
+    273-304: I-optimality (there: V-optimality with a set of new points).
+
+    Examples
+    --------
+    >>> from hybridkin import choose_rows, datasets, robots
+    >>> pool = datasets.load_trunk().q[::10]
+    >>> rows, error = choose_rows(robots.bionic_handling_assistant(), pool, 20)
+    >>> rows.shape, bool(error[-1] < 0.5 * error[0])
+    ((20,), True)
+    """
+    if isinstance(model, HybridForwardModel) and model.error_model == "drop":
+        warnings.warn(
+            "`model` has error_model='drop' and learns nothing: rows chosen for learning make its "
+            "calibration worse than random ones; choose an error model, or measure random rows.",
+            stacklevel=2,
+        )
+    robot = as_forward_model(model).robot
+    q = _actuators(robot, candidates, "candidates")
+    known = q[:0] if measured is None else _actuators(robot, measured, "measured")
+    aim = q if target is None else _actuators(robot, target, "target")
+    if not 1 <= n <= len(q):
+        raise ValueError(f"`n` must lie in 1 to {len(q)}, the number of candidates, got {n!r}.")
+    with torch.no_grad():
+        errors = _TipErrors(robot, torch.cat([q, known, aim]))
+        return _greedy(errors, q, n, known, aim)
+
+
+def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
+    """Return checked rows (N, n)."""
+    q = shaped(value, name, ["N", str(robot.n_actuators or "n")])
+    if not len(q):
+        raise ValueError(f"`{name}` must hold at least one row, got none.")
+    check_finite(**{name: q})
+    rows = torch.from_numpy(q)
+    for message in robot.check_actuators(rows, name) if isinstance(robot, Chain) else ():
+        warnings.warn(message, stacklevel=3)
+    return rows
+
+
+class _TipErrors:
+    """The tip's error as A theta, with theta ~ N(0, 1): what a serial hybrid can learn.
+
+    The rows of A are [J_z D (x) phi | base]: weights of the features phi(q) act on the coordinates
+    z inside the robot, in units D that move the tip by 1 m (rms); the base shifts and turns.
+
+    Parameters
+    ----------
+    robot : ForwardModel
+        The mechanical model.
+    q : Tensor of shape (N, n)
+        Rows that give features and coordinates their units.
+    """
+
+    def __init__(self, robot: ForwardModel, q: Tensor) -> None:
+        arcs = isinstance(robot, ArcChain)
+        self.robot = robot
+        self.features = PoseFeatures.of_range(q, robot) if arcs else QuadraticFeatures.of_range(q)
+        tips, J = robot.from_coordinates_and_jacobian(robot.coordinates(q)[0])
+        moved = J.square().sum(1).mean(0).sqrt()
+        self.units = torch.where(moved > 1e-9 * moved.max(), 1.0 / moved, 0.0)
+        self.center, self.size = tips.mean(0), (tips - tips.mean(0)).norm(dim=1).max()
+        if isinstance(robot, Chain):
+            self.center, self.size = robot.base[:3, 3].to(q), robot.reach.to(q)
+        n_linear = self.features.n_linear
+        if len(self.units) * n_linear > _MOST:
+            raise ValueError(
+                f"`model` must have at most {_MOST} weights to learn, so that matrices stay below "
+                f"200 MB, got {len(self.units)} coordinates times {n_linear} linear features."
+            )
+        most = max(_LARGEST // len(self.units) - n_linear, 0)
+        basis = _linearised.basis(self.features(q), n_linear, most)
+        other = torch.arange(basis.shape[1]) >= n_linear
+        self.basis = basis * torch.where(other, _OTHER, _LINEAR) * self.size
+        self.noise = (_NOISE * self.size) ** 2 * identity(tips.shape[1], q)
+
+    def parts(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return J_z D (N, m, C), the features (N, K) and the columns of the base (N, m, B)."""
+        tips, J = self.robot.from_coordinates_and_jacobian(self.robot.coordinates(q)[0])
+        base = (_SHIFT * self.size * identity(tips.shape[1], q)).expand(len(q), -1, -1)
+        if tips.shape[1] == 3:
+            base = torch.cat([base, -_TURN * cross_matrix(tips - self.center)], dim=2)
+        return J * self.units, self.features(q) @ self.basis, base
+
+    def design(self, q: Tensor) -> Tensor:
+        """Return A of rows q (N, n), shape (N, m, P)."""
+        J, phi, base = self.parts(q)
+        return torch.cat([_linearised.design(J, phi), base], dim=2)
+
+    def gram(self, q: Tensor) -> Tensor:
+        """Return sum_n A_n' A_n over rows q (N, n), shape (P, P)."""
+        blocks = (self.design(rows).flatten(0, 1) for rows in q.split(_BLOCK))
+        return sum((A.mT @ A for A in blocks), q.new_zeros(()))
+
+
+def _greedy(
+    errors: _TipErrors, q: Tensor, n: int, known: Tensor, aim: Tensor
+) -> tuple[NDArray[np.intp], NDArray]:
+    """Return n of the rows q, each the best after those before it, and the errors they leave.
+
+    With S the covariance of theta, M the mean of A' A over the aim and s^2 the noise, a row takes
+    tr[(A S A' + s^2)^-1 A S M S A'] off the mean squared error tr(M S). Both products are updated
+    for all rows by what a chosen one, of rank m, takes off S.
+    """
+    J, phi, base = errors.parts(q)
+    (_, m, C), K = J.shape, phi.shape[1]
+    M = errors.gram(aim) / len(aim)
+    information = identity(len(M), M) + errors.gram(known) / errors.noise[0, 0]
+    S = torch.cholesky_inverse(torch.linalg.cholesky(information))
+    SMS = S @ M @ S
+    about = [(A @ S @ A.mT, A @ SMS @ A.mT) for A in map(errors.design, q.split(_BLOCK))]
+    spread, worth = (torch.cat(part) for part in zip(*about, strict=True))
+    left, chosen, squares = (M * S).sum(), [], []
+    free = torch.ones_like(q[:, 0], dtype=torch.bool)
+    for _ in range(n):
+        gain = torch.linalg.solve(spread + errors.noise, worth).diagonal(dim1=1, dim2=2).sum(1)
+        k = int(torch.where(free, gain, -1.0).argmax())
+        free[k] = False
+        L = torch.linalg.cholesky(spread[k] + errors.noise)
+        G = torch.linalg.solve_triangular(L, errors.design(q[k : k + 1])[0] @ S, upper=False).mT
+        MG = M @ G
+        weights, moves = torch.cat([G, S @ MG], dim=1).split([C * K, len(S) - C * K])
+        inside = phi @ weights.view(C, K, 2 * m).transpose(0, 1).flatten(1)
+        a, b = (J @ inside.view(-1, C, 2 * m) + base @ moves).split(m, dim=2)
+        cross = a @ b.mT
+        worth = worth - cross - cross.mT + a @ (G.mT @ MG) @ a.mT
+        spread, S = spread - a @ a.mT, S - G @ G.mT
+        left = left - (G * MG).sum()
+        chosen.append(k)
+        squares.append(float(left))
+    return np.array(chosen), np.sqrt(np.maximum(squares, 0.0))
