@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import identity, shaped
+from hybridkin._core.arrays import identity, labels, shaped
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.rotations import cross_matrix
 from hybridkin.calibration.measured import check_finite
@@ -25,6 +25,7 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 _LINEAR, _OTHER, _SHIFT, _TURN, _NOISE = 0.055, 0.0165, 0.033, 0.1, 0.0055
 _LARGEST, _MOST = 1000, 5000  # parameters: directions of features are kept up to; ever
 _BLOCK = 1000  # rows whose design is held at once
+_ROWS, _WORTH = 8, 2.0  # rows that stand for a motion; how many independent ones they are worth
 
 
 def choose_rows(
@@ -34,7 +35,8 @@ def choose_rows(
     *,
     measured: ArrayLike | None = None,
     target: ArrayLike | None = None,
-) -> tuple[NDArray[np.intp], NDArray]:
+    groups: ArrayLike | None = None,
+) -> tuple[NDArray, NDArray]:
     """Return which candidates to measure next, in order, and the error expected after each.
 
     Greedy Bayesian I-optimality: every row is the one that takes most off the expected error over
@@ -107,11 +109,22 @@ def choose_rows(
     q = _actuators(robot, candidates, "candidates")
     known = q[:0] if measured is None else _actuators(robot, measured, "measured")
     aim = q if target is None else _actuators(robot, target, "target")
-    if not 1 <= n <= len(q):
-        raise ValueError(f"`n` must lie in 1 to {len(q)}, the number of candidates, got {n!r}.")
+    names, places = np.arange(len(q)), np.arange(len(q))[:, None]
+    if groups is not None:
+        names, places = _few_rows_of(labels(groups, len(q)))
+    if not 1 <= n <= len(names):
+        raise ValueError(f"`n` must lie in 1 to {len(names)}, the number of candidates, got {n!r}.")
     with torch.no_grad():
         errors = _TipErrors(robot, torch.cat([q, known, aim]))
-        return _greedy(errors, q, n, known, aim)
+        chosen, error = _greedy(errors, q[torch.from_numpy(places)], n, known, aim)
+    return names[chosen], error
+
+
+def _few_rows_of(groups: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the labels of all motions (G,), and rows of each (G, R) from its first to its last."""
+    names, of_row, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    order, ends = np.argsort(of_row, kind="stable"), np.cumsum(counts)
+    return names, order[np.rint(np.linspace(ends - counts, ends - 1, _ROWS).T).astype(int)]
 
 
 def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
@@ -160,7 +173,7 @@ class _TipErrors:
         basis = _linearised.basis(self.features(q), n_linear, most)
         other = torch.arange(basis.shape[1]) >= n_linear
         self.basis = basis * torch.where(other, _OTHER, _LINEAR) * self.size
-        self.noise = (_NOISE * self.size) ** 2 * identity(tips.shape[1], q)
+        self.variance = (_NOISE * self.size) ** 2
 
     def parts(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return J_z D (N, m, C), the features (N, K) and the columns of the base (N, m, B)."""
@@ -183,37 +196,44 @@ class _TipErrors:
 
 def _greedy(
     errors: _TipErrors, q: Tensor, n: int, known: Tensor, aim: Tensor
-) -> tuple[NDArray[np.intp], NDArray]:
-    """Return n of the rows q, each the best after those before it, and the errors they leave.
+) -> tuple[list[int], NDArray]:
+    """Return n of the motions q (G, R, n), each the best after those before, and the errors left.
 
-    With S the covariance of theta, M the mean of A' A over the aim and s^2 the noise, a row takes
-    tr[(A S A' + s^2)^-1 A S M S A'] off the mean squared error tr(M S). Both products are updated
-    for all rows by what a chosen one, of rank m, takes off S.
+    With S the covariance of theta, M the mean of A' A over the aim and s^2 the noise, a motion with
+    the rows A takes tr[(A S A' + s^2)^-1 A S M S A'] off the mean squared error tr(M S). Both
+    products are updated for all motions by what a chosen one, of low rank, takes off S.
     """
-    J, phi, base = errors.parts(q)
+    size = q.shape[1]
+    J, phi, base = errors.parts(q.flatten(0, 1))
     (_, m, C), K = J.shape, phi.shape[1]
     M = errors.gram(aim) / len(aim)
-    information = identity(len(M), M) + errors.gram(known) / errors.noise[0, 0]
+    information = identity(len(M), M) + errors.gram(known) / errors.variance
     S = torch.cholesky_inverse(torch.linalg.cholesky(information))
     SMS = S @ M @ S
-    about = [(A @ S @ A.mT, A @ SMS @ A.mT) for A in map(errors.design, q.split(_BLOCK))]
+    blocks = (errors.design(part.flatten(0, 1)) for part in q.split(_BLOCK // size))
+    designs = (A.flatten(0, 1).unflatten(0, (-1, size * m)) for A in blocks)
+    about = [(A @ S @ A.mT, A @ SMS @ A.mT) for A in designs]
     spread, worth = (torch.cat(part) for part in zip(*about, strict=True))
+    # Rows of a motion err alike.
+    noise = max(1.0, size / _WORTH) * errors.variance * identity(size * m, q)
     left, chosen, squares = (M * S).sum(), [], []
-    free = torch.ones_like(q[:, 0], dtype=torch.bool)
+    free = torch.ones_like(spread[:, 0, 0], dtype=torch.bool)
     for _ in range(n):
-        gain = torch.linalg.solve(spread + errors.noise, worth).diagonal(dim1=1, dim2=2).sum(1)
+        gain = torch.linalg.solve(spread + noise, worth).diagonal(dim1=1, dim2=2).sum(1)
         k = int(torch.where(free, gain, -1.0).argmax())
         free[k] = False
-        L = torch.linalg.cholesky(spread[k] + errors.noise)
-        G = torch.linalg.solve_triangular(L, errors.design(q[k : k + 1])[0] @ S, upper=False).mT
+        A = errors.design(q[k]).flatten(0, 1)
+        L = torch.linalg.cholesky(spread[k] + noise)
+        G = torch.linalg.solve_triangular(L, A @ S, upper=False).mT
         MG = M @ G
         weights, moves = torch.cat([G, S @ MG], dim=1).split([C * K, len(S) - C * K])
-        inside = phi @ weights.view(C, K, 2 * m).transpose(0, 1).flatten(1)
-        a, b = (J @ inside.view(-1, C, 2 * m) + base @ moves).split(m, dim=2)
+        inside = phi @ weights.view(C, K, -1).transpose(0, 1).flatten(1)
+        moved = J @ inside.unflatten(1, (C, -1)) + base @ moves
+        a, b = moved.view(len(q), size * m, -1).split(size * m, dim=2)
         cross = a @ b.mT
         worth = worth - cross - cross.mT + a @ (G.mT @ MG) @ a.mT
         spread, S = spread - a @ a.mT, S - G @ G.mT
         left = left - (G * MG).sum()
         chosen.append(k)
         squares.append(float(left))
-    return np.array(chosen), np.sqrt(np.maximum(squares, 0.0))
+    return chosen, np.sqrt(np.maximum(squares, 0.0))

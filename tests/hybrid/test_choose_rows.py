@@ -33,7 +33,7 @@ def explicit(robot, q, measured, target):
 
         def after(rows):
             A = torch.cat([errors.design(measured), errors.design(q[rows])]).flatten(0, 1)
-            S = torch.linalg.inv(information + A.mT @ A / errors.noise[0, 0])
+            S = torch.linalg.inv(information + A.mT @ A / errors.variance)
             spread = [torch.trace(A @ S @ A.mT) for A in errors.design(target)]
             return float(torch.stack(spread).mean())
 
