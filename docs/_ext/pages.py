@@ -8,6 +8,7 @@ from docutils.utils.math import latex2mathml
 
 EXAMPLES = (
     "csv_to_track",
+    "next_rows",
     "table1",
     "error_histogram",
     "learning_curve",

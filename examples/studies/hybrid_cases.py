@@ -161,7 +161,7 @@ def trunk_cases(
     """Return the cases of the simulated trunks; `inner` trains within that part of the range."""
     cases, largest = [], max(sizes)
     for seed, name in enumerate(PLANTS):
-        make = partial(_without_noise, name, folder, n_jobs)
+        make = partial(without_noise, name, folder, n_jobs)
         rows = make(n_random=n_test + (n_draws * largest if inner is None else 0))
         test, data = (rows[0][:n_test], rows[1][:n_test]), (rows[0][n_test:], rows[1][n_test:])
         if inner is not None:
@@ -183,7 +183,7 @@ def trunk_cases(
     return cases
 
 
-def _without_noise(
+def without_noise(
     name: str, folder: Any, n_jobs: int | None, **rows: Any
 ) -> tuple[NDArray, NDArray]:
     """Return rows of a plant without noise, so that it can be added or not."""
