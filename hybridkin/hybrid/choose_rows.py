@@ -59,15 +59,19 @@ def choose_rows(
     n : int
         How many to choose.
     measured : array-like of shape (M, n_actuators), optional
-        Actuator vectors measured already; of a fitted hybrid hand over those of its fit.
+        Actuator vectors measured already [unit of q]; of a fitted hybrid those of its fit.
     target : array-like of shape (K, n_actuators), optional
-        Where the error is to be small, the actuator vectors along a path for example. Default: all
+        Where the error is to be small, along a path for example [unit of q]. Default: all
         candidates.
+    groups : array-like of shape (N,), optional
+        Motion of every candidate. Whole motions are chosen, of which 8 rows from the first to the
+        last stand for all and are worth two independent ones.
 
     Returns
     -------
-    indices : ndarray of int of shape (n,)
-        Rows of `candidates`, in the order chosen: the first k are the choice for k.
+    indices : ndarray of shape (n,)
+        Rows of `candidates`, or labels of the motions where there are `groups`, in the order
+        chosen: the first k are the choice for k.
     expected_error : ndarray of shape (n,)
         Root mean square error of the tip over the target that is expected to be left after each
         row [m]. Where it falls slowly more rows pay little. It comes from the size of the robot,
@@ -86,10 +90,15 @@ def choose_rows(
     UserWarning
         For a hybrid with ``error_model="drop"``, which learns nothing.
 
+    Notes
+    -----
+    On three segments, one core: 100 of 2000 candidates take a second and 80 MB, of 20,000 six
+    seconds and 350 MB.
+
     References
     ----------
     Chaloner and Verdinelli, Bayesian Experimental Design: A Review, Statistical Science 10 (1995),
-    273-304: I-optimality (there: V-optimality with a set of new points).
+    273-304, section 2.
 
     Examples
     --------

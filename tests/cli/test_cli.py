@@ -107,6 +107,64 @@ def document(capsys, *arguments):
     return code, json.loads(out, parse_constant=pytest.fail)
 
 
+# next
+
+
+def planned(folder):
+    """Return the configurations of next.csv (N, 6) [mm, pulled positive], and the errors [mm]."""
+    table = np.genfromtxt(folder / "next.csv", delimiter=",", names=True)
+    assert table.dtype.names == (*COLUMNS, "expected_error")
+    table = np.array([*map(tuple, table)])
+    return table[:, :6], table[:, 6]
+
+
+@pytest.mark.slow
+def test_next_keeps_to_the_limits_with_balanced_tendons(robot, tmp_path, capsys):
+    code, out, _ = run(capsys, "next", robot, "-n", 12, "--out", tmp_path / "plan")
+    assert code == 0
+    q, error = planned(tmp_path / "plan")
+    assert len(q) == 12
+    assert np.abs(q).max() <= 6.0
+    assert np.abs(q).max() > 4.0
+    np.testing.assert_allclose(q.reshape(-1, 2, 3).sum(axis=2), 0.0, atol=1e-6)
+    assert (np.diff(error) < 0.0).all()
+    assert f"{error[-1]:.2f}" in out
+    options = ["--q-min", 0, "--q-max", 4, "-n", 3, "--out", tmp_path / "pull"]
+    assert run(capsys, "next", robot, *options)[0] == 0
+    q, _ = planned(tmp_path / "pull")
+    assert (q.min(), q.max() <= 4.0) == (0.0, True)
+    np.testing.assert_allclose(q.reshape(-1, 2, 3).min(axis=2), 0.0, atol=1e-6)  # one is slack
+
+
+@pytest.mark.slow
+def test_next_counts_what_is_measured_already(robot, log, tmp_path, capsys):
+    plan = ["next", robot, "-n", 3, "--out", tmp_path / "plan"]
+    code, fresh = document(capsys, *plan)
+    assert (code, fresh["n_measured"], fresh["limits"]["source"]) == (0, 0, "robot description")
+    code, record = document(capsys, *plan, "--measured", log)
+    assert (code, record["n_measured"]) == (0, 240)
+    assert record["expected_errors"][0] < 0.5 * fresh["expected_errors"][0]
+
+
+@pytest.mark.slow
+def test_next_along_a_path(robot, tmp_path, capsys):
+    (tmp_path / "path.csv").write_text("x,y,z\n0,0,190\n10,0,190\n20,0,189\n")
+    plan = ["next", robot, "-n", 4, "--out", tmp_path / "plan"]
+    _, everywhere = document(capsys, *plan)
+    path = ["--path", tmp_path / "path.csv", "--dt", 1, "--unit", "mm"]
+    code, record = document(capsys, *plan, *path)
+    assert (code, record["path"]["points"]) == (0, 3)
+    assert record["path"]["error"] < 1e-3
+    assert record["expected_errors"][-1] < 0.3 * everywhere["expected_errors"][-1]
+
+
+@pytest.mark.slow
+def test_next_of_a_fitted_model_goes_to_the_limits_of_the_description(fitted, tmp_path, capsys):
+    code, record = document(capsys, "next", fitted / "model", "-n", 2, "--out", tmp_path / "plan")
+    assert (code, record["limits"]["source"]) == (0, "robot description")
+    assert record["limits"]["q_max"] == [0.006] * 6
+
+
 # fit
 
 

@@ -24,16 +24,20 @@ def square(q):
     return torch.stack([q[..., 0] ** 2 + q[..., 1], q[..., 0] * q[..., 1]], dim=-1)
 
 
-def explicit(robot, q, measured, target):
-    """The mean squared error over the target from the inverse of the whole information matrix."""
+def explicit(robot, q, measured, target, times=1.0):
+    """The mean squared error over the target from the inverse of the whole information matrix.
+
+    `times` multiplies the variance of the rows that are chosen.
+    """
     q, measured, target = map(torch.from_numpy, (q, measured, target))
     with torch.no_grad():
         errors = _TipErrors(robot, torch.cat([q, measured, target]))
         information = torch.eye(errors.design(q).shape[2], dtype=q.dtype)
 
         def after(rows):
-            A = torch.cat([errors.design(measured), errors.design(q[rows])]).flatten(0, 1)
-            S = torch.linalg.inv(information + A.mT @ A / errors.variance)
+            A, B = (errors.design(part).flatten(0, 1) for part in (measured, q[rows]))
+            data = A.mT @ A / errors.variance + B.mT @ B / (times * errors.variance)
+            S = torch.linalg.inv(information + data)
             spread = [torch.trace(A @ S @ A.mT) for A in errors.design(target)]
             return float(torch.stack(spread).mean())
 
@@ -51,6 +55,32 @@ def test_every_row_is_the_best_by_enumeration(robot):
         others = {i: after([*before, i]) for i in range(9) if i not in before}
         assert row == min(others, key=others.get)
         assert_allclose(error[k], others[row] ** 0.5, rtol=1e-9)
+
+
+def test_every_motion_is_the_best_by_enumeration():
+    q, names = lengths(48), np.repeat([*"abcdef"], 8)
+    after = explicit(trunk(), q, q[:0], q, times=4.0)  # 8 rows of a motion are worth 2
+    chosen, error = choose_rows(trunk(), q, 3, groups=names)
+    for k, name in enumerate(chosen):
+        before = [*chosen[:k]]
+        left = {
+            other: after(np.flatnonzero(np.isin(names, [*before, other])))
+            for other in {*names} - {*before}
+        }
+        assert name == min(left, key=left.get)
+        assert_allclose(error[k], left[name] ** 0.5, rtol=1e-9)
+    mixed = np.random.default_rng(4).permutation(48)
+    assert_array_equal(choose_rows(trunk(), q[mixed], 3, groups=names[mixed])[0], chosen)
+
+
+def test_a_motion_counts_once_however_many_rows_it_has():
+    ends = lengths(12)
+    few, many = (np.concatenate([np.linspace(ends[0], end, n) for end in ends]) for n in (8, 22))
+    names = np.arange(12)
+    chosen, error = choose_rows(trunk(), few, 6, groups=np.repeat(names, 8), target=ends)
+    same, errors = choose_rows(trunk(), many, 6, groups=np.repeat(names, 22), target=ends)
+    assert_array_equal(same, chosen)
+    assert_allclose(errors, error, rtol=0.05)
 
 
 @pytest.mark.parametrize("robot", [trunk(), tendon_chain(), elastic_chain(), arm()])
@@ -143,6 +173,8 @@ BAD = {
     "`target` must hold at least one row": lambda q: choose_rows(trunk(), q, 1, target=q[:0]),
     "`n` must lie in 1 to 9, .* got 10": lambda q: choose_rows(trunk(), q, 10),
     "`n` must lie in 1 to 9, .* got 0": lambda q: choose_rows(trunk(), q, 0),
+    "`n` must lie in 1 to 3, .* got 4": lambda q: choose_rows(trunk(), q, 4, groups=[*"aaabbbccc"]),
+    r"`groups` must have shape \(9,\)": lambda q: choose_rows(trunk(), q, 1, groups=[*"ab"]),
     "must have at most 5000 weights": lambda q: choose_rows(lambda q: q, np.ones((9, 80)), 1),
 }
 
