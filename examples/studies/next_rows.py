@@ -38,6 +38,7 @@ MORE = (150, 300, 400)  # of random rows, to find how many are as good as chosen
 MOTIONS = (5, 10, 20)
 CHOSEN, FARTHEST, SOBOL, RANDOM = "chosen", "farthest point", "Sobol", "random"
 _LOW, _HIGH = 0.19, 0.31  # range of the lengths [m]
+_NOISE = 1e-3, 5e-4  # of lengths and tips, as the defaults of `make_trunk` [m]
 _TEST_SHARE = 0.25  # of the motions
 
 
@@ -78,17 +79,14 @@ def box(
         One entry per fit: "case", "draw", "way", "model", "n", "mean" and "max" [m]; of chosen rows
         also "expected" [m].
     """
-    entries = []
-    wanted = sorted({*SIZES, 400, 800, n_pool})
-    for case in trunk_cases(wanted, n_draws, n_test, folder, n_jobs):
-        if len(case.q) == n_pool:
-            entries += _box_entries(case, sizes, more, auto)
-    return entries
+    cases = trunk_cases([n_pool], n_draws, n_test, folder, n_jobs)
+    return [entry for case in cases for entry in box_entries(case, sizes, more, auto)]
 
 
-def _box_entries(
+def box_entries(
     case: Case, sizes: Sequence[int], more: Sequence[int], auto: Sequence[int]
 ) -> list[dict[str, Any]]:
+    """Return the entries of one pool, see `box`."""
     chosen, expected = choose_rows(case.chain, case.q, max(sizes))
     ways = {CHOSEN: [chosen], FARTHEST: [_farthest(case.q, max(sizes))]}
     ways[SOBOL] = [_nearest_to_sobol(case.q, max(sizes), case.draw)]
@@ -139,7 +137,8 @@ def along_a_path(
     Returns
     -------
     list of dict
-        As of `box`, with the ways "chosen for the path", "chosen" and "random".
+        As of `box`, with the ways "chosen for the path, its own rows too" (with noise),
+        "chosen for the path", "chosen" and "random".
     """
     path = trajectories.figure_eight((0.0, 0.0, 0.70), (0.50, 0.25), duration=n_points / 10, dt=0.1)
     limits = {"q_min": _LOW, "q_max": _HIGH, "q_pref": 0.25}
@@ -147,17 +146,30 @@ def along_a_path(
     q = ik.track(path).q[:n_points]
     tests = {name: without_noise(name, folder, n_jobs, q_target=q) for name in PLANTS}
     entries = []
-    for case in trunk_cases(sorted({*SIZES, 400, 800, n_pool}), n_draws, n_test, folder, n_jobs):
-        if len(case.q) < n_pool:
-            continue
-        orders = {f"{CHOSEN} for the path": choose_rows(case.chain, case.q, n, target=q)[0]}
-        orders[CHOSEN] = choose_rows(case.chain, case.q, n)[0]
-        random = np.random.default_rng([case.draw, 0]).permutation(len(case.q))
-        rows = [*orders.items(), *((RANDOM, random[:k]) for k in more)]
-        for way, order in rows:
-            drawn = case.q[order], case.x[order]
-            entries.append(_entry(case, way, "pose", *drawn, tests[case.name]))
+    for case in trunk_cases([n_pool], n_draws, n_test, folder, n_jobs):
+        test, rng = tests[case.name], np.random.default_rng(case.draw)
+        on_path = [
+            part + noise * rng.standard_normal(part.shape)
+            for part, noise in zip(test, _NOISE, strict=True)
+        ]
+        pool = case.q, case.x
+        more_rows = tuple(map(np.concatenate, zip(on_path, pool, strict=True)))
+        random = np.random.default_rng([case.draw, 0]).permutation(n_pool)
+        ways = [
+            (f"{CHOSEN} for the path, its own rows too", more_rows, _chosen(case, more_rows, n, q)),
+            (f"{CHOSEN} for the path", pool, _chosen(case, pool, n, q)),
+            (CHOSEN, pool, _chosen(case, pool, n)),
+            *((RANDOM, pool, random[:k]) for k in more),
+        ]
+        for way, (lengths, tips), rows in ways:
+            entries.append(_entry(case, way, "pose", lengths[rows], tips[rows], test))
     return entries
+
+
+def _chosen(
+    case: Case, pool: tuple[NDArray, ...], n: int, target: NDArray | None = None
+) -> NDArray:
+    return choose_rows(case.chain, pool[0], n, target=target)[0]
 
 
 def motions(
