@@ -319,8 +319,8 @@ def _worths(entries: list[dict[str, Any]], case: str) -> list[str]:
             some = [e for e in entries if (e["way"], e["n"]) == (way, n)]
             by = [worth(entries, case, np.mean([e[k] for e in some]), k) for k in ("mean", "max")]
             lines.append(
-                f"- {n} rows {way} are worth {by[0]:.0f} random ones by the mean, {by[1]:.0f} by "
-                "the largest error."
+                f"- {n} rows, {way}: worth {by[0]:.0f} random ones by the mean, {by[1]:.0f} by the "
+                "largest error (nan: not between those fitted)."
             )
     return lines
 

@@ -26,7 +26,7 @@ def test_report_has_all_ways_and_sizes(tmp_path):
     text = report.markdown()
     assert "| way | 50 | 100 | 200 |" in text
     assert "| random | 2.00 ± 0.00 (10) | 1.00 ± 0.00 (5) | 0.50 ± 0.00 (2) |" in text
-    assert "50 rows chosen are worth 80 random ones by the mean" in text
+    assert "50 rows, chosen: worth 80 random ones by the mean, 80 by the largest" in text
     assert "Motions: trunk, quadratic" in text
     assert {p.name for p in report.write(tmp_path / "out")} == {"report.md", "report.json"}
 
