@@ -4,7 +4,7 @@ The tables of the docs page "Which configurations to measure next"::
 
     python examples/studies/next_rows.py --out results/next_rows
 
-About half an hour on one core, and as long again for the rows of the simulated trunks, which
+About a quarter of an hour on one core, and more for the rows of the simulated trunks, which
 ``--rows FOLDER`` keeps. It needs `hybridkin[sim]`, and for motions the recording ftdcr_v4 in the
 folder that ``--data`` or HYBRIDKIN_DATA names. Draw k of pools, rows and motions has the seed k.
 """
@@ -173,7 +173,7 @@ def _chosen(
 
 
 def motions(
-    sizes: Sequence[int] = MOTIONS, n_draws: int = 6, *, thin: int = 4, data_home: Any = None
+    sizes: Sequence[int] = MOTIONS, n_draws: int = 3, *, thin: int = 4, data_home: Any = None
 ) -> list[dict[str, Any]]:
     """Return errors on held-out motions of ftdcr_v4, for motions chosen and at random.
 
@@ -184,7 +184,7 @@ def motions(
     ----------
     sizes : sequence of int
         Numbers of motions.
-    n_draws : int, default=6
+    n_draws : int, default=3
         Splits into test and pool.
     thin : int, default=4
         Step between training rows.
@@ -345,7 +345,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     common = {"n_draws": given.draws, "folder": given.rows, "n_jobs": given.jobs}
     path = along_a_path(**common)
-    moved = motions(n_draws=2 * given.draws, data_home=given.data)
+    moved = motions(n_draws=given.draws, data_home=given.data)
     for name in next_report(box(**common), path, moved).write(given.out):
         print(name)
 

@@ -112,24 +112,18 @@ def _paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
 def _next(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
-    measured, path = None, arguments.path
+    measured = path = None
     if arguments.log is not None:
         known = None if loaded.description is None else loaded.description.log
         log_format = _log_format(arguments, known, arguments.model)
         measured = _read(arguments, log_format, loaded.chain, False)
         measured.check(arguments.force)
-    if path is not None:
+    if arguments.path is not None:
         unit = arguments.unit or loaded.log_format().x_unit
-        path = workflow.read_path(path, unit=unit, dt=arguments.dt)
-    report, paths = workflow.next_rows(
-        loaded,
-        arguments.out,
-        n=arguments.n,
-        limits=_limits(arguments, loaded, within_fit=False),
-        measured=measured,
-        path=path,
-        progress=bars,
-    )
+        path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
+    options = {"n": arguments.n, "measured": measured, "path": path, "progress": bars}
+    limits = _limits(arguments, loaded, within_fit=False)
+    report, paths = workflow.next_rows(loaded, arguments.out, limits=limits, **options)
     return _Outcome(report.record, report.plain(), paths)
 
 
@@ -257,14 +251,11 @@ _COMMANDS = (_paper, _next, _fit, _evaluate, _track, _animate, _export, _describ
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 
-def _limits(
-    arguments: argparse.Namespace, loaded: LoadedModel, within_fit: bool = True
-) -> PathLimits:
+def _limits(arguments: argparse.Namespace, loaded: LoadedModel, **options: bool) -> PathLimits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
     asked = hybridkin.robots.Limits(arguments.q_min, arguments.q_max, arguments.dq_max)
     factor = loaded.log_format().q_factor
-    limits = vars(asked.scaled(factor))
-    return hybridkin.workflow.path_limits(loaded, **limits, within_fit=within_fit)
+    return hybridkin.workflow.path_limits(loaded, **vars(asked.scaled(factor)), **options)
 
 
 def _read(

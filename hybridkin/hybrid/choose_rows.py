@@ -69,7 +69,7 @@ def choose_rows(
 
     Returns
     -------
-    indices : ndarray of shape (n,)
+    indices : ndarray of int or labels, of shape (n,)
         Rows of `candidates`, or labels of the motions where there are `groups`, in the order
         chosen: the first k are the choice for k.
     expected_error : ndarray of shape (n,)
@@ -169,7 +169,8 @@ class _TipErrors:
         tips, J = robot.from_coordinates_and_jacobian(robot.coordinates(q)[0])
         moved = J.square().sum(1).mean(0).sqrt()
         self.units = torch.where(moved > 1e-9 * moved.max(), 1.0 / moved, 0.0)
-        self.center, self.size = tips.mean(0), (tips - tips.mean(0)).norm(dim=1).max()
+        self.center, size = tips.mean(0), (tips - tips.mean(0)).norm(dim=1).max()
+        self.size = torch.where(size > 0.0, size, 1.0)
         if isinstance(robot, Chain):
             self.center, self.size = robot.base[:3, 3].to(q), robot.reach.to(q)
         n_linear = self.features.n_linear
@@ -180,8 +181,8 @@ class _TipErrors:
             )
         most = max(_LARGEST // len(self.units) - n_linear, 0)
         basis = _linearised.basis(self.features(q), n_linear, most)
-        other = torch.arange(basis.shape[1]) >= n_linear
-        self.basis = basis * torch.where(other, _OTHER, _LINEAR) * self.size
+        linear, other = basis.tensor_split([n_linear], dim=1)
+        self.basis = self.size * torch.cat([_LINEAR * linear, _OTHER * other], dim=1)
         self.variance = (_NOISE * self.size) ** 2
 
     def parts(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridkin._core.units import METRES
 from hybridkin.hybrid.choose_rows import choose_rows
@@ -61,8 +59,8 @@ def next_rows(
     Returns
     -------
     report : Report
-        Its ``record`` holds "expected_errors" [m], after each configuration, "n_measured" and
-        "limits", and "path": points and the largest "error" [m] of the inverse kinematics.
+        Its ``record`` holds "expected_errors" [m], after each configuration, "n_measured",
+        "limits", and in words "where" the error is to be small.
     paths : list of Path
         What was written.
 
@@ -74,40 +72,30 @@ def next_rows(
     """
     check_out(out)
     limits = path_limits(loaded, within_fit=False) if limits is None else limits
-    domain = Domain(loaded, limits)
-    candidates, target = domain.postures(_POOL), None
-    report = Report(f"{loaded.name}: {n} configurations to measure next")
-    report.record.update(model=str(loaded.path), n=n, limits=dict(vars(limits)), path=None)
-    report.text(f"Limits: {limits.source}.")
+    domain, log = Domain(loaded, limits), loaded.log_format()
+    candidates, target, where = domain.postures(_POOL), None, "within the limits"
     if path is not None:
         target = best_track(domain, path, _TOL, progress).q
-        far = float(distance(loaded.tips(target), path.x).max())
         candidates = np.concatenate([target, candidates])
-        report.record["path"] = {"points": len(path), "error": far}
-        report.text(
-            f"Where the error is to be small: a path of {len(path)} points, which the model misses "
-            f"by {1e3 * far:.3g} mm at most."
-        )
+        far = distance(loaded.tips(target), path.x).max()
+        where = f"along the path, which the model misses by {1e3 * far:.3g} mm at most"
     known = None if measured is None else loaded.effective(measured.q, measured.motions)
     rows, errors = choose_rows(loaded.model, candidates, n, measured=known, target=target)
     sent = candidates[rows] if loaded.play is None else loaded.play.command(candidates[rows])[0]
-    report.record.update(n_measured=0 if known is None else len(known), expected_errors=errors)
+    report = Report(f"{loaded.name}: {n} configurations to measure next")
+    n_measured = 0 if known is None else len(known)
+    report.record.update(model=str(loaded.path), n=n, n_measured=n_measured, where=where)
+    report.record.update(limits=dict(vars(limits)), expected_errors=errors)
     shown = sorted({k for k in _SHOWN if k < n} | {n})
-    report.table(
-        ["measured", "expected error [mm]"], [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
-    )
+    table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
+    report.table(["rows", "expected error [mm]"], table)
     report.text(
-        "The expected error is that of a serial hybrid, before any tip is measured: it says where "
-        "more rows end paying, not how large the error will be."
+        f"Error {where}, expected before any tip is measured: it says where more rows end paying, "
+        f"not how large the error will be. {n_measured} rows are measured already. Limits: "
+        f"{limits.source}."
     )
-    report.file("next.csv", partial(_write, loaded, sent, errors))
+    cells = np.column_stack([sent / log.q_factor, errors / METRES[log.x_unit]]) + 0.0  # no -0
+    head = ",".join([*log.q, "expected_error"])
+    written = {"fmt": "%.9g", "delimiter": ",", "header": head, "comments": ""}
+    report.file("next.csv", partial(np.savetxt, X=cells, encoding="utf-8", **written))
     return report, report.write(out)
-
-
-def _write(loaded: LoadedModel, q: NDArray, errors: NDArray, file: Path) -> None:
-    log = loaded.log_format()
-    table = np.column_stack([q / log.q_factor, errors / METRES[log.x_unit]])
-    with open(file, "w", encoding="utf-8", newline="") as lines:
-        head = [*log.q, "expected_error"]
-        writer = csv.writer(lines, lineterminator="\n")
-        writer.writerows([head, *np.char.mod("%.9g", table + 0.0)])  # no -0
