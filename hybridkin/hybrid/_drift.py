@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,9 @@ from torch import Tensor
 
 from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.regressor_modules import AffineModule
+
+_ALPHAS = 10.0 ** np.arange(3.0, -6.1, -0.5)  # penalties to choose from
+_SWITCH = 4.0  # the gain in log evidence that a correction must bring
 
 
 class Drift(NamedTuple):
@@ -53,9 +57,33 @@ class Drift(NamedTuple):
         gram, moment = kept * self.gram + weighed.T @ phi, kept * self.moment + weighed.T @ residual
         return self._replace(gram=gram, moment=moment)
 
+    def emptied(self) -> Drift:
+        """Return the drift before any measurement."""
+        return self._replace(gram=0.0 * self.gram, moment=0.0 * self.moment)
+
+    def likeliest_alpha(self, noise: float) -> float:
+        """Return the penalty of largest evidence, infinite where no correction is as likely.
+
+        Parameters
+        ----------
+        noise : float
+            Standard deviation of a coordinate of a residual without a change [m]. NaN: unknown,
+            then the penalty is 1.
+        """
+        if np.isnan(noise):
+            return 1.0
+        sizes, axes = np.linalg.eigh(self.gram)
+        alphas = _ALPHAS[:, None]
+        along = (axes.T @ self.moment / noise) ** 2
+        explained = along.sum(1) / (sizes + alphas)
+        gain = 0.5 * (explained - self.moment.shape[1] * np.log1p(sizes / alphas)).sum(1)
+        return float(_ALPHAS[gain.argmax()]) if gain.max() > _SWITCH else inf
+
     def correction(self, alpha: float) -> AffineModule:
         """Return the correction as a torch module q (..., n) -> (..., m)."""
-        system = self.gram + alpha * np.eye(len(self.gram))
-        readout = np.linalg.solve(system, self.moment)
+        readout = 0.0 * self.moment
+        if alpha < inf:
+            system = self.gram + alpha * np.eye(len(self.gram))
+            readout = np.linalg.solve(system, self.moment)
         coef = readout[1:].T / self.scale
         return AffineModule(coef, readout[0] - coef @ self.center)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from math import inf
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.chains.rigid import RigidChain
 from hybridkin.hybrid import _features, _guards, _module
+from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Blend
 from hybridkin.hybrid._pose import PoseHybridModule
@@ -41,7 +42,7 @@ _MODULES: dict[str, type[PortableModule]] = {
         *(_guards.BoxGuard, _guards.LeverageGuard, _guards.QuadraticLeverage),
         _guards.GroupDistance,
         *(_module.TipCorrection, _module.InnerCorrection),
-        *(_module.HybridModule, PoseHybridModule),
+        *(_module.HybridModule, PoseHybridModule, AdaptedModel, AdaptedPoseModel),
     )
 }
 # Fitted error models that describe themselves, and others that a hybrid may be given.
@@ -92,6 +93,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         n_features_in=model.n_features_in_,
         feature_names_in=vars(model).get("feature_names_in_", []),
         single_output=model._single_output,
+        noise=model._noise,
     )
 
 
@@ -105,7 +107,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.error_model = _estimator(asked) if isinstance(asked, dict) else asked
     check_settings(model)
     model.module_ = restore(stored.part("module"))
-    if isinstance(model.module_, PoseHybridModule) != (model.output == "pose"):
+    if isinstance(model.module_, (PoseHybridModule, AdaptedPoseModel)) != (model.output == "pose"):
         raise ValueError(f"`output` {model.output!r} does not fit {stored.part('module').kind!r}")
     model.mechanical_model_ = model.module_.mechanical
     model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
@@ -130,6 +132,9 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
             raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
         # Earlier files hold a finite radius outside the domain, which no log supports.
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
+    # Older files do not have it, and cannot be adapted.
+    noise = stored.value("noise", (float, None)) if "noise" in stored.settings else None
+    model._noise = nan if noise is None else noise
     known = "fitted_rows" in stored.arrays  # older files do not have it
     model._fitted_rows = stored.array("fitted_rows", "N") if known else None
     results = training.get("cv_results") if isinstance(training, dict) else None

@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
@@ -20,6 +21,8 @@ from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
+from hybridkin.hybrid._adapt import PARAMETERS, adapted, check_parameters, held_out_noise
+from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import (
     Part,
@@ -31,6 +34,7 @@ from hybridkin.hybrid._fit import (
     residuals,
     with_geometry_chosen,
 )
+from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -254,6 +258,7 @@ class HybridForwardModel(HybridPredictor):
         self.error_model_, self.module_ = fitted.error_model, fitted.module
         self._single_output = rows.y.ndim == 1
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
+        self._noise = held_out_noise(fitted, rows, self.output, self.cv_results_)
         self.radius_: Radius | None = None
         if self.coverage is not None:
             used = given if asked.parts else rows
@@ -268,12 +273,13 @@ class HybridForwardModel(HybridPredictor):
         sample_weight: ArrayLike | None = None,
         *,
         decay: float = 0.98,
-        alpha: float = 1.0,
+        alpha: float | None = None,
     ) -> HybridForwardModel:
         """Follow a change of the robot, a payload or wear, by new measurements in order of time.
 
         Mechanical model and error model stay as they were fitted. The new residual is learned as
-        an affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``.
+        an affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``. It follows
+        one motion; `adapt` is for a robot whose base or actuator zeros are not those of the fit.
 
         Parameters
         ----------
@@ -286,8 +292,10 @@ class HybridForwardModel(HybridPredictor):
         decay : float, default=0.98
             Factor in (0, 1] on the weight of all earlier rows with every row: 0.98 forgets within
             about fifty measurements.
-        alpha : float, default=1.0
-            Penalty on B, in measurements: a small one follows single measurements.
+        alpha : float, optional
+            Penalty on B, in measurements: a small one follows single measurements. Default: the one
+            of largest evidence, for errors as large as those of the fit on held-out rows; B stays
+            zero unless the evidence for a change is clear.
 
         Returns
         -------
@@ -296,27 +304,119 @@ class HybridForwardModel(HybridPredictor):
         """
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
-        for name, value, high in (("decay", decay, 1.0), ("alpha", alpha, np.inf)):
+        given = [("decay", decay, 1.0)] + ([] if alpha is None else [("alpha", alpha, np.inf)])
+        for name, value, high in given:
             if not 0.0 < number(value, name) <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
         rows = self._checked_rows(X, y, sample_weight, None, reset=False)
         if self.play_ is not None:
             X, self._play_state = self.play_.apply(rows.X, self._play_state)
             rows = rows._replace(X=X)
-        chain, q = self.mechanical_model_, rows.q
+        self._warn_of_units(rows)
+        module = self.module_
+        if isinstance(module, AdaptedModel):
+            q, tips = module.before(rows.q, torch.from_numpy(rows.tips))
+            rows = rows._replace(X=q.numpy(), y=tips.numpy().reshape(rows.y.shape))
+        fitted = self._fitted_module()
         with torch.no_grad():
-            error = residuals(chain, q, rows.y, self.output).reshape(rows.tips.shape)
-            residual = error - self.module_.with_drift(None).error_part(q).numpy()
-        if isinstance(chain, Chain):
-            tips = chain(q).detach()
-            both = torch.cat([tips, torch.from_numpy(rows.tips[:, :3])])
-            message = motion_message("y", both, tips, float(chain.reach))
-            if message is not None:
-                warnings.warn(message, stacklevel=2)
-        self._drift = self._drift.learned(q.numpy(), residual, rows.counts, decay)
+            error = residuals(fitted.mechanical, rows.q, rows.y, self.output)
+            residual = error.reshape(rows.tips.shape) - fitted.error_part(rows.q).numpy()
+        self._drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
+        if alpha is None:
+            alpha = self._drift.likeliest_alpha(self._noise)
         # What was handed out before stays as it was.
-        self.module_ = self.module_.with_drift(self._drift.correction(alpha))
+        drifted = fitted.with_drift(self._drift.correction(alpha))
+        self.module_ = module.of(drifted) if isinstance(module, AdaptedModel) else drifted
         return self
+
+    def adapt(
+        self,
+        X: Any,
+        y: Any,
+        *,
+        parameters: Sequence[str] = PARAMETERS,
+        groups: ArrayLike | None = None,
+    ) -> HybridForwardModel:
+        """Adapt the model to a robot that has changed since the fit, from a few rows.
+
+        On another day the base stands elsewhere and the zeros of the actuators have shifted. Five
+        rows spread over the workspace are enough to find both: ``x = T f_hyb(q + shift)``, with a
+        rigid motion T. What the fit has learned stays. A robot that has not changed stays as it is.
+
+        The change is always one since the fit: `adapt` replaces an earlier one, and what
+        `partial_fit` has learned. A payload or softer segments are another kind of change; for
+        these record a new log.
+
+        Parameters
+        ----------
+        X : array-like of shape (k, n)
+            New actuator vectors, a single one too; with `play` the rows of a group in their order.
+        y : array-like of shape (k, m) or (k,)
+            Measured tips [m]; of poses (k, 6), see `output`.
+        parameters : sequence of str, default=("base", "actuator_zeros")
+            What may have changed.
+        groups : array-like of shape (k,), optional
+            Motion of every row. The rows of one motion err alike, and count as fewer.
+
+        Returns
+        -------
+        HybridForwardModel
+            This estimator. `mechanical_model_` has changed as well, `calibration_` and `radius_`
+            are those of the fit.
+
+        Raises
+        ------
+        ValueError
+            For other `parameters`, and for "base" where the outputs are neither tips in space nor
+            poses.
+
+        Warns
+        -----
+        UserWarning
+            Where the errors on the new rows stay far larger than those of the fit on held-out rows.
+
+        Examples
+        --------
+        >>> from hybridkin import HybridForwardModel, datasets, robots
+        >>> data = datasets.load_trunk()
+        >>> model = HybridForwardModel(robots.bionic_handling_assistant(), "linear")
+        >>> model = model.fit(data.q[:200], data.x[:200])
+        >>> today = data.q[200:205], data.x[200:205] + [0.05, 0.0, 0.0]  # the base has moved
+        >>> model.adapt(*today, parameters=["base"]).module_.motion[0, 3] > 0.04
+        tensor(True)
+        """
+        check_is_fitted(self, "module_")
+        fitted = self._fitted_module()
+        if np.isnan(self._noise):
+            raise ValueError(
+                "`adapt` needs the held-out errors of the fit, which a file of an earlier version "
+                "does not hold; fit the model again and save it."
+            )
+        rows = self._checked_rows(X, y, None, groups, reset=False)
+        check_parameters(parameters, self.output == "pose" or rows.tips.shape[1] == 3)
+        rows = rows._replace(X=self._effective(rows.X, rows.groups))
+        self._warn_of_units(rows)
+        self.module_, message = adapted(fitted, rows, self._noise, self._drift.scale, parameters)
+        if message is not None:
+            warnings.warn(message, stacklevel=2)
+        self.mechanical_model_ = self.module_.mechanical
+        self._drift, self._play_state = self._drift.emptied(), None
+        return self
+
+    def _fitted_module(self) -> HybridModule:
+        """Return the module of the fit, before any change of the robot."""
+        module = self.module_
+        return (module.fitted if isinstance(module, AdaptedModel) else module).with_drift(None)
+
+    def _warn_of_units(self, rows: Rows) -> None:
+        """Warn where measured tips span so much more than the robot that they are not in metres."""
+        if not isinstance(chain := self.mechanical_model_, Chain):
+            return
+        tips = chain(rows.q).detach()
+        both = torch.cat([tips, torch.from_numpy(rows.tips[:, :3])])
+        message = motion_message("y", both, tips, float(chain.reach))
+        if message is not None:
+            warnings.warn(message, stacklevel=3)
 
     def _checked_rows(
         self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True

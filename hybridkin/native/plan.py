@@ -15,7 +15,7 @@ from hybridkin._core.stored import Stored
 
 # Kinds of nodes, as src/plan.h numbers them.
 ARCS, ELASTIC, RIGID, AFFINE, ELM, POLYNOMIAL, KERNEL, READOUT = range(1, 9)
-LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK, GROUP_DISTANCE = range(9, 15)
+LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK, GROUP_DISTANCE, ADAPTED = range(9, 16)
 GROUPED = (AFFINE, ELM, KERNEL, QUADRATIC_LEVERAGE)
 GROUP = 8  # hidden units, or columns of a leverage, that stand together
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
@@ -350,6 +350,13 @@ def _hybrid(plan: Plan, stored: Stored) -> int:
     return plan.node(HYBRID, n, m, numbers, base, drift, tested, len(inner), *places)
 
 
+def _adapted(plan: Plan, stored: Stored) -> int:
+    fitted, motion = plan.node_of(stored.part("fitted")), stored.array("motion", (4, 4))
+    n, m = plan.entry(fitted, 1), plan.entry(fitted, 2)
+    numbers = [stored.array("shift", (n,)), motion[:3, :3], motion[:3, 3]]
+    return plan.node(ADAPTED, n, m, numbers, fitted)
+
+
 def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     model = plan.node_of(stored.part("model"))
     n, m = plan._code[model + 1 : model + 3]
@@ -379,5 +386,6 @@ WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
     "box_guard": _box_guard,
     "group_distance": _group_distance,
     "hybrid_module": _hybrid,
+    "adapted_model": _adapted,
     "inverse_kinematics": _inverse_kinematics,
 }

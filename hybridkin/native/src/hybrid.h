@@ -149,7 +149,7 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
 }
 
 /* The largest distance of any guard and of the groups, and its slope (n) by q where not NULL. */
-static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
+static inline void HK(farthest)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
     const int32_t *node = p->code + at, *part = node + HK_MORE + HK_FIRST;
     const int n = node[HK_N], count = HK_IS(p, at, HK_HYBRID) ? node[HK_MORE + HK_COUNT] : 0;
     HK(seen) seen;

@@ -11,8 +11,32 @@
 #include "guards.h"
 #include "hybrid.h"
 
-/* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. */
+/* The q (n) of the fit for one of a robot that has changed since, and the place of the fit. */
+static inline int HK(before)(const hk_plan *p, int at, const V *q, V *then) {
+    const real *shift = hk_numbers(p, at);
+    for (int j = 0; j < p->code[at + HK_N]; j++) then[j] = q[j] + shift[j];
+    return p->code[at + HK_MORE];
+}
+
+/* Vectors a (3, n), turned by R. */
+static inline void HK(turn)(int n, const real *R, V *a) {
+    for (int j = 0; j < n; j++) {
+        const V v[3] = {a[j], a[n + j], a[2 * n + j]};
+        for (int i = 0; i < 3; i++)
+            a[n * i + j] = v[0] * R[3 * i] + v[1] * R[3 * i + 1] + v[2] * R[3 * i + 2];
+    }
+}
+
+/* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. Of a robot that has
+   changed since the fit it is x = R f(q + shift) + p. */
 static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance) {
+    const int n = p->code[at + HK_N], adapted = HK_IS(p, at, HK_ADAPTED);
+    const real *R = adapted && p->code[at + HK_M] == 3 ? hk_numbers(p, at) + n : NULL;
+    V then[HK_MAX_N];
+    if (adapted) {
+        at = HK(before)(p, at, q, then);
+        q = then;
+    }
     if (distance) *distance = SPLAT(0.0);
     if (HK_IS(p, at, HK_HYBRID))
         HK(hybrid)(p, at, q, x, J, distance);
@@ -20,4 +44,18 @@ static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V
         HK(chain)(p, at, q, x, J);
     else
         HK(regress)(p, at, q, x, J, NULL);
+    if (!R) return;
+    HK(turn)(1, R, x);
+    for (int i = 0; i < 3; i++) x[i] = x[i] + R[9 + i];
+    if (J) HK(turn)(n, R, J);
+}
+
+/* The largest distance of any guard, and its slope (n) by q where not NULL. */
+static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
+    V then[HK_MAX_N];
+    if (HK_IS(p, at, HK_ADAPTED)) {
+        at = HK(before)(p, at, q, then);
+        q = then;
+    }
+    HK(farthest)(p, at, q, distance, slope);
 }

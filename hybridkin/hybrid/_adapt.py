@@ -1,0 +1,226 @@
+"""How a robot has changed since the fit, from a few new rows: its base and its zeros."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridkin._core.arrays import identity
+from hybridkin._core.rotations import cross_matrix, rotation, rotation_vector
+from hybridkin.chains.chain import Chain
+from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
+from hybridkin.hybrid._fit import FittedHybrid, Rows, residuals
+from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._pose import PoseHybridModule
+from hybridkin.hybrid._readout_fit import ReadoutFit
+from hybridkin.learning.elm import ELMRegressor
+from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.native.library import evaluate
+
+PARAMETERS = ("base", "actuator_zeros")
+_SCALES = 10.0 ** np.arange(-3.0, 0.6, 0.5)  # prior standard deviations, in natural units
+_SWITCH = 4.0  # the gain in log evidence that a change must bring
+_COMMON = 0.5  # share of the variance of a row that is common to its group
+_ROUNDS, _CHOOSING = 30, 6  # of Gauss-Newton; the first ones choose the scales
+_SETTLED = 1e-9
+_LARGE = 3.0  # remaining errors over those of the fit
+_MEAN_LENGTH = 1.596  # of a normal vector of three coordinates
+_MOST = 2000  # rows whose errors are computed for that
+_LEAST = 0.2  # share of the errors before learning that remain at least
+
+
+def adapted(
+    fitted: HybridModule,
+    rows: Rows,
+    noise: float,
+    scale: NDArray,
+    parameters: Sequence[str],
+) -> tuple[HybridModule | AdaptedModel, str | None]:
+    """Return the model after the change that new rows make most probable, and a warning about it.
+
+    The change theta = (turn, way, shift) is in natural units: a turn about the base in radians, a
+    way of the base in reaches of the robot, a shift of an actuator in half its range in the log.
+    It has a normal prior about zero. The three standard deviations are those of the largest
+    evidence, and base and zeros stay as they were unless the evidence for a change is clear.
+
+    Parameters
+    ----------
+    fitted : HybridModule
+        The model of the fit.
+    rows : Rows
+        New rows; the rows of a group share a part of their errors.
+    noise : float
+        Standard deviation of a coordinate of a tip about the model of the fit [m].
+    scale : ndarray of shape (n,)
+        Half the range of every actuator in the log of the fit [unit of q].
+    parameters : sequence of str
+        What may have changed, out of `PARAMETERS`.
+
+    References
+    ----------
+    MacKay, Bayesian interpolation, Neural Computation 4 (1992), for the evidence.
+    """
+    problem = _Problem(fitted, rows, scale)
+    theta = std = np.zeros(6 + len(scale))
+    if "base" in parameters:
+        theta = problem.registered(noise)
+    for k in range(_ROUNDS):
+        residual, A = (_whitened(a, rows.groups) / noise for a in problem.linearised(theta))
+        A = A.reshape(-1, len(theta))
+        gram, moment = A.T @ A, A.T @ (residual.ravel() + A @ theta)
+        if k < _CHOOSING:
+            std = _likeliest_scales(gram, moment, parameters)
+        system = std[:, None] * gram * std + np.eye(len(std))
+        previous, theta = theta, std * np.linalg.solve(system, std * moment)
+        if np.abs(theta - previous).max() <= _SETTLED:
+            break
+    rms = float(np.sqrt(np.mean(residual**2)))
+    return (problem.model(theta) if theta.any() else fitted), _misfit(rms, noise)
+
+
+def _misfit(rms: float, noise: float) -> str | None:
+    """Return a warning where errors remain that the fit does not have; `rms` relative to them."""
+    if rms <= _LARGE:
+        return None
+    return (
+        f"`y` differs from the adapted model by {1e3 * 3**0.5 * rms * noise:.3g} mm (rms), the fit "
+        f"from held-out rows by {1e3 * 3**0.5 * noise:.3g} mm: the robot has changed in another "
+        "way than `parameters` allow, for example by a payload. Record a new log and `fit`."
+    )
+
+
+def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
+    """Raise where a change cannot be found."""
+    if isinstance(parameters, str) or not parameters or not {*parameters} <= {*PARAMETERS}:
+        raise ValueError(
+            f"`parameters` must be one or both of {PARAMETERS} in a list, got {parameters!r}."
+        )
+    if "base" in parameters and not in_space:
+        raise ValueError(
+            f"`parameters` must be ['actuator_zeros'] for this `y`, got {parameters!r}: 'base' "
+            "moves tips of three coordinates, or poses."
+        )
+
+
+def held_out_noise(
+    fitted: FittedHybrid, rows: Rows, output: str, cv_results: dict[str, Any] | None
+) -> float:
+    """Return the standard deviation of a coordinate of the error on held-out rows [m].
+
+    Regressors that do not know their held-out errors may have learned the rows by heart: theirs
+    count as no less than a share of the errors before learning.
+    """
+    error = fitted.error_model
+    if cv_results is not None:
+        return float(np.min(cv_results["mean_distance"])) / _MEAN_LENGTH
+    if isinstance(error, ReadoutFit):
+        return error.rmse / error.residual.shape[1] ** 0.5
+    if isinstance(error, ELMRegressorCV):
+        return float(np.sqrt(np.nanmean(np.square(error.left_out_errors_))))
+    rows = rows.take(np.arange(0, len(rows.X), 1 + len(rows.X) // _MOST))
+    q = rows.q
+    before = residuals(fitted.mechanical, q, rows.y, output).reshape(rows.tips.shape)
+    with torch.no_grad():
+        after = before - fitted.module.error_part(q).numpy()
+        if isinstance(error, ELMRegressor):  # exactly those of single rows, by their leverage
+            own = rows.counts * error.module_.leverage(q).numpy()
+            after /= np.maximum(1.0 - own, 1e-3)[:, None]
+    if isinstance(error, ELMRegressor) or error is None:
+        before = 0.0 * before
+    first, second = (
+        np.average(a**2, axis=0, weights=rows.counts).mean()
+        for a in (_LEAST * (before - before.mean(0)), after)
+    )
+    return float(max(first, second) ** 0.5)
+
+
+class _Problem:
+    """New rows, and the model after a change of the robot."""
+
+    def __init__(self, fitted: HybridModule, rows: Rows, scale: NDArray) -> None:
+        self.fitted, self.q, self.y = fitted, rows.q, torch.from_numpy(rows.tips)
+        robot, self.pivot, self.reach = fitted.robot, self.q.new_zeros(3), 1.0
+        if isinstance(robot, Chain):
+            self.pivot, self.reach = robot.base[:3, 3].to(self.q), float(robot.reach)
+        self.scale = torch.from_numpy(scale)
+
+    def model(self, theta: NDArray) -> AdaptedModel:
+        """Return the model after a change theta (6 + n,)."""
+        change = torch.from_numpy(theta)
+        R, motion = rotation(change[:3])[0], identity(4, change)
+        motion[:3, :3] = R
+        motion[:3, 3] = self.pivot - R @ self.pivot + self.reach * change[3:6]
+        kind = AdaptedPoseModel if isinstance(self.fitted, PoseHybridModule) else AdaptedModel
+        return kind(self.fitted, self.scale * change[6:], motion)
+
+    def registered(self, noise: float) -> NDArray:
+        """Return the change of the base alone that fits best, where to start.
+
+        Arun, Huang & Blostein (1987); the turn stays small about axes of which the rows say little.
+        """
+        x = torch.from_numpy(evaluate(self.fitted, self.q.numpy())[0])
+        y, theta = self.y[:, :3], self.q.new_zeros(6 + len(self.scale))
+        moments = (y - y.mean(0)).mT @ (x - x.mean(0)) + noise**2 * identity(3, x)
+        left, _, right = torch.linalg.svd(moments)
+        left[:, 2] *= torch.linalg.det(left @ right).sign()
+        theta[:3] = rotation_vector(left @ right)
+        way = y.mean(0) - self.pivot - left @ right @ (x.mean(0) - self.pivot)
+        theta[3:6] = way / self.reach
+        return theta.numpy()
+
+    def linearised(self, theta: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the residual (k, m) at a change, and the derivative (k, m, 6 + n) of the model.
+
+        Of poses the errors of orientation are in metres, a radian as the reach of the robot.
+        """
+        model = self.model(theta).rows()
+        x, J = map(torch.from_numpy, evaluate(model, self.q.numpy(), jacobian=True))
+        residual, J = self.y - x, J * self.scale
+        A = torch.cat([J.new_zeros(*x.shape, 6), J], dim=-1)
+        if x.shape[1] in (3, 6):
+            spin = rotation(torch.from_numpy(theta[:3]))[1]
+            arm = x[:, :3] - self.pivot - self.reach * torch.from_numpy(theta[3:6])
+            A[:, :3, :3] = -cross_matrix(arm) @ spin
+            A[:, :3, 3:6] = self.reach * identity(3, x)
+        if x.shape[1] == 6:
+            turn = rotation(self.y[:, 3:])[0] @ rotation(x[:, 3:])[0].mT
+            residual[:, 3:] = self.reach * rotation_vector(turn)
+            A[:, 3:, :3] = spin
+            A[:, 3:] *= self.reach
+        return residual.numpy(), A.numpy()
+
+
+def _whitened(values: NDArray, groups: NDArray | None) -> NDArray:
+    """Return rows (k, ...) as independent ones: errors of the rows of a group have a common part.
+
+    The mean of a group is known less well by that part, what differs from it better.
+    """
+    if groups is None:
+        return values
+    _, of, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(counts), *values.shape[1:]))
+    np.add.at(sums, of, values)
+    shape = (-1,) + (1,) * (values.ndim - 1)
+    means = (sums / counts.reshape(shape))[of]
+    own = 1.0 - _COMMON
+    return (values - means) / own**0.5 + means / ((own + _COMMON * counts) ** 0.5)[of].reshape(
+        shape
+    )
+
+
+def _likeliest_scales(gram: NDArray, moment: NDArray, parameters: Sequence[str]) -> NDArray:
+    """Return the prior standard deviations (6 + n,) of largest evidence, zero for no change."""
+    base, zeros = (name in parameters for name in PARAMETERS)
+    scales = _SCALES.tolist()
+    bases = [(0.0, 0.0), *(product(scales, scales) if base else ())]
+    tried = np.array([(*pair, own) for pair in bases for own in [0.0, *(scales if zeros else ())]])
+    std = np.repeat(tried, (3, 3, len(moment) - 6), axis=1)
+    systems = std[:, :, None] * gram * std[:, None] + np.eye(len(moment))
+    explained = (std * moment) * np.linalg.solve(systems, (std * moment)[..., None])[..., 0]
+    evidence = 0.5 * (explained.sum(1) - np.linalg.slogdet(systems)[1])
+    return std[np.argmax(evidence - _SWITCH * (tried[:, 1:] > 0.0).sum(1))]

@@ -1,0 +1,136 @@
+"""A fitted hybrid on a robot that has changed: its base has moved, its actuators have new zeros."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from typing_extensions import Self
+
+from hybridkin._core.blocks import check_vectors
+from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin._core.rotations import rotation, rotation_vector
+from hybridkin._core.stored import Layout
+from hybridkin.chains.chain import Chain
+from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._pose import PoseHybridModule
+
+
+class AdaptedModel(ForwardModel):
+    """The model x = T f(q + shift) of a fitted hybrid f, with a rigid motion T of its outputs.
+
+    Everything that was learned belongs to the configuration q + shift and to the frame before T.
+
+    Parameters
+    ----------
+    fitted : HybridModule
+        f, as it was fitted. Where T is not the identity its outputs are tips or poses in space.
+    shift : Tensor of shape (n,)
+        How far the zeros of the actuators have moved [unit of q].
+    motion : Tensor of shape (4, 4)
+        T, how the base has moved in the measuring frame.
+    """
+
+    layout = Layout("adapted_model", {"shift": "n", "motion": "44"}, parts=("fitted",))
+    fitted: HybridModule
+
+    def __init__(self, fitted: HybridModule, shift: Tensor, motion: Tensor) -> None:
+        super().__init__()
+        self.fitted = fitted
+        self.register_buffer("shift", shift)
+        self.register_buffer("motion", motion)
+        self.n_actuators, self.n_outputs = len(shift), fitted.n_outputs
+
+    @property
+    def mechanical(self) -> ForwardModel | None:
+        """The mechanical part after the change: a chain where a chain can have such zeros."""
+        f, shift = self.fitted.mechanical, self.shift
+        if f is None:
+            return None
+        if isinstance(f, Chain):
+            geometry = f.geometry()
+            zeros = {name: geometry[name] - shift for name in geometry if name.endswith("_zeros")}
+            if zeros or not shift.any():
+                return f.with_geometry(base=self.motion @ geometry["base"], **zeros)
+        return self.of(type(self.fitted)(f, [], shift[:0]))
+
+    @property
+    def robot(self) -> ForwardModel:
+        """The mechanical part after the change, or the module itself without one."""
+        return self.mechanical or self
+
+    def of(self, fitted: HybridModule) -> Self:
+        """Return another hybrid after the same change."""
+        return type(self)(fitted, self.shift, self.motion)
+
+    def rows(self) -> Self:
+        """Return the module whose outputs are the columns of measured y: for tips the same."""
+        return self.of(self.fitted.rows())
+
+    def before(self, q: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rows q (N, n) and y (N, m) as they were before the change."""
+        return self._then(q), self._moved(y, torch.linalg.inv(self.motion))
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return x of shape (..., m) [m]."""
+        return self._moved(self.fitted(self._then(q)), self.motion)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., m) and dx/dq (..., m, n), in closed form where the parts have one."""
+        x, J = self.fitted.forward_and_jacobian(self._then(q))
+        return self._moved(x, self.motion), self._turned(J.mT, self.motion).mT
+
+    def mechanical_part(self, q: Tensor) -> Tensor:
+        """Return T f_mech(q + shift), zero without a mechanical model, shape (..., m) [m]."""
+        x = self.fitted.mechanical_part(self._then(q))
+        return x if self.fitted.mechanical is None else self._moved(x, self.motion)
+
+    def error_part(self, q: Tensor) -> Tensor:
+        """Return what is added to the mechanical part, shape (..., m) [m]."""
+        error = self.fitted.error_part(self._then(q))
+        move = self._moved if self.fitted.mechanical is None else self._turned
+        return move(error, self.motion)
+
+    def error_weight(self, q: Tensor) -> Tensor:
+        """Return the error weight, shape (...)."""
+        return self.fitted.error_weight(self._then(q))
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return the distance of q + shift from the training rows, shape (...)."""
+        return self.fitted.domain_distance(self._then(q))
+
+    def _then(self, q: Tensor) -> Tensor:
+        check_vectors(q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators")
+        return q + self.shift.to(q)
+
+    def _turned(self, v: Tensor, motion: Tensor) -> Tensor:
+        """Return vectors (..., 3), or several of them in (..., m), turned as a motion turns."""
+        if v.shape[-1] % 3:
+            return v  # not in space: of such models only the zeros are adapted
+        return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
+
+    def _moved(self, x: Tensor, motion: Tensor) -> Tensor:
+        """Return outputs (..., m) moved by a motion."""
+        return self._turned(x, motion) + motion[:3, 3].to(x) if x.shape[-1] == 3 else x
+
+
+class AdaptedPoseModel(AdaptedModel, PoseModel):
+    """An `AdaptedModel` of a pose hybrid; its rows are positions and rotation vectors."""
+
+    layout = AdaptedModel.layout._replace(kind="adapted_pose_model")
+    fitted: PoseHybridModule  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def pose(self, q: Tensor) -> Tensor:
+        """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
+        T = self.fitted.pose(self._then(q))
+        return self.motion.to(T) @ T
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
+        T, J = self.fitted.pose_and_jacobian(self._then(q))
+        return self.motion.to(T) @ T, self._turned(J.mT, self.motion).mT
+
+    def _moved(self, x: Tensor, motion: Tensor) -> Tensor:
+        tip, vector = x[..., :3], x[..., 3:]
+        if vector.shape[-1]:
+            vector = rotation_vector(motion[:3, :3].to(x) @ rotation(vector)[0])
+        return torch.cat([super()._moved(tip, motion), vector], dim=-1)

@@ -1,0 +1,292 @@
+"""A model that follows its robot to another day: moved base, shifted zeros, nothing else."""
+
+import copy
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.exceptions import NotFittedError
+from torch.testing import assert_close
+
+from hybridkin import (
+    ElasticTendonChain,
+    ELMRegressor,
+    HybridForwardModel,
+    InverseKinematics,
+    RigidChain,
+    datasets,
+    jacobian,
+    load_model,
+    native,
+    robots,
+    save_model,
+)
+from hybridkin._core.rotations import rotation, rotation_vector
+from hybridkin.hybrid._adapt import _whitened
+from hybridkin.hybrid._adapted import AdaptedModel
+
+SHIFT = 0.006 * np.array([1.0, -0.5, 0.8, -1.2, 0.3, 0.9, -1.0, 0.6, -0.7])
+TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.03, -0.05, 0.02])
+
+
+R = rotation(TURN)[0].numpy()
+
+
+def moved(x):
+    """Return tips (N, 3), or poses (N, 6), after the base has moved."""
+    tips = x[:, :3] @ R.T + WAY
+    turns = rotation(torch.from_numpy(x[:, 3:]))[0] if x.shape[1] == 6 else None
+    if turns is None:
+        return tips
+    return np.hstack([tips, rotation_vector(torch.from_numpy(R) @ turns).numpy()])
+
+
+def error(model, q, x):
+    return np.linalg.norm(model.predict(q) - x, axis=1).mean()
+
+
+@pytest.fixture(scope="module")
+def trunk():
+    """Return a fit, five rows spread over the workspace, and test rows."""
+    data = datasets.load_trunk()
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, "pose", coupling="serial", calibrate="default")
+    model.fit(data.q[:400], data.x[:400])
+    q, x = data.q[400:1000], data.x[400:1000]
+    picks = [0]
+    for _ in range(4):
+        far = np.linalg.norm(x[:, None] - x[picks], axis=2).min(1)
+        picks.append(int(far.argmax()))
+    rest = np.setdiff1d(np.arange(600), picks)
+    return model, (q[picks], x[picks]), (q[rest], x[rest])
+
+
+@pytest.mark.parametrize("change", ["zeros", "base", "both"])
+def test_five_rows_find_a_change(trunk, change):
+    fitted, (q, x), (q_new, x_new) = trunk
+    shift = 0.0 if change == "base" else SHIFT
+    move = moved if change != "zeros" else lambda x: x
+    model = copy.deepcopy(fitted).adapt(q - shift, move(x))
+    before = error(fitted, q_new, x_new)
+    off = error(fitted, q_new - shift, move(x_new))
+    after = error(model, q_new - shift, move(x_new))
+    assert off > 2.0 * before
+    assert after < before + 0.25 * (off - before)
+
+
+def test_a_robot_that_has_not_changed_stays_as_it_is(trunk):
+    fitted, five, (q, _) = trunk
+    model = copy.deepcopy(fitted).adapt(*five)
+    assert model.module_.state_dict().keys() == fitted.module_.state_dict().keys()
+    assert_array_equal(model.predict(q), fitted.predict(q))
+
+
+def test_many_rows_find_the_change_itself(trunk):
+    fitted, _, (q, x) = trunk
+    x = moved(fitted.predict(q))
+    model = copy.deepcopy(fitted).adapt(q - SHIFT, x)
+    assert_allclose(model.module_.shift, SHIFT, rtol=0, atol=1e-3)
+    assert_allclose(model.predict(q - SHIFT), x, rtol=0, atol=1e-3)
+
+
+class Unicycle(torch.nn.Module):
+    """A model without a geometry, tips in space of two actuators."""
+
+    def forward(self, q):
+        a, b = q.unbind(-1)
+        return torch.stack([a.sin(), b.cos(), 0.3 * a * b], -1)
+
+
+def fits():
+    """Return models by name, each with rows to fit."""
+    data, rng, make = datasets.load_trunk(), np.random.default_rng(0), HybridForwardModel
+    q, x = data.q[:250], data.x[:250]
+    trunk, few = robots.bionic_handling_assistant(), ELMRegressor(30, random_state=0)
+    elastic = ElasticTendonChain([0.005, 0.005], [0.1, 0.1])
+    origins = np.tile(np.eye(4), (3, 1, 1))
+    origins[1:, 0, 3] = 0.3
+    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0], [1, 0, 1]], tool=[0.2, 0, 0.1])
+    pulls, turns, ways = (rng.uniform(-a, a, (150, n)) for a, n in ((0.004, 6), (0.6, 3), (1, 2)))
+    with torch.no_grad():
+        T = trunk.pose(torch.from_numpy(q))
+        pulled, turned, gone = (
+            f(torch.from_numpy(rows)).numpy() + 0.05 * rows[:, :1] ** 2
+            for f, rows in ((elastic, pulls), (arm, turns), (Unicycle(), ways))
+        )
+    poses = np.hstack([x, rotation_vector(T[:, :3, :3]).numpy()])
+    serial = make(trunk, "quadratic", coupling="serial", calibrate="default")
+    return {
+        "elm": (make(trunk, few), q, x),
+        "serial": (serial, q, x),
+        "box": (make(trunk, few, guard="box"), q, x),
+        "no guard": (make(trunk, "pose", guard=None), q, x),
+        "drop": (make(trunk, "drop"), q, x),
+        "play": (make(trunk, few, play=0.001), q, x),
+        "pose": (make(trunk, few, output="pose"), q, poses),
+        "elastic": (make(elastic, few), pulls, pulled),
+        "rigid": (make(arm, few), turns, turned),
+        "function": (make(Unicycle(), few), ways, gone),
+        "data alone": (make(None, ELMRegressor(100, alpha=1e-6, random_state=0)), q, x),
+    }
+
+
+@pytest.fixture(scope="module", params=[*fits()])
+def case(request):
+    """Return a fit, and rows of its robot after a change that it can express exactly."""
+    model, q, x = fits()[request.param]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # pulls that contradict each other
+        model.fit(q, x)
+        shift = 0.1 * np.ptp(q, axis=0) * np.linspace(-1, 1, q.shape[1])
+        return model, q - shift, moved(model.predict(q)), q
+
+
+def test_any_model_is_adapted_saved_and_fitted_again(case, tmp_path):
+    fitted, q, x, then = case
+    off, before = error(fitted, q, x), fitted.predict(q)
+    model = copy.deepcopy(fitted).adapt(q, x)
+    assert error(model, q, x) < 0.1 * off
+    assert_array_equal(fitted.predict(q), before)
+    again = copy.deepcopy(model).adapt(q, x)  # about the fit, not about the last change
+    assert_allclose(again.predict(q), model.predict(q), rtol=0, atol=1e-12)
+    back = copy.deepcopy(model).adapt(then, fitted.predict(then))
+    assert_allclose(back.predict(q), before, rtol=0, atol=1e-9)
+    if not isinstance(model.mechanical_model, Unicycle):
+        save_model(model, tmp_path / "model.safetensors")
+        loaded = load_model(tmp_path / "model.safetensors")
+        assert_allclose(loaded.predict(q), model.predict(q), rtol=0, atol=1e-12)
+        assert_allclose(loaded.predict_mechanical(q), model.predict_mechanical(q), atol=1e-12)
+        assert_allclose(loaded.adapt(q, x).predict(q), again.predict(q), rtol=0, atol=1e-9)
+
+
+def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
+    fitted, q, x, _ = case
+    model = copy.deepcopy(fitted).adapt(q, x)
+    if fitted.play_ is not None:
+        q = fitted.play_.apply(q)[0]
+        fitted.play_ = model.play_ = None
+    module, q = model.module_, q[:20]
+    assert isinstance(module, AdaptedModel)
+    turn, shifted = module.motion[:3, :3].numpy(), q + module.shift.numpy()
+    expected = fitted.predict(shifted)
+    tips = expected[:, :3] @ turn.T + module.motion[:3, 3].numpy()
+    assert_allclose(model.predict(q)[:, :3], tips, rtol=0, atol=1e-13)
+    J, J_then = model.jacobian(q), fitted.jacobian(shifted)
+    assert_allclose(J[:, :3], turn @ J_then[:, :3], rtol=1e-12, atol=1e-12)
+    assert_array_equal(model.error_weight(q), fitted.error_weight(shifted))
+    assert_array_equal(model.in_domain(q), fitted.in_domain(shifted))
+    rows, at = module.rows(), torch.from_numpy(q)
+    assert_close(rows.forward_and_jacobian(at)[0], torch.from_numpy(model.predict(q)))
+    assert_close(module.jacobian(at), jacobian(lambda q: module(q), at), rtol=1e-9, atol=1e-9)
+    single = copy.deepcopy(module).float()(at.float())
+    assert single.dtype == torch.float32
+    assert_close(single.double(), module(at), rtol=0, atol=1e-4)
+    if model.output == "pose":
+        assert_close(module.pose(at)[:, :3, 3], module(at))
+        assert_close(module.pose_and_jacobian(at)[1][:, :3], module.jacobian(at))
+        turns = torch.from_numpy(turn) @ rotation(torch.from_numpy(expected[:, 3:]))[0]
+        assert_close(module.pose(at)[:, :3, :3], turns)
+    else:
+        parts = model.predict_mechanical(q) + model.predict_error(q)
+        assert_allclose(parts, model.predict(q), rtol=0, atol=1e-12)
+
+
+def test_a_drift_is_learned_on_top_of_a_change_and_forgotten_by_the_next(case):
+    fitted, q, x, _ = case
+    model = copy.deepcopy(fitted).adapt(q, x)
+    adapted_only = model.predict(q)
+    target = adapted_only.copy()
+    target[:, :3] += [0.02, -0.01, 0.03]
+    model.partial_fit(q[:80], target[:80], decay=1.0, alpha=1e-3)
+    inside = model.in_domain(q)
+    off = np.linalg.norm((target - adapted_only)[inside], axis=1).mean()
+    left = np.linalg.norm((model.predict(q) - target)[inside], axis=1).mean()
+    assert left < 0.2 * off
+    assert_allclose(model.adapt(q, x).predict(q), adapted_only, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "still"), [(["base"], "shift"), (["actuator_zeros"], "motion")]
+)
+def test_only_what_may_have_changed_is_adapted(trunk, parameters, still):
+    fitted, five, _ = trunk
+    q, x = five
+    rows = (q, moved(x)) if still == "shift" else (q - SHIFT, x)
+    model = copy.deepcopy(fitted).adapt(*rows, parameters=parameters)
+    none = {"shift": torch.zeros(9), "motion": torch.eye(4)}[still]
+    assert_close(getattr(model.module_, still), none.double(), rtol=0, atol=0)
+
+
+def test_a_single_row_moves_the_model_towards_it(trunk):
+    fitted, _, (q, x) = trunk
+    model = copy.deepcopy(fitted).adapt(q[:1], moved(x[:1]))
+    assert error(model, q[:1], moved(x[:1])) < 0.3 * error(fitted, q[:1], moved(x[:1]))
+
+
+def test_a_large_turn_of_the_base_is_found(trunk):
+    fitted, (q, _), (q_new, _) = trunk
+    turn = rotation(torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64))[0].numpy()
+    model = copy.deepcopy(fitted).adapt(q, fitted.predict(q) @ turn.T)
+    assert error(model, q_new, fitted.predict(q_new) @ turn.T) < 5e-3
+
+
+def test_the_errors_of_the_rows_of_a_group_have_a_common_part():
+    groups = np.array(["b", "a", "b", "b", "c"])
+    common = 0.5 * (groups[:, None] == groups) + 0.5 * np.eye(5)
+    whitening = _whitened(np.eye(5), groups)
+    assert_allclose(whitening.T @ whitening, np.linalg.inv(common), rtol=0, atol=1e-14)
+
+
+def test_the_rows_of_one_motion_count_as_fewer(trunk):
+    fitted, _, (q, x) = trunk
+    q, x = q[:30], x[:30] + np.array([0.004, 0.0, 0.0])
+    free = copy.deepcopy(fitted).adapt(q, x)
+    one = copy.deepcopy(fitted).adapt(q, x, groups=np.zeros(30))
+    assert isinstance(free.module_, AdaptedModel)
+    assert not isinstance(one.module_, AdaptedModel)
+
+
+def test_what_is_no_change_of_base_or_zeros_is_said(trunk):
+    fitted, _, (q, x) = trunk
+    other = x + 0.1 * np.sin(40.0 * q[:, :3])
+    with pytest.warns(UserWarning, match="changed in another way"):
+        copy.deepcopy(fitted).adapt(q, other)
+
+
+@pytest.mark.parametrize("wrong", ["base", [], ["tool"], ["base", "radii"]])
+def test_wrong_parameters_are_refused(trunk, wrong):
+    fitted, five, _ = trunk
+    with pytest.raises(ValueError, match="`parameters` must be one or both"):
+        fitted.adapt(*five, parameters=wrong)
+
+
+def test_outputs_that_are_not_in_space_have_no_base():
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-1, 1, (60, 3))
+    y = np.column_stack([q.sum(1), q[:, 0] ** 2])
+    model = HybridForwardModel(None, ELMRegressor(60, 1e-6, random_state=0)).fit(q, y)
+    with pytest.raises(ValueError, match="'base' moves"):
+        model.adapt(q, y)
+    shifted = q[:40] - [0.1, -0.2, 0.05]
+    model.adapt(shifted, y[:40], parameters=["actuator_zeros"])
+    assert_allclose(model.module_.shift, [0.1, -0.2, 0.05], rtol=0, atol=0.02)
+    x, J = model.predict_and_jacobian(shifted)
+    assert_allclose(x, y[:40], rtol=0, atol=0.05)
+    assert J.shape == (40, 2, 3)
+
+
+def test_a_model_that_was_not_fitted_is_refused(trunk):
+    with pytest.raises(NotFittedError):
+        HybridForwardModel(robots.bionic_handling_assistant()).adapt(*trunk[1])
+
+
+def test_the_tracker_runs_an_adapted_model_in_the_compiled_core(trunk):
+    fitted, (q, x), _ = trunk
+    model = copy.deepcopy(fitted).adapt(q - SHIFT, moved(x))
+    ik = InverseKinematics(model, q_min=0.15, q_max=0.35, q_pref=0.25)
+    target = model.predict(q[:1])[0]
+    found = ik.solve(target, q0=np.full(9, 0.25))
+    assert_allclose(model.predict(found.q[None])[0], target, rtol=0, atol=1e-4)
+    assert ik.tracker(found.q).backend.startswith("compiled") == native.available()
