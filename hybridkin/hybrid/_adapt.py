@@ -107,36 +107,36 @@ def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
         )
 
 
-def held_out_noise(
-    fitted: FittedHybrid, rows: Rows, output: str, cv_results: dict[str, Any] | None
-) -> float:
+def held_out_noise(error: Any, cv_results: dict[str, Any] | None) -> float:
     """Return the standard deviation of a coordinate of the error on held-out rows [m].
 
-    Regressors that do not know their held-out errors may have learned the rows by heart: theirs
-    count as no less than a share of the errors before learning.
+    NaN where neither the fitted error model nor the scores of candidates give it.
     """
-    error = fitted.error_model
     if cv_results is not None:
         return float(np.min(cv_results["mean_distance"])) / _MEAN_LENGTH
     if isinstance(error, ReadoutFit):
         return error.rmse / error.residual.shape[1] ** 0.5
-    if isinstance(error, ELMRegressorCV):
-        return float(np.sqrt(np.nanmean(np.square(error.left_out_errors_))))
-    rows = rows.take(np.arange(0, len(rows.X), 1 + len(rows.X) // _MOST))
-    q = rows.q
-    before = residuals(fitted.mechanical, q, rows.y, output).reshape(rows.tips.shape)
+    known = isinstance(error, ELMRegressorCV)
+    return float(np.sqrt(np.nanmean(np.square(error.left_out_errors_)))) if known else np.nan
+
+
+def training_noise(fitted: FittedHybrid, rows: Rows, output: str) -> float:
+    """Return the standard deviation of a coordinate of the error on training rows [m].
+
+    Of an ELMRegressor they are held out, one by one. Other regressors may have learned the rows by
+    heart: their errors count as no less than a share of the errors before learning.
+    """
+    error, rows = fitted.error_model, rows.take(np.arange(0, len(rows.X), 1 + len(rows.X) // _MOST))
+    before = residuals(fitted.mechanical, rows.q, rows.y, output).reshape(rows.tips.shape)
     with torch.no_grad():
-        after = before - fitted.module.error_part(q).numpy()
-        if isinstance(error, ELMRegressor):  # exactly those of single rows, by their leverage
-            own = rows.counts * error.module_.leverage(q).numpy()
+        after = before - fitted.module.error_part(rows.q).numpy()
+        if isinstance(error, ELMRegressor):
+            own = rows.counts * error.module_.leverage(rows.q).numpy()
             after /= np.maximum(1.0 - own, 1e-3)[:, None]
-    if isinstance(error, ELMRegressor) or error is None:
-        before = 0.0 * before
-    first, second = (
-        np.average(a**2, axis=0, weights=rows.counts).mean()
-        for a in (_LEAST * (before - before.mean(0)), after)
-    )
-    return float(max(first, second) ** 0.5)
+    mean_squares = [np.average(after**2, axis=0, weights=rows.counts).mean()]
+    if error is not None and not isinstance(error, ELMRegressor):
+        mean_squares.append(_LEAST**2 * before.var(axis=0).mean())
+    return float(max(mean_squares) ** 0.5)
 
 
 class _Problem:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from math import inf, nan
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.chains.rigid import RigidChain
 from hybridkin.hybrid import _features, _guards, _module
+from hybridkin.hybrid._adapt import held_out_noise
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Blend
@@ -132,13 +133,13 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
             raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
         # Earlier files hold a finite radius outside the domain, which no log supports.
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
-    # Older files do not have it, and cannot be adapted.
-    noise = stored.value("noise", (float, None)) if "noise" in stored.settings else None
-    model._noise = nan if noise is None else noise
     known = "fitted_rows" in stored.arrays  # older files do not have it
     model._fitted_rows = stored.array("fitted_rows", "N") if known else None
     results = training.get("cv_results") if isinstance(training, dict) else None
     model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
+    known = "noise" in stored.settings
+    noise = stored.value("noise", (float, None)) if known else None
+    model._noise = held_out_noise(model.error_model_, model.cv_results_) if noise is None else noise
     return model
 
 

@@ -21,7 +21,13 @@ from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
-from hybridkin.hybrid._adapt import PARAMETERS, adapted, check_parameters, held_out_noise
+from hybridkin.hybrid._adapt import (
+    PARAMETERS,
+    adapted,
+    check_parameters,
+    held_out_noise,
+    training_noise,
+)
 from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import (
@@ -258,7 +264,9 @@ class HybridForwardModel(HybridPredictor):
         self.error_model_, self.module_ = fitted.error_model, fitted.module
         self._single_output = rows.y.ndim == 1
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
-        self._noise = held_out_noise(fitted, rows, self.output, self.cv_results_)
+        self._noise = held_out_noise(fitted.error_model, self.cv_results_)
+        if np.isnan(self._noise):
+            self._noise = training_noise(fitted, rows, self.output)
         self.radius_: Radius | None = None
         if self.coverage is not None:
             used = given if asked.parts else rows

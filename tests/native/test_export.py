@@ -16,7 +16,7 @@ from hybridkin.native.plan import NoKernel
 
 LOOP = Path(__file__).parents[2] / "examples" / "c" / "loop.c"
 MODELS = ("chain_of_all_parts", "elastic_chain", "rigid", "serial_pose", "blend")
-MODELS += ("drift_and_radius", "elm")
+MODELS += ("drift_and_radius", "elm", "adapted")
 WARNINGS = "-Wall -Wextra -pedantic -Wconversion -Wdouble-promotion -Werror".split()
 CC, ZIG = shutil.which("cc"), importlib.util.find_spec("ziglang")
 needs_cc = pytest.mark.skipif(CC is None, reason="no C compiler `cc`")

@@ -8,6 +8,8 @@ from saved_models import FOLDER
 from sklearn.linear_model import LinearRegression
 
 from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel, load_model
+from hybridkin._core.rotations import rotation
+from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._features import (
     Features,
     HiddenFeatures,
@@ -26,7 +28,7 @@ pytestmark = pytest.mark.needs_core
 
 N = 6
 CENTER, HALF = 0.2 + 0.01 * np.arange(N), 0.03 + 0.005 * np.arange(N)
-WITHOUT_KERNEL = ("pose_output",)
+WITHOUT_KERNEL = ("pose_output", "adapted_pose")
 STORED = [path for path in sorted(FOLDER.glob("*.safetensors")) if path.stem not in WITHOUT_KERNEL]
 NETWORKS = ("logistic", "tanh", "sin", "centred", "full")
 TIP = (*NETWORKS, "affine", "polynomial", "kernel", "linear", "quadratic", "hidden", "pose")
@@ -265,6 +267,24 @@ def test_hybrids_without_mechanical_model(kind):
     corrections = [TipCorrection(module, guard("leverage", module))]
     both = HybridModule(None, corrections, torch.ones(1).double(), drift(5))
     assert_as_in_torch(both, inputs(1.2, 19), tol=2e-12)
+
+
+@pytest.mark.parametrize("coupling", ["parallel", "serial"])
+@pytest.mark.parametrize("trust", [None, "box", "leverage"])
+def test_a_robot_that_has_changed_is_that_of_torch(coupling, trust):
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = rotation(torch.tensor([0.4, -0.8, 1.1], dtype=torch.float64))[0]
+    motion[:3, 3] = torch.tensor([0.3, -0.1, 0.2])
+    fitted = hybrid("quadratic", coupling, trust, drifting=True, weight=0.6)
+    module = AdaptedModel(fitted, torch.from_numpy(0.3 * HALF * draw(N)), motion)
+    for spread in (0.3, 1.2, 20.0):
+        assert_as_in_torch(module, inputs(spread, 19), tol=2e-12 if spread > 10 else 1e-13)
+
+
+def test_two_outputs_are_shifted_alone():
+    fitted = HybridModule(None, [TipCorrection(regressor("tanh", 2))], torch.ones(1).double())
+    module = AdaptedModel(fitted, torch.from_numpy(HALF), torch.eye(4).double())
+    assert_as_in_torch(module, inputs(1.2, 19))
 
 
 @pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)

@@ -115,6 +115,15 @@ def _drifting():
     return model.partial_fit(q[:5], trunk_log()[1][:5] + 0.01), q
 
 
+def _adapted(model, q):
+    """A robot on another day: the base has moved, the zeros are others; and a payload."""
+    base = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    x = model.predict(q)
+    turned = np.hstack([x[:, :3] @ base.T + [0.02, 0.0, 0.05], x[:, 3:]])
+    model.adapt(q - [0.01, -0.02, 0.005], turned)
+    return model.partial_fit(q[:5], model.predict(q[:5]) + 0.01), q
+
+
 def _network(network):
     q, x, groups = trunk_log(16)
     given = {"groups": groups} if isinstance(network, ELMRegressorCV) else {}
@@ -153,6 +162,8 @@ def models() -> dict[str, tuple[Any, Any]]:
         "play": _hybrid("linear", play=[0.01, 0.02, 0.0]),
         "tested_by_groups": _hybrid("linear", coupling="serial", guard="box"),
         "drift_and_radius": _drifting(),
+        "adapted": _adapted(*_hybrid("quadratic", coupling="serial")),
+        "adapted_pose": _adapted(*_hybrid(small, output="pose")),
         "rigid_hybrid": _rigid_hybrid(),
         "elastic_hybrid": _elastic_hybrid(),
     }
