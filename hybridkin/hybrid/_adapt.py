@@ -14,6 +14,7 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.rotations import cross_matrix, rotation, rotation_vector
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
+from hybridkin.hybrid._drift import MISFITS, SWITCH
 from hybridkin.hybrid._fit import FittedHybrid, Rows, residuals
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
@@ -24,7 +25,6 @@ from hybridkin.native.library import evaluate
 
 PARAMETERS = ("base", "actuator_zeros")
 _SCALES = 10.0 ** np.arange(-3.0, 0.6, 0.5)  # prior standard deviations, in natural units
-_SWITCH = 4.0  # the gain in log evidence that a change must bring
 _COMMON = 0.5  # share of the variance of a row that is common to its group
 _ROUNDS, _CHOOSING = 30, 6  # of Gauss-Newton; the first ones choose the scales
 _SETTLED = 1e-9
@@ -67,16 +67,17 @@ def adapted(
     """
     problem = _Problem(fitted, rows, scale)
     theta = std = np.zeros(6 + len(scale))
+    misfit, residual = 1.0, np.zeros(0)
     if "base" in parameters:
         theta = problem.registered(noise)
     for k in range(_ROUNDS):
         residual, A = (_whitened(a, rows.groups) / noise for a in problem.linearised(theta))
         A = A.reshape(-1, len(theta))
-        gram, moment = A.T @ A, A.T @ (residual.ravel() + A @ theta)
+        target = residual.ravel() + A @ theta
         if k < _CHOOSING:
-            std = _likeliest_scales(gram, moment, parameters)
-        system = std[:, None] * gram * std + np.eye(len(std))
-        previous, theta = theta, std * np.linalg.solve(system, std * moment)
+            std, misfit = _likeliest_scales(A, target, parameters)
+        system = std[:, None] * (A.T @ A) * std + misfit * np.eye(len(std))
+        previous, theta = theta, std * np.linalg.solve(system, std * (A.T @ target))
         if np.abs(theta - previous).max() <= _SETTLED:
             break
     rms = float(np.sqrt(np.mean(residual**2)))
@@ -182,8 +183,8 @@ class _Problem:
         x, J = map(torch.from_numpy, evaluate(model, self.q.numpy(), jacobian=True))
         residual, J = self.y - x, J * self.scale
         A = torch.cat([J.new_zeros(*x.shape, 6), J], dim=-1)
+        spin = rotation(torch.from_numpy(theta[:3]))[1]
         if x.shape[1] in (3, 6):
-            spin = rotation(torch.from_numpy(theta[:3]))[1]
             arm = x[:, :3] - self.pivot - self.reach * torch.from_numpy(theta[3:6])
             A[:, :3, :3] = -cross_matrix(arm) @ spin
             A[:, :3, 3:6] = self.reach * identity(3, x)
@@ -213,14 +214,28 @@ def _whitened(values: NDArray, groups: NDArray | None) -> NDArray:
     )
 
 
-def _likeliest_scales(gram: NDArray, moment: NDArray, parameters: Sequence[str]) -> NDArray:
-    """Return the prior standard deviations (6 + n,) of largest evidence, zero for no change."""
+def _likeliest_scales(
+    A: NDArray, target: NDArray, parameters: Sequence[str]
+) -> tuple[NDArray, float]:
+    """Return the prior standard deviations (6 + n,) and the misfit of largest evidence.
+
+    A standard deviation of zero stands for no change, a misfit for the variance of what no change
+    explains, over that of the fit. For rows A theta = target of unit variance.
+    """
     base, zeros = (name in parameters for name in PARAMETERS)
     scales = _SCALES.tolist()
     bases = [(0.0, 0.0), *(product(scales, scales) if base else ())]
     tried = np.array([(*pair, own) for pair in bases for own in [0.0, *(scales if zeros else ())]])
-    std = np.repeat(tried, (3, 3, len(moment) - 6), axis=1)
-    systems = std[:, :, None] * gram * std[:, None] + np.eye(len(moment))
-    explained = (std * moment) * np.linalg.solve(systems, (std * moment)[..., None])[..., 0]
-    evidence = 0.5 * (explained.sum(1) - np.linalg.slogdet(systems)[1])
-    return std[np.argmax(evidence - _SWITCH * (tried[:, 1:] > 0.0).sum(1))]
+    std = np.repeat(tried, (3, 3, A.shape[1] - 6), axis=1)
+    moments = std * (A.T @ target)
+    systems = std[:, :, None] * (A.T @ A) * std[:, None]
+    evidence = np.empty((len(MISFITS), len(std)))
+    for k, misfit in enumerate(MISFITS):
+        inner = systems / misfit + np.eye(A.shape[1])
+        explained = (moments * np.linalg.solve(inner, moments[..., None])[..., 0]).sum(1) / misfit
+        left = (target @ target - explained) / misfit + len(A) * np.log(misfit)
+        evidence[k] = -0.5 * (left + np.linalg.slogdet(inner)[1])
+    evidence -= SWITCH * (tried[:, 1:] > 0.0).sum(1)
+    evidence -= np.log2(MISFITS)[:, None]
+    k, best = np.unravel_index(evidence.argmax(), evidence.shape)
+    return std[best], float(MISFITS[k])

@@ -12,8 +12,11 @@ from torch import Tensor
 from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.regressor_modules import AffineModule
 
-_ALPHAS = 10.0 ** np.arange(3.0, -6.1, -0.5)  # penalties to choose from
-_SWITCH = 4.0  # the gain in log evidence that a correction must bring
+_ALPHAS = np.append(inf, 10.0 ** np.arange(3.0, -6.1, -0.5))  # penalties to choose from
+# Evidence for a change of a robot: the gain in its logarithm that a part of a change must bring,
+# and the variances of what the change does not explain to choose from, over that of the fit; every
+# doubling must bring a gain of one.
+SWITCH, MISFITS = 2.0, 2.0 ** np.arange(5)
 
 
 class Drift(NamedTuple):
@@ -30,19 +33,25 @@ class Drift(NamedTuple):
         Weighted products of [1, u].
     moment : ndarray of shape (n + 1, m)
         Their weighted products with the residuals [m].
+    squares : ndarray of shape ()
+        Weighted sum of squared residuals [m^2].
+    squares : ndarray of shape ()
+        Weighted sum of the squared residuals [m^2].
     """
 
     center: NDArray
     scale: NDArray
     gram: NDArray
     moment: NDArray
+    squares: NDArray
 
     @classmethod
     def of_range(cls, q: Tensor, n_outputs: int) -> Drift:
         """Return the drift before any measurement, for a fit to rows q (N, n)."""
         center, scale = center_and_scale(q)
         n = len(scale) + 1
-        return cls(center.numpy(), scale.numpy(), np.zeros((n, n)), np.zeros((n, n_outputs)))
+        none = np.zeros((n, n)), np.zeros((n, n_outputs)), np.zeros(())
+        return cls(center.numpy(), scale.numpy(), *none)
 
     def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.
@@ -55,11 +64,12 @@ class Drift(NamedTuple):
         weighed = (own * decay**later)[:, None] * phi
         kept = decay ** weights.sum()
         gram, moment = kept * self.gram + weighed.T @ phi, kept * self.moment + weighed.T @ residual
-        return self._replace(gram=gram, moment=moment)
+        squares = kept * self.squares + weighed[:, 0] @ (residual**2).sum(1)
+        return self._replace(gram=gram, moment=moment, squares=squares)
 
     def emptied(self) -> Drift:
         """Return the drift before any measurement."""
-        return self._replace(gram=0.0 * self.gram, moment=0.0 * self.moment)
+        return Drift(*self[:2], *(0.0 * part for part in self[2:]))
 
     def likeliest_alpha(self, noise: float) -> float:
         """Return the penalty of largest evidence, infinite where no correction is as likely.
@@ -73,11 +83,15 @@ class Drift(NamedTuple):
         if np.isnan(noise):
             return 1.0
         sizes, axes = np.linalg.eigh(self.gram)
-        alphas = _ALPHAS[:, None]
-        along = (axes.T @ self.moment / noise) ** 2
-        explained = along.sum(1) / (sizes + alphas)
-        gain = 0.5 * (explained - self.moment.shape[1] * np.log1p(sizes / alphas)).sum(1)
-        return float(_ALPHAS[gain.argmax()]) if gain.max() > _SWITCH else inf
+        along = ((axes.T @ self.moment) ** 2).sum(1)
+        n_outputs, alphas, misfits = self.moment.shape[1], _ALPHAS[:, None], MISFITS[:, None]
+        explained = (along / (sizes + alphas)).sum(1)
+        spread = n_outputs * np.log1p(sizes.clip(min=0.0) / alphas).sum(1)
+        left = (self.squares - explained) / (misfits * noise**2)
+        count = n_outputs * self.gram[0, 0]
+        evidence = -0.5 * (left + spread + count * np.log(misfits)) - np.log2(misfits)
+        evidence -= 2.0 * SWITCH * (_ALPHAS < inf)  # offset and slope
+        return float(_ALPHAS[evidence.max(0).argmax()])
 
     def correction(self, alpha: float) -> AffineModule:
         """Return the correction as a torch module q (..., n) -> (..., m)."""

@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
+from hybridkin._core.arrays import as_array
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
+from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._radius import Radius
 from hybridkin.learning.hidden_layer import check_inputs
@@ -26,7 +28,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The methods of a `HybridForwardModel` that answer from what `fit` found."""
 
     output: str
-    module_: HybridModule
+    module_: HybridModule | AdaptedModel
     mechanical_model_: ForwardModel | None
     play_: PlayOperator | None
     radius_: Radius | None
@@ -114,6 +116,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
 
+    @property
+    def _shift(self) -> NDArray | float:
+        """How far `adapt` has found the zeros of the actuators to have moved [unit of q]."""
+        module = self.module_
+        return as_array(module.shift) if isinstance(module, AdaptedModel) else 0.0
+
     def _effective(self, X: NDArray, groups: ArrayLike | None) -> NDArray:
         """Return the motion of the actuators, where there is play."""
         if self.play_ is None or not len(X):
@@ -122,7 +130,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _evaluated(
         self,
-        function: Callable[[HybridModule, NDArray], Sequence[NDArray]],
+        function: Callable[[HybridModule | AdaptedModel, NDArray], Sequence[NDArray]],
         X: Any,
         groups: ArrayLike | None,
         warn: bool = True,
@@ -141,12 +149,14 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
-def _method(name: str) -> Callable[[HybridModule, NDArray], Sequence[NDArray]]:
+def _method(name: str) -> Callable[[HybridModule | AdaptedModel, NDArray], Sequence[NDArray]]:
     """Return what computes a method of a module for rows q."""
     return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
 
 
-def _with_domain(module: HybridModule, q: NDArray, value: bool = True) -> list[NDArray]:
+def _with_domain(
+    module: HybridModule | AdaptedModel, q: NDArray, value: bool = True
+) -> list[NDArray]:
     """Return x of rows q where asked for, and whether they lie within the domain."""
     *x, distance = evaluate(module, q, value, distance=True)
     return [*x, distance <= 1.0]

@@ -120,7 +120,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
             x, _ = model.module_.rows().forward_and_jacobian(center[None])
     except RuntimeError as error:
         raise ValueError("the arrays do not fit together") from error
-    shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]))
+    stored.arrays.setdefault("drift_squares", np.zeros(()))  # older files do not have it
+    shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]), ())
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None

@@ -115,7 +115,7 @@ class HybridForwardModel(HybridPredictor):
         q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``; of poses q
         -> tip position, with ``pose``, ``pose_jacobian`` and ``tip_transform`` as well.
     mechanical_model_ : ForwardModel or None
-        The mechanical part, calibrated when asked.
+        The mechanical part, calibrated when asked; `adapt` moves its base and its zeros.
     error_model_ : estimator, ReadoutFit, Blend or None
         The fitted error model; of a blend its ``weights`` and ``error_models``. Of serial coupling
         and of named features it holds the ``alphas`` chosen and the ``residual`` of every row from
@@ -132,7 +132,8 @@ class HybridForwardModel(HybridPredictor):
         The play; None where there is none, and where "auto" found no significant gain.
     radius_ : Radius or None
         Where a coverage was asked for: the radius ``inside`` the domain [m], infinite where the
-        groups are too few, and ``outside`` it, always infinite. `partial_fit` does not update it.
+        groups are too few, and ``outside`` it, always infinite. `partial_fit` and `adapt` do not
+        update it.
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)

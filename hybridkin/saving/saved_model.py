@@ -202,7 +202,7 @@ def _units(model: object, output: str = "position") -> dict[str, str | list[str]
 
 def _domain(model: HybridForwardModel) -> dict[str, Any]:
     """Return the guard and the range of the training rows, NaN where a column did not vary."""
-    center, scale = model._drift.center, model._drift.scale
+    center, scale = model._drift.center - model._shift, model._drift.scale
     varied = scale != 1.0  # a column without a range counts as one of [-1, 1]
     low, high = (np.where(varied, bound, np.nan) for bound in (center - scale, center + scale))
     return {"guard": model.guard, "q_low": plain(low), "q_high": plain(high)}

@@ -80,7 +80,8 @@ class LoadedModel:
             return None
         drift = self.hybrid._drift
         half = np.where(drift.scale == 1.0, 0.0, drift.scale)  # one that never moved counts as 1
-        return robots.Limits(drift.center - half, drift.center + half)
+        center = drift.center - self.hybrid._shift
+        return robots.Limits(center - half, center + half)
 
     @property
     def play(self) -> PlayOperator | None:

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from saved_models import FOLDER, trunk_log
+from scipy.stats import multivariate_normal
 from sklearn.linear_model import Ridge
 from torch.testing import assert_close
 
 from hybridkin import HybridForwardModel, datasets, load_model, robots, save_model
+from hybridkin.hybrid._drift import Drift
 
 PAYLOAD = np.array([[0.1, -0.2, 0.0], [0.0, 0.1, 0.3], [0.05, 0.0, -0.1]])
 
@@ -115,3 +118,43 @@ def test_unfitted_it_fits_and_it_is_saved(tmp_path, trunk):
 def test_clear_errors(fitted, trunk, settings):
     with pytest.raises(ValueError, match=f"`{next(iter(settings))}` must lie in"):
         fitted.partial_fit(*trunk, **settings)
+
+
+@pytest.mark.parametrize("n_rows", [1, 5, 20, 200])
+def test_a_robot_that_has_not_changed_is_left_alone(n_rows):
+    data = datasets.load_trunk()
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, "quadratic", coupling="serial", calibrate="default")
+    model.fit(data.q[:300], data.x[:300])
+    q, x = data.q[600:1000], data.x[600:1000]
+    before, same = rms(model, q, x), copy.deepcopy(model)
+    model.partial_fit(data.q[400 : 400 + n_rows], data.x[400 : 400 + n_rows])
+    assert rms(model, q, x) < 1.1 * before
+    same.partial_fit(data.q[400 : 400 + n_rows], data.x[400 : 400 + n_rows] + 0.1)
+    assert rms(same, q, x + 0.1) < 0.1
+
+
+def test_the_penalty_is_that_of_largest_evidence():
+    """Against the density of the residuals themselves, a normal one about zero."""
+    rng = np.random.default_rng(0)
+    q, noise = rng.uniform(-1, 1, (12, 2)), 0.01
+    drift = Drift.of_range(torch.from_numpy(q), 3)
+    phi = np.column_stack([np.ones(12), (q - drift.center) / drift.scale])
+    residual = phi @ rng.normal(size=(3, 3)) * 0.05 + noise * rng.normal(size=(12, 3))
+    found = drift.learned(q, residual, np.ones(12), 1.0).likeliest_alpha(noise)
+
+    def log_density(alpha):
+        covariance = noise**2 * (np.eye(12) + phi @ phi.T / alpha)
+        return sum(multivariate_normal(cov=covariance).logpdf(a) for a in residual.T)
+
+    alphas = 10.0 ** np.arange(-4, 3.1, 0.5)
+    assert found == alphas[np.argmax([log_density(a) for a in alphas])]
+
+
+def test_a_file_without_the_held_out_error_can_still_learn_a_drift():
+    model = load_model(FOLDER / "parallel_elm.safetensors")
+    q, x, _ = trunk_log()
+    model.partial_fit(q[:5], x[:5])
+    with pytest.raises(ValueError, match="`adapt` needs the held-out errors"):
+        model.adapt(q[:5], x[:5])
+    load_model(FOLDER / "blend.safetensors").adapt(q[:5], x[:5])  # has the scores of all candidates
