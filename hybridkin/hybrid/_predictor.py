@@ -15,9 +15,11 @@ from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.arrays import as_array
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapted import AdaptedModel
+from hybridkin.hybrid._fit import Rows
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._radius import Radius
 from hybridkin.learning.hidden_layer import check_inputs
@@ -121,6 +123,21 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """How far `adapt` has found the zeros of the actuators to have moved [unit of q]."""
         module = self.module_
         return as_array(module.shift) if isinstance(module, AdaptedModel) else 0.0
+
+    def _fitted_module(self) -> HybridModule:
+        """Return the module of the fit, before any change of the robot."""
+        module = self.module_
+        return (module.fitted if isinstance(module, AdaptedModel) else module).with_drift(None)
+
+    def _warn_of_units(self, rows: Rows) -> None:
+        """Warn where measured tips span so much more than the robot that they are not in metres."""
+        if not isinstance(chain := self.mechanical_model_, Chain):
+            return
+        tips = chain(rows.q).detach()
+        both = torch.cat([tips, torch.from_numpy(rows.tips[:, :3])])
+        message = motion_message("y", both, tips, float(chain.reach))
+        if message is not None:
+            warnings.warn(message, stacklevel=3)
 
     def _effective(self, X: NDArray, groups: ArrayLike | None) -> NDArray:
         """Return the motion of the actuators, where there is play."""

@@ -16,7 +16,6 @@ from torch import nn
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import as_forward_model
-from hybridkin._core.units import motion_message
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
@@ -40,7 +39,6 @@ from hybridkin.hybrid._fit import (
     residuals,
     with_geometry_chosen,
 )
-from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -411,21 +409,6 @@ class HybridForwardModel(HybridPredictor):
         self.mechanical_model_ = self.module_.mechanical
         self._drift, self._play_state = self._drift.emptied(), None
         return self
-
-    def _fitted_module(self) -> HybridModule:
-        """Return the module of the fit, before any change of the robot."""
-        module = self.module_
-        return (module.fitted if isinstance(module, AdaptedModel) else module).with_drift(None)
-
-    def _warn_of_units(self, rows: Rows) -> None:
-        """Warn where measured tips span so much more than the robot that they are not in metres."""
-        if not isinstance(chain := self.mechanical_model_, Chain):
-            return
-        tips = chain(rows.q).detach()
-        both = torch.cat([tips, torch.from_numpy(rows.tips[:, :3])])
-        message = motion_message("y", both, tips, float(chain.reach))
-        if message is not None:
-            warnings.warn(message, stacklevel=3)
 
     def _checked_rows(
         self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
