@@ -60,7 +60,7 @@ def run(learn):
 
 # %%
 # The payload takes the error of the fitted model from 2 to 6.5 mm; the one that learns comes to
-# 4 mm, with a new lag wherever the path goes on to where nothing has been measured yet.
+# 4.7 mm, with a new lag wherever the path goes on to where nothing has been measured yet.
 
 if importlib.util.find_spec("mujoco") is None:
     print('Skipped: this example needs MuJoCo; pip install "hybridkin[sim]".')

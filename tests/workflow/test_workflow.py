@@ -530,3 +530,22 @@ def test_columns_in_a_wrong_order_are_named_by_the_calibrated_chain(log, tmp_pat
     checked = workflow.read_log(path, log_format, chain=robot.chain)
     assert [f.kind for f in checked.report.misread] == ["order"]
     assert checked.misread(robot.chain) == []
+
+
+def test_the_range_and_the_preferred_configuration_move_with_the_zeros(tmp_path):
+    data = datasets.load_trunk()
+    q, x = data.q[:200], data.x[:200]
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, "linear", coupling="serial")
+    model.fit(q, x, groups=np.arange(200) // 20)
+    found = []
+    for _ in range(2):
+        save_model(model, tmp_path / "model")
+        loaded = workflow.open_model(tmp_path / "model")
+        limits = workflow.path_limits(loaded)
+        found.append((Domain(loaded, limits).preferred, limits.q_min))
+        model.adapt(q - 0.01 * np.linspace(-1, 1, 9), model.predict(q))
+    assert np.abs(loaded.hybrid.module_.shift.numpy()).max() > 0.005
+    for before, after in zip(*found, strict=True):
+        np.testing.assert_allclose(before - after, loaded.hybrid.module_.shift, atol=1e-12)
+    assert loaded.domain_distance(found[1][0][None])[0] <= 1.0
