@@ -18,6 +18,7 @@ EXAMPLES = (
     "slack_tendons",
     "tracking",
     "payload",
+    "new_day",
     "rigid_arm",
     "elm_dask",
 )
