@@ -62,7 +62,6 @@ class Case(NamedTuple):
     x: NDArray
     groups: NDArray | None
     tests: dict[str, tuple[NDArray, ...]]  # q, x and, where there are motions, these
-    coverage: float | None = None
     in_time: bool = False  # whether the rows of a group are in the order of time
 
 
@@ -83,6 +82,7 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
                 results = model.cv_results_
                 scores = zip(results["candidate"], results["mean_distance"].tolist(), strict=True)
                 entry |= {"chosen": results["chosen"], "scores": dict(scores)}
+                entry["parameters"] = results["parameters"]
                 entry["mechanics"] = results["mechanical_model"]
             errors = {test: _errors(model, *rows) for test, rows in case.tests.items()}
             entries.append({**entry, "errors": errors})
@@ -98,13 +98,7 @@ def _errors(
     model: HybridForwardModel, q: NDArray, x: NDArray, groups: NDArray | None = None
 ) -> dict[str, float]:
     errors = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1)
-    found = {"mean": float(errors.mean()), "max": float(errors.max()), "n_test": len(errors)}
-    if model.coverage is not None:
-        radius = model.predict(q, return_radius=True, groups=groups)[1]
-        known = np.isfinite(radius)  # elsewhere, outside the domain, no radius holds
-        found |= {"known": float(known.mean()), "radius": float(radius.min())}
-        found["within"] = float((errors <= radius)[known].mean()) if known.any() else np.nan
-    return found
+    return {"mean": float(errors.mean()), "max": float(errors.max()), "n_test": len(errors)}
 
 
 def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
@@ -129,7 +123,7 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
             learners[f"{coupling}, {kind}"] = partial(hybrid, kind, coupling=coupling)
     learners["serial, pose, no guard"] = partial(hybrid, "pose", coupling="serial", guard=None)
     auto = partial(HybridForwardModel, case.chain, AUTO, random_state=seed)
-    learners[AUTO] = partial(auto, coverage=case.coverage)
+    learners[AUTO] = auto
     if case.in_time:
         learners[AUTO_PLAY] = partial(auto, play="auto")
     return learners
@@ -289,7 +283,7 @@ def run_cases(data_home: Any, thin: int) -> list[Case]:
     return cases
 
 
-def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case]:
+def motion_cases(data_home: Any, thin: int) -> list[Case]:
     """Return the cases of ftdcr_v4, none where the recording is absent."""
     try:
         data = datasets.load_ftdcr(data_home)
@@ -317,7 +311,5 @@ def motion_cases(data_home: Any, coverage: float | None, thin: int) -> list[Case
                 part = data.q[rows], data.x[rows], groups[rows]
                 tests = {way: (data.q[test], data.x[test], data.groups[test])}
                 in_time = groups is data.groups
-                cases.append(
-                    Case(name, k, chain, ("base",), parameters, *part, tests, coverage, in_time)
-                )
+                cases.append(Case(name, k, chain, ("base",), parameters, *part, tests, in_time))
     return cases

@@ -139,7 +139,6 @@ def extrapolation(
 
 def held_out_motions(
     *,
-    coverage: float | None = 0.9,
     thin: int = 2,
     models: Sequence[str] | None = None,
     data_home: Any = None,
@@ -156,9 +155,6 @@ def held_out_motions(
 
     Parameters
     ----------
-    coverage : float or None, default=0.9
-        Share of tips within the estimated error radius of "auto"; the result has the share found
-        among the rows that have one.
     thin : int, default=2
         Step between training rows: the motions are slow.
     models, data_home, n_jobs, progress
@@ -167,11 +163,9 @@ def held_out_motions(
     Returns
     -------
     list of dict
-        One entry per case and model, as in `learning_curves`. Where the model estimates a radius,
-        its "errors" have "radius" [m], "known", the share of rows with a radius, which lie in the
-        domain, and "within", the share of these whose tips are inside it.
+        One entry per case and model, as in `learning_curves`.
     """
-    cases = motion_cases(data_home, coverage, thin) + run_cases(data_home, thin)
+    cases = motion_cases(data_home, thin) + run_cases(data_home, thin)
     return examine(cases, models, n_jobs, progress)
 
 
@@ -230,33 +224,21 @@ def hybrids_report(
             values = (1e3 * np.array(means.get(model, [np.nan] * 3)) for means in found)
             rows.append([model, *(f"{mean:.2f} ({largest:.1f})" for mean, _, largest in values)])
         report.table(["model", *(", ".join(case) for case in cases)], rows)
-        report.text("Choice of auto, its cross-validated error, its test error and radius, in mm:")
+        report.text("Choice of auto, its cross-validated error and its test error, in mm:")
         report.table(_CHOICES, [_choice(entry) for entry in entries if "scores" in entry])
     if outside:
         report.figure("hybrid_outside", _outside_figure(outside), "Tip error outside the range.")
     return report
 
 
-_CHOICES = (
-    *("case", "draw", "model", "chosen", "cross-validated", "test"),
-    *("in the domain", "of these within the radius", "radius"),
-)
+_CHOICES = ("case", "draw", "model", "calibrated", "chosen", "cross-validated", "test")
 
 
 def _choice(entry: dict[str, Any]) -> list[str]:
     errors = next(iter(entry["errors"].values()))
     numbers = [f"{1e3 * e:.2f}" for e in (entry["scores"][entry["chosen"]], errors["mean"])]
-    if "within" in errors:
-        numbers += [f"{100 * errors[key]:.1f} %" for key in ("known", "within")]
-        numbers.append(f"{1e3 * errors['radius']:.1f}")
-    return [
-        entry["case"],
-        str(entry["draw"]),
-        entry["model"],
-        entry["chosen"],
-        *numbers,
-        *["-"] * (5 - len(numbers)),
-    ]
+    names = [entry[key] for key in ("model", "parameters", "chosen")]
+    return [entry["case"], str(entry["draw"]), *names, *numbers]
 
 
 def _tests(table: list[dict[str, Any]]) -> list[tuple[str, str]]:
