@@ -13,6 +13,8 @@ from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import Fit, Rows, solve
 from hybridkin.calibration._parameters import Problem
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
 _WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
 _EQUAL = 1.0 - 1e-4  # of guesses that explain the tips alike the given chain counts
@@ -50,9 +52,14 @@ def search(
     return Start(best.problem, best.theta, message)
 
 
-def widened(start: Start, names: tuple[str, ...], prior: Mapping[str, float]) -> Start:
-    """Return the start of a fit of more parameters, from where one of fewer ended."""
-    problem = Problem.of(start.problem.chain, names, {}, prior)
+def widened(
+    start: Start, names: tuple[str, ...], prior: Mapping[str, float], elastic: bool = False
+) -> Start:
+    """Return the start of a fit of more parameters, or of elastic tendons, from another start."""
+    chain = start.problem.chain
+    if elastic and isinstance(chain, ConstantCurvatureChain):
+        chain = ElasticTendonChain.from_chain(chain)
+    problem = Problem.of(chain, names, {}, prior)
     known = zip(start.problem.parameters, start.problem.parts(start.theta), strict=True)
     found = {part.name: theta for part, theta in known}
     theta = [found.get(part.name, np.zeros(part.size)) for part in problem.parameters]

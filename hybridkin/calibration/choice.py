@@ -28,6 +28,7 @@ _FEW = 40  # rows, below which `io` says little
 _ROWS, _CLEARLY = 8, 0.7  # rows for each parameter; a larger set must be clearly better
 _USUAL = ((), ("base",), ("radii", "base"))  # sets that are calibrated from few rows, too
 _EQUAL = 0.007  # of the score: then the smaller set is taken
+_ALIKE = 0.01  # of the error: then the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
 _TIED = 0.01  # of the largest spread of q: not excited
 _MOVES = 0.05  # of the largest move of the tip
@@ -212,27 +213,44 @@ def _name(names: tuple[str, ...]) -> str:
 
 
 def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]:
-    """Return where the search of every set starts; a larger one starts from a smaller one."""
+    """Return where the fit of every set starts: guesses are searched where rings become free.
+
+    Other sets start from the one before; elastic tendons also from a plain chain whose rings are as
+    free.
+    """
     starts: list[Start | None] = []
-    for rung in rungs:
-        names = set(rung.parameters)
-        before = None
+    for chain, names, free in ((rung.chain, rung.parameters, _rings(rung)) for rung in rungs):
+        stds, near, far = dict.fromkeys(names, 0.5), None, None
         for one, start in zip(rungs, starts, strict=False):
-            ring = {"radii", "turns", "angles"} & names <= {*one.parameters} | (
-                {"angles"} if "turns" in one.parameters else set()
-            )
-            if start is not None and one.chain is rung.chain and ring:
-                before = start
-        stds = dict.fromkeys(rung.parameters, 0.5)
+            if start is not None and one.chain is chain:
+                near, enough = start, free <= _rings(one)
+            elif start is not None and ("angles" in free) == ("angles" in _rings(one)):
+                far = start
         if not names:
             starts.append(None)
-        elif before is None:
-            starts.append(search(rung.chain, rows, rung.parameters, loss, {}, stds))
+        elif near is not None and enough:
+            starts.append(_refitted([widened(near, names, stds)], rows, loss))
+        elif far is not None:
+            tried = [widened(start, names, stds, True) for start in (near, far) if start]
+            starts.append(_refitted(tried, rows, loss))
         else:
-            at = widened(before, rung.parameters, stds)
-            fit = solve(at.problem, rows, at.theta, loss, roughly=True)
-            starts.append(at._replace(theta=fit.theta))
+            starts.append(search(chain, rows, names, loss, {}, stds))
     return starts
+
+
+def _rings(rung: _Rung) -> set[str]:
+    """Return what of the rings of actuators is free, as far as it takes a search."""
+    free = {"angles" if name == "turns" else name for name in rung.parameters}
+    return free & (
+        {"angles"} if isinstance(rung.chain, ElasticTendonChain) else {"angles", "radii"}
+    )
+
+
+def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
+    """Return the start of least error, each fitted roughly; the first where it is as good."""
+    fits = [solve(start.problem, rows, start.theta, loss, roughly=True) for start in starts]
+    best = min(range(len(fits)), key=lambda k: fits[k].rmse * (1.0 + (k > 0) * _ALIKE))
+    return starts[best]._replace(theta=fits[best].theta)
 
 
 def _splits(rows: Rows, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
