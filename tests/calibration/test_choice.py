@@ -1,0 +1,156 @@
+"""Which parameters are calibrated: chosen on planted robots, whose answer is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_array_equal
+
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel, RigidChain
+from hybridkin.calibration.choice import Errors, choose_geometry
+from hybridkin.calibration.measured import inner_and_outer
+
+NOISE = 5e-4
+
+
+def chambers(n, spread=0.05, seed=0):
+    return np.random.default_rng(seed).uniform(0.2 - spread, 0.2 + spread, (n, 3))
+
+
+def measured(chain, q, seed=1):
+    noise = NOISE * np.random.default_rng(seed).standard_normal((len(q), 3))
+    return chain(torch.from_numpy(q)).numpy() + noise
+
+
+def moved_base():
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, 3] = torch.tensor([0.05, -0.1, 0.2])
+    return base
+
+
+def bent(**geometry):
+    return ConstantCurvatureChain([0.05], rest_bends=[[0.4, -0.3]], **geometry)
+
+
+@pytest.mark.slow
+def test_a_log_gets_the_smallest_set_that_explains_it():
+    q, nominal = chambers(80), ConstantCurvatureChain([0.05])
+    truths = {
+        "base": ConstantCurvatureChain([0.05], base=moved_base()),
+        "radii + base": ConstantCurvatureChain([0.06], base=moved_base()),
+        "radii + rest_bends + base": bent(base=moved_base()),
+    }
+    for name, truth in truths.items():
+        choice = choose_geometry(nominal, q, measured(truth, q))
+        assert choice.name == name
+        assert " + ".join(choice.parameters) == name
+        assert choice.chain is nominal
+        assert choice.errors[name].io < 3 * NOISE
+        assert not choice.messages
+    assert list(choice.errors)[:4] == ["nothing", *truths]
+
+
+@pytest.mark.slow
+def test_small_motions_do_not_calibrate_what_they_do_not_show():
+    """A tenth of the range identifies the radius, and no rest bend that holds far outside."""
+    truth = ConstantCurvatureChain([0.052], base=moved_base())
+    near, far = chambers(80, 0.005), chambers(80, 0.05, seed=2)
+    x = measured(truth, near)
+    choice = choose_geometry(ConstantCurvatureChain([0.05]), near, x)
+    assert choice.name == "radii + base"
+    errors = []
+    for names in (choice.parameters, ("radii", "angles", "rest_bends", "actuator_zeros", "base")):
+        model = HybridForwardModel(ConstantCurvatureChain([0.05]), "drop", calibrate=names)
+        off = model.fit(near, x).predict(far) - truth(torch.from_numpy(far)).numpy()
+        errors.append(np.linalg.norm(off, axis=1).mean())
+    assert errors[0] < 0.6 * errors[1]
+
+
+@pytest.mark.slow
+def test_slack_tendons_become_elastic():
+    plain = ConstantCurvatureChain([0.005], lengths=[0.1])
+    truth = ElasticTendonChain([0.005], [0.1], bending_stiffness=4e-6, axial_stiffness=8.0)
+    q = np.random.default_rng(0).uniform(-0.004, 0.004, (90, 3))
+    x = truth(torch.from_numpy(q)).numpy()
+    choice = choose_geometry(plain, q, x + 1e-4 * np.random.default_rng(1).standard_normal(x.shape))
+    assert isinstance(choice.chain, ElasticTendonChain)
+    assert choice.name.startswith("elastic tendons: ")
+    assert choice.errors[choice.name].cv < 0.2 * choice.errors["radii + base"].cv
+    balanced = q - q.mean(axis=1, keepdims=True)
+    kept = choose_geometry(plain, balanced, measured(plain, balanced))
+    assert isinstance(kept.chain, ConstantCurvatureChain)
+    assert not kept.messages  # a common pull bends nothing here, so that its absence is no lack
+
+
+@pytest.mark.slow
+def test_few_rows_calibrate_radii_and_base():
+    nominal, truth = ConstantCurvatureChain([0.05]), ConstantCurvatureChain([0.06])
+    slightly = truth.with_geometry(rest_bends=0.01 * torch.ones(1, 2, dtype=torch.float64))
+    q = chambers(25)
+    choice = choose_geometry(nominal, q, measured(slightly, q))
+    assert choice.parameters == ("radii", "base")
+    assert all(math.isnan(errors.io) for errors in choice.errors.values())
+    clearly = choose_geometry(nominal, q, measured(bent(), q))
+    assert clearly.parameters == ("radii", "rest_bends", "base")
+
+
+@pytest.mark.slow
+def test_a_tied_log_warns_in_actuator_terms():
+    nominal, q = ConstantCurvatureChain([0.05]), chambers(60)
+    q[:, 2] = q[:, 0]
+    x = measured(nominal, q)
+    model = HybridForwardModel(nominal, "drop", calibrate="auto")
+    with pytest.warns(UserWarning, match=r"the log never moves \+1 q\[0\] -1 q\[2\] ") as said:
+        model.fit(q, x)
+    assert len(said) == 1
+    q[:, 2] = 0.2
+    with pytest.warns(UserWarning, match=r"the log never moves \+1 q\[2\] \("):
+        model.fit(q, measured(nominal, q))
+
+
+@pytest.mark.slow
+def test_without_learning_the_held_out_error_decides():
+    q = chambers(60)
+    x = measured(bent(), q)
+    nominal, one_motion = ConstantCurvatureChain([0.05]), np.zeros(60)
+    choice = choose_geometry(nominal, q, x, groups=one_motion, outside=False)
+    assert all(math.isnan(errors.io) for errors in choice.errors.values())
+    assert choice.name == "radii + rest_bends + base"
+    model = HybridForwardModel(nominal, "drop", calibrate="auto").fit(q, x)
+    assert set(model.calibration_.values) == set(choice.parameters)
+
+
+def test_lists_and_other_models_stay_as_given():
+    q, nominal = chambers(60), ConstantCurvatureChain([0.05])
+    x = measured(ConstantCurvatureChain([0.06]), q)
+    choice = choose_geometry(nominal, q, x, parameters=("radii",))
+    assert (choice.parameters, choice.errors, choice.chain) == (("radii",), {}, nominal)
+    by_default = HybridForwardModel(nominal, "linear").fit(q, x)
+    assert by_default.calibration_ is None
+    listed = HybridForwardModel(nominal, "linear", calibrate=["radii"]).fit(q, x)
+    assert set(listed.calibration_.values) == {"radii"}
+    data_alone = HybridForwardModel(torch.nn.Linear(3, 3).double(), "drop", calibrate="auto")
+    assert data_alone.fit(q, x).calibration_ is None
+
+
+@pytest.mark.slow
+def test_rigid_robots_choose_their_base():
+    origins = np.tile(np.eye(4), (2, 1, 1))
+    origins[1, 0, 3] = 0.3
+    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0]], tool=[0.2, 0, 0])
+    q = np.random.default_rng(0).uniform(-1, 1, (60, 2))
+    moved = arm.with_geometry(base=moved_base())
+    assert choose_geometry(arm, q, measured(moved, q)).name == "base"
+
+
+def test_score_and_split():
+    assert Errors(2.0, 4.0).score == pytest.approx(32.0 ** (1 / 3))
+    assert Errors(2.0, math.nan).score == 2.0
+    rng = np.random.default_rng(0)
+    X = np.column_stack([rng.uniform(-1, 1, 200), 10 * rng.uniform(-1, 1, 200), np.ones(200)])
+    inner, outer = inner_and_outer(X)
+    assert (len(inner), len(outer)) == (80, 70)
+    far = np.linalg.norm((X - X.mean(0))[:, :2] / X[:, :2].std(0), axis=1)
+    assert far[inner].max() < far[outer].min()
+    assert_array_equal(inner_and_outer(X * [3.0, 0.1, 7.0])[0], inner)  # units do not matter
