@@ -121,7 +121,8 @@ def _fit(command: argparse.ArgumentParser) -> None:
     """Fit a hybrid model to a measured log.
 
     Check the log, calibrate the robot to it, compare mechanical, data-driven and hybrid models on
-    held-out motions, and save the best with a report.
+    held-out motions, and save the best with a report. What to calibrate is chosen by the errors on
+    the log, unless the robot description lists it as `calibrate`.
 
     Some examples:
       hybridkin fit log.csv --robot robot.toml --groups motion --out model

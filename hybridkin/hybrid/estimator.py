@@ -69,18 +69,23 @@ class HybridForwardModel(HybridPredictor):
         - "kernel": Gaussian kernel ridge, its width and penalty chosen on 5 folds;
         - "drop": the mechanical model alone;
         - "auto": the blend of these, with linear and other features in both couplings, that has
-          the least error on held-out groups, or rows; kernel ridge up to 2000 rows. Where tendons
-          of a `ConstantCurvatureChain` contradict each other and its geometry is calibrated, an
-          `ElasticTendonChain` is tried first. Group rows by what will be new in use.
+          the least error on held-out groups, or rows, and a little on rows outside those of the
+          fit; kernel ridge up to 2000 rows. No correction where its gain over the mechanical model
+          is within its standard error. Group rows by what will be new in use.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
         the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q
         itself for other mechanical models; delta is linear in features of q, so a regressor must
         be an ELMRegressor (its hidden layer and `alpha` are used) or an ELMRegressorCV. It needs
         less data where the error has a simple cause inside the robot.
-    calibrate : sequence of str or "default", default=()
+    calibrate : sequence of str, "auto", "default" or None, default=None
         Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
-        in every fold of a cross-validation. "default": the chain's own list.
+        in every fold of a cross-validation. "auto" chooses among sets of parameters, from nothing
+        to the whole geometry, by the errors on held-out groups, or rows, and on the outer rows
+        after a fit to the inner ones (for error_model="drop" by the first alone); where tendons of
+        a `ConstantCurvatureChain` contradict each other it tries an `ElasticTendonChain`, too. So
+        does error_model="auto" with a list. "default": the chain's own list. None means "auto" of a
+        chain with error_model="auto", else nothing.
     guard : {"leverage", "box", None}, default="leverage"
         Where eps is trusted. "leverage": the domain is where the inputs are as close to the
         training rows as these are to each other, in the hidden features of a network at the tip,
@@ -120,10 +125,12 @@ class HybridForwardModel(HybridPredictor):
         a fit without it or its group [m].
     cv_results_ : dict or None
         Of error_model="auto": by candidate, the last of which is the blend, the mean distance on
-        held-out rows and its spread over the folds [m]; the ``weights`` of the blend, what is
-        ``chosen`` ("blend", or the only candidate with a weight), and the scores of the mechanical
-        models, without play (``mechanical_model``). The blend is judged by weights chosen without
-        the fold. New motions unlike all in the log are harder than held-out ones.
+        held-out rows and its spread over the folds [m]; ``io_distance``, that on the outer 35 % of
+        the rows after a fit to the inner 40 % [m]; the ``weights`` of the blend, and what is
+        ``chosen`` ("blend", or the only candidate with a weight). ``parameters`` is the set that
+        was calibrated, ``mechanical_model`` holds the same two errors of every set, "cv" and "io",
+        without play [m]. The blend is judged by weights chosen without the fold. New motions unlike
+        all in the log are harder than held-out ones.
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator or None
@@ -224,7 +231,8 @@ class HybridForwardModel(HybridPredictor):
         UserWarning
             Where the different rows are fewer than 20, or than twice the coefficients of an affine
             function of q. Where tendons of a ConstantCurvatureChain contradict each other, as slack
-            tendons do (so do `predict` and the Jacobians), where numbers look like millimetres,
+            tendons do (so do `predict` and the Jacobians), where calibrate="auto" finds directions
+            of X that move the tip and that the log does not, where numbers look like millimetres,
             where the groups are too few for `coverage`, and the warnings of `calibrate`.
         """
         for message in self.fit_with_messages(X, y, sample_weight, groups):
