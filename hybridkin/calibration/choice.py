@@ -220,7 +220,7 @@ def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]
     """
     starts: list[Start | None] = []
     for chain, names, free in ((rung.chain, rung.parameters, _rings(rung)) for rung in rungs):
-        stds, near, far = dict.fromkeys(names, 0.5), None, None
+        stds, near, far, enough = dict.fromkeys(names, 0.5), None, None, False
         for one, start in zip(rungs, starts, strict=False):
             if start is not None and one.chain is chain:
                 near, enough = start, free <= _rings(one)
@@ -228,7 +228,7 @@ def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]
                 far = start
         if not names:
             starts.append(None)
-        elif near is not None and enough:
+        elif near and enough:
             starts.append(_refitted([widened(near, names, stds)], rows, loss))
         elif far is not None:
             tried = [widened(start, names, stds, True) for start in (near, far) if start]

@@ -323,8 +323,8 @@ def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
     chain = fitted.mechanical
     if fitted.calibration is not None or not isinstance(chain, Chain):
         return fitted.messages
-    found = [*fitted.messages, *chain.check_actuators(rows.q, "X")]
-    found.append(chain.contradiction(rows.q, "X"))
     tips = torch.from_numpy(rows.tips[:, :3])
-    found.append(motion_message("y", tips, chain(rows.q), float(chain.reach)))
-    return tuple(message for message in found if message is not None)
+    motion = motion_message("y", tips, chain(rows.q), float(chain.reach))
+    found = [*fitted.messages, *chain.check_actuators(rows.q, "X")]
+    more = chain.contradiction(rows.q, "X"), motion
+    return (*found, *(message for message in more if message is not None))

@@ -74,7 +74,7 @@ def check_settings(estimator: BaseEstimator) -> None:
             "`mechanical_model` must be a torch module q -> x or None, got "
             f"{type(mechanical).__name__}; wrap a function in an nn.Module."
         )
-    elif not isinstance(mechanical, Chain) and not by_word and [*wanted]:
+    elif not isinstance(mechanical, Chain) and not by_word and [*(wanted or ())]:
         raise TypeError(
             f"`mechanical_model` must be a chain, with a geometry, to `calibrate` {wanted!r}, got "
             f"{type(mechanical).__name__}."
