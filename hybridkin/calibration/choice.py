@@ -26,6 +26,7 @@ from hybridkin.chains.elastic_tendons import ElasticTendonChain
 _MOST, _FOLDS = 400, 3  # rows and folds for the scores
 _FEW = 40  # rows, below which `io` says little
 _ROWS, _CLEARLY = 8, 0.7  # rows for each parameter; a larger set must be clearly better
+_WORSE = 1.25  # times the least `cv`: not taken
 _USUAL = ((), ("base",), ("radii", "base"))  # sets that are calibrated from few rows, too
 _EQUAL = 0.007  # of the score: then the smaller set is taken
 _ALIKE = 0.01  # of the error: then the first of two starts is taken
@@ -169,6 +170,8 @@ def choose_geometry(
         free = np.array([0 if at is None else at.theta.size for at in starts])
         known = (free <= len(kept) / _ROWS) | [rung.parameters in _USUAL for rung in rungs]
         scores[~known] /= _CLEARLY
+        cv = np.array([one.cv for one in found])
+        scores[cv > _WORSE * cv.min()] = np.inf  # whatever outside: it is the usual case
         best = int(np.argmax(scores <= (1.0 + _EQUAL) * scores.min()))
         errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
     name, chosen, names = rungs[best]
