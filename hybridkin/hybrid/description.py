@@ -102,6 +102,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     """Return the fitted hybrid of a description and of what `training_of` returned."""
     n, restore = stored.value("n_features_in", int), restorer()
     model = estimator_of(HybridForwardModel, stored.value("params", dict))
+    if isinstance(model.calibrate, list):
+        model.calibrate = tuple(model.calibrate)
     if "nominal" in stored.parts:
         model.mechanical_model = restorer()(stored.part("nominal"))
     asked = stored.value("error_model", (str, dict, None))

@@ -145,8 +145,8 @@ def test_rigid_robots_choose_their_base():
 
 
 def test_score_and_split():
-    assert Errors(2.0, 4.0).score == pytest.approx(32.0 ** (1 / 3))
-    assert Errors(2.0, math.nan).score == 2.0
+    assert Errors(3.0, 4.0, 2.0).score == pytest.approx(32.0 ** (1 / 3))
+    assert Errors(2.0).score == 2.0
     rng = np.random.default_rng(0)
     X = np.column_stack([rng.uniform(-1, 1, 200), 10 * rng.uniform(-1, 1, 200), np.ones(200)])
     inner, outer = inner_and_outer(X)

@@ -73,7 +73,7 @@ def test_it_says_what_it_chose(chosen):
     assert results["parameters"] == "radii + base"
     assert results["mechanical_model"].keys() == {"radii + base"}
     own = results["mechanical_model"]["radii + base"]
-    assert own == {"cv": results["mean_distance"][0], "io": results["io_distance"][0]}
+    assert (own["cv"], own["io"]) == (results["mean_distance"][0], results["io_distance"][0])
     assert results["io_distance"].shape == (n,)
     assert results["fold_distance"].shape == (n, 5)
     assert_allclose(results["fold_distance"].std(1, ddof=1), results["std_distance"])
