@@ -69,6 +69,10 @@ class Errors(NamedTuple):
         """What the choice minimises: the mean of `corrected` and twice `io`, or `cv` alone."""
         return self.cv if np.isnan(self.io) else (self.corrected * self.io**2) ** (1.0 / 3.0)
 
+    def known(self) -> dict[str, float]:
+        """Return the errors by name, without those that were not needed."""
+        return {name: error for name, error in self._asdict().items() if not np.isnan(error)}
+
 
 @dataclass(frozen=True)
 class GeometryChoice:

@@ -81,7 +81,7 @@ def select(spec: Spec, rows: Rows, given: Rows) -> tuple[Spec, dict[str, Any]]:
     name, errors = ("nothing", {}) if geometry is None else (geometry.name, geometry.errors)
     own = {name: Errors(*(float(results[key][0]) for key in ("mean_distance", "io_distance")))}
     results["parameters"] = name
-    results["mechanical_model"] = {n: one._asdict() for n, one in (errors or own).items()}
+    results["mechanical_model"] = {n: one.known() for n, one in (errors or own).items()}
     blend = [part._replace(weight=float(w)) for w, part in zip(shares, settled, strict=True)]
     return replace(spec, parts=tuple(part for part in blend if part.weight > 0.0)), results
 

@@ -192,14 +192,15 @@ def _of_set(name: str, errors: dict[str, dict[str, float]]) -> str:
 
 def write_choice(report: Report, geometry: GeometryChoice) -> None:
     """Add which parameters are calibrated, and the errors of all sets that were tried."""
-    tried = {name: errors._asdict() for name, errors in geometry.errors.items()}
+    tried = {name: errors.known() for name, errors in geometry.errors.items()}
     report.record["parameters"] = {"taken": geometry.name, "tried": tried}
     report.text(
         "## What is calibrated",
         f"Calibrated: **{geometry.name}**. Mean tip distance in mm on held-out motions, on the "
         "outer 35 % of the rows after a fit to the inner 40 %, and on held-out motions with a "
-        "quadratic correction. The set with nearly the least product of the last with the square of the "
-        "second is taken, unless the last is a tenth above the least; of equals the smallest.",
+        "quadratic correction. The set with nearly the least product of the last with the "
+        "square of the second is taken, unless the last is a tenth above the least; of equals the "
+        "smallest.",
     )
     rows = [[n, *(f"{1e3 * e:.2f}" for e in errors)] for n, errors in geometry.errors.items()]
     report.table(["parameters", "held-out motions", "outside", "corrected"], rows)
