@@ -180,8 +180,9 @@ def choose_geometry(
         scores = np.array([Errors(*np.maximum(one, least)).score for one in found])
         free = np.array([0 if at is None else at.theta.size for at in starts])
         known = (free <= len(kept) / _ROWS) | [rung.parameters in _USUAL for rung in rungs]
-        scores[~known] /= _CLEARLY
         usual = np.array([one.cv if np.isnan(one.io) else one.corrected for one in found])
+        for errors_of in (scores, usual):
+            errors_of[~known] /= _CLEARLY
         scores[usual > _WORSE * max(usual.min(), least)] = np.inf
         best = int(np.argmax(scores <= (1.0 + _EQUAL) * scores.min()))
         errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
