@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from math import inf, log10
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import gen_batches
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
@@ -17,6 +18,38 @@ _GRID = (inf, 4.0, 0.0, -4.0)  # penalties to start with, in half decades
 _LOW, _HIGH = (-6.0, -12.0), 8.0
 _EQUAL = 1e-3
 _RANK = 1e-8  # of the features' sum of squares
+_BLOCK = 2**22  # numbers of products that are kept: 32 MB
+
+
+class Products:
+    """The products phi_k phi_l, l <= k, of the features of every row.
+
+    Sums over rows and over such products are one matrix product with these. Those of few rows are
+    kept; of more rows they are computed at every use, block by block.
+
+    Parameters
+    ----------
+    phi : Tensor of shape (N, K)
+        Features.
+    """
+
+    def __init__(self, phi: Tensor) -> None:
+        self._phi = phi.numpy(force=True)
+        self._rows = max(_BLOCK // _pairs(phi.shape[1]), 1)
+        self._kept = [*self._blocks()] if len(phi) <= self._rows else None
+
+    def __iter__(self) -> Iterator[tuple[slice, NDArray]]:
+        """Yield some rows, and their products (K (K + 1) / 2, n)."""
+        return self._blocks() if self._kept is None else iter(self._kept)
+
+    def _blocks(self) -> Iterator[tuple[slice, NDArray]]:
+        for rows in gen_batches(len(self._phi), self._rows):
+            columns = self._phi[rows].T.copy()
+            block = np.empty((_pairs(len(columns)), columns.shape[1]))
+            for k in range(len(columns)):
+                out = block[_pairs(k) : _pairs(k + 1)]
+                np.multiply(columns[: k + 1], columns[k], out=out)
+            yield rows, block
 
 
 class Linearised:
@@ -32,25 +65,26 @@ class Linearised:
         Features.
     y : Tensor of shape (N, m)
         Targets.
+    products : Products, optional
+        Those of the features. Default: they are computed.
     """
 
-    def __init__(self, J: Tensor, phi: Tensor, y: Tensor) -> None:
+    def __init__(self, J: Tensor, phi: Tensor, y: Tensor, products: Products | None = None) -> None:
         self.J, self.phi, self.y = J, phi, y
-        (n, _, C), K = J.shape, phi.shape[1]
-        inner = J.mT @ J
-        self.gram = phi.new_empty(C, K, C, K)  # sum_n (J' J)_ab phi phi'
-        for a in range(C):
-            row = (inner[:, a, : a + 1, None] * phi[:, None]).reshape(n, -1).mT @ phi
-            block = row.unflatten(0, (a + 1, K))
-            self.gram[: a + 1, :, a], self.gram[a, :, : a + 1] = block, block.transpose(0, 1)
+        self._products = Products(phi) if products is None else products
+        self.gram = _gram(J, phi.shape[1], self._products)
         self.moment = moment(J, y, phi)
+        self._apart: dict[int, Tensor] = {}  # the Gram matrices of large groups
 
     def factor(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
         """Return which features take part (K,), and the Cholesky factor (D, D) of their system."""
         kept = torch.isfinite(penalty)
-        system = self.gram[:, kept][..., kept].flatten(2).flatten(0, 1)
+        return kept, torch.linalg.cholesky(self._system(penalty, kept))
+
+    def _system(self, penalty: Tensor, kept: Tensor) -> Tensor:
+        system = _part(self.gram, kept)
         system.diagonal().add_(penalty[kept].repeat(len(self.gram)))
-        return kept, torch.linalg.cholesky(system)
+        return system
 
     def residual(self, readout: Tensor) -> Tensor:
         """Return y - J W phi, shape (N, m)."""
@@ -67,37 +101,69 @@ class Linearised:
         penalty : Tensor of shape (K,)
             Penalty of every feature.
         members : list of Tensor, optional
-            Rows of every group. None: every row by itself.
+            Rows of every group, the same ones at every call. None: every row by itself.
         """
         kept, L = self.factor(penalty)
-        phi = self.phi[:, kept]
         own = self.residual(solve_kept(self.moment, kept, L))
-        inverse = torch.cholesky_inverse(L)
         if members is None:
-            share = self.J @ self._spread(phi, inverse) @ self.J.mT
+            share = self.J @ self._spread(kept, torch.cholesky_inverse(L)) @ self.J.mT
             return torch.linalg.solve(identity(share.shape[1], share) - share, own)
         result = torch.empty_like(own)
-        for rows in members:
-            A, y = design(self.J[rows], phi[rows]).flatten(0, 1), self.y[rows].flatten()
-            if len(A) <= len(L):
-                share = identity(len(A), A) - A @ inverse @ A.mT
-                left = torch.linalg.solve(share, own[rows].flatten())
+        for k, rows in enumerate(members):
+            J, phi, y = self.J[rows], self.phi[rows], self.y[rows]
+            if y.numel() <= len(L):
+                A = design(J, phi[:, kept]).flatten(0, 1)
+                white = torch.linalg.solve_triangular(L, A.mT, upper=False)
+                share = identity(len(A), A) - white.mT @ white
+                left = torch.linalg.solve(share, own[rows].flatten()).view_as(y)
             else:
-                rest = torch.linalg.cholesky(L @ L.mT - A.mT @ A)
-                right = self.moment[:, kept].flatten() - y @ A
-                left = y - A @ torch.cholesky_solve(right[:, None], rest)[:, 0]
-            result[rows] = left.view_as(own[rows])
+                if k not in self._apart:
+                    self._apart[k] = _gram(J, phi.shape[1], Products(phi))
+                system = self._system(penalty, kept) - _part(self._apart[k], kept)
+                rest = torch.linalg.cholesky(system)
+                readout = solve_kept(self.moment - moment(J, y, phi), kept, rest)
+                left = y - (J @ (phi @ readout.mT)[..., None])[..., 0]
+            result[rows] = left
         return result
 
-    def _spread(self, phi: Tensor, inverse: Tensor) -> Tensor:
-        """Return the covariance (N, C, C) of W phi, from that of W."""
-        C, K = len(self.gram), phi.shape[1]
-        spread = phi.new_empty(len(phi), C, C)
-        for a in range(C):
-            part = phi @ inverse[a * K : (a + 1) * K, : (a + 1) * K]
-            row = (part.unflatten(1, (a + 1, K)) @ phi[..., None])[..., 0]
-            spread[:, a, : a + 1] = spread[:, : a + 1, a] = row
-        return spread
+    def _spread(self, kept: Tensor, inverse: Tensor) -> Tensor:
+        """Return the covariance (N, C, C) of W phi, from that of W (D, D)."""
+        C, at = self.J.shape[2], kept.nonzero()[:, 0].numpy()
+        K = int(at.max(initial=-1)) + 1
+        whole = np.zeros((C * K, C * K))
+        whole[np.ix_(*[np.add.outer(K * np.arange(C), at).ravel()] * 2)] = inverse.numpy()
+        (a, b), (k, l) = np.tril_indices(C), np.tril_indices(K)
+        blocks = whole.reshape(C, K, C, K)[a, :, b]
+        folded = blocks[:, k, l] + blocks[:, l, k]
+        folded[:, k == l] *= 0.5
+        spread = np.empty((C, C, len(self.phi)))
+        for rows, block in self._products:
+            spread[a, b, rows] = spread[b, a, rows] = folded @ block[: len(k)]
+        return torch.from_numpy(spread).permute(2, 0, 1)
+
+
+def _gram(J: Tensor, K: int, products: Products) -> Tensor:
+    """Return sum_n (J' J)_ab phi phi', shape (C, K, C, K)."""
+    C = J.shape[2]
+    inner = (J.mT @ J).numpy()[(slice(None), *np.tril_indices(C))]
+    sums = sum(inner[rows].T @ block.T for rows, block in products)
+    gram = np.take(sums, _places(K), axis=1)[_places(C)]
+    return torch.from_numpy(gram.transpose(0, 2, 1, 3).copy())
+
+
+def _part(gram: Tensor, kept: Tensor) -> Tensor:
+    """Return the rows and columns (D, D) of the features that take part."""
+    return gram[:, kept][..., kept].flatten(2).flatten(0, 1)
+
+
+def _pairs(n: int) -> int:
+    return n * (n + 1) // 2
+
+
+def _places(n: int) -> NDArray:
+    """Return where the pairs of n things (n, n) stand among those in order of the larger one."""
+    i, j = np.indices((n, n))
+    return _pairs(np.maximum(i, j)) + np.minimum(i, j)
 
 
 def moment(J: Tensor, y: Tensor, phi: Tensor) -> Tensor:

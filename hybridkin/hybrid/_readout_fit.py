@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from functools import partial
-from math import inf, nan
+from functools import cached_property, partial
+from math import ceil, inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +14,12 @@ from torch import Tensor
 
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel
-from hybridkin._core.stored import Restore, Stored
+from hybridkin._core.stored import Layout, Restore, Stored
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
+from hybridkin.native.library import evaluate
 
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
@@ -64,6 +66,30 @@ class ReadoutFit(NamedTuple):
         )
 
 
+class _Beyond(ForwardModel):
+    """A model as a function of its inner coordinates; of arcs the compiled core computes it."""
+
+    layout = Layout("constant_curvature", {})
+
+    def __init__(self, model: ForwardModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        return self.model.from_coordinates_and_jacobian(q)
+
+    def stored(self) -> Stored:
+        chain = self.model
+        if not isinstance(chain, ArcChain):
+            raise TypeError("only arcs have a kernel of their own")
+        m = ceil(chain.tip_at)
+        offsets = chain.offsets[:m].numpy(force=True).copy()
+        offsets[-1] *= chain.tip_at == m
+        arrays = {"base": chain.base.numpy(force=True), "offsets": offsets, "radii": np.ones(m)}
+        derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}
+        return Stored(self.layout.kind, {"tip_at": float(m)}, arrays, derived=derived)
+
+
 class _AtTip(ForwardModel):
     """A model whose inner coordinates are its tip: a correction of them is one at the tip."""
 
@@ -90,6 +116,7 @@ def fit_readout(
     groups: ArrayLike | None = None,
     alphas: Pair | None = None,
     noise_ratio: float = inf,
+    left_out: bool = True,
 ) -> ReadoutFit:
     """Return the readout that minimises the error of the tip plus a penalty on its weights.
 
@@ -125,6 +152,8 @@ def fit_readout(
     noise_ratio : float, default=inf
         With `alphas`: the variance of a tip's coordinate over that of an actuator, without the
         noise of this one [m^2 over the squared unit of q]. Infinity: the actuators are exact.
+    left_out : bool, default=True
+        With `alphas`: whether the leave-out residuals are computed; else they are NaN.
 
     Returns
     -------
@@ -139,7 +168,7 @@ def fit_readout(
     with torch.no_grad():
         problem = _Problem(model, features, q[first], x[first], weight)
         if alphas is not None:
-            found = _fitted(problem.in_noise(noise_ratio), members, alphas)
+            found = _fitted(problem.in_noise(noise_ratio), members, alphas, left_out=left_out)
         else:
             found = _chosen(problem, members)
             noise_ratio = problem.likeliest_ratio(torch.from_numpy(found.residual))
@@ -171,13 +200,19 @@ def _chosen(
 
 
 def _fitted(
-    problem: _Problem, members: list[Tensor] | None, alphas: Pair, start: Tensor | None = None
+    problem: _Problem,
+    members: list[Tensor] | None,
+    alphas: Pair,
+    start: Tensor | None = None,
+    left_out: bool = True,
 ) -> ReadoutFit:
     """Return the fit with given penalties, from weights to start at."""
     penalty = problem.penalty(alphas)
     weights, gradient = problem.minimum(problem.nothing if start is None else start, penalty)
-    left_out = problem.linearised(weights).left_out(penalty, members)
-    residual = problem.in_metres(left_out).numpy(force=True)
+    residual = np.full(problem.x.shape, nan)
+    if left_out:
+        found = problem.linearised(weights).left_out(penalty, members)
+        residual = problem.in_metres(found).numpy(force=True)
     readout, ratio = problem.readout(weights), problem.noise_ratio
     return ReadoutFit(readout, alphas, residual, {}, gradient, ratio)
 
@@ -190,7 +225,8 @@ class _Problem:
     ) -> None:
         self.mechanical, self.features = mechanical, features
         self.q, self.x, self.root = q, x, weight.sqrt()[:, None]
-        self.noise_ratio, self.whitening = inf, None
+        self.noise_ratio, self.whitening, self._last = inf, None, None
+        self._beyond = _Beyond(mechanical)
         self.z = mechanical.coordinates(q)[0]
         tips, J = mechanical.from_coordinates_and_jacobian(self.z)
         self.rest = x - tips
@@ -202,6 +238,7 @@ class _Problem:
         most = max(_LARGEST // len(self.units) - features.n_linear, 0)
         self.basis = _linearised.basis(self.root * phi, features.n_linear, most)
         self.phi = phi @ self.basis
+        self.products = _linearised.Products(self.phi)
         self.nothing = phi.new_zeros(len(self.units), self.phi.shape[1])
 
     def in_noise(self, ratio: float) -> _Problem:
@@ -209,7 +246,8 @@ class _Problem:
         if ratio == inf:
             return self
         problem = copy.copy(self)
-        spread, axes = self._principal_noise()
+        problem._last = None
+        spread, axes = self._principal_noise
         variance = spread + ratio
         # The mean square of whitened residuals is that of residuals in metres, were they all noise.
         weights = self.root.square()
@@ -220,7 +258,7 @@ class _Problem:
 
     def likeliest_ratio(self, residual: Tensor) -> float:
         """Return the ratio that makes residuals (N, m) [m] likeliest as normal noise."""
-        spread, axes = self._principal_noise()
+        spread, axes = self._principal_noise
         squares = (axes.mT @ residual[..., None])[..., 0].square()
         weights = self.root.square().expand_as(squares)
         total, mean = weights.sum(), (weights * spread).sum() / weights.sum()
@@ -232,6 +270,7 @@ class _Problem:
 
         return min([inf, *(float(mean) * _RATIOS).tolist()], key=unlikely)
 
+    @cached_property
     def _principal_noise(self) -> tuple[Tensor, Tensor]:
         """Return variances (N, m) and axes (N, m, m) of what noise of the actuators does to x."""
         J = self.mechanical.forward_and_jacobian(self.q)[1]
@@ -255,9 +294,13 @@ class _Problem:
         return self.phi.new_tensor([alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n))
 
     def linearised(self, readout: Tensor) -> Linearised:
-        """Return the ridge problem about a readout (C, K)."""
-        J, rest = self._about(readout)
-        return Linearised(J, self.phi, rest + (J @ (self.phi @ readout.mT)[..., None])[..., 0])
+        """Return the ridge problem about a readout (C, K); the last one is kept."""
+        if self._last is None or not torch.equal(self._last[0], readout):
+            rest, J = self._about(readout)
+            J = self._whitened(J * self.units)
+            y = self._whitened(rest) + (J @ (self.phi @ readout.mT)[..., None])[..., 0]
+            self._last = readout, Linearised(J, self.phi, y, self.products)
+        return self._last[1]
 
     def score(self, linear: Linearised, members: list[Tensor] | None, alphas: Pair) -> float:
         """Return the mean squared leave-out distance [m^2]."""
@@ -305,19 +348,25 @@ class _Problem:
         return Readout(self.features, self.units[:, None] * (weights @ self.basis.mT))
 
     def _about(self, readout: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the Jacobians (N, m, C) by the scaled coordinates, and the residuals (N, m)."""
+        """Return residuals (N, m) [m] and Jacobians (N, m, C) by the coordinates."""
         z = self.z + self.units * (self.phi @ readout.mT)
-        tip, J = self.mechanical.from_coordinates_and_jacobian(z)
-        J, rest = self.root[:, None] * J * self.units, self.root * (self.x - tip)
-        if self.whitening is None:
-            return J, rest
-        return self.whitening @ J, (self.whitening @ rest[..., None])[..., 0]
+        tip, J = map(torch.from_numpy, evaluate(self._beyond, z.numpy(), jacobian=True))
+        return self.x - tip, J
+
+    def _whitened(self, values: Tensor) -> Tensor:
+        """Return values (N, m) or (N, m, C) in units of the noise, times the roots of weights."""
+        flat = values.reshape(*self.x.shape, -1)
+        if self.whitening is not None:
+            flat = self.whitening @ flat
+        return (self.root[..., None] * flat).view_as(values)
 
     def _value_and_slope(
         self, readout: Tensor, weight: Tensor, taking_part: Tensor
     ) -> tuple[float, Tensor]:
         """Return the objective and half its gradient (C, K)."""
-        J, rest = self._about(readout)
-        slope = weight * readout - _linearised.moment(J, rest, self.phi)
+        rest, J = self._about(readout)
+        rest = self._whitened(rest)
+        moment = _linearised.moment(J, self._whitened(rest), self.phi)
+        slope = weight * readout - self.units[:, None] * moment
         slope = torch.where(taking_part, slope, 0.0)
         return float(rest.square().sum() + (weight * readout.square()).sum()), slope
