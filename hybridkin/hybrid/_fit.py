@@ -101,6 +101,7 @@ class Spec:
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
+    left_out: bool = True  # whether residuals of rows left out are wanted
 
 
 class FittedHybrid(NamedTuple):
@@ -239,7 +240,7 @@ def _fit_part(
         return None, None
     serial = part.coupling == "serial"
     if mechanical is not None and (serial or isinstance(model, NamedFeatures)):
-        fitted = _fit_features(part, mechanical, rows, q)
+        fitted = _fit_features(part, mechanical, rows, q, spec.left_out)
         readout = fitted.readout
         correction = InnerCorrection(mechanical, readout) if serial else TipCorrection(readout)
     else:
@@ -271,7 +272,9 @@ def _fit_regressor(model: Any, given_rows: Rows, rows: Rows, place: NDArray) -> 
     return fitted
 
 
-def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, q: Tensor) -> ReadoutFit:
+def _fit_features(
+    part: Part, mechanical: ForwardModel, rows: Rows, q: Tensor, left_out: bool
+) -> ReadoutFit:
     """Return the readout of named features, or of the hidden layer of an ELM.
 
     An ELMRegressor brings its `alpha` as the penalty; of an ELMRegressorCV the penalties are
@@ -285,9 +288,8 @@ def _fit_features(part: Part, mechanical: ForwardModel, rows: Rows, q: Tensor) -
         noise_ratio = inf
     x = torch.from_numpy(rows.tips)
     weight = None if rows.weights is None else torch.from_numpy(rows.weights)
-    return fit_readout(
-        mechanical, features, rows.q, x, part.coupling, weight, rows.groups, alphas, noise_ratio
-    )
+    given = rows.q, x, part.coupling, weight, rows.groups
+    return fit_readout(mechanical, features, *given, alphas, noise_ratio, left_out)
 
 
 def _named(kind: str, mechanical: ForwardModel, q: Tensor) -> Features:

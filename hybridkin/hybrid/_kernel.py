@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from itertools import product
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from sklearn.kernel_ridge import KernelRidge
+from sklearn.metrics.pairwise import euclidean_distances
 
 from hybridkin.calibration.measured import folds
 
@@ -35,17 +38,31 @@ def tuned_kernel(
     """
     splits = folds_of(X, groups)
     spread = X.var(axis=0).mean() or 1.0
+    squares = euclidean_distances(X.astype(np.float64), squared=True)
+    root, least = np.sqrt(weights).reshape(-1, *[1] * (error.ndim - 1)), inf
+    targets = root * error
 
-    def ridge(at: tuple[int, int]) -> KernelRidge:
-        gamma = _GAMMAS[at[0]] / spread
-        return KernelRidge(kernel="rbf", gamma=gamma).set_params(alpha=_ALPHAS[at[1]])
+    @lru_cache(1)
+    def kernel(width: int) -> NDArray:
+        return np.exp(-_GAMMAS[width] / spread * squares) * np.outer(root, root)
 
     @cache
     def held_out(at: tuple[int, int]) -> float:
-        total = 0.0
+        """Return the sum of held-out distances, of the first folds where that is too much."""
+        nonlocal least
+        total, K, alpha = 0.0, kernel(at[0]), _ALPHAS[at[1]]
         for train, test in splits:
-            fitted = ridge(at).fit(X[train], error[train], sample_weight=weights[train])
-            total += float(weights[test] @ distance(fitted.predict(X[test]), error[test]))
+            system = K[np.ix_(train, train)]
+            system.flat[:: len(train) + 1] += alpha
+            try:
+                dual = cho_solve(cho_factor(system.T, True, True, False), targets[train])
+            except LinAlgError:
+                return inf
+            found = K[np.ix_(test, train)] @ dual / root[test]
+            total += float(weights[test] @ distance(found, error[test]))
+            if total > least:
+                return total
+        least = total
         return total
 
     widths, penalties = range(len(_GAMMAS)), range(len(_ALPHAS))
@@ -55,4 +72,5 @@ def tuned_kernel(
         near = product(range(width - 1, width + 2), range(penalty - 1, penalty + 2))
         allowed = (at for at in near if at[0] in widths and at[1] in penalties)
         previous, best = best, min(allowed, key=held_out)
-    return ridge(best)
+    width, alpha = _GAMMAS[best[0]] / spread, _ALPHAS[best[1]]
+    return KernelRidge(kernel="rbf", gamma=width).set_params(alpha=alpha)

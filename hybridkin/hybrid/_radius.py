@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import ceil, floor, inf
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
     for train, test in folds(X, rows.groups):
         part = given.take(np.isin(place, train))
         chosen = spec if spec.parts else select(with_geometry_chosen(spec, part), part, part)[0]
-        module = fit_hybrid(chosen, part).module
+        module = fit_hybrid(replace(chosen, left_out=False), part).module
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():
             inside[test] = module.in_domain(q).numpy()
