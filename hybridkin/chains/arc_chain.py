@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ ALIASES = {"turns": "angles", "tool": "offsets"}
 
 _ROUTINGS = ("segment", "base")
 _MOST_UNLIKE = 1000.0  # radii of one robot; more leave too few digits to the routing "base"
+Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
 STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "routing": str}
 
 
@@ -45,7 +46,7 @@ class Frames(NamedTuple):
 class ArcChain(Chain):
     """A chain of circular arcs; its kinds differ in how the actuators shape them.
 
-    A kind gives `_arcs_and_slope` and `_arc_tangents`.
+    A kind gives `_arcs_and_slope` and `_arcs_and_change`.
     """
 
     _structure = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
@@ -167,15 +168,14 @@ class ArcChain(Chain):
         >>> chain.geometry_jacobian(torch.zeros(3, dtype=torch.float64), longer).flatten()
         tensor([0., 0., 1.], dtype=torch.float64)
         """
-        rows = self._rows(q)
-        length, bending = self._split(self._to_tip(self._arcs_and_slope(rows)[0]))
+        arcs, change = self._arcs_and_change(self._rows(q))
+        length, bending = self._split(self._to_tip(arcs))
         offsets = self._tip_offsets().to(q)
         tail, columns = tip_and_columns(length, bending, offsets, rigid=True)
         tangents = {name: value.to(q) for name, value in tangents.items()}
-        moves = self._to_tip(self._arc_tangents(rows, tangents).permute(2, 1, 0)).permute(2, 1, 0)
         columns, S = self._turned(columns).permute(2, 0, 1).contiguous(), len(length)
         by_arcs, by_offsets = columns.split([3 * S, S], dim=2)
-        J = by_arcs @ moves.mT
+        J = change(by_arcs @ self._to_tip(identity(3 * self.n_segments, q)), tangents)
         if "offsets" in tangents:
             J = J + by_offsets @ self._tip_offsets(tangents["offsets"]).T
         if "base" in tangents:
@@ -317,8 +317,8 @@ class ArcChain(Chain):
         """
         raise NotImplementedError
 
-    def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-        """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
+    def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
+        """Return arcs (3 S, N), and what makes slopes (N, 3, P) of those (N, 3, 3 S) by them."""
         raise NotImplementedError
 
     def _changes(

@@ -12,7 +12,7 @@ from hybridkin._core.arrays import Numbers, Transform, identity
 from hybridkin._core.stored import Layout
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled, float_dtype
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
 
 __all__ = ["ConstantCurvatureChain"]
 
@@ -262,6 +262,12 @@ class ConstantCurvatureChain(ArcChain):
     def _readings(self) -> Tensor:
         at = levers(self.radii, self.angles, self.actuators_per_segment)
         return reading_matrix(at, self.actuators_per_segment, self.routing, self.lengths is None)
+
+    def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
+        def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+            return by_arcs @ self._arc_tangents(rows, tangents).mT
+
+        return self._arcs_and_slope(rows)[0], change
 
     def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""

@@ -14,7 +14,7 @@ from hybridkin._core.stored import Layout
 from hybridkin.chains import _slack
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled, float_dtype
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]
@@ -269,25 +269,32 @@ class ElasticTendonChain(ArcChain):
         return _slack.Balance(shape, stretch.relu() * taut, taut, compliance)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        straight = nn.functional.pad(self.get_buffer("lengths").to(rows), (0, 2 * self.n_segments))
         _, at, responses = self._find(rows)
+        straight = nn.functional.pad(self.get_buffer("lengths").to(rows), (0, 2 * self.n_segments))
         maps = responses.shape.index_select(0, at)
         arcs = (_slack.applied(maps, _slack.extended(rows)) + straight).T.contiguous()
         return arcs, maps[..., :-1].permute(1, 2, 0)
 
-    def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-        """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
-        S = self.n_segments
-        change, by_bendings = self._changes(rows, tangents)
-        by_readings = nn.functional.pad(by_bendings, (S, 0))
-        readings, _, stiffness, rest, _ = (part.to(rows) for part in self._elasticity())
-        shape, pull, taut, compliance = self._balance(rows)
-        bending = change["bending_stiffness"]
-        by_stiffness = torch.cat([change["axial_stiffness"], bending, bending], dim=-1)
-        by_rest = nn.functional.pad(change["rest_bends"].mT.flatten(1), (S, 0))
-        # By the implicit function theorem: the forces out of balance, times the compliance.
-        force = stiffness * by_rest + (rest - shape)[:, None] * by_stiffness
-        force = force - torch.einsum("ni,pik->npk", pull, by_readings)
-        stretch = torch.einsum("nk,pik->npi", shape, by_readings) + change["tendon_zeros"]
-        moves = (force - (stretch * taut[:, None]) @ readings) @ compliance
-        return moves + nn.functional.pad(change["lengths"], (0, 2 * S))
+    def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
+        S, (shape, pull, taut, compliance) = self.n_segments, self._balance(rows)
+
+        def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+            new, by_bendings = self._changes(rows, tangents)
+            readings, _, stiffness, rest, _ = (part.to(rows) for part in self._elasticity())
+            bending = new["bending_stiffness"]
+            by_stiffness = torch.cat([new["axial_stiffness"], bending, bending], dim=-1)
+            by_rest = nn.functional.pad(new["rest_bends"].mT.flatten(1), (S, 0))
+            # By the implicit function theorem: the forces out of balance, times the compliance.
+            # Here from the tip: how it moves by a force on the shape, and by the pull of a tendon.
+            by_force = by_arcs @ compliance
+            by_pull = (by_force @ readings.mT) * taut[:, None]
+            turned = pull[:, None, :, None] * by_force[:, :, None, S:]
+            turned = turned + by_pull[..., None] * shape[:, None, None, S:]
+            softer = by_force * (rest - shape)[:, None]
+            effects = [by_force, softer, -by_pull, -turned.flatten(2), by_arcs[..., :S]]
+            causes = [stiffness * by_rest, by_stiffness, new["tendon_zeros"]]
+            causes += [by_bendings.flatten(1), new["lengths"]]
+            return torch.cat(effects, dim=-1) @ torch.cat(causes, dim=-1).mT
+
+        straight = nn.functional.pad(self.get_buffer("lengths").to(rows), (0, 2 * S))
+        return (shape + straight).mT.contiguous(), change

@@ -132,10 +132,10 @@ class Linearised:
         K = int(at.max(initial=-1)) + 1
         whole = np.zeros((C * K, C * K))
         whole[np.ix_(*[np.add.outer(K * np.arange(C), at).ravel()] * 2)] = inverse.numpy()
-        (a, b), (k, l) = np.tril_indices(C), np.tril_indices(K)
+        (a, b), (k, j) = np.tril_indices(C), np.tril_indices(K)
         blocks = whole.reshape(C, K, C, K)[a, :, b]
-        folded = blocks[:, k, l] + blocks[:, l, k]
-        folded[:, k == l] *= 0.5
+        folded = blocks[:, k, j] + blocks[:, j, k]
+        folded[:, k == j] *= 0.5
         spread = np.empty((C, C, len(self.phi)))
         for rows, block in self._products:
             spread[a, b, rows] = spread[b, a, rows] = folded @ block[: len(k)]

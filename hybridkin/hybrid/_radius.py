@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from math import ceil, floor, inf
 from dataclasses import replace
+from math import ceil, floor, inf
 from typing import NamedTuple
 
 import numpy as np
