@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hybridkin.calibration._parameters import Problem
 from hybridkin.chains.chain import Chain
+from hybridkin.native.library import evaluate
 
 _MAX_ROUNDS = 12
 _MEDIAN = 2.3660  # of the squared length of a normal vector with three coordinates
@@ -43,14 +44,13 @@ class Rows(NamedTuple):
 
     def residual(self, chain: Chain) -> NDArray:
         """Return the coordinate errors (N, 3)."""
-        with torch.no_grad():
-            return (chain(self.q) - self.x).numpy()
+        return evaluate(chain, self.q.numpy())[0] - self.x.numpy()
 
-    def jacobian(self, problem: Problem, theta: NDArray) -> NDArray:
+    def jacobian(self, problem: Problem, theta: NDArray, chain: Chain) -> NDArray:
         """Return the derivative of the residual, times the roots of the weights, (3 N, P)."""
         with torch.no_grad():
             tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
-            J = problem.chain_at(theta).geometry_jacobian(self.q, tangents)
+            J = chain.geometry_jacobian(self.q, tangents)
             return (self.weight.sqrt()[:, None, None] * J).numpy().reshape(-1, theta.size)
 
     def rmse(self, chain: Chain) -> float:
@@ -111,21 +111,29 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
     weight = rows.weight.numpy()
     root = np.sqrt(weight)[:, None]
 
+    @lru_cache(1)
+    def known(key: bytes) -> tuple[Chain, NDArray]:
+        chain = problem.chain_at(np.frombuffer(key).copy())
+        return chain, rows.residual(chain)
+
     def residual(theta: NDArray) -> NDArray:
-        return rows.residual(problem.chain_at(theta))
+        return known(theta.tobytes())[1]
+
+    def jacobian(theta: NDArray) -> NDArray:
+        return rows.jacobian(problem, theta, known(theta.tobytes())[0])
 
     def whitened(theta: NDArray, sigma: float) -> NDArray:
         return np.concatenate([(root * residual(theta)).ravel() / sigma, theta / problem.prior_std])
 
-    def jacobian(theta: NDArray, sigma: float) -> NDArray:
-        return np.vstack([rows.jacobian(problem, theta) / sigma, np.diag(1.0 / problem.prior_std)])
+    def slope(theta: NDArray, sigma: float) -> NDArray:
+        return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
 
     floor = 1e-12 * float(problem.chain.reach)
     robust = loss != "linear"
     sigma = max(rows.noise(residual(theta), robust), floor)
     converged, tol = False, 1e-5 if roughly else 1e-12
     options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol)
-    options |= {"jac": jacobian, "bounds": (problem.low, problem.high), "max_nfev": 100}
+    options |= {"jac": slope, "bounds": (problem.low, problem.high), "max_nfev": 100}
     options |= {"loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"}
     for _ in range(2 if roughly else _MAX_ROUNDS):
         solution = least_squares(whitened, theta, args=(sigma,), **options)
@@ -133,7 +141,7 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
         previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    found, count = rows.rmse(problem.chain_at(theta)), float(weight.sum())
+    found, count = rows.rmse(known(theta.tobytes())[0]), float(weight.sum())
     free = max(3.0 * count - theta.size, 1.0)
     noise = max(sigma if robust else found * (count / free) ** 0.5, floor)
-    return Fit(problem, theta, rows.jacobian(problem, theta), noise, found, bool(converged))
+    return Fit(problem, theta, jacobian(theta), noise, found, bool(converged))
