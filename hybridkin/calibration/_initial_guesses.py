@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridkin.calibration._least_squares import Rows
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
+from hybridkin.native.library import evaluate
 
 _Chain = TypeVar("_Chain", bound=Chain)
 
@@ -57,7 +58,8 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
 
 def aligned(chain: _Chain, rows: Rows) -> _Chain:
     """Return the chain at the base pose that matches the two clouds of tips (Kabsch)."""
-    tips, weight = chain(rows.q), rows.weight[:, None] / rows.weight.sum()
+    tips = torch.from_numpy(evaluate(chain, rows.q.numpy())[0]).to(rows.x)
+    weight = rows.weight[:, None] / rows.weight.sum()
     here, there = (weight * tips).sum(0), (weight * rows.x).sum(0)
     u, _, vh = torch.linalg.svd((weight * (tips - here)).mT @ (rows.x - there))
     sign = torch.ones_like(here)

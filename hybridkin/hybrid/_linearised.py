@@ -153,7 +153,8 @@ def _gram(J: Tensor, K: int, products: Products) -> Tensor:
 
 def _part(gram: Tensor, kept: Tensor) -> Tensor:
     """Return the rows and columns (D, D) of the features that take part."""
-    return gram[:, kept][..., kept].flatten(2).flatten(0, 1)
+    part = gram.clone() if kept.all() else gram[:, kept][..., kept]
+    return part.flatten(2).flatten(0, 1)
 
 
 def _pairs(n: int) -> int:

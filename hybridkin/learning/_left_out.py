@@ -3,6 +3,8 @@
 import numpy as np
 import torch
 from scipy import linalg
+from scipy.linalg.blas import dsyrk  # pyright: ignore
+from scipy.linalg.lapack import dposv  # pyright: ignore
 from sklearn.utils import gen_batches
 
 from hybridkin.learning._ridge import moments
@@ -89,14 +91,18 @@ class LeftOut:
             return self._refitted(out, asked, alphas)
         Z, D = self._z(out), self._d(alphas)
         residuals, among = self._residuals(Z, D, out), np.searchsorted(out, asked)
-        fixed = np.eye(len(out)) * (not self._wide)
+        fixed = np.asfortranarray(np.eye(len(out))) * (not self._wide)
         if self._intercept and not self._wide:
             fixed -= np.outer(self._root[out], self._root[out]) / self._n
-        errors = (
-            linalg.solve(fixed + (Z * d) @ Z.T, r, assume_a="sym")[among]
-            for d, r in zip(D, residuals, strict=True)
-        )
-        return np.stack(list(errors)) / self._root[asked, None]
+        errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
+        for k, d in enumerate(D):  # all of one sign
+            half = Z * np.sqrt(np.abs(d))
+            P = dsyrk(np.copysign(1.0, d[0]), half.T, 1.0, fixed, trans=True, lower=True)
+            _, solution, failed = dposv(P, residuals[k], lower=True)
+            if failed:
+                solution = linalg.solve(np.tril(P) + np.tril(P, -1).T, residuals[k], assume_a="sym")
+            errors[k] = solution[among]
+        return errors / self._root[asked, None]
 
     def _d(self, alphas):
         numerator = alphas[:, None] if self._wide else -1.0
