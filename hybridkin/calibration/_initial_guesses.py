@@ -82,11 +82,10 @@ def _searched(chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool) ->
                 for k in range(n_segments):
                     for option in [(flip, turn) for flip in (hand, not hand) for turn in _TURNS]:
                         tried = [*choice[:k], option, *choice[k + 1 :]]
-                        guess = _chosen(chain, tried, scale, rows, free_base)
-                        rms = rows.rmse(_scaled(guess.chain, guess.scale))
+                        rms = _chosen(chain, tried, scale, rows, free_base)[1]
                         if rms < score * (1.0 - 1e-9):
                             score, choice = rms, tried
-            guess = _chosen(chain, choice, scale, rows, free_base)
+            guess, _ = _chosen(chain, choice, scale, rows, free_base)
             key = tuple(choice)
             if key not in found or score < found[key][0]:
                 found[key] = (score, guess)
@@ -98,13 +97,15 @@ def _searched(chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool) ->
 
 def _chosen(
     chain: ArcChain, choice: list[tuple[bool, float]], scale: float, rows: Rows, align: bool
-) -> Guess:
+) -> tuple[Guess, float]:
+    """Return a guess, and the root mean square tip distance of its chain with scaled radii."""
     mirrored, turns = zip(*choice, strict=True)
     turned = _ringed(chain, mirrored, np.array(turns))
+    scaled = _scaled(turned, scale)
     if align:
-        scaled = aligned(_scaled(turned, scale), rows)
+        scaled = aligned(scaled, rows)
         turned = turned.with_geometry(base=scaled.geometry()["base"])
-    return Guess(turned, scale, mirrored)
+    return Guess(turned, scale, mirrored), rows.rmse(scaled)
 
 
 def _ringed(chain: ArcChain, mirrored: tuple[bool, ...], turns: NDArray) -> ArcChain:

@@ -249,6 +249,13 @@ def fit_geometry(
     return result, [message for message in messages if message is not None]
 
 
+def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
+    """Return the chain calibrated to different rows from a start, and nothing else of it."""
+    like = start.problem.chain.geometry()["base"]
+    rows = Rows(*(part.to(like) for part in (q, x, weights)))
+    return solve(start.problem, rows, start.theta, "linear").chain()
+
+
 def _few(fit: Fit, rows: Rows) -> str | None:
     """Return a warning where the rmse is too good to be true: by a fifth, and more with less."""
     n_rows, n_free = len(rows.q), fit.theta.size

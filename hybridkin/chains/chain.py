@@ -76,7 +76,10 @@ class Chain(PoseModel):
         chain = type(self).__new__(type(self))
         nn.Module.__init__(chain)
         chain.__dict__.update({name: self.__dict__[name] for name in self._structure})
-        chain._set_geometry({**self._buffers, **geometry})
+        if set(geometry) <= {"base"}:  # from which nothing follows
+            chain._buffers.update({**self._buffers, **geometry})
+        else:
+            chain._set_geometry({**self._buffers, **geometry})
         return chain
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.units import motion_message
-from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -101,7 +101,7 @@ class Spec:
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
-    left_out: bool = True  # whether residuals of rows left out are wanted
+    left_out: bool = True  # whether more than predictions is wanted, as residuals of rows left out
 
 
 class FittedHybrid(NamedTuple):
@@ -195,14 +195,19 @@ def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
         return spec
     if spec.calibrate == "auto":
         return calibrated(with_geometry_chosen(spec, rows), rows, groups)
+    start = None if spec.geometry is None else spec.geometry.start
+    x = _positions(spec, rows)
+    if start is not None and not spec.left_out:
+        chain = refitted(start, rows.q, x, torch.from_numpy(rows.counts))
+        return replace(spec, mechanical=chain, calibrate=())
     result, messages = fit_geometry(
         cast(Chain, spec.mechanical),
         rows.q,
-        _positions(spec, rows),
+        x,
         spec.calibrate,
         groups=groups,
         sample_weight=rows.weights,
-        start=None if spec.geometry is None else spec.geometry.start,
+        start=start,
     )
     messages = (*spec.messages, *messages)
     return replace(

@@ -56,7 +56,7 @@ def select(spec: Spec, rows: Rows, given: Rows) -> tuple[Spec, dict[str, Any]]:
     by_fold = weighed._replace(groups=None if rows.groups is None else fold_of)
     splits = [*folds, inner_and_outer(rows.X)]
     parts = [weighed.take(train) for train, _ in splits]
-    alone = [replace(calibrated(spec, part), left_out=False) for part in parts]
+    alone = [calibrated(replace(spec, left_out=False), part) for part in parts]
     geometry, spec = spec.geometry, calibrated(spec, given)  # its warnings count the rows given
     candidates = _candidates(spec)
     if len(y) > _MOST:
