@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from math import inf, log10
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ class Products:
     """
 
     def __init__(self, phi: Tensor) -> None:
-        self._phi = phi.numpy(force=True)
+        self.phi = phi.numpy(force=True)
         self._rows = max(_BLOCK // _pairs(phi.shape[1]), 1)
         self._kept = [*self._blocks()] if len(phi) <= self._rows else None
 
@@ -44,12 +45,11 @@ class Products:
         return self._blocks() if self._kept is None else iter(self._kept)
 
     def _blocks(self) -> Iterator[tuple[slice, NDArray]]:
-        for rows in gen_batches(len(self._phi), self._rows):
-            columns = self._phi[rows].T.copy()
+        for rows in gen_batches(len(self.phi), self._rows):
+            columns = self.phi[rows].T.copy()
             block = np.empty((_pairs(len(columns)), columns.shape[1]))
-            for k in range(len(columns)):
-                out = block[_pairs(k) : _pairs(k + 1)]
-                np.multiply(columns[: k + 1], columns[k], out=out)
+            for k, column in enumerate(columns):
+                np.multiply(columns[: k + 1], column, out=block[_pairs(k) : _pairs(k + 1)])
             yield rows, block
 
 
@@ -73,19 +73,19 @@ class Linearised:
     def __init__(self, J: Tensor, phi: Tensor, y: Tensor, products: Products | None = None) -> None:
         self.J, self.phi, self.y = J, phi, y
         self._products = Products(phi) if products is None else products
-        self.gram = _gram(J, phi.shape[1], self._products)
+        self.gram = _gram(J, self._products)
         self.moment = moment(J, y, phi)
         self._apart: dict[int, Tensor] = {}  # the Gram matrices of large groups
 
-    def factor(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
-        """Return which features take part (K,), and the Cholesky factor (D, D) of their system."""
-        kept = torch.isfinite(penalty)
-        return kept, torch.linalg.cholesky(self._system(penalty, kept))
+    def factor(self, penalty: Tensor, less: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return which features take part (K,), and the Cholesky factor (D, D) of their system.
 
-    def _system(self, penalty: Tensor, kept: Tensor) -> Tensor:
-        system = _part(self.gram, kept)
+        `less` is the Gram matrix of rows that do not count.
+        """
+        kept, gram = torch.isfinite(penalty), self.gram if less is None else self.gram - less
+        system = gram[:, kept][..., kept].flatten(2).flatten(0, 1)
         system.diagonal().add_(penalty[kept].repeat(len(self.gram)))
-        return system
+        return kept, torch.linalg.cholesky(system)
 
     def residual(self, readout: Tensor) -> Tensor:
         """Return y - J W phi, shape (N, m)."""
@@ -110,21 +110,20 @@ class Linearised:
             share = self.J @ self._spread(kept, torch.cholesky_inverse(L)) @ self.J.mT
             return torch.linalg.solve(identity(share.shape[1], share) - share, own)
         result = torch.empty_like(own)
+        few = len(L) if len(members) > _FOLDS else len(L) // 4
         for k, rows in enumerate(members):
             J, phi, y = self.J[rows], self.phi[rows], self.y[rows]
-            if y.numel() <= (len(L) if len(members) > _FOLDS else len(L) // 4):
+            if y.numel() <= few:
                 A = design(J, phi[:, kept]).flatten(0, 1)
                 white = torch.linalg.solve_triangular(L, A.mT, upper=False)
                 share = identity(len(A), A) - white.mT @ white
-                left = torch.linalg.solve(share, own[rows].flatten()).view_as(y)
-            else:
-                if k not in self._apart:
-                    self._apart[k] = _gram(J, phi.shape[1], Products(phi))
-                system = self._system(penalty, kept) - _part(self._apart[k], kept)
-                rest = torch.linalg.cholesky(system)
-                readout = solve_kept(self.moment - moment(J, y, phi), kept, rest)
-                left = y - (J @ (phi @ readout.mT)[..., None])[..., 0]
-            result[rows] = left
+                result[rows] = torch.linalg.solve(share, own[rows].flatten()).view_as(y)
+                continue
+            if k not in self._apart:
+                self._apart[k] = _gram(J, Products(phi))
+            rest = self.factor(penalty, self._apart[k])
+            readout = solve_kept(self.moment - moment(J, y, phi), *rest)
+            result[rows] = self.residual(readout)[rows]
         return result
 
     def _spread(self, kept: Tensor, inverse: Tensor) -> Tensor:
@@ -143,22 +142,15 @@ class Linearised:
         return torch.from_numpy(spread).permute(2, 0, 1)
 
 
-def _gram(J: Tensor, K: int, products: Products) -> Tensor:
+def _gram(J: Tensor, products: Products) -> Tensor:
     """Return sum_n (J' J)_ab phi phi', shape (C, K, C, K)."""
-    C = J.shape[2]
-    inner = (J.mT @ J).numpy()[(slice(None), *np.tril_indices(C))]
+    inner = (J.mT @ J).numpy()[(slice(None), *np.tril_indices(J.shape[2]))]
     sums = sum(inner[rows].T @ block.T for rows, block in products)
-    gram = np.take(sums, _places(K), axis=1)[_places(C)]
+    gram = np.take(sums, _places(products.phi.shape[1]), axis=1)[_places(J.shape[2])]
     return torch.from_numpy(gram.transpose(0, 2, 1, 3).copy())
 
 
-def _part(gram: Tensor, kept: Tensor) -> Tensor:
-    """Return the rows and columns (D, D) of the features that take part."""
-    part = gram.clone() if kept.all() else gram[:, kept][..., kept]
-    return part.flatten(2).flatten(0, 1)
-
-
-def _pairs(n: int) -> int:
+def _pairs(n: Any) -> Any:
     return n * (n + 1) // 2
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from functools import cached_property, partial
 from math import ceil, inf, nan
 from typing import NamedTuple
@@ -12,14 +13,16 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from hybridkin._core.arrays import identity
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel
-from hybridkin._core.stored import Layout, Restore, Stored
+from hybridkin._core.stored import Restore, Stored
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
-from hybridkin.native.library import evaluate
+from hybridkin.native.library import Program, program_of
+from hybridkin.native.plan import Plan
 
 _LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
@@ -66,44 +69,31 @@ class ReadoutFit(NamedTuple):
         )
 
 
-class _Beyond(ForwardModel):
-    """A model as a function of its inner coordinates; of arcs the compiled core computes it."""
-
-    layout = Layout("constant_curvature", {})
-
-    def __init__(self, model: ForwardModel) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self.model.from_coordinates_and_jacobian(q)
-
-    def stored(self) -> Stored:
-        chain = self.model
-        if not isinstance(chain, ArcChain):
-            raise TypeError("only arcs have a kernel of their own")
-        m = ceil(chain.tip_at)
-        offsets = chain.offsets[:m].numpy(force=True).copy()
-        offsets[-1] *= chain.tip_at == m
-        arrays = {"base": chain.base.numpy(force=True), "offsets": offsets, "radii": np.ones(m)}
-        derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}
-        return Stored(self.layout.kind, {"tip_at": float(m)}, arrays, derived=derived)
+_Tips = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
-class _AtTip(ForwardModel):
-    """A model whose inner coordinates are its tip: a correction of them is one at the tip."""
+def _tips(model: ForwardModel) -> _Tips:
+    """Return `from_coordinates_and_jacobian`, of arcs by the compiled core where it is there."""
+    if not isinstance(model, ArcChain) or program_of(model) is None:
+        return model.from_coordinates_and_jacobian
+    m = ceil(model.tip_at)
+    offsets = model.offsets[:m].numpy(force=True).copy()
+    offsets[-1] *= model.tip_at == m
+    arrays = {"base": model.base.numpy(force=True), "offsets": offsets, "radii": np.ones(m)}
+    derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}  # of q that are arcs
+    plan = Plan(Stored("constant_curvature", {"tip_at": float(m)}, arrays, derived=derived))
+    program = Program(plan)
 
-    def __init__(self, model: ForwardModel) -> None:
-        super().__init__()
-        self.model = model
+    def tips(z: Tensor) -> tuple[Tensor, Tensor]:
+        x, J, _ = program.evaluate(z.numpy(), jacobian=True)
+        return torch.from_numpy(x), torch.from_numpy(J)
 
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self.model.forward_and_jacobian(q)
+    return tips
 
-    coordinates = forward_and_jacobian
 
-    def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        return z, torch.eye(z.shape[1], dtype=z.dtype, device=z.device).expand(len(z), -1, -1)
+def _at_tip(z: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what `_tips` gives where the inner coordinates are the tip."""
+    return z, identity(z.shape[1], z).expand(len(z), -1, -1)
 
 
 def fit_readout(
@@ -164,11 +154,11 @@ def fit_readout(
     first, counts, place = distinct_rows(q, x, sample_weight, groups)
     weight = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
     members = None if groups is None else _linearised.members_of(np.asarray(groups)[first])
-    model = mechanical if coupling == "serial" else _AtTip(mechanical)
+    members = members if left_out else []
     with torch.no_grad():
-        problem = _Problem(model, features, q[first], x[first], weight)
+        problem = _Problem(mechanical, features, q[first], x[first], weight, coupling == "serial")
         if alphas is not None:
-            found = _fitted(problem.in_noise(noise_ratio), members, alphas, left_out=left_out)
+            found = _fitted(problem.in_noise(noise_ratio), members, alphas)
         else:
             found = _chosen(problem, members)
             noise_ratio = problem.likeliest_ratio(torch.from_numpy(found.residual))
@@ -200,35 +190,36 @@ def _chosen(
 
 
 def _fitted(
-    problem: _Problem,
-    members: list[Tensor] | None,
-    alphas: Pair,
-    start: Tensor | None = None,
-    left_out: bool = True,
+    problem: _Problem, members: list[Tensor] | None, alphas: Pair, start: Tensor | None = None
 ) -> ReadoutFit:
-    """Return the fit with given penalties, from weights to start at."""
+    """Return the fit with given penalties, from weights to start at; residuals of `members`."""
     penalty = problem.penalty(alphas)
     weights, gradient = problem.minimum(problem.nothing if start is None else start, penalty)
-    residual = np.full(problem.x.shape, nan)
-    if left_out:
-        found = problem.linearised(weights).left_out(penalty, members)
-        residual = problem.in_metres(found).numpy(force=True)
+    left_out = problem.x * nan
+    if members != []:
+        left_out = problem.in_metres(problem.linearised(weights).left_out(penalty, members))
     readout, ratio = problem.readout(weights), problem.noise_ratio
-    return ReadoutFit(readout, alphas, residual, {}, gradient, ratio)
+    return ReadoutFit(readout, alphas, left_out.numpy(force=True), {}, gradient, ratio)
 
 
 class _Problem:
     """The rows of a fit, in scaled coordinates and in a basis of the features without idle ones."""
 
     def __init__(
-        self, mechanical: ForwardModel, features: Features, q: Tensor, x: Tensor, weight: Tensor
+        self,
+        mechanical: ForwardModel,
+        features: Features,
+        q: Tensor,
+        x: Tensor,
+        weight: Tensor,
+        serial: bool = True,
     ) -> None:
         self.mechanical, self.features = mechanical, features
         self.q, self.x, self.root = q, x, weight.sqrt()[:, None]
         self.noise_ratio, self.whitening, self._last = inf, None, None
-        self._beyond = _Beyond(mechanical)
-        self.z = mechanical.coordinates(q)[0]
-        tips, J = mechanical.from_coordinates_and_jacobian(self.z)
+        self._tips = _tips(mechanical) if serial else _at_tip
+        self.z = mechanical.coordinates(q)[0] if serial else mechanical(q)
+        tips, J = self._tips(self.z)
         self.rest = x - tips
         J = self.root[:, None] * J
         moved = (J.square().sum((0, 1)) / weight.sum()).sqrt()
@@ -350,7 +341,7 @@ class _Problem:
     def _about(self, readout: Tensor) -> tuple[Tensor, Tensor]:
         """Return residuals (N, m) [m] and Jacobians (N, m, C) by the coordinates."""
         z = self.z + self.units * (self.phi @ readout.mT)
-        tip, J = map(torch.from_numpy, evaluate(self._beyond, z.numpy(), jacobian=True))
+        tip, J = self._tips(z)
         return self.x - tip, J
 
     def _whitened(self, values: Tensor) -> Tensor:
