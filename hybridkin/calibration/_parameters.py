@@ -121,9 +121,10 @@ class Posed(_Named):
         return torch.cat([pose, self.start[3:]], dim=0)
 
     def tangents(self, part: Tensor) -> Tensor:
-        spins = cross_matrix(rotation(part[:3])[1].T)  # of the columns of the left Jacobian
+        turned, left = rotation(part[:3])
         tangents = self.start.new_zeros(6, 4, 4)
-        tangents[:3, :3, :3] = spins @ self.moved(part)[:3, :3]
+        # Spins about the columns of the left Jacobian.
+        tangents[:3, :3, :3] = cross_matrix(left.T) @ (turned @ self.start[:3, :3])
         tangents[3:, :3, 3] = torch.diag(torch.from_numpy(self.units[3:]).to(part))
         return tangents
 

@@ -11,9 +11,10 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, RigidChain, calibrate, datasets
 from hybridkin._core.rotations import rotation
-from hybridkin.calibration._least_squares import LOSSES, row_loss
+from hybridkin.calibration._least_squares import LOSSES, Rows, row_loss
 from hybridkin.calibration._parameters import Problem, parameter_names
-from hybridkin.calibration.calibrate import fit_geometry
+from hybridkin.calibration._search import search
+from hybridkin.calibration.calibrate import fit_geometry, refitted
 
 # The plain chain makes most tips itself here: tendons pulled at random mean no slack.
 pytestmark = pytest.mark.filterwarnings("ignore:.* pull the tendons of a segment together")
@@ -706,6 +707,17 @@ def test_tendons_that_contradict_each_other_warn_once(rng):
         result, messages = fit_geometry(truth, balanced, truth(balanced), ("radii",))
     assert messages == [str(caught[0].message)]
     assert_close(result.values["radii"], truth.radii, rtol=1e-9, atol=0)
+
+
+def test_a_fit_from_a_start_gives_the_chain_alone(rng):
+    truth, nominal = trunk(base=planted_base()), trunk([0.09] * 3)
+    q, names = chambers(rng, 60), ("radii", "base")
+    x, weights = truth(q) + 1e-4 * gauss(rng, 60, 3), 1.0 + torch.arange(60) % 3
+    stds = dict.fromkeys(names, 0.5)
+    start = search(nominal, Rows(q, x, weights), names, "linear", {}, stds)
+    chain = refitted(start, q, x, weights)
+    result, _ = fit_geometry(nominal, q, x, names, sample_weight=weights, start=start)
+    assert_close(chain.geometry(), result.chain.geometry(), rtol=1e-12, atol=1e-13)
 
 
 def test_only_chains_can_be_calibrated(rng):

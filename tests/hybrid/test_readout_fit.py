@@ -8,6 +8,7 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, robots
 from hybridkin._core.model import ForwardModel, reverse_jacobian
+from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, HiddenFeatures, QuadraticFeatures, Readout
 from hybridkin.hybrid._linearised import (
     Linearised,
@@ -18,7 +19,7 @@ from hybridkin.hybrid._linearised import (
     solve_kept,
 )
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
-from hybridkin.hybrid._readout_fit import _Problem, fit_readout
+from hybridkin.hybrid._readout_fit import _Problem, _tips, fit_readout
 
 ARM = """
 <robot name="arm">
@@ -248,6 +249,40 @@ def test_rows_left_out_equal_fits_without_them(sizes, rng):
         out = groups == label
         expected = linear.residual(solved(linear, penalty, ~out))[out]
         assert_close(found[out], expected, atol=1e-10, rtol=1e-10)
+
+
+def test_products_of_many_rows_are_computed_in_blocks(rng, monkeypatch):
+    whole, penalty = ridge(rng)
+    monkeypatch.setattr(_linearised, "_BLOCK", 200)  # 7 rows of 28 products
+    parts = Linearised(whole.J, whole.phi, whole.y)
+    assert_close(parts.gram, whole.gram)
+    expected = torch.einsum("nxa,nk,nxb,nl->akbl", whole.J, whole.phi, whole.J, whole.phi)
+    assert_close(whole.gram, expected)
+    assert_close(parts.left_out(penalty), whole.left_out(penalty))
+
+
+@pytest.mark.parametrize("at", [3.0, 2.0, 1.4])
+@pytest.mark.parametrize("elastic", [False, True])
+def test_tips_of_arcs_are_those_of_the_chain(at, elastic, rng):
+    geometry = {"lengths": [0.1, 0.09, 0.08], "offsets": [0.01, 0.02, 0.03]}
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, :3] = torch.linalg.qr(uniform(rng, 3, 3))[0]
+    base[:3, 3] = uniform(rng, 3)
+    kind = ElasticTendonChain if elastic else ConstantCurvatureChain
+    chain = kind([0.01, 0.009, 0.008], base=base, **geometry).with_tip(at)
+    z = chain.coordinates(0.004 * uniform(rng, 20, 9))[0]
+    found = _tips(chain)(z)
+    assert_close(found, chain.from_coordinates_and_jacobian(z), rtol=1e-12, atol=1e-14)
+
+
+def test_fit_without_residuals_of_rows_left_out(rng):
+    chain, q = rows_of("trunk", rng, 40)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    features = QuadraticFeatures.of_range(q)
+    whole = fit_readout(chain, features, q, x, alphas=(0.1, 1.0))
+    brief = fit_readout(chain, features, q, x, alphas=(0.1, 1.0), left_out=False)
+    assert torch.equal(brief.readout.weights, whole.readout.weights)
+    assert torch.isnan(torch.from_numpy(brief.residual)).all()
 
 
 def test_rows_left_out_of_the_whole_fit(rng):

@@ -1,0 +1,41 @@
+"""Kernel ridge tuned on folds against fits of scikit-learn on the same folds."""
+
+import numpy as np
+import pytest
+from sklearn.kernel_ridge import KernelRidge
+
+from hybridkin.hybrid import _kernel
+from hybridkin.hybrid._kernel import distance, folds_of, tuned_kernel
+
+
+def held_out(X, y, weights, groups, gamma, alpha):
+    """Return the sum of held-out distances, by fits of scikit-learn."""
+    total = 0.0
+    for train, test in folds_of(X, groups):
+        ridge = KernelRidge(kernel="rbf", gamma=gamma).set_params(alpha=alpha)
+        ridge.fit(X[train], y[train], sample_weight=weights[train])
+        total += weights[test] @ distance(ridge.predict(X[test]), y[test])
+    return total
+
+
+@pytest.mark.parametrize("n_outputs", [None, 3])
+@pytest.mark.parametrize("grouped", [False, True])
+def test_no_neighbour_of_the_tuned_kernel_is_better(n_outputs, grouped):
+    rng = np.random.default_rng(3)
+    X = rng.uniform(-0.1, 0.1, (60, 2))
+    y = 0.01 * np.sin(20.0 * X @ rng.standard_normal((2, n_outputs or 1)))
+    y += 1e-3 * rng.standard_normal(y.shape)
+    y = y if n_outputs else y[:, 0]
+    weights = rng.integers(1, 4, 60).astype(float)
+    groups = np.arange(60) // 6 if grouped else None
+    found = tuned_kernel(X, y, weights, groups)
+    spread = X.var(axis=0).mean()
+    best = held_out(X, y, weights, groups, found.gamma, found.alpha)
+    width = np.argmin(np.abs(np.array(_kernel._GAMMAS) - found.gamma * spread))
+    penalty = np.argmin(np.abs(np.array(_kernel._ALPHAS) - found.alpha))
+    assert 0 < penalty < len(_kernel._ALPHAS) - 1
+    near = [(gamma, found.alpha) for gamma in _kernel._GAMMAS[max(width - 1, 0) : width + 2]]
+    near += [(_kernel._GAMMAS[width], _kernel._ALPHAS[penalty + step]) for step in (-1, 1)]
+    for gamma, alpha in near:
+        other = held_out(X, y, weights, groups, gamma / spread, alpha)
+        assert best <= other * (1.0 + 1e-9)
