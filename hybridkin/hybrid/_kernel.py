@@ -39,7 +39,7 @@ def tuned_kernel(
     splits = folds_of(X, groups)
     spread = X.var(axis=0).mean() or 1.0
     squares = euclidean_distances(X.astype(np.float64), squared=True)
-    root, least = np.sqrt(weights).reshape(-1, *[1] * (error.ndim - 1)), inf
+    root = np.sqrt(weights).reshape(-1, *[1] * (error.ndim - 1))
     targets = root * error
 
     @lru_cache(1)
@@ -48,8 +48,7 @@ def tuned_kernel(
 
     @cache
     def held_out(at: tuple[int, int]) -> float:
-        """Return the sum of held-out distances, of the first folds where that is too much."""
-        nonlocal least
+        """Return the sum of held-out distances."""
         total, K, alpha = 0.0, kernel(at[0]), _ALPHAS[at[1]]
         for train, test in splits:
             system = K[np.ix_(train, train)]
@@ -60,9 +59,6 @@ def tuned_kernel(
                 return inf
             found = K[np.ix_(test, train)] @ dual / root[test]
             total += float(weights[test] @ distance(found, error[test]))
-            if total > least:
-                return total
-        least = total
         return total
 
     widths, penalties = range(len(_GAMMAS)), range(len(_ALPHAS))
