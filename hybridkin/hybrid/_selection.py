@@ -21,6 +21,7 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _PICKS = 10  # of a blend
+_EQUAL = 1e-9  # rounding of scores
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with their cube
 
@@ -120,7 +121,7 @@ class _HeldOut(NamedTuple):
         picks, total = np.zeros(len(predicted)), np.zeros_like(y)
         for k in range(1, _PICKS + 1):
             means = [weights @ distance((total + x) / k, y) for x in predicted]
-            best = int(np.argmin(means))
+            best = int(np.argmax(means <= (1.0 + _EQUAL) * np.min(means)))  # the first of equals
             picks[best] += 1
             total += predicted[best]
         return picks / _PICKS
