@@ -21,7 +21,7 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _PICKS = 10  # of a blend
-_EQUAL = 1e-9  # rounding of scores
+_EQUAL = 1e-8  # of scores: readouts end at 1e-9 of their gradient
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with their cube
 
