@@ -10,9 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.linear_model import Ridge
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor
@@ -62,12 +59,6 @@ class Errors(NamedTuple):
 
     cv: float  # held-out motions, or rows
     io: float = np.nan  # the outer rows, after a fit to the inner ones
-    corrected: float = np.nan  # as `cv`, with a quadratic correction where that helps
-
-    @property
-    def score(self) -> float:
-        """What the choice minimises: the mean of `corrected` and twice `io`, or `cv` alone."""
-        return self.cv if np.isnan(self.io) else (self.corrected * self.io**2) ** (1.0 / 3.0)
 
     def known(self) -> dict[str, float]:
         """Return the errors by name, without those that were not needed."""
@@ -125,13 +116,11 @@ def choose_geometry(
 
     The sets grow from nothing, the base, the radii to the whole geometry; where tendons of a
     `ConstantCurvatureChain` contradict each other, elastic tendons of the same geometry follow. A
-    set has the score ``(corrected * io**2)**(1/3)``: `corrected` is the mean tip distance on
-    held-out motions, with a quadratic correction of the residual where that helps, `io` that on the
-    outer 35 % of the rows after a fit to the inner 40 %, without any: there a guard takes the
-    correction away. The smallest set with nearly the least score is taken, of those whose
-    `corrected` is at most a tenth above the least. A set with more than one parameter in 8 rows
-    must be clearly better, unless it is the base and the radii; below 40 rows the score is `cv`,
-    the held-out distance without a correction.
+    set has the score ``(cv * io**2)**(1/3)``: `cv` is the mean tip distance on held-out motions,
+    `io` that on the outer 35 % of the rows after a fit to the inner 40 %. The smallest set with
+    nearly the least score is taken, of those whose `cv` is at most a tenth above the least. A set
+    with more than one parameter in 8 rows must be clearly better, unless it is the base and the
+    radii; below 40 rows the score is `cv`.
 
     Parameters
     ----------
@@ -176,20 +165,23 @@ def choose_geometry(
         found = [
             _errors(rung, at, rows, splits, loss) for rung, at in zip(rungs, starts, strict=True)
         ]
-        least = _EXACT * float(chain.reach)
-        scores = np.array([Errors(*np.maximum(one, least)).score for one in found])
         free = np.array([0 if at is None else at.theta.size for at in starts])
-        known = (free <= len(kept) / _ROWS) | [rung.parameters in _USUAL for rung in rungs]
-        usual = np.array([one.cv if np.isnan(one.io) else one.corrected for one in found])
-        for errors_of in (scores, usual):
-            errors_of[~known] /= _CLEARLY
-        scores[usual > _WORSE * max(usual.min(), least)] = np.inf
-        best = int(np.argmax(scores <= (1.0 + _EQUAL) * scores.min()))
+        sure = (free <= len(kept) / _ROWS) | [rung.parameters in _USUAL for rung in rungs]
+        best = _best(np.maximum(found, _EXACT * float(chain.reach)), sure)
         errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
     name, chosen, names = rungs[best]
     return GeometryChoice(
         given if chosen is chain else chosen, names, starts[best], name, errors, tied
     )
+
+
+def _best(errors: NDArray, sure: NDArray) -> int:
+    """Return which of K sets is taken, from its `Errors` (K, 2) and whether it is small enough."""
+    cv, io = errors.T
+    scores = cv if np.isnan(io).any() else np.cbrt(cv * io**2)
+    sure = sure | (scores < _CLEARLY * scores[sure].min(initial=np.inf))
+    good = sure & (cv <= _WORSE * cv[sure].min())
+    return int(np.argmax(good & (scores <= (1.0 + _EQUAL) * scores[good].min())))
 
 
 def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_Rung]:
@@ -284,24 +276,16 @@ def _errors(
     loss: str,
 ) -> Errors:
     """Return the errors of a set; a split is (1, ...) of held-out rows, (0, ...) of outer ones."""
-    learned = any(kind == 0 for kind, *_ in splits)
-    totals = np.zeros((3, 2))  # of io, cv, corrected: weighted distances, and weights
+    totals = np.zeros((2, 2))  # of io and cv: weighted distances, and weights
     for kind, train, test in splits:
         chain, known, new = rung.chain, *(Rows(*(part[i] for part in rows)) for i in (train, test))
         if start is not None:
             chain = solve(start.problem, known, start.theta, loss, roughly=True).chain()
         residual, weight = new.residual(chain), new.weight.numpy()
         totals[kind] += weight @ np.linalg.norm(residual, axis=1), weight.sum()
-        if kind and learned:
-            correction = make_pipeline(StandardScaler(), PolynomialFeatures(2), Ridge())
-            counts = {"ridge__sample_weight": known.weight.numpy()}
-            correction.fit(known.q.numpy(), known.residual(chain), **counts)
-            left = residual - correction.predict(new.q.numpy())
-            totals[2] += weight @ np.linalg.norm(left, axis=1), weight.sum()
-    if not learned:
-        return Errors(float(totals[1, 0] / totals[1, 1]))
-    io, cv, corrected = (totals[:, 0] / totals[:, 1]).tolist()
-    return Errors(cv, io, min(cv, corrected))
+    with np.errstate(invalid="ignore"):
+        io, cv = (totals[:, 0] / totals[:, 1]).tolist()
+    return Errors(cv, io)
 
 
 def _tied(chain: Chain, q: Tensor) -> tuple[str, ...]:

@@ -129,9 +129,8 @@ class HybridForwardModel(HybridPredictor):
         the rows after a fit to the inner 40 % [m]; the ``weights`` of the blend, and what is
         ``chosen`` ("blend", or the only candidate with a weight). ``parameters`` is the set that
         was calibrated, ``mechanical_model`` holds the same two errors of every set, "cv" and "io",
-        and "corrected", the first with a quadratic correction, without play [m]. The blend is
-        judged by weights chosen without the fold. New motions unlike all in the log are harder than
-        held-out ones.
+        without play [m]. The blend is judged by weights chosen without the fold. New motions unlike
+        all in the log are harder than held-out ones.
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator or None

@@ -196,14 +196,13 @@ def write_choice(report: Report, geometry: GeometryChoice) -> None:
     report.record["parameters"] = {"taken": geometry.name, "tried": tried}
     report.text(
         "## What is calibrated",
-        f"Calibrated: **{geometry.name}**. Mean tip distance in mm on held-out motions, on the "
-        "outer 35 % of the rows after a fit to the inner 40 %, and on held-out motions with a "
-        "quadratic correction. The set with nearly the least product of the last with the "
-        "square of the second is taken, unless the last is a tenth above the least; of equals the "
-        "smallest.",
+        f"Calibrated: **{geometry.name}**. Mean tip distance in mm on held-out motions, and on the "
+        "outer 35 % of the rows after a fit to the inner 40 %. The set with nearly the least "
+        "product of the first with the square of the second is taken, unless the first is a tenth "
+        "above the least; of equals the smallest.",
     )
     rows = [[n, *(f"{1e3 * e:.2f}" for e in errors)] for n, errors in geometry.errors.items()]
-    report.table(["parameters", "held-out motions", "outside", "corrected"], rows)
+    report.table(["parameters", "held-out motions", "outside"], rows)
 
 
 def write_calibration(

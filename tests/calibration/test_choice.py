@@ -8,7 +8,7 @@ import torch
 from numpy.testing import assert_array_equal
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel, RigidChain
-from hybridkin.calibration.choice import Errors, choose_geometry
+from hybridkin.calibration.choice import Errors, _best, choose_geometry
 from hybridkin.calibration.measured import inner_and_outer
 
 NOISE = 5e-4
@@ -144,9 +144,20 @@ def test_rigid_robots_choose_their_base():
     assert choose_geometry(arm, q, measured(moved, q)).name == "base"
 
 
-def test_score_and_split():
-    assert Errors(3.0, 4.0, 2.0).score == pytest.approx(32.0 ** (1 / 3))
-    assert Errors(2.0).score == 2.0
+def test_which_set_is_taken():
+    every, nan = np.ones(3, dtype=bool), math.nan
+    assert _best(np.array([[2.0, 1.0], [1.9, 1.3], [1.9, 1.3]]), every) == 0
+    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.9, 0.8]]), every) == 1
+    assert _best(np.array([[2.0, 1.0], [1.7, 5.0], [1.7, 6.0]]), every) == 1
+    assert _best(np.array([[3.0, nan], [2.0, nan], [1.0, nan]]), every) == 2
+    few = np.array([True, True, False])
+    assert _best(np.array([[3.0, nan], [2.0, nan], [1.5, nan]]), few) == 1
+    assert _best(np.array([[3.0, nan], [2.0, nan], [1.3, nan]]), few) == 2
+    assert _best(np.array([[3.0, nan], [2.0, nan]]), np.zeros(2, dtype=bool)) == 1
+    assert Errors(2.0).known() == {"cv": 2.0}
+
+
+def test_split_into_inner_and_outer_rows():
     rng = np.random.default_rng(0)
     X = np.column_stack([rng.uniform(-1, 1, 200), 10 * rng.uniform(-1, 1, 200), np.ones(200)])
     inner, outer = inner_and_outer(X)
