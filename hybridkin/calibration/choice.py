@@ -120,7 +120,8 @@ def choose_geometry(
     `io` that on the outer 35 % of the rows after a fit to the inner 40 %. The smallest set with
     nearly the least score is taken, of those whose `cv` is at most a tenth above the least. A set
     with more than one parameter in 8 rows must be clearly better, unless it is the base and the
-    radii; below 40 rows the score is `cv`.
+    radii. Of a set with more than one parameter in 8 inner rows `io` is not used but that of a
+    smaller one, times the ratio of their `cv`. Below 40 rows the score is `cv`.
 
     Parameters
     ----------
@@ -167,7 +168,8 @@ def choose_geometry(
         ]
         free = np.array([0 if at is None else at.theta.size for at in starts])
         sure = (free <= len(kept) / _ROWS) | [rung.parameters in _USUAL for rung in rungs]
-        best = _best(np.maximum(found, _EXACT * float(chain.reach)), sure)
+        enough = free <= len(splits[-1][1]) / _ROWS
+        best = _best(np.maximum(found, _EXACT * float(chain.reach)), sure, enough)
         errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
     name, chosen, names = rungs[best]
     return GeometryChoice(
@@ -175,9 +177,22 @@ def choose_geometry(
     )
 
 
-def _best(errors: NDArray, sure: NDArray) -> int:
-    """Return which of K sets is taken, from its `Errors` (K, 2) and whether it is small enough."""
+def _best(errors: NDArray, sure: NDArray, enough: NDArray) -> int:
+    """Return which of K sets is taken.
+
+    Parameters
+    ----------
+    errors : ndarray of shape (K, 2)
+        Their `Errors`, of the smaller sets first.
+    sure : ndarray of bool of shape (K,)
+        Whether all rows are enough for the parameters of a set; else it must be clearly better.
+    enough : ndarray of bool of shape (K,)
+        Whether the inner rows are; else `io` is that of the last set of which they are, and falls
+        as `cv` does since.
+    """
     cv, io = errors.T
+    last = np.maximum.accumulate(np.where(enough, np.arange(len(cv)), 0))
+    io = io[last] * cv / cv[last]
     scores = cv if np.isnan(io).any() else np.cbrt(cv * io**2)
     sure = sure | (scores < _CLEARLY * scores[sure].min(initial=np.inf))
     good = sure & (cv <= _WORSE * cv[sure].min())

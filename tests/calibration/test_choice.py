@@ -146,14 +146,18 @@ def test_rigid_robots_choose_their_base():
 
 def test_which_set_is_taken():
     every, nan = np.ones(3, dtype=bool), math.nan
-    assert _best(np.array([[2.0, 1.0], [1.9, 1.3], [1.9, 1.3]]), every) == 0
-    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.9, 0.8]]), every) == 1
-    assert _best(np.array([[2.0, 1.0], [1.7, 5.0], [1.7, 6.0]]), every) == 1
-    assert _best(np.array([[3.0, nan], [2.0, nan], [1.0, nan]]), every) == 2
+    pair = np.ones(2, dtype=bool)
+    assert _best(np.array([[2.0, 1.0], [1.9, 1.3], [1.9, 1.3]]), every, every) == 0
+    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.9, 0.8]]), every, every) == 1
+    assert _best(np.array([[2.0, 1.0], [1.7, 5.0], [1.7, 6.0]]), every, every) == 1
+    assert _best(np.array([[3.0, nan], [2.0, nan], [1.0, nan]]), every, every) == 2
     few = np.array([True, True, False])
-    assert _best(np.array([[3.0, nan], [2.0, nan], [1.5, nan]]), few) == 1
-    assert _best(np.array([[3.0, nan], [2.0, nan], [1.3, nan]]), few) == 2
-    assert _best(np.array([[3.0, nan], [2.0, nan]]), np.zeros(2, dtype=bool)) == 1
+    assert _best(np.array([[3.0, nan], [2.0, nan], [1.5, nan]]), few, every) == 1
+    assert _best(np.array([[3.0, nan], [2.0, nan], [1.3, nan]]), few, every) == 2
+    assert _best(np.array([[3.0, nan], [2.0, nan]]), ~pair, pair) == 1
+    # Where the inner rows are too few for the last set, its `io` follows from the one before.
+    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.8, 9.0]]), every, few) == 2
+    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.95, 0.1]]), every, few) == 1
     assert Errors(2.0).known() == {"cv": 2.0}
 
 
