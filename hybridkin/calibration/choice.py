@@ -25,7 +25,7 @@ from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
 _MOST, _FOLDS = 400, 3  # rows and folds for the scores
 _FEW = 40  # rows, below which `io` says little
-_ROWS, _CLEARLY = 8, 0.7  # rows for each parameter; a larger set must be clearly better
+_ROWS, _CLEARLY = 7, 0.7  # rows for each parameter; a larger set must be clearly better
 _WORSE = 1.1  # times the least error on held-out motions: not taken, whatever `io`
 _USUAL = ((), ("base",), ("radii", "base"))  # sets that are calibrated from few rows, too
 _EQUAL = 0.007  # of the score: then the smaller set is taken
@@ -119,9 +119,9 @@ def choose_geometry(
     set has the score ``(cv * io**2)**(1/3)``: `cv` is the mean tip distance on held-out motions,
     `io` that on the outer 35 % of the rows after a fit to the inner 40 %. The smallest set with
     nearly the least score is taken, of those whose `cv` is at most a tenth above the least. A set
-    with more than one parameter in 8 rows must be clearly better, unless it is the base and the
-    radii. Of a set with more than one parameter in 8 inner rows `io` is not used but that of a
-    smaller one, times the ratio of their `cv`. Below 40 rows the score is `cv`.
+    with more than one parameter in 7 rows must be clearly better, unless it is the base and the
+    radii. Of a set with more than one parameter in 7 inner rows `io` counts no more than that of
+    the last smaller one, times the ratio of their `cv`. Below 40 rows the score is `cv`.
 
     Parameters
     ----------
@@ -187,12 +187,12 @@ def _best(errors: NDArray, sure: NDArray, enough: NDArray) -> int:
     sure : ndarray of bool of shape (K,)
         Whether all rows are enough for the parameters of a set; else it must be clearly better.
     enough : ndarray of bool of shape (K,)
-        Whether the inner rows are; else `io` is that of the last set of which they are, and falls
-        as `cv` does since.
+        Whether the inner rows are; else `io` is at most that of the last set of which they are,
+        times the ratio of their `cv`.
     """
     cv, io = errors.T
     last = np.maximum.accumulate(np.where(enough, np.arange(len(cv)), 0))
-    io = io[last] * cv / cv[last]
+    io = np.minimum(io, io[last] * cv / cv[last])
     scores = cv if np.isnan(io).any() else np.cbrt(cv * io**2)
     sure = sure | (scores < _CLEARLY * scores[sure].min(initial=np.inf))
     good = sure & (cv <= _WORSE * cv[sure].min())

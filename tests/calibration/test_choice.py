@@ -156,8 +156,9 @@ def test_which_set_is_taken():
     assert _best(np.array([[3.0, nan], [2.0, nan], [1.3, nan]]), few, every) == 2
     assert _best(np.array([[3.0, nan], [2.0, nan]]), ~pair, pair) == 1
     # Where the inner rows are too few for the last set, its `io` follows from the one before.
+    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.8, 9.0]]), every, every) == 1
     assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.8, 9.0]]), every, few) == 2
-    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.95, 0.1]]), every, few) == 1
+    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.95, 9.0]]), every, few) == 1
     assert Errors(2.0).known() == {"cv": 2.0}
 
 
