@@ -154,7 +154,7 @@ def fit_readout(
     first, counts, place = distinct_rows(q, x, sample_weight, groups)
     weight = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
     members = None if groups is None else _linearised.members_of(np.asarray(groups)[first])
-    members = members if left_out else []
+    members = members if left_out or alphas is None else []
     with torch.no_grad():
         problem = _Problem(mechanical, features, q[first], x[first], weight, coupling == "serial")
         if alphas is not None:
