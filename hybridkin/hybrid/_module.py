@@ -186,6 +186,24 @@ class HybridModule(ForwardModel):
         """The mechanical model, or the module itself without one."""
         return self if self.mechanical is None else self.mechanical
 
+    @property
+    def fitted(self) -> HybridModule:
+        """The model of the fit: this one, whose robot has not changed; see `AdaptedModel`."""
+        return self
+
+    @property
+    def shift(self) -> Tensor:
+        """How far the zeros of the actuators have moved since the fit [unit of q]."""
+        return self.weights.new_zeros(())
+
+    def of(self, fitted: HybridModule) -> HybridModule:
+        """Return another hybrid after the same change of the robot: none."""
+        return fitted
+
+    def before(self, q: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rows q (N, n) and y (N, m) as they were before the change."""
+        return q, y
+
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this one stays as it is."""
         corrections = [c for _, c in self._parts()]

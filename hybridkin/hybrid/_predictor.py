@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
-from hybridkin._core.arrays import as_array
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
@@ -117,17 +116,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
-
-    @property
-    def _shift(self) -> NDArray | float:
-        """How far `adapt` has found the zeros of the actuators to have moved [unit of q]."""
-        module = self.module_
-        return as_array(module.shift) if isinstance(module, AdaptedModel) else 0.0
-
-    def _fitted_module(self) -> HybridModule:
-        """Return the module of the fit, before any change of the robot."""
-        module = self.module_
-        return (module.fitted if isinstance(module, AdaptedModel) else module).with_drift(None)
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn where measured tips span so much more than the robot that they are not in metres."""

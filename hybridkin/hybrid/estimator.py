@@ -27,7 +27,6 @@ from hybridkin.hybrid._adapt import (
     held_out_noise,
     training_noise,
 )
-from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import (
     Part,
@@ -328,11 +327,9 @@ class HybridForwardModel(HybridPredictor):
             X, self._play_state = self.play_.apply(rows.X, self._play_state)
             rows = rows._replace(X=X)
         self._warn_of_units(rows)
-        module = self.module_
-        if isinstance(module, AdaptedModel):
-            q, tips = module.before(rows.q, torch.from_numpy(rows.tips))
-            rows = rows._replace(X=q.numpy(), y=tips.numpy().reshape(rows.y.shape))
-        fitted = self._fitted_module()
+        q, tips = self.module_.before(rows.q, torch.from_numpy(rows.tips))
+        rows = rows._replace(X=q.numpy(), y=tips.numpy().reshape(rows.y.shape))
+        fitted = self.module_.fitted.with_drift(None)
         with torch.no_grad():
             error = residuals(fitted.mechanical, rows.q, rows.y, self.output)
             residual = error.reshape(rows.tips.shape) - fitted.error_part(rows.q).numpy()
@@ -341,7 +338,7 @@ class HybridForwardModel(HybridPredictor):
             alpha = self._drift.likeliest_alpha(self._noise)
         # What was handed out before stays as it was.
         drifted = fitted.with_drift(self._drift.correction(alpha))
-        self.module_ = module.of(drifted) if isinstance(module, AdaptedModel) else drifted
+        self.module_ = self.module_.of(drifted)
         return self
 
     def adapt(
@@ -401,7 +398,7 @@ class HybridForwardModel(HybridPredictor):
         tensor(True)
         """
         check_is_fitted(self, "module_")
-        fitted = self._fitted_module()
+        fitted = self.module_.fitted.with_drift(None)
         if np.isnan(self._noise):
             raise ValueError(
                 "`adapt` needs the held-out errors of the fit, which a file of an earlier version "

@@ -15,6 +15,7 @@ import numpy as np
 import sklearn
 import torch
 
+from hybridkin._core.arrays import as_array
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import plain
 from hybridkin._core.version import __version__
@@ -202,7 +203,7 @@ def _units(model: object, output: str = "position") -> dict[str, str | list[str]
 
 def _domain(model: HybridForwardModel) -> dict[str, Any]:
     """Return the guard and the range of the training rows, NaN where a column did not vary."""
-    center, scale = model._drift.center - model._shift, model._drift.scale
+    center, scale = model._drift.center - as_array(model.module_.shift), model._drift.scale
     varied = scale != 1.0  # a column without a range counts as one of [-1, 1]
     low, high = (np.where(varied, bound, np.nan) for bound in (center - scale, center + scale))
     return {"guard": model.guard, "q_low": plain(low), "q_high": plain(high)}

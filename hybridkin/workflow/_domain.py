@@ -125,8 +125,8 @@ class Domain:
         if self.has_tendons:
             candidates.insert(0 if trained is None else 1, np.zeros(self.loaded.n_actuators))
         hybrid = self.loaded.hybrid
-        if hybrid is not None and (tested := hybrid._fitted_module().tested) is not None:
-            rows = tested.rows.numpy() - hybrid._shift
+        if hybrid is not None and (tested := hybrid.module_.fitted.tested) is not None:
+            rows = as_array(tested.rows - hybrid.module_.shift)
             candidates.append(rows[np.linalg.norm(rows - candidates[0], axis=1).argmin()])
         q = np.clip(candidates, limits.q_min, limits.q_max)
         distance = self.loaded.domain_distance(q)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.arrays import as_array
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
@@ -80,7 +81,7 @@ class LoadedModel:
             return None
         drift = self.hybrid._drift
         half = np.where(drift.scale == 1.0, 0.0, drift.scale)  # one that never moved counts as 1
-        center = drift.center - self.hybrid._shift
+        center = drift.center - as_array(self.hybrid.module_.shift)
         return robots.Limits(center - half, center + half)
 
     @property
