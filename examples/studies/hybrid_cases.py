@@ -200,14 +200,21 @@ def _noisy(q: NDArray, x: NDArray, seed: list[int]) -> tuple[NDArray, NDArray]:
     return q + noise[0], x + noise[1]
 
 
+def _recording(load: Callable[[Any], Any], data_home: Any) -> Any:
+    """Return a recording, or None with a warning where it is absent."""
+    try:
+        return load(data_home)
+    except FileNotFoundError as missing:
+        warnings.warn(f"Left out: {missing}", stacklevel=4)
+        return None
+
+
 def armlab_cases(
     sizes: Sequence[int], n_draws: int, n_test: int, data_home: Any, inner: bool = False
 ) -> list[Case]:
     """Return the cases of armlab_3cable, none where the recording is absent."""
-    try:
-        data = datasets.load_armlab(data_home)
-    except FileNotFoundError as missing:
-        warnings.warn(f"Left out: {missing}", stacklevel=3)
+    data = _recording(datasets.load_armlab, data_home)
+    if data is None:
         return []
     turns = -2.0 * np.pi / 3.0 * np.arange(3)[None]
     chain = ConstantCurvatureChain([0.003], angles=turns, lengths=[0.15])
@@ -247,10 +254,8 @@ def _nine_tendons() -> dict[str, tuple[Any, tuple[str, ...]]]:
 
 def pull_cases(data_home: Any, thin: int) -> list[Case]:
     """Return the cases of ftdcr_v4 that are learned from small pulls; none without the data."""
-    try:
-        data = datasets.load_ftdcr(data_home)
-    except FileNotFoundError as missing:
-        warnings.warn(f"Left out: {missing}", stacklevel=3)
+    data = _recording(datasets.load_ftdcr, data_home)
+    if data is None:
         return []
     near = (data.q >= _PULLED * data.q.min(0)).all(1)
     rows = np.flatnonzero(near)[::thin]
@@ -267,10 +272,8 @@ def run_cases(data_home: Any, thin: int) -> list[Case]:
 
     Each motor pulls one tendon of its segment and releases the opposite one.
     """
-    try:
-        data = datasets.load_asl_trunk(data_home)
-    except FileNotFoundError as missing:
-        warnings.warn(f"Left out: {missing}", stacklevel=3)
+    data = _recording(datasets.load_asl_trunk, data_home)
+    if data is None:
         return []
     q = np.hstack([_SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)])
     chain = ConstantCurvatureChain(np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12))
@@ -285,10 +288,8 @@ def run_cases(data_home: Any, thin: int) -> list[Case]:
 
 def motion_cases(data_home: Any, thin: int) -> list[Case]:
     """Return the cases of ftdcr_v4, none where the recording is absent."""
-    try:
-        data = datasets.load_ftdcr(data_home)
-    except FileNotFoundError as missing:
-        warnings.warn(f"Left out: {missing}", stacklevel=3)
+    data = _recording(datasets.load_ftdcr, data_home)
+    if data is None:
         return []
     families = np.array([label.split("_")[1] for label in data.groups])
     single, pair = (np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair"))
