@@ -124,9 +124,9 @@ class ForwardModel(PortableModule):
     n_outputs: int = 0
 
     @property
-    def least_actuator(self) -> float:
-        """What no entry of q can be below: 0 for absolute lengths, else -inf."""
-        return -math.inf
+    def limits(self) -> dict[str, Any]:
+        """What `q_min`, `q_max` and `dq_max` of `InverseKinematics` are where nothing is given."""
+        return {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
 
     @property
     def robot(self) -> ForwardModel:

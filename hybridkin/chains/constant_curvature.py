@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -216,9 +216,9 @@ class ConstantCurvatureChain(ArcChain):
         )
 
     @property
-    def least_actuator(self) -> float:
-        """0.0 for extensible segments, whose actuators have lengths; -inf for tendons."""
-        return 0.0 if self.lengths is None else -math.inf
+    def limits(self) -> dict[str, Any]:
+        """None for tendons; the actuators of extensible segments have lengths above 0."""
+        return super().limits | ({"q_min": 0.0} if self.lengths is None else {})
 
     def _check_rows(self, rows: Tensor, name: str) -> None:
         if self.lengths is None and (rows <= 0).any():

@@ -46,8 +46,10 @@ class RigidChain(Chain):
     names : sequence of n str, optional
         Names of the joints. Default: "joint_1", ...
     q_min, q_max : array-like of shape (n,), optional
-        Joint limits [rad] or [m], kept for `InverseKinematics`; the arm itself ignores them.
+        Joint limits [rad] or [m], the defaults of `InverseKinematics`; the arm itself ignores them.
         Default: none, infinite.
+    dq_max : array-like of shape (n,), optional
+        Largest speeds of the joints [rad/s] or [m/s], likewise. Default: none, infinite.
     tip : array-like of shape (4, 4), optional
         Pose of the end link in the frame that the last joint moves. Default: identity.
     tool : array-like of shape (3,), default=(0, 0, 0)
@@ -77,7 +79,7 @@ class RigidChain(Chain):
 
     _entries = ("base", "tool")
     _structure = ("n_actuators", "kinds", "names")
-    _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "base")
+    _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "dq_max", "base")
     layout = Layout("rigid", dict.fromkeys(_arrays, ""), {"kinds": list, "names": list})
 
     def __init__(
@@ -89,6 +91,7 @@ class RigidChain(Chain):
         names: Sequence[str] | None = None,
         q_min: Numbers | None = None,
         q_max: Numbers | None = None,
+        dq_max: Numbers | None = None,
         tip: Numbers | None = None,
         tool: Numbers = (0.0, 0.0, 0.0),
         base: Numbers | Transform | None = None,
@@ -114,19 +117,23 @@ class RigidChain(Chain):
             raise ValueError(f"`kinds` must hold {n} of {_KINDS}, one per joint, got {self.kinds}.")
         if len(self.names) != n:
             raise ValueError(f"`names` must hold {n} names, one per joint, got {self.names}.")
-        low = shaped(np.full(n, -np.inf) if q_min is None else q_min, "q_min", "n", n, finite=False)
-        high = shaped(np.full(n, np.inf) if q_max is None else q_max, "q_max", "n", n, finite=False)
+        limits = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
+        for name, value in limits.items():
+            none = np.full(n, -np.inf if name == "q_min" else np.inf)
+            limits[name] = shaped(none if value is None else value, name, "n", n, finite=False)
+        low, high, speed = limits.values()
         if not (low <= high).all():
             raise ValueError(
                 f"`q_min` must not exceed `q_max`, got {low.tolist()} and {high.tolist()}."
             )
+        if not (speed > 0.0).all():
+            raise ValueError(f"`dq_max` must be positive, got {speed.tolist()}.")
         slides = torch.tensor([kind == "prismatic" for kind in self.kinds], device=axes.device)
         motions = _joint_motions.joint_motions(origins, axes, slides)
         geometry = {
             "origins": origins,
             "axes": axes,
-            "q_min": low,
-            "q_max": high,
+            **limits,
             "tip": rigid_pose(np.eye(4) if tip is None else tip, "tip"),
             "tool": shaped(tool, "tool", "3"),
             "base": pose(base, "base", dtype),
@@ -243,6 +250,11 @@ class RigidChain(Chain):
             For chains that branch or have no moving joint.
         """
         return cls(**moving_joints(chain_path(chain)), **options)
+
+    @property
+    def limits(self) -> dict[str, Any]:
+        """The limits of the joints, as tensors of shape (n,)."""
+        return {name: self.get_buffer(name) for name in ("q_min", "q_max", "dq_max")}
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -412,7 +424,8 @@ class RigidChain(Chain):
         """Return the arm of a description."""
         settings = {key: stored.list_of(str, key) for key in cls.layout.settings}
         arrays = {
-            name: stored.array(name, finite=name not in ("q_min", "q_max"))
+            name: stored.array(name, finite=not name.startswith(("q_", "dq_")))
             for name in cls.layout.arrays
+            if name in stored.arrays  # older files know no speeds
         }
         return cls(**arrays, **settings, dtype=torch.from_numpy(arrays["base"]).dtype)

@@ -55,7 +55,8 @@ class StepSettings(Portable):
     """What a step depends on besides q and the target; see `InverseKinematics`.
 
     Limits, weights and a fixed posture are float64 tensors of shape () or (n,). `posture` is
-    `q_pref`, and the middle of the limits where none is given.
+    `q_pref`, and the middle of the limits where none is given; `of_model` names the limits that are
+    those of the model.
     """
 
     task: Task
@@ -69,6 +70,7 @@ class StepSettings(Portable):
     limits: str
     dt: float
     weights: Tensor | None
+    of_model: tuple[str, ...]
     posture: Tensor | Posture | None = field(init=False)
 
     def __post_init__(self) -> None:
@@ -94,7 +96,7 @@ class StepSettings(Portable):
         found, n = [], self.n_actuators
         for name in ("q_min", "q_max", "dq_max", "q_pref"):
             value = vars(self)[name]
-            if isinstance(value, Tensor) and n is not None:
+            if isinstance(value, Tensor) and n is not None and name not in self.of_model:
                 q = torch.where(torch.isfinite(value), value, 0.0).expand(1, n)
                 factor = _FAST if name == "dq_max" else 1.0
                 found += self.task.models[0].robot.unit_messages(q, name, factor)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from inspect import signature
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,10 +50,11 @@ class InverseKinematics:
         and OUT_OF_DOMAIN. Poses, several points and NumPy functions are tasks, see
         `hybridkin.tasks`; then x has the shape of their targets.
     q_min, q_max : float or array-like of shape (n,), optional
-        Limits of q, in the unit of q. Default: none, and 0 as `q_min` of absolute lengths, those of
-        extensible segments.
+        Limits of q, in the unit of q. Default: those of the model, as the joint limits of a
+        `RigidChain` and 0 as `q_min` of extensible segments; infinite ones switch them off.
     dq_max : float or array-like of shape (n,), optional
         Largest speed of every actuator [unit of q per second]: a step is at most ``dq_max dt``.
+        Default: that of the model, as of a URDF; infinity switches it off.
     q_pref : float, array-like of shape (n,) or callable, optional
         Preferred configuration, or a function that gives it for configurations (..., n), torch to
         torch, such as a step against a gradient. Default: the middle of the limits where both are
@@ -128,11 +129,16 @@ class InverseKinematics:
         weights: Array | None = None,
     ) -> None:
         self.model, task = model, as_task(model)
+        own, given = task.models[0].robot.limits, {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
+        good = 0 not in np.shape(own["q_min"])
+        require(good, "`model` must have an actuator, but its joints are all fixed: a constant.")
+        own = {name: own[name] for name, value in given.items() if value is None}
+        given |= own
         self.settings = StepSettings(
             task,
-            bound(task.models[0].robot.least_actuator if q_min is None else q_min, "q_min"),
-            bound(math.inf if q_max is None else q_max, "q_max"),
-            bound(math.inf if dq_max is None else dq_max, "dq_max", positive=True),
+            bound(given["q_min"], "q_min"),
+            bound(given["q_max"], "q_max"),
+            bound(given["dq_max"], "dq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
             number(beta, "beta"),
             None if gain is None else number(gain, "gain"),
@@ -140,6 +146,7 @@ class InverseKinematics:
             limits,
             number(dt, "dt"),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
+            tuple(own),
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
@@ -151,7 +158,8 @@ class InverseKinematics:
             value = vars(self.settings).get(name)
             if isinstance(value, Tensor):
                 ends = dict.fromkeys(f"{float(end):.4g}" for end in (value.min(), value.max()))
-                parts += [f"{name}={' to '.join(ends)}"] if torch.isfinite(value).any() else []
+                whose = " of the model" if name in self.settings.of_model else ""
+                parts += [f"{name}={' to '.join(ends)}{whose}"] * bool(torch.isfinite(value).any())
             elif value not in (None, default.default):
                 parts.append(f"{name}={value!r}")
         return f"InverseKinematics({', '.join(parts)})"

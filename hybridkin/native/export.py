@@ -217,7 +217,8 @@ def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
         if center.shape == half.shape == (n,):
             return center, half
     radii = buffers.get("radii", np.full(1, 2.0))
-    middle = 3.0 * radii.mean() if module.least_actuator == 0.0 else 0.0
+    lengths = "radii" in buffers and module.limits["q_min"] == 0.0
+    middle = 3.0 * radii.mean() if lengths else 0.0
     return np.full(n, middle), np.full(n, 0.5 * radii.min())
 
 

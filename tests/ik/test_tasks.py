@@ -440,3 +440,28 @@ def test_rows_that_have_not_converged_get_no_derivatives(rng):
     assert (slope == 0.0).all()
     with pytest.raises(ValueError, match="torch tensor"):
         InverseKinematics(CHAIN, **LIMITS).solve(np.zeros(3), differentiable=True)
+
+
+def test_the_limits_of_an_arm_are_the_defaults(rng):
+    """Within them, no faster than its joints; infinite ones switch them off; repr says whose."""
+    origins = np.stack([np.eye(4)] * 3)
+    origins[1:, 0, 3] = 0.3
+    limits = {"q_min": [-1.0, -0.5, -2.0], "q_max": [1.0, 0.5, 2.0], "dq_max": [1.0, 2.0, 3.0]}
+    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], tool=[0.2, 0, 0], **limits)
+    q = torch.rand(60, 3, generator=rng, dtype=torch.float64)
+    hybrid = HybridForwardModel(arm, "linear").fit(q.numpy(), arm(q).numpy())
+    for model in (arm, PoseTask(arm), hybrid):
+        ik = InverseKinematics(model)
+        for name, value in limits.items():
+            assert_close(vars(ik.settings)[name], torch.tensor(value, dtype=torch.float64))
+        assert "q_max=0.5 to 2 of the model" in repr(ik)
+    ik = InverseKinematics(arm)
+    step = ik.step(np.zeros(3), np.array([0.0, 0.8, 0.0]))
+    assert (np.abs(step.dq) <= 0.01 * np.array(limits["dq_max"])).all()
+    assert step.saturated.any()
+    assert not ik.solve(np.array([-0.8, 0.0, 0.0])).converged
+    free = InverseKinematics(arm, q_min=-np.inf, q_max=np.inf, dq_max=np.inf)
+    assert repr(free) == "InverseKinematics(RigidChain)"
+    assert free.solve(np.array([-0.79, 0.0, 0.0]), q0=np.full(3, 0.1)).converged
+    some = InverseKinematics(arm, q_max=0.1)
+    assert "q_min=-2 to -0.5 of the model, q_max=0.1, dq_max" in repr(some)
