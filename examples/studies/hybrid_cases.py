@@ -47,7 +47,7 @@ _LOW, _HIGH = 0.19, 0.31  # the range of `paper_protocol` [m]
 _NEAR = 6.05e-3  # cables of the inner part of armlab_3cable [m]
 _PULLED = 0.6  # of the largest pull of every tendon of ftdcr_v4: its inner part
 _PAIRS = ((2, 3), (1, 4), (0, 5))  # motors of asl_trunk_static by segment, base to tip
-_SPOOL = 0.05  # tendon per unit of their commands, a guess [m]
+SPOOL = 0.05  # tendon per unit of their commands, a guess [m]
 
 
 class Case(NamedTuple):
@@ -200,7 +200,7 @@ def _noisy(q: NDArray, x: NDArray, seed: list[int]) -> tuple[NDArray, NDArray]:
     return q + noise[0], x + noise[1]
 
 
-def _recording(load: Callable[[Any], Any], data_home: Any) -> Any:
+def recording(load: Callable[[Any], Any], data_home: Any) -> Any:
     """Return a recording, or None with a warning where it is absent."""
     try:
         return load(data_home)
@@ -213,7 +213,7 @@ def armlab_cases(
     sizes: Sequence[int], n_draws: int, n_test: int, data_home: Any, inner: bool = False
 ) -> list[Case]:
     """Return the cases of armlab_3cable, none where the recording is absent."""
-    data = _recording(datasets.load_armlab, data_home)
+    data = recording(datasets.load_armlab, data_home)
     if data is None:
         return []
     turns = -2.0 * np.pi / 3.0 * np.arange(3)[None]
@@ -233,7 +233,7 @@ def armlab_cases(
     return cases
 
 
-def _nine_tendons() -> dict[str, tuple[Any, tuple[str, ...]]]:
+def nine_tendons() -> dict[str, tuple[Any, tuple[str, ...]]]:
     """Return the mechanical models of ftdcr_v4 by name, and what to calibrate of each."""
     radii, turns = np.full(3, 0.0045), 2.0 * np.pi / 3.0 * np.arange(3)
     geometry: dict[str, Any] = {
@@ -254,7 +254,7 @@ def _nine_tendons() -> dict[str, tuple[Any, tuple[str, ...]]]:
 
 def pull_cases(data_home: Any, thin: int) -> list[Case]:
     """Return the cases of ftdcr_v4 that are learned from small pulls; none without the data."""
-    data = _recording(datasets.load_ftdcr, data_home)
+    data = recording(datasets.load_ftdcr, data_home)
     if data is None:
         return []
     near = (data.q >= _PULLED * data.q.min(0)).all(1)
@@ -263,7 +263,7 @@ def pull_cases(data_home: Any, thin: int) -> list[Case]:
     part = data.q[rows], data.x[rows], data.groups[rows]
     return [
         Case(f"ftdcr_v4, {name}", 0, chain, ("base",), parameters, *part, tests)
-        for name, (chain, parameters) in _nine_tendons().items()
+        for name, (chain, parameters) in nine_tendons().items()
     ]
 
 
@@ -272,10 +272,10 @@ def run_cases(data_home: Any, thin: int) -> list[Case]:
 
     Each motor pulls one tendon of its segment and releases the opposite one.
     """
-    data = _recording(datasets.load_asl_trunk, data_home)
+    data = recording(datasets.load_asl_trunk, data_home)
     if data is None:
         return []
-    q = np.hstack([_SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)])
+    q = np.hstack([SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)])
     chain = ConstantCurvatureChain(np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12))
     cases = []
     for k, (train, test) in enumerate(GroupKFold(5).split(q, groups=data.groups)):
@@ -288,7 +288,7 @@ def run_cases(data_home: Any, thin: int) -> list[Case]:
 
 def motion_cases(data_home: Any, thin: int) -> list[Case]:
     """Return the cases of ftdcr_v4, none where the recording is absent."""
-    data = _recording(datasets.load_ftdcr, data_home)
+    data = recording(datasets.load_ftdcr, data_home)
     if data is None:
         return []
     families = np.array([label.split("_")[1] for label in data.groups])
@@ -305,7 +305,7 @@ def motion_cases(data_home: Any, thin: int) -> list[Case]:
         "the same, groups: segments": ([(single, pair)], families),
     }
     cases = []
-    for name, (chain, parameters) in _nine_tendons().items():
+    for name, (chain, parameters) in nine_tendons().items():
         for way, (splits, groups) in ways.items():
             for k, (train, test) in enumerate(splits):
                 rows = train[::thin]

@@ -19,8 +19,9 @@ from hybridkin.chains.chain import Chain
 
 _Vector = TypeVar("_Vector", NDArray, Tensor)
 
-# Positive geometry, and the factor of its start within which it stays, both ways.
-SCALED = {"radii": 5.0, "lengths": 5.0, "bending_stiffness": 1e4, "axial_stiffness": 1e4}
+# Geometry that keeps its sign, and the factor of its start within which it stays, both ways.
+SCALED = dict.fromkeys(("radii", "lengths", "gains"), 5.0)
+SCALED |= dict.fromkeys(("bending_stiffness", "axial_stiffness"), 1e4)
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
 
 
@@ -37,9 +38,10 @@ class _Named:
     labels : tuple of str
         Its free directions, as "radii[0]".
     units : ndarray
-        How far one natural unit of each direction goes: [m], [rad], or [-] of its start.
+        How far one natural unit of each direction goes: [m], [rad], [unit of q], or [-] of its
+        start.
     kind : tuple of str
-        What each unit is: "m", "rad" or "-".
+        What each unit is: "m", "rad", "q" or "-".
     """
 
     name: str
@@ -59,8 +61,9 @@ class _Named:
 class Entries(_Named):
     """Numbers moved along constant directions, each entry by at most one of them.
 
-    Positive numbers (`log`) are moved by their logarithm. `physical` are the default bounds. The
-    user's value has the entries with the indices `shown`, in `shape`.
+    Numbers that keep their sign (`log`) are moved by the logarithm of their size, which is what has
+    bounds. `physical` are the default bounds. The user's value has the entries with the indices
+    `shown`, in `shape`.
     """
 
     directions: NDArray  # (numel, size)
@@ -82,6 +85,7 @@ class Entries(_Named):
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
         """Return the limits of the free directions, by default the physical ones."""
         origin = self.start.numpy().ravel()[self.shown]
+        origin = np.abs(origin) if self.log else origin
         low, high = self.physical if bound is None else bound
         if bound is None:  # the start itself is always allowed
             low, high = np.minimum(low, origin), np.maximum(high, origin)
@@ -100,7 +104,7 @@ class Entries(_Named):
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         """Return the standard errors of `value` from those of the free directions."""
         error = (np.abs(self.directions) @ std)[self.shown].reshape(self.shape)
-        return error * value if self.log else error
+        return error * np.abs(value) if self.log else error
 
     def flags(self, identified: NDArray) -> NDArray:
         """Return for each entry of `value` whether the directions that move it are identified."""
@@ -165,27 +169,33 @@ def parameter(chain: Chain, name: str) -> Parameter:
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
     unit, kind, physical = reach, "m", (-np.inf, np.inf)
-    if name in SCALED:
-        unit, kind, origin = 1.0, "-", start.numpy().ravel()
-        physical = origin / SCALED[name], origin * SCALED[name]
+    if entry in SCALED:
+        unit, kind, origin = 1.0, "-", np.abs(start.numpy().ravel())
+        physical = origin / SCALED[entry], origin * SCALED[entry]
     elif entry == "rest_bends":
         unit, kind, physical = 1.0, "rad", (-math.pi, math.pi)
     elif entry == "angles":
         unit, kind = 1.0, "rad"
     elif entry == "offsets":
         physical = (_SHORTEST * reach, np.inf)
-    elif entry.endswith("_zeros"):
+    elif entry == "tendon_zeros":
         unit = float(geometry["radii"].mean())
+    elif entry == "actuator_zeros":
+        unit = float(geometry["radii"].mean() / geometry["gains"].abs().mean())
+        kind = "m" if (geometry["gains"] == 1.0).all() else "q"
     directions, shown = unit * np.eye(size), np.arange(size)
     if name == "turns" and isinstance(chain, ArcChain):  # each segment's actuators together
         counts = np.array(chain.actuators_per_segment)
         directions = np.repeat(np.eye(len(counts)), counts, axis=0)
         shown, shape = np.cumsum(counts) - counts, (len(counts),)
+    elif name == "gain":  # a common factor
+        directions, shown, shape = np.ones((size, 1)), shown[:1], ()
+        physical = tuple(side[:1] for side in physical)
     elif name != entry:  # "tool", the last of the offsets
         directions, shown, shape = directions[:, -1:], shown[-1:], ()
     labels, size = _labels(name, shape), len(shown)
     basic = name, entry, start, labels, np.full(size, unit), (kind,) * size
-    return Entries(*basic, directions, physical, shown, shape, log=name in SCALED)
+    return Entries(*basic, directions, physical, shown, shape, log=entry in SCALED)
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:

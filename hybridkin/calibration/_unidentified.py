@@ -17,13 +17,15 @@ _ALIKE = 0.02
 _STILL = 1e-6  # [mm]
 _NO_EFFECT = "does not move the tips"
 _INSIDE = 0.05  # of a unit vector: within a span
-_STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%")}
+_DETERMINED = 0.05  # standard error of the logarithm
+_STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%"), "q": (1.0, "of q")}
 
 
-def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
+def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float) -> tuple[str, ...]:
     """Return a sentence for each direction that hardly moves the tips, in few parameters.
 
-    `directions` (K, P) are orthonormal moves in units of the prior.
+    `directions` (K, P) are orthonormal moves in units of the prior, `covariance` (P, P) is that of
+    the free parameters.
     """
     problem = fit.problem
     units = np.concatenate([part.units for part in problem.parameters])
@@ -46,13 +48,33 @@ def sentences(fit: Fit, directions: NDArray, n_rows: float) -> tuple[str, ...]:
         rest = [", ".join(words[1:]), f"{hidden} smaller" if hidden else ""]
         moved = " with ".join(filter(None, [words[0], " and ".join(filter(None, rest))]))
         name_of = [part.name for part in problem.parameters for _ in part.labels]
-        first, *others = [(label.removeprefix("all "), name_of[i]) for label, _, i in shown]
-        advice = f"leave {first[0]} out or measure it"
+        first, *others = [(label.removeprefix("all "), name_of[i], i) for label, _, i in shown]
+        advice, known = f"leave {first[0]} out or measure it", ""
         if others:
             second = next((other for other in others if other[1] != first[1]), others[0])
             advice = f"leave out or measure {first[0]} or {second[0]}"
-        found.append(f"{moved} {effect}: {advice}.")
+            known = _determined(fit, covariance, move * to_steps, first[2], second[2])
+        found.append(f"{moved} {effect}: {advice}.{known}")
     return tuple(found)
+
+
+def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) -> str:
+    """Return which ratio or product of two parameters the data determine, where it is one.
+
+    They do where the two move by the same share: the standard error of the logarithm is small.
+    """
+    parts, labels, geometry = fit.problem.parameters, fit.problem.labels, fit.chain().geometry()
+    kinds = [kind for part in parts for kind in part.kind]
+    if not kinds[i] == kinds[j] == "-" or abs(abs(move[i]) - abs(move[j])) > _ALIKE * abs(move[i]):
+        return ""
+    i, j = sorted((i, j), key=labels.__getitem__)
+    way = 1 if move[i] * move[j] > 0 else -1
+    error = np.sqrt(covariance[i, i] + covariance[j, j] - 2 * way * covariance[i, j])
+    values = [v for part in parts for v in part.value(geometry[part.entry]).flatten()[: part.size]]
+    value = float(values[i] / values[j] ** way)
+    what = f"{labels[i]} {'/' if way > 0 else '*'} {labels[j]}"
+    shown = f" The data determine {what} = {value:.4g} (std. error {abs(value) * error:.2g})."
+    return shown if error < _DETERMINED else ""
 
 
 def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float, int]]:

@@ -46,7 +46,7 @@ class CalibrationResult(Portable):
     values : dict of str to array
         The calibrated geometry by parameter name, in the chain's shapes and units, as
         ``chain.geometry()`` has it; "tool" () [m] is the last of the offsets, "turns" (S,) [rad]
-        the angle of the first actuator of each segment.
+        the angle of the first actuator of each segment, "gain" () the first of the gains.
     std_errors : dict of str to array
         One standard error for each entry of `values`; for "base" shape (6,), three of rotation
         [rad] and three of translation [m], in the measuring frame.
@@ -119,37 +119,39 @@ def calibrate(
 ) -> CalibrationResult:
     """Return the chain whose geometry explains measured tips best.
 
-    Nonlinear least squares on the tip distance with exact derivatives. Radii and lengths are
-    fitted by their logarithm and so stay positive. A weak prior keeps every parameter near its
-    start where the data do not identify it; its weight against the data follows the noise level,
-    which is estimated from the residuals, so exact data override it. With a free base or free
-    angles several initial guesses are tried, among them other turns and mirror images of the
-    actuator rings, so that a robot wired the other way round is recognised.
+    Nonlinear least squares on the tip distance with exact derivatives. Radii, lengths and gains
+    are fitted by their logarithm and so keep their sign. A weak prior keeps every parameter near
+    its start where the data do not identify it; its weight against the data follows the noise
+    level, which is estimated from the residuals, so exact data override it. With a free base or
+    free angles several initial guesses are tried, among them other turns and mirror images of the
+    actuator rings, so that a robot wired the other way round is recognised. Tendons on a backbone
+    of given length identify gains only together with the radii: `unidentified` then has the ratio.
 
     Parameters
     ----------
     chain : ConstantCurvatureChain, ElasticTendonChain, RigidChain or another Chain
         Start of the search; it is not changed.
     q : array or Tensor of shape (N, n_actuators)
-        Actuator vectors [m], of revolute joints [rad].
+        Actuator vectors [m, or unit of q of a chain with gains], of revolute joints [rad].
     x : array or Tensor of shape (N, 3)
         Measured tip positions [m].
     parameters : sequence of str, default=("radii", "base")
         Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
-        chains), "offsets", "rest_bends", "actuator_zeros", "base" (pose), of elastic tendon chains
-        "bending_stiffness", "axial_stiffness" and "tendon_zeros"; or instead of all angles
-        "turns", of each segment's ring of actuators as a whole, and instead of all offsets "tool",
-        the last one.
+        chains), "offsets", "rest_bends", "actuator_zeros", "gains", "base" (pose), of elastic
+        tendon chains "bending_stiffness", "axial_stiffness" and "tendon_zeros"; or instead of all
+        angles "turns", of each segment's ring of actuators as a whole, instead of all offsets
+        "tool", the last one, and instead of all gains "gain", their common factor.
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
         All but "linear" bound the influence of outliers: ``rho(|e|^2 / 3)`` of SciPy's
         ``least_squares``, with the distance ``|e|`` of a row over the noise, times its weight.
     bounds : dict of str to (low, high), optional
-        Limits of all entries of a name, in its own unit. Default: a factor of 5 on radii and
-        lengths and of 10 000 on stiffnesses, half a turn on rest bends, and offsets that are no
-        shorter than minus a tenth of the robot's length.
+        Limits of all entries of a name, in its own unit, of gains those of their size. Default: a
+        factor of 5 on radii, lengths and gains and of 10 000 on stiffnesses, half a turn on rest
+        bends, and offsets that are no shorter than minus a tenth of the robot's length.
     prior : float or dict of str to float, default=0.5
-        Standard deviation of the weak prior in natural units: a fraction of radii, lengths and
-        stiffnesses, of the mean radius for actuator and tendon zeros, of the robot's length for
+        Standard deviation of the weak prior in natural units: a fraction of radii, lengths, gains
+        and stiffnesses, of the mean radius (over the mean gain, where q is no length) for
+        actuator and tendon zeros, of the robot's length for
         "offsets", "tool" and the base position, radians for angles, rest bends and the base
         orientation. ``inf`` turns it off.
     groups : array-like of shape (N,), optional
@@ -341,7 +343,7 @@ def _result(
         narrowing=prior_std / safe,
         identifiable=identifiable,
         singular_values=narrowed,
-        unidentified=sentences(fit, unidentified, float(rows.weight.sum())),
+        unidentified=sentences(fit, unidentified, covariance, float(rows.weight.sum())),
         unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,

@@ -221,7 +221,9 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
     elif isinstance(chain, ElasticTendonChain):
         sets = ((), ("base",), *_ELASTIC)
     else:
-        sets = ((), ("base",), *(_EXTENSIBLE if chain.lengths is None else _TENDONS))
+        gain = () if chain.in_metres else ("gain",)  # of tendons it is in the radii
+        extensible = [(*names, *gain) for names in _EXTENSIBLE]
+        sets = ((), ("base",), *(extensible if chain.lengths is None else _TENDONS))
     rungs = [_Rung(_name(names), chain, names) for names in sets]
     if elastic is not None:
         rungs += [_Rung(_RIVAL + _name(names), elastic, names) for names in _ELASTIC]

@@ -13,10 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.arrays import Numbers, labels, real_array
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
 from hybridkin.calibration.measured import folds
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 
 __all__ = ["PlayFit", "fit_play"]
+
+_WIDTHS = np.array([0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3])  # [m]
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ def fit_play(
     q: Numbers,
     x: Numbers,
     groups: ArrayLike,
-    widths: Sequence[float] = (0.0, 0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3),
+    widths: Sequence[float] | None = None,
     parameters: Sequence[str] | None = None,
     **calibrate_options: Any,
 ) -> PlayFit:
@@ -81,8 +84,9 @@ def fit_play(
         Measured tip positions [m].
     groups : array-like of shape (N,)
         Motion of every row; the play of each starts afresh.
-    widths : sequence of float, default=(0, 0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3)
-        Total play to try, the same for all tendons [m]. Zero is always tried. While the largest
+    widths : sequence of float, optional
+        Total play to try, the same for all tendons [unit of q]. Default: 0, 0.05, 0.1, 0.2 and
+        0.4 mm, of a chain with gains by the mean of these. Zero is always tried. While the largest
         width is the best, twice that width is tried as well, up to the largest range of q.
     parameters : sequence of str, optional
         What to calibrate, see `calibrate`. Default: the chain's own list.
@@ -117,7 +121,9 @@ def fit_play(
     >>> fit.kept, fit.width
     (True, 0.0004)
     """
-    tried = np.unique(np.concatenate([[0.0], real_array(widths, "widths").ravel()])).tolist()
+    size = float(chain.gains.detach().abs().mean()) if isinstance(chain, ArcChain) else 1.0
+    given = _WIDTHS / size if widths is None else real_array(widths, "widths").ravel()
+    tried = np.unique(np.concatenate([[0.0], given])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q, x = real_array(q, "q"), real_array(x, "x")
     groups = labels(groups, len(q))

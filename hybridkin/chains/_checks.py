@@ -13,7 +13,9 @@ from torch import Tensor
 
 from hybridkin._core import arrays
 from hybridkin._core.arrays import Numbers, Transform, real_array
+from hybridkin._core.units import warn_millimetres
 
+_MOST_UNLIKE = 1000.0  # radii of one robot; more leave too few digits to the routing "base"
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
@@ -43,6 +45,46 @@ def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]
             f"`{name}` must have shape {shape}, or be one number, got {tuple(tensor.shape)}."
         )
     return tensor.expand(shape).clone()
+
+
+def arc_geometry(
+    radii: Numbers,
+    lengths: Numbers | None,
+    n_actuators: int | Sequence[int],
+    fewest: int,
+    angles: Numbers | None,
+    offsets: Numbers,
+    rest_bends: Numbers,
+    gains: Numbers,
+    base: Numbers | Transform | None,
+    dtype: torch.dtype,
+) -> tuple[tuple[int, ...], dict[str, Tensor]]:
+    """Return the actuators of each segment, at least `fewest`, and what all chains of arcs have."""
+    radii = lengths_of(radii, "radii", dtype)
+    if radii.max() > _MOST_UNLIKE * radii.min():
+        raise ValueError(
+            f"`radii` must be within a factor of {_MOST_UNLIKE:g} of each other, got "
+            f"{radii.tolist()} m; check their units."
+        )
+    S = radii.numel()
+    counts = actuator_counts(n_actuators, S, fewest)
+    warn_millimetres("radii", radii, 1.0)
+    if not _is_nested(gains) and np.shape(gains) == (S,):  # one for each segment
+        gains = np.repeat(np.asarray(gains), counts)
+    geometry = {
+        "radii": radii,
+        "angles": flat_angles(angles, counts, dtype),
+        "offsets": filled(offsets, "offsets", dtype, (S,)),
+        "rest_bends": filled(rest_bends, "rest_bends", dtype, (S, 2)),
+        "gains": filled(gains, "gains", dtype, (sum(counts),)),
+        "base": pose(base, "base", dtype),
+    }
+    if lengths is not None:
+        geometry["lengths"] = lengths_of(lengths, "lengths", dtype, S)
+        warn_millimetres("lengths", geometry["lengths"], 10.0)
+    if not geometry["gains"].all():
+        raise ValueError(f"`gains` must not be zero [m per unit of q], got {gains}.")
+    return counts, geometry
 
 
 def numeric(

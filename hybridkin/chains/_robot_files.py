@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridkin._core.units import METRES
+from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
@@ -75,6 +75,7 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("segment", "radius length " + " ".join(_STIFFNESS), "be a positive number", _is_positive),
     ("segment", "angle_deg offset", "be a number", _is_number),
     ("segment", "angles_deg zeros", "hold numbers", _many(_is_number)),
+    ("segment", "gain spool_radius", *_POSITIVE),
     ("segment", "rest_bend_deg", "hold 2 numbers", _many(_is_number, 2)),
     ("segment", "clockwise", "be true or false", lambda value: isinstance(value, bool)),
     ("segment", "actuators repeat", *_WHOLE),
@@ -85,7 +86,6 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
     ("log", "x_unit", *_among(*METRES)),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
-    ("log", "q_scale spool_radius", *_POSITIVE),
     ("limits", "q_min q_max", "be a number, or a list of numbers", _one_or_many(_is_number)),
     ("limits", "dq_max", *_POSITIVE),
     ("limits", "unit", *_among("m", "log")),
@@ -126,6 +126,7 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     """Return the chain of a description with segments."""
     elastic = tables.get("model", _PLAIN) == _ELASTIC
     segments: list[dict[str, Any]] = []
+    unit = tables.get("log", {"q_unit": "rad"}).get("q_unit", "1")
     for i, table in enumerate(tables["segment"]):
         unused = [] if elastic else [key for key in _STIFFNESS if key in table]
         if unused:
@@ -133,14 +134,16 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
                 f"`{unused[0]}` in [[segment]] is not known to model {_PLAIN!r}; leave it out, or "
                 f'set model = "{_ELASTIC}".'
             )
-        segments += [_segment(table, f"[[segment]] {i + 1}", elastic)] * table.get("repeat", 1)
+        segments += [_segment(table, f"[[segment]] {i + 1}", elastic, unit)] * table.get(
+            "repeat", 1
+        )
     if len(segments) > _MOST:
         raise ValueError(
             f"[[segment]] must describe at most {_MOST} segments in all, got "
             f"{len(segments)}; check `repeat`."
         )
     given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
-    for key in ("length", *_STIFFNESS) if elastic else ("length",):
+    for key in ("length", "gains", *(_STIFFNESS if elastic else ())):
         missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
         needed = elastic and key == "length"
         if missing and (needed or len(missing) < len(segments)):
@@ -150,11 +153,12 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
             )
         given[key] = None if missing else given[key]
     given |= {"lengths": given.pop("length"), "base": _base(tables.get("base", {}))}
+    given["gains"] = given["gains"] or 1.0
     given |= {"routing": tables["routing"]} if "routing" in tables else {}
     return ElasticTendonChain(**given) if elastic else ConstantCurvatureChain(**given)
 
 
-def _segment(table: Mapping[str, Any], where: str, elastic: bool) -> dict[str, Any]:
+def _segment(table: Mapping[str, Any], where: str, elastic: bool, unit: str) -> dict[str, Any]:
     """Return what a chain is made from for one segment; None for what may be left out."""
     if "radius" not in table:
         raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
@@ -172,6 +176,10 @@ def _segment(table: Mapping[str, Any], where: str, elastic: bool) -> dict[str, A
             f"`{key}` in {where} must describe at least {fewest} actuators, got {len(angles)}; two "
             "actuators do not determine which way a segment bends."
         )
+    n = len(angles)
+    gains, zeros = _gains(table, where, n, unit), each(table, "zeros", where, n)
+    if gains is not None and not elastic:  # as the log counts
+        zeros *= UNITS.get(unit, 1.0)
     return {
         "radii": table["radius"],
         "length": table.get("length"),
@@ -179,9 +187,24 @@ def _segment(table: Mapping[str, Any], where: str, elastic: bool) -> dict[str, A
         "n_actuators": len(angles),
         "angles": angles,
         "rest_bends": np.radians(table.get("rest_bend_deg", [0.0, 0.0])),
-        "tendon_zeros" if elastic else "actuator_zeros": each(table, "zeros", where, len(angles)),
+        "tendon_zeros" if elastic else "actuator_zeros": zeros,
+        "gains": gains,
         **{key: table.get(key) for key in _STIFFNESS if elastic},
     }
+
+
+def _gains(table: Mapping[str, Any], where: str, n: int, unit: str) -> np.ndarray | None:
+    """Return metres per unit of q (n,), of angles per radian; None where q is in metres."""
+    gains, spools = (each(table, key, where, n) for key in ("gain", "spool_radius"))
+    spun = spools.any()
+    if not (spun or gains.any()):
+        return None
+    if unit in METRES or (spun and (unit not in ("deg", "rad") or gains.any())):
+        raise ValueError(
+            f"`gain` or `spool_radius` in {where} must stand with a `q_unit` in [log] that is no "
+            f'length, `spool_radius` with "deg" or "rad" and without `gain`, got {unit!r}.'
+        )
+    return spools + gains / UNITS.get(unit, 1.0)
 
 
 def _base(table: Mapping[str, Any]) -> np.ndarray:

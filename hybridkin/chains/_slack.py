@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import identity
-
 MOST = 62  # a set of tendons is the bits of one integer
 _WHOLE_STEPS = 8  # then one tendon at a time, which ends for certain
 _MOST_TURNS = 12  # two to this power, should rounding keep it from an end
@@ -24,6 +22,7 @@ class Elasticity(NamedTuple):
     stiffness: Tensor  # (3 S,)
     rest: Tensor  # (3 S,), the shape without tendons
     zeros: Tensor  # (n,)
+    gains: Tensor  # (n,)
 
 
 class Responses(NamedTuple):
@@ -43,17 +42,16 @@ class Balance(NamedTuple):
     compliance: Tensor  # (N, 3 S, 3 S), shape by a generalised force
 
 
-def responses_of(
-    taut: Tensor, readings: Tensor, units: Tensor, stiffness: Tensor, rest: Tensor, zeros: Tensor
-) -> Responses:
+def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
     """Return the linear answers of sets of taut tendons (M, n)."""
+    readings, units, stiffness, rest, zeros, gains = elasticity
     pulling = readings.T * taut[:, None]  # (M, 3 S, n)
     hessian = torch.diag(stiffness) + pulling @ readings
     scaled = units[:, None] * hessian * units
     compliance = units[:, None] * torch.linalg.inv_ex(scaled).inverse * units
-    force = torch.cat([pulling, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1)
+    force = torch.cat([pulling * gains, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1)
     shape = compliance @ force
-    given = torch.cat([identity(len(zeros), zeros), -zeros[:, None]], dim=-1)
+    given = torch.cat([torch.diag(gains), -zeros[:, None]], dim=-1)
     return Responses(shape, readings @ shape - given, compliance)
 
 
@@ -80,7 +78,7 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
     n = rows.shape[1]
 
     def maps_of(codes: Tensor) -> Tensor:
-        return responses_of(as_mask(codes, n), *elasticity).stretch
+        return responses_of(as_mask(codes, n), Elasticity(*elasticity)).stretch
 
     full = maps_of(torch.tensor([2**n - 1], device=rows.device))[0]
     return _pivoted(maps_of, full, extended(rows))

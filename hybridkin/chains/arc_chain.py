@@ -5,30 +5,29 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform, identity, number
+from hybridkin._core.arrays import identity, number
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
-from hybridkin._core.units import LONGEST_PULL, millimetres_message, warn_millimetres
+from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
-from hybridkin.chains._checks import actuator_counts, filled, flat_angles, lengths_of, pose
+from hybridkin.chains._checks import arc_geometry
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-ALIASES = {"turns": "angles", "tool": "offsets"}
+ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 """Names of `calibrate` that move a part of an entry of the geometry, and that entry."""
 
 _ROUTINGS = ("segment", "base")
-_MOST_UNLIKE = 1000.0  # radii of one robot; more leave too few digits to the routing "base"
 Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
 STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "routing": str}
 
@@ -59,6 +58,7 @@ class ArcChain(Chain):
     angles: Tensor  # (n,)
     offsets: Tensor  # (S,)
     rest_bends: Tensor  # (S, 2)
+    gains: Tensor  # (n,) metres per unit of q
     lengths: Tensor | None  # (S,), of extensible segments None
 
     @property
@@ -66,46 +66,27 @@ class ArcChain(Chain):
         """The natural size of the robot, shape () [m]: its backbone, or else 10 mean radii."""
         return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
 
-    def _checked(
-        self,
-        radii: Numbers,
-        lengths: Numbers | None,
-        n_actuators: int | Sequence[int],
-        fewest: int,
-        angles: Numbers | None,
-        routing: str,
-        offsets: Numbers,
-        rest_bends: Numbers,
-        base: Numbers | Transform | None,
-        dtype: torch.dtype,
-    ) -> dict[str, Tensor]:
-        """Set the structure of the chain, and return the checked geometry that all kinds have.
+    @property
+    def in_metres(self) -> bool:
+        """Whether q is in metres: all gains are 1."""
+        return bool((self.gains == 1.0).all())
 
-        `fewest` is how few actuators a segment may have.
-        """
+    @property
+    def rest(self) -> Tensor:
+        """The q (n,) at which no tendon is pulled, or chambers have length 0."""
+        return self._buffers.get("actuator_zeros", 0.0 * self.gains)
+
+    def metres(self, q: Tensor) -> Tensor:
+        """Return what q (..., n) means in metres: lengths, or changes of length."""
+        return self.gains.to(q) * (q - self.rest.to(q))
+
+    def _checked(self, routing: str, *given: Any) -> dict[str, Tensor]:
+        """Set the structure of the chain, and return its `arc_geometry` of what is given."""
         if routing not in _ROUTINGS:
             raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
-        radii = lengths_of(radii, "radii", dtype)
-        if radii.max() > _MOST_UNLIKE * radii.min():
-            raise ValueError(
-                f"`radii` must be within a factor of {_MOST_UNLIKE:g} of each other, got "
-                f"{radii.tolist()} m; check their units."
-            )
-        S = radii.numel()
-        self.actuators_per_segment = actuator_counts(n_actuators, S, fewest)
-        self.n_segments, self.n_actuators = S, sum(self.actuators_per_segment)
-        self.routing, self.tip_at = routing, float(S)
-        warn_millimetres("radii", radii, 1.0)
-        geometry = {
-            "radii": radii,
-            "angles": flat_angles(angles, self.actuators_per_segment, dtype),
-            "offsets": filled(offsets, "offsets", dtype, (S,)),
-            "rest_bends": filled(rest_bends, "rest_bends", dtype, (S, 2)),
-            "base": pose(base, "base", dtype),
-        }
-        if lengths is not None:
-            geometry["lengths"] = lengths_of(lengths, "lengths", dtype, S)
-            warn_millimetres("lengths", geometry["lengths"], 10.0)
+        self.actuators_per_segment, geometry = arc_geometry(*given)
+        self.n_segments, self.n_actuators = len(geometry["radii"]), len(geometry["angles"])
+        self.routing, self.tip_at = routing, float(self.n_segments)
         return geometry
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
@@ -306,8 +287,11 @@ class ArcChain(Chain):
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return a warning where lengths exceed 10 m, or length changes the backbone's 4-fold."""
+        name = name if self.in_metres else f"{name}` times `gains"
+        # Of limits that are not there, and of speeds, q itself is small.
+        metres = torch.minimum((self.gains.to(q) * q).abs(), self.metres(q).abs())
         limit = 10.0 if self.lengths is None else LONGEST_PULL * float(self.lengths.detach().sum())
-        message = millimetres_message(name, q.abs(), factor * limit)
+        message = millimetres_message(name, metres, factor * limit)
         return [] if message is None else [message]
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -439,7 +423,8 @@ class ArcChain(Chain):
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
         """Return the chain of a description."""
         counts = stored.list_of(int, "actuators_per_segment")
-        names = [name for name in cls._entries if name != "lengths" or name in stored.arrays]
+        may_lack = ("lengths", "gains")
+        names = [name for name in cls._entries if name not in may_lack or name in stored.arrays]
         entries: dict[str, Any] = {name: stored.array(name) for name in names}
         if sum(counts) != len(entries["angles"]):
             raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")

@@ -51,8 +51,12 @@ class ConstantCurvatureChain(ArcChain):
     rest_bends : float or array-like of shape (S, 2), default=0.0
         Pre-curvature: bending vector of each segment while all its actuators agree [rad].
     actuator_zeros : float or array-like of shape (n,), default=0.0
-        Offset of each sensor [m]: the chain bends by ``q - actuator_zeros``. A list of
-        lists, one per segment, is accepted too.
+        Offset of each sensor [unit of q]: the chain bends by ``gains * (q - actuator_zeros)``. A
+        list of lists, one per segment, is accepted too.
+    gains : float or array-like of shape (S,) or (n,), default=1.0
+        Metres per unit of q, of all actuators, of each segment or of each actuator; negative where
+        q counts the other way. q, Jacobians and limits are then in that unit, for example motor
+        counts. A list of lists, one per segment, is accepted too.
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
         Pose of the robot's base in the measuring frame. Default: identity.
     dtype : torch.dtype, default=torch.float64
@@ -71,7 +75,7 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
-    _entries = (*("radii", "angles", "lengths", "offsets", "rest_bends", "actuator_zeros", "base"),)
+    _entries = tuple("radii angles lengths offsets rest_bends actuator_zeros gains base".split())
     layout = Layout(
         "constant_curvature",
         dict.fromkeys(_entries, ""),
@@ -90,13 +94,14 @@ class ConstantCurvatureChain(ArcChain):
         offsets: Numbers = 0.0,
         rest_bends: Numbers = 0.0,
         actuator_zeros: Numbers = 0.0,
+        gains: Numbers = 1.0,
         base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
         dtype = float_dtype(dtype)
         geometry = self._checked(
-            radii, lengths, n_actuators, 3, angles, routing, offsets, rest_bends, base, dtype
+            routing, radii, lengths, n_actuators, 3, angles, offsets, rest_bends, gains, base, dtype
         )
         zeros = filled(actuator_zeros, "actuator_zeros", dtype, (self.n_actuators,))
         rows = geometry["angles"].split(self.actuators_per_segment)
@@ -113,9 +118,10 @@ class ConstantCurvatureChain(ArcChain):
     @property
     def default_parameters(self) -> tuple[str, ...]:
         """The geometry that a calibration fits by default."""
+        gain = () if self.in_metres else ("gain",)
         if self.lengths is None:
-            return ("radii", "base")
-        return ("radii", "turns", "rest_bends", "lengths", "base")
+            return ("radii", *gain, "base")
+        return ("radii", "turns", "rest_bends", "lengths", *gain, "base")
 
     def consistency(self, q: Tensor) -> Tensor:
         """Return how far the actuator readings of each segment contradict each other.
@@ -143,9 +149,10 @@ class ConstantCurvatureChain(ArcChain):
         >>> chain.consistency(q).round(decimals=6)
         tensor([0.0000, 0.0030], dtype=torch.float64)
         """
-        rows = self._rows(q) - self.actuator_zeros.to(q)
-        readings, arc_matrix = self._readings().to(q), self.arc_matrix.to(q)
-        residual = rows - rows @ (readings @ arc_matrix[-readings.shape[1] :]).T
+        rows, readings = self.metres(self._rows(q)), self._readings().to(q)
+        residual = (
+            rows - rows @ (readings @ (self.arc_matrix / self.gains).to(q)[-readings.shape[1] :]).T
+        )
         return self._by_segment(residual, q)
 
     def contradictory(self, q: Tensor) -> Tensor:
@@ -176,7 +183,7 @@ class ConstantCurvatureChain(ArcChain):
         tensor([[False],
                 [ True]])
         """
-        readings = self._by_segment(self._rows(q) - self.actuator_zeros.to(q), q)
+        readings = self._by_segment(self.metres(self._rows(q)), q)
         residual = self.consistency(q)
         explained = (readings.square() - residual.square()).clamp(min=0.0).sqrt()
         least = torch.maximum(_NOTICED * self.radii.to(q), _CONTRADICTED * explained)
@@ -217,15 +224,20 @@ class ConstantCurvatureChain(ArcChain):
 
     @property
     def limits(self) -> dict[str, Any]:
-        """None for tendons; the actuators of extensible segments have lengths above 0."""
-        return super().limits | ({"q_min": 0.0} if self.lengths is None else {})
+        """None for tendons; the actuators of extensible segments have lengths above 0 m."""
+        if self.lengths is not None:
+            return super().limits
+        low = torch.where(self.gains > 0, self.actuator_zeros, -math.inf)
+        high = torch.where(self.gains < 0, self.actuator_zeros, math.inf)
+        return super().limits | {"q_min": low, "q_max": high}
 
     def _check_rows(self, rows: Tensor, name: str) -> None:
-        if self.lengths is None and (rows <= 0).any():
-            row = int((rows <= 0).any(dim=1).nonzero()[0])
+        lengths = self.metres(rows)
+        if self.lengths is None and (lengths <= 0).any():
+            row = int((lengths <= 0).any(dim=1).nonzero()[0])
             raise ValueError(
-                f"`{name}` must hold positive actuator lengths [m], got {rows[row].min():.6g} in "
-                f"row {row}; for tendon length changes build the chain with `lengths=`."
+                f"`{name}` must hold positive actuator lengths [m], got {lengths[row].min():.6g} "
+                f"in row {row}; for tendon length changes build the chain with `lengths=`."
             )
 
     def extra_repr(self) -> str:
@@ -243,7 +255,8 @@ class ConstantCurvatureChain(ArcChain):
         inverse = torch.linalg.solve(scaled.mT @ scaled, scaled.mT)
         # One step of refinement: the normal equations lose some digits.
         inverse = inverse + (identity(len(inverse), inverse) - inverse @ scaled) @ inverse
-        matrix = nn.functional.pad(inverse, (0, 0, len(units) - len(inverse), 0)) * units[:, None]
+        matrix = nn.functional.pad(inverse, (0, 0, len(units) - len(inverse), 0))
+        matrix = matrix * units[:, None] * self.gains
         straight = torch.zeros_like(radii) if lengths is None else lengths
         offset = torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
         self.register_buffer("arc_matrix", matrix)
@@ -275,12 +288,15 @@ class ConstantCurvatureChain(ArcChain):
         readings, S = self._readings().to(rows), self.n_segments
         by_reading = nn.functional.pad(by_reading, (readings.shape[1] - 2 * S, 0))
         # The derivative of a least-squares inverse M of B, with M M' = (B' B)^-1.
-        M = self.arc_matrix.to(rows)[-readings.shape[1] :]
+        inverse = (self.arc_matrix / self.gains).to(rows)  # of actuators in metres
+        M = inverse[-readings.shape[1] :]
         contradicted = identity(len(readings), rows) - readings @ M
         by_matrix = M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
         by_matrix = nn.functional.pad(by_matrix, (0, 0, 3 * S - len(M), 0))
         straight = change.get("lengths", torch.zeros_like(change["radii"]))
         rest = torch.cat([straight, *change["rest_bends"].unbind(-1)], dim=-1)
         shift = rest - change["actuator_zeros"] @ self.arc_matrix.to(rows).T
-        moving = (rows - self.actuator_zeros.to(rows)) @ by_matrix.flatten(0, 1).T
-        return moving.unflatten(1, by_matrix.shape[:2]) + shift
+        moving = (self.metres(rows) @ by_matrix.flatten(0, 1).T).unflatten(1, by_matrix.shape[:2])
+        if "gains" in tangents:
+            moving = moving + ((rows - self.rest.to(rows))[:, None] * change["gains"]) @ inverse.T
+        return moving + shift

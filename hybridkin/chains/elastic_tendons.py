@@ -19,7 +19,7 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]
 
-_SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros".split()
+_SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros gains".split()
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are stored
 
 
@@ -27,9 +27,9 @@ class ElasticTendonChain(ArcChain):
     """Tip position of an elastic backbone behind tendons that can pull but not push.
 
     A shape a = (length changes, bending vectors of all segments) stretches the tendons by
-    ``e = B a - (q - tendon_zeros)``, B the path lengths of `ConstantCurvatureChain`. A taut tendon
-    pulls with its stretch, in units of the tendons' stiffness; a slack one (e < 0) does nothing.
-    The backbone takes the shape of least energy,
+    ``e = B a - (gains * q - tendon_zeros)``, B the path lengths of `ConstantCurvatureChain`. A
+    taut tendon pulls with its stretch, in units of the tendons' stiffness; a slack one (e < 0) does
+    nothing. The backbone takes the shape of least energy,
     ``1/2 (a - a0)' K (a - a0) + 1/2 sum max(0, e)^2``, with a0 the rest bends: strictly convex, one
     answer for every q, continuous in it and linear while the same tendons are taut.
 
@@ -61,6 +61,8 @@ class ElasticTendonChain(ArcChain):
     tendon_zeros : float or array-like of shape (n,), default=0.0
         Pre-tension: stretch of each tendon at q = 0 on the straight backbone [m]; negative where it
         hangs slack. A list of lists, one per segment, is accepted too.
+    gains : float or array-like of shape (S,) or (n,), default=1.0
+        Metres per unit of q, as of `ConstantCurvatureChain`.
     rest_bends : float or array-like of shape (S, 2), default=0.0
         Pre-curvature: bending vector of each segment without tendons [rad].
     offsets : float or array-like of shape (S,), default=0.0
@@ -114,6 +116,7 @@ class ElasticTendonChain(ArcChain):
         bending_stiffness: Numbers | None = None,
         axial_stiffness: Numbers | None = None,
         tendon_zeros: Numbers = 0.0,
+        gains: Numbers = 1.0,
         rest_bends: Numbers = 0.0,
         offsets: Numbers = 0.0,
         base: Numbers | Transform | None = None,
@@ -124,7 +127,7 @@ class ElasticTendonChain(ArcChain):
         if lengths is None:
             raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
         geometry = self._checked(
-            radii, lengths, n_actuators, 1, angles, routing, offsets, rest_bends, base, dtype
+            routing, radii, lengths, n_actuators, 1, angles, offsets, rest_bends, gains, base, dtype
         )
         if self.n_actuators > _slack.MOST:
             raise ValueError(
@@ -147,7 +150,7 @@ class ElasticTendonChain(ArcChain):
         Parameters
         ----------
         chain : ConstantCurvatureChain
-            With `lengths`; its `actuator_zeros` become the `tendon_zeros`.
+            With `lengths`; its `actuator_zeros`, times the gains, become the `tendon_zeros`.
         **options
             Further arguments, `bending_stiffness` for example.
 
@@ -168,7 +171,7 @@ class ElasticTendonChain(ArcChain):
                 "`chain` must have `lengths`: the actuators of extensible segments are no tendons."
             )
         geometry, counts = chain.geometry(), chain.actuators_per_segment
-        geometry["tendon_zeros"] = geometry.pop("actuator_zeros")
+        geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
         given = {"n_actuators": counts, "routing": chain.routing, "dtype": chain.radii.dtype}
         return cls(**{**geometry, "angles": angles, **given, **options}).with_tip(chain.tip_at)
@@ -178,7 +181,7 @@ class ElasticTendonChain(ArcChain):
         """The geometry that a calibration fits by default."""
         stiffness = ("bending_stiffness", "axial_stiffness")
         geometry = ("radii", "turns", "rest_bends", "lengths", "tool", "base")
-        return (*geometry, *stiffness, "tendon_zeros")
+        return (*geometry, *stiffness, "tendon_zeros", *(() if self.in_metres else ("gain",)))
 
     def tensions(self, q: Tensor) -> Tensor:
         """Return how far every tendon is stretched.
@@ -220,6 +223,7 @@ class ElasticTendonChain(ArcChain):
             torch.cat([self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]),
             torch.cat([0.0 * one, *self.rest_bends.unbind(-1)]),
             self.tendon_zeros,
+            self.gains,
         )
 
     def _all_responses(self, rows: Tensor) -> _slack.Responses:
@@ -238,7 +242,7 @@ class ElasticTendonChain(ArcChain):
         guard = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
         with guard:
             elasticity = _slack.Elasticity(*(part.double() for part in self._elasticity()))
-            responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), *elasticity)
+            responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), elasticity)
             responses = _slack.Responses(*(part.to(rows) for part in responses))
         if not passing:
             self._table = (shaping, key, responses)
@@ -252,10 +256,10 @@ class ElasticTendonChain(ArcChain):
                 _slack.find_in_table, rows.detach(), table.stretch.detach()
             )
             return codes, codes, table
-        elasticity = [part.to(rows) for part in self._elasticity()]
+        elasticity = _slack.Elasticity(*(part.to(rows) for part in self._elasticity()))
         given = (part.detach() for part in (rows, *elasticity))
         codes = _slack.FindTaut.apply(_slack.find_by_solving, *given)
-        responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), *elasticity)
+        responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), elasticity)
         return codes, torch.arange(len(rows), device=rows.device), responses
 
     def _balance(self, rows: Tensor) -> _slack.Balance:
@@ -280,7 +284,7 @@ class ElasticTendonChain(ArcChain):
 
         def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
             new, by_bendings = self._changes(rows, tangents)
-            readings, _, stiffness, rest, _ = (part.to(rows) for part in self._elasticity())
+            readings, _, stiffness, rest, *_ = (part.to(rows) for part in self._elasticity())
             bending = new["bending_stiffness"]
             by_stiffness = torch.cat([new["axial_stiffness"], bending, bending], dim=-1)
             by_rest = nn.functional.pad(new["rest_bends"].mT.flatten(1), (S, 0))
@@ -293,7 +297,8 @@ class ElasticTendonChain(ArcChain):
             softer = by_force * (rest - shape)[:, None]
             effects = [by_force, softer, -by_pull, -turned.flatten(2), by_arcs[..., :S]]
             causes = [stiffness * by_rest, by_stiffness, new["tendon_zeros"]]
-            causes += [by_bendings.flatten(1), new["lengths"]]
+            causes += [by_bendings.flatten(1), new["lengths"], new["gains"]]
+            effects.append(by_pull * rows[:, None])
             return torch.cat(effects, dim=-1) @ torch.cat(causes, dim=-1).mT
 
         straight = nn.functional.pad(self.get_buffer("lengths").to(rows), (0, 2 * S))

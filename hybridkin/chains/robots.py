@@ -71,16 +71,14 @@ class LogFormat:
     q, x : tuple of str
         Columns of the actuator vector and of the tip position, in the chain's order.
     q_unit, x_unit : {"m", "cm", "mm", "um", "in"}
-        Units of these columns. With `q_scale` that of q is any name; of a robot without segments it
-        may be "rad", "deg" or "1" as well.
+        Units of these columns. Of a chain with `gains` that of q is any name but these; of a robot
+        without segments it may be "rad", "deg" or "1" as well.
     q_sign : int or tuple of int
         -1 where the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
         Rows whose motion ends in this belong to the motion named without it.
     groups, time : str or None
         Columns of the motion that a row belongs to, and of its time stamp [s].
-    q_scale : float, tuple of float or None
-        Of actuators that are motors or pressures: the length [m] that one unit of the log moves.
     """
 
     q: tuple[str, ...]
@@ -91,12 +89,17 @@ class LogFormat:
     group_suffix: str = ""
     groups: str | None = None
     time: str | None = None
-    q_scale: float | tuple[float, ...] | None = None
 
     @property
     def q_factor(self) -> np.ndarray:
         """What the model counts per unit of the log, sign included, shape () or (n,)."""
-        return np.multiply(self.q_sign, self.q_scale or UNITS[self.q_unit])
+        return np.multiply(self.q_sign, UNITS.get(self.q_unit, 1.0))
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The arguments of `datasets.load_log` for such a log."""
+        unit = self.q_unit if self.q_unit in UNITS else "1"
+        return {k: v for k, v in vars(self).items() if k != "group_suffix"} | {"q_unit": unit}
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +109,9 @@ class Limits:
     Attributes
     ----------
     q_min, q_max : ndarray of shape (n,) or None
-        Least and largest value of every actuator, as the chain counts them [m].
+        Least and largest value of every actuator, as the chain counts them [unit of q].
     dq_max : ndarray of shape (n,) or None
-        Largest speed [m/s].
+        Largest speed [unit of q per s].
     """
 
     q_min: np.ndarray | None = None
@@ -245,8 +248,12 @@ def read_description(path: str | Path) -> RobotDescription:
             clockwise = false               # which way the others follow
             offset = 0.0                    # rigid length after the segment [m]
             rest_bend_deg = [0.0, 0.0]      # its pre-curvature: a bending vector
-            zeros = [0.0, 0.0, 0.0]         # offset of the sensor of each actuator [m]
-                                            # of elastic tendons their `tendon_zeros`
+            zeros = [0.0, 0.0, 0.0]         # offset of the sensor of each actuator, in metres or,
+                                            # with a gain, in the unit of the log; of elastic
+                                            # tendons their `tendon_zeros` [m]
+            gain = 2.7e-5                   # of counts, pressures ...: metres per unit of the log,
+                                            # one number or one each; in all segments or in none
+            spool_radius = 0.006            # or of motors [m]; their q_unit is "deg" or "rad"
             bending_stiffness = 2.0e-7      # of elastic tendons only, in all segments or in none
             axial_stiffness = 10.0          # likewise; units and defaults: `ElasticTendonChain`
             repeat = 2                      # as many segments like this one
@@ -258,10 +265,7 @@ def read_description(path: str | Path) -> RobotDescription:
             [log]                           # how its logs are written, optional
             q = ["servo_1", "servo_2", "servo_3"]
             x = ["tip_x", "tip_y", "tip_z"]
-            q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; of motors "deg", "rad"
-            spool_radius = 0.006            # [m], of motors; one number or one each
-            q_scale = 2.0e-5                # or of pressures, steps ...: metres per unit of the
-                                            # log, one number or one each; q_unit is any name
+            q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; with a gain any other
             x_unit = "mm"
             q_sign = -1                     # -1: a pulled tendon counts as positive; or one each
             groups = "motion"               # column that names the motion of a row, optional
@@ -272,7 +276,8 @@ def read_description(path: str | Path) -> RobotDescription:
             q_min = -0.010                  # as the chain counts them: shortening < 0 [m]
             q_max = 0.010
             dq_max = 0.020                  # [m/s]
-            unit = "m"                      # the default; "log": in unit and sign of [log]
+            unit = "m"                      # the default; "log": in unit and sign of [log], which
+                                            # it must be with a gain
 
         A file of [log] alone, with [limits] or without, is a robot whose model is learned from data
         alone. Its `q_unit` may also be "deg", "rad" or "1" (as it is) without a spool.
@@ -334,33 +339,28 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     if doubled := sorted({name for name in columns if columns.count(name) > 1}):
         raise ValueError(f"[log] must name every column once, got {doubled} more often.")
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
-    unit = given.setdefault("q_unit", "1" if "q_scale" in given else "m")
+    gained = chain is not None and not chain.in_metres
+    unit = given.setdefault("q_unit", "1" if gained else "m")
     known = [*UNITS] if chain is None else [*METRES]
-    fits = unit in known
-    if "spool_radius" in given:
-        fits = unit in ("deg", "rad") and "q_scale" not in given
-    elif "q_scale" in given:
-        fits = unit not in METRES
-    if not fits:
+    if not gained and unit not in known:
         raise ValueError(
             f'`q_unit` in [log] must be one of {known}; of motors "deg" or "rad", with a '
-            "`spool_radius` [m]; of pressures or other units any name but a length, with `q_scale` "
-            f"[m per unit] instead; got {unit!r}."
+            "`spool_radius` [m] in every [[segment]]; of pressures or other units any name, with "
+            f"`gain` [m per unit] instead; got {unit!r}."
         )
-    keys = ("q_sign", "q_scale", "spool_radius")
-    *_, radii = (each(table, key, "[log]", len(table["q"])) for key in keys)
-    if given.pop("spool_radius", None):
-        given["q_scale"] = tuple((UNITS[unit] * radii).tolist())
+    each(table, "q_sign", "[log]", len(table["q"]))
     return LogFormat(**given)
 
 
 def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
     given = {key: value for key, value in table.items() if key != "unit"}
     unit, log = table.get("unit", "m"), robot.log
-    need = "m" if log is None else "log" if robot.chain is None else unit
+    plain = robot.chain is not None and robot.chain.in_metres
+    need = "m" if log is None else unit if plain else "log"
     if given and unit != need:
-        lacks = "[log]" if log is None else "[[segment]]"
-        raise ValueError(f'`unit` in [limits] must be "{need}" without {lacks}, got "{unit}".')
+        why = "without [[segment]]" if robot.chain is None else "with gains"
+        why = "without [log]" if log is None else why
+        raise ValueError(f'`unit` in [limits] must be "{need}" {why}, got "{unit}".')
     limits = Limits(**{key: each(given, key, "[limits]", robot.n_actuators) for key in given})
     low, high = limits.q_min, limits.q_max
     if low is not None and high is not None and (low > high).any():

@@ -276,7 +276,7 @@ def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: 
     given = {name: value for name, value in given.items() if value is not None}
     given |= {name: None for name in ("groups", "time") if given.get(name) == "none"}
     if known is not None:
-        return replace(known, **given, **({"q_scale": None} if "q_unit" in given else {}))
+        return replace(known, **given)
     if "q" not in given or "x" not in given:
         raise ValueError(
             f"{source} does not say how logs are written: it has no [log] table, as in "

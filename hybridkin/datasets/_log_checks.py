@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin.datasets._log_geometry import geometry_findings
+from hybridkin.datasets._log_geometry import geometry_findings, in_metres
 from hybridkin.datasets._log_report import MISREAD, SEVERITIES, LogFinding, LogReport, named_rows
 from hybridkin.datasets._log_residual import residual_findings
 from hybridkin.datasets._logs import Log, column_names
@@ -82,10 +82,11 @@ def check_log(
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))
         for check in (_frozen, _constant, _same, _duplicates, _jumps, _times, _motions):
             findings += check(rows)
-        found = [] if chain is None else geometry_findings(rows.log, chain, base_is_free)
+        read, chain = in_metres(rows.log, chain)
+        found = [] if chain is None else geometry_findings(read, chain, base_is_free)
         findings += found
         if not any(f.kind in MISREAD for f in found):
-            findings += residual_findings(rows.log, chain, rows.same_motion())
+            findings += residual_findings(read, chain, rows.same_motion())
         columns = columns[valid]
     ranges = np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)
     return LogReport(

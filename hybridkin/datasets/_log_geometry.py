@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ from hybridkin.datasets._logs import Log, column_names
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS, _FEW = 500, 150  # enough to tell one robot from its mirror image; of many changes
 _CONVERT = (
-    "set `spool_radius` (of motors) or `q_scale` (of pressures or steps: metres per unit) in [log] "
-    "of the robot description"
+    "set `spool_radius` (of motors) or `gain` (of pressures or steps: metres per unit) in every "
+    "[[segment]] of the robot description (`gains` of a chain)"
 )
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 # Of the tip's spread over the robot's reach: what cannot be, what is usual. Of strokes over radii
@@ -85,6 +86,16 @@ class _Robot:
                 shift = by * q[:, i].std() * way[:, None] * np.eye(q.shape[1])[i]
                 found[kind, i, by] = q + shift
         return found
+
+
+def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
+    """Return the log and the chain with q in metres, where the chain has gains."""
+    if chain is None or chain.in_metres:
+        return log, chain
+    q = chain.metres(torch.from_numpy(log.q.astype(float))).detach().cpu().numpy()
+    plain = {"gains": chain.gains / chain.gains, "actuator_zeros": 0.0 * chain.gains}
+    plain = {name: value for name, value in plain.items() if name in chain.geometry()}
+    return replace(log, q=q, units={**log.units, "q": "m"}), chain.with_geometry(**plain)
 
 
 def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFinding]:

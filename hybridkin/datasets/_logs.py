@@ -97,7 +97,6 @@ def load_log(
     q_unit: str = "m",
     x_unit: str = "m",
     q_sign: ArrayLike = 1,
-    q_scale: ArrayLike | None = None,
     delimiter: str | None = None,
     drop_invalid: bool = False,
 ) -> Log:
@@ -119,16 +118,12 @@ def load_log(
         Column of the time stamp [s].
     q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
-        left as it is.
+        left as it is: counts or pressures, of a chain with `gains`.
     x_unit : {"m", "cm", "mm", "um", "in"}, default="m"
         Unit of the tip columns in the file.
     q_sign : 1, -1 or sequence of them, default=1
         Factor of the actuator columns: -1 where the file counts a pulled tendon as positive, since
         length changes here are negative for shortening.
-    q_scale : float or sequence of float, optional
-        Of actuators that are motors or pressures: the length [m] that one unit of the file moves,
-        for each column or for all; of a spool its radius times pi / 180 per degree. `q_unit` then
-        is only a name.
     delimiter : str or None, default=None
         Separator of a text file. None: comma, semicolon or tab, whichever the header has most of.
     drop_invalid : bool, default=False
@@ -177,9 +172,7 @@ def load_log(
     q, x = table.names("q", q), table.names("x", x)
     if len(x) != 3:
         raise ValueError(f"`x` must name 3 columns, got {len(x)}: {x}.")
-    if q_scale is not None and q_unit == "m":  # the default
-        q_unit = "1"
-    factor = _checked_factor(len(q), q_unit, x_unit, q_sign, q_scale)
+    factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
     values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
     places = np.arange(len(values)) if table.lines is None else table.lines
     valid = np.isfinite(values).all(axis=1)
@@ -190,7 +183,7 @@ def load_log(
             f"infinite value ({where}); correct them, or leave them out by drop_invalid=True where "
             "others are left."
         )
-    values, n, length = values[valid], len(q), q_scale is not None or q_unit in METRES
+    values, n = values[valid], len(q)
     columns = values[:, :n], values[:, n : n + 3]
     for name, unit, column in zip("qx", (q_unit, x_unit), columns, strict=True):
         span, middle = np.ptp(column, axis=0).max(), np.median(np.abs(column))
@@ -210,7 +203,7 @@ def load_log(
         q_names=q,
         x_names=x,
         q_sign=q_sign,
-        units={"q": "m" if length else "1" if q_unit == "1" else "rad", "x": "m"},
+        units={"q": "m" if q_unit in METRES else "1" if q_unit == "1" else "rad", "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )
@@ -286,26 +279,17 @@ class _Table(NamedTuple):
         return np.column_stack([*found.values()]), labels
 
 
-def _checked_factor(
-    n: int, q_unit: str, x_unit: str, q_sign: ArrayLike, q_scale: ArrayLike | None
-) -> NDArray:
-    """Return the factor of the n columns of q, once units, sign and scale are known to be such."""
-    if q_scale is None and q_unit not in UNITS:
-        other = "of other units give `q_scale` [m per unit]"
+def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
+    """Return the factor of the n columns of q, once units and sign are known to be such."""
+    if q_unit not in UNITS:
+        other = "of other units give '1' and the chain `gains` [m per unit]"
         raise ValueError(f"`q_unit` must be one of {list(UNITS)}, got {q_unit!r}; {other}.")
     if x_unit not in METRES:
         raise ValueError(f"`x_unit` must be one of {list(METRES)}, got {x_unit!r}.")
-    scale = np.asarray(UNITS.get(q_unit) if q_scale is None else q_scale, dtype=float)
-    sound = scale.shape in ((), (n,)) and ((scale > 0) & (scale < np.inf)).all()
-    if not sound or (q_scale is not None and q_unit in METRES):
-        raise ValueError(
-            f"`q_scale` must be a positive number, or {n}, one per column of `q`, and `q_unit` no "
-            f"length, got {q_scale!r} and {q_unit!r}."
-        )
     sign = np.asarray(q_sign, dtype=float)
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
         raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
-    return sign * scale
+    return sign * UNITS[q_unit]
 
 
 def _read_text(path: Path, delimiter: str | None) -> _Table:

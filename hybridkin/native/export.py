@@ -216,10 +216,10 @@ def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
         center, half = (buffers.get(name, np.empty(0)) for name in pair)
         if center.shape == half.shape == (n,):
             return center, half
-    radii = buffers.get("radii", np.full(1, 2.0))
-    lengths = "radii" in buffers and module.limits["q_min"] == 0.0
-    middle = 3.0 * radii.mean() if lengths else 0.0
-    return np.full(n, middle), np.full(n, 0.5 * radii.min())
+    radii, gains = buffers.get("radii", np.full(1, 2.0)), buffers.get("gains", np.ones(n))
+    extensible = "gains" in buffers and "lengths" not in buffers
+    middle = (3.0 * radii.mean() if extensible else 0.0) / gains
+    return middle + buffers.get("actuator_zeros", 0.0), 0.5 * radii.min() / np.abs(gains)
 
 
 def _runs(

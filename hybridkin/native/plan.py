@@ -158,7 +158,7 @@ def _elastic_tendons(plan: Plan, stored: Stored) -> int:
     x, y = -radii[of] * np.cos(angles), -radii[of] * np.sin(angles)
     bent = (np.cumsum(rest, 0) if base else rest)[of]  # the zeros become those of bends from rest
     zeros = stored.array("tendon_zeros") + x * bent[:, 0] + y * bent[:, 1]
-    tendons = np.stack([zeros, x, y, x * x, x * y, y * y], 1)
+    tendons = np.stack([zeros, x, y, x * x, x * y, y * y, stored.array("gains")], 1)
     same = counts[0] if len({*counts}) == 1 else 0
     return plan.node(ELASTIC, len(x), 3, [frame, segments, tendons], m, S, same, *counts)
 

@@ -79,8 +79,8 @@ def geometry(chain: Chain) -> dict[str, Any]:
     -------
     dict
         "kind"; "base" position [m] and rotation vector [deg]; of chains of arcs "routing" and
-        "segments", each with radius, length and offset [m], angles and rest bend [deg] and, of
-        elastic tendons, stiffnesses.
+        "segments", each with radius, length and offset [m], angles and rest bend [deg], gain where
+        it is not 1 [m per unit of q] and, of elastic tendons, stiffnesses.
     """
     pose = real_array(chain.base, "base")
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec(degrees=True)
@@ -97,6 +97,8 @@ def geometry(chain: Chain) -> dict[str, Any]:
         "angles_deg": angles,
         "rest_bend_deg": np.degrees(parts["rest_bends"].reshape(-1, 2)),
     }
+    if not chain.in_metres:
+        columns["gain"] = np.split(parts["gains"], np.cumsum(chain.actuators_per_segment)[:-1])
     for name in ("bending_stiffness", "axial_stiffness"):
         if name in parts:
             columns[name] = parts[name].ravel()
@@ -130,7 +132,8 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
     Domain and limits are in unit and sign of the logs, where these are known.
     """
     record, description = report.record, loaded.description
-    log_format = LogFormat((), (), "mm" if isinstance(loaded.chain, ArcChain) else "1")
+    lengths = isinstance(loaded.chain, ArcChain) and loaded.chain.in_metres
+    log_format = LogFormat((), (), "mm" if lengths else "1")
     if description is not None and description.log is not None:
         log_format = description.log
     if record["error_model"] is not None:

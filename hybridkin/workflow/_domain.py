@@ -121,9 +121,9 @@ class Domain:
         """
         trained, limits = self.loaded.trained_range, self.limits
         low, high = (vars(trained or limits)[name] for name in ("q_min", "q_max"))
-        candidates = [0.5 * (low + high) @ self.bending]
-        if self.has_tendons:
-            candidates.insert(0 if trained is None else 1, np.zeros(self.loaded.n_actuators))
+        candidates = [self.rest + (0.5 * (low + high) - self.rest) @ self.bending]
+        if self.tendons is not None:
+            candidates.insert(0 if trained is None else 1, self.rest)
         hybrid = self.loaded.hybrid
         if hybrid is not None and (tested := hybrid.module_.fitted.tested) is not None:
             rows = as_array(tested.rows - hybrid.module_.shift)
@@ -133,9 +133,16 @@ class Domain:
         return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
 
     @property
-    def has_tendons(self) -> bool:
-        """Whether the robot is one of tendons, which none pulls at zero."""
-        return isinstance(self.loaded.chain, ArcChain) and self.loaded.chain.lengths is not None
+    def tendons(self) -> ArcChain | None:
+        """The chain, where the robot is one of tendons."""
+        chain = self.loaded.chain
+        return chain if isinstance(chain, ArcChain) and chain.lengths is not None else None
+
+    @property
+    def rest(self) -> NDArray:
+        """The command (n,) at which no tendon is pulled, of other robots zero."""
+        chain = self.tendons
+        return np.zeros(self.loaded.n_actuators) if chain is None else as_array(chain.rest.detach())
 
     @cached_property
     def sample(self) -> tuple[NDArray, NDArray]:
@@ -169,16 +176,19 @@ class Domain:
         The tendons of a segment do not pull against each other. Where none can be slackened by what
         another one pulls, the slackest is at its upper limit.
         """
-        low, high, chain = self.limits.q_min, self.limits.q_max, self.loaded.chain
+        low, high, chain = self.limits.q_min, self.limits.q_max, self.tendons
         q = np.random.default_rng(0).uniform(low, high, (n, len(low)))
-        if not isinstance(chain, ArcChain) or chain.lengths is None:
+        if chain is None:
             return q
+        rest, gains = self.rest, as_array(chain.gains.detach())  # balanced in metres
+        low, high = np.sort([gains * (low - rest), gains * (high - rest)], axis=0)
+        q = gains * (q - rest)
         ends, angles = np.cumsum(chain.actuators_per_segment), as_array(chain.angles.detach())
         for own in np.split(np.arange(len(low)), ends[:-1]):
             axes = np.stack([np.cos(angles[own]), np.sin(angles[own])], axis=1)
             q[:, own] = q[:, own] @ axes @ np.linalg.pinv(axes)
             q[:, own] -= (q[:, own] - high[own]).max(axis=1, keepdims=True).clip(min=0.0)
-        return q[((q >= low) & (q <= high)).all(axis=1)]
+        return rest + q[((q >= low) & (q <= high)).all(axis=1)] / gains
 
     @cached_property
     def bending(self) -> NDArray:

@@ -13,6 +13,7 @@ from hybridkin.chains.chain import Chain
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.plots import ErrorBoxDisplay, ErrorHistogramDisplay, new_figure
 from hybridkin.workflow.log import MeasuredLog
+from hybridkin.workflow.model import play_widths
 from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries, millimetres, statistics
 
 _SHOWN = ("mechanical, calibrated", "hybrid, ELM", "hybrid, auto")
@@ -116,7 +117,7 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "candidates": dict(
             zip(found["candidate"], map(float, found["mean_distance"]), strict=True)
         ),
-        "play": None if model.play_ is None else np.ravel(model.play_.width).tolist(),
+        "play": play_widths(model),
         "play_asked": model.play is not None,
     }
     return {**entry, "words": _in_words(entry)}

@@ -134,9 +134,8 @@ def read_log(
     ValueError
         If columns or motions are not there.
     """
-    columns = dict(vars(log_format))
-    suffix = columns.pop("group_suffix")
-    log = load_log(path, **columns, delimiter=delimiter, drop_invalid=True)
+    suffix = log_format.group_suffix
+    log = load_log(path, **log_format.reading, delimiter=delimiter, drop_invalid=True)
     if log.groups is None and exclude:
         raise ValueError("`exclude` needs `groups`, the column that names the motions.")
     if log.groups is not None:

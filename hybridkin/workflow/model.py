@@ -13,6 +13,7 @@ from hybridkin._core.arrays import as_array
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid.estimator import HybridForwardModel
@@ -92,7 +93,7 @@ class LoadedModel:
     @property
     def play_width(self) -> list[float] | None:
         """The width of the play of every actuator [m], None without play."""
-        return None if self.play is None else np.ravel(self.play.width).tolist()
+        return None if self.hybrid is None else play_widths(self.hybrid)
 
     def effective(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
         """Return what the actuators do (N, n) at commands q, of one motion or by motion."""
@@ -136,7 +137,18 @@ class LoadedModel:
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
-        return robots.LogFormat(names, ("x", "y", "z"))
+        plain = not isinstance(self.chain, ArcChain) or self.chain.in_metres
+        return robots.LogFormat(names, ("x", "y", "z"), "m" if plain else "1")
+
+
+def play_widths(model: HybridForwardModel) -> list[float] | None:
+    """Return the width of the play of every actuator [m], None without play."""
+    if model.play_ is None:
+        return None
+    chain, width = model.mechanical_model_, model.play_.width
+    if isinstance(chain, ArcChain) and not chain.in_metres:
+        width = width * as_array(chain.gains.detach().abs())
+    return np.ravel(width).tolist()
 
 
 def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel:

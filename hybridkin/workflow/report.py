@@ -31,6 +31,7 @@ _MILLIMETRES, _DEGREES = (1e3, "mm"), (180.0 / np.pi, "deg")
 _UNITS = {
     "bending_stiffness": (1e6, "mm²/rad²"),
     "axial_stiffness": (1.0, "-"),
+    **dict.fromkeys(("gains", "gain"), (1.0, "m/unit of q")),
     **dict.fromkeys(("angles", "turns", "rest_bends"), _DEGREES),
 }
 
@@ -100,15 +101,17 @@ def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, 
     Returns
     -------
     list of dict
-        "name"; "unit", "mm", "deg", "mm²/rad²" or "-"; "start", "value" and "std_error" in that
-        unit, of the base its turn from the start and its position; "narrowing", "physical" and
-        "identified".
+        "name"; "unit", "mm", "deg", "mm²/rad²" or "-", of gains "m/unit of q"; "start", "value" and
+        "std_error" in that unit, of the base its turn from the start and its position;
+        "narrowing", "physical" and "identified".
     """
     entries = []
     labels, narrowing = iter(result.names), iter(result.narrowing.tolist())
     for name, value in result.values.items():
         before, value = _start_value(start, name), np.asarray(value)
         units = value.size * [_UNITS.get(name, _MILLIMETRES)]
+        if name == "actuator_zeros" and isinstance(start, ArcChain) and not start.in_metres:
+            units = value.size * [(1.0, "units of q")]
         if name == "base":
             turn = Rotation.from_matrix(value[:3, :3] @ before[:3, :3].T).as_rotvec()
             before, value = np.append(np.zeros(3), before[:3, 3]), np.append(turn, value[:3, 3])
@@ -132,6 +135,8 @@ def _start_value(start: Chain, name: str) -> NDArray:
         return geometry["angles"][np.cumsum(counts) - counts]
     if name == "tool" and name not in geometry:
         return geometry["offsets"][-1:]
+    if name == "gain":
+        return geometry["gains"][:1]
     return geometry[name]
 
 

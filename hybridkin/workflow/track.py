@@ -138,8 +138,8 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
     if isinstance(start, str):
         if start not in ("rest", "path"):
             raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
-        zero = domain.has_tendons or ((low <= 0) & (high >= 0)).all()
-        rest = np.zeros(len(low)) if zero else domain.preferred
+        zero = domain.tendons or ((low <= 0) & (high >= 0)).all()
+        rest = domain.rest if zero else domain.preferred
         return rest if start == "rest" else None
     q, span = np.array(start, dtype=float), high - low
     if q.shape != low.shape or (np.abs(q - 0.5 * (low + high)) > 1.5 * span).any():
@@ -305,8 +305,7 @@ def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
-    columns = dict(vars(log_format), groups=None)
-    del columns["group_suffix"]
+    columns = log_format.reading | {"groups": None}
     columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
     if {*TARGET} <= {*header}:
         columns["x"] = TARGET

@@ -272,6 +272,7 @@ def test_missing_file(tmp_path):
 
 
 SEGMENT = "[[segment]]\nradius = 0.1\nlength = 1\n"
+SPOOL, GAIN = SEGMENT + "spool_radius = 0.006\n", SEGMENT + "gain = 2e-5\n"
 LOG = "[log]\nq = ['a', 'b', 'c']\nx = ['x', 'y', 'z']\n"
 
 
@@ -316,13 +317,13 @@ LOG = "[log]\nq = ['a', 'b', 'c']\nx = ['x', 'y', 'z']\n"
         (SEGMENT + LOG + "q_sign = [1, -1]", "`q_sign` in .log. must hold 3 numbers"),
         (SEGMENT + LOG + "q_unit = ['mm']", "`q_unit` in .log. must be text"),
         (SEGMENT + LOG + "q_unit = 'deg'", "`q_unit` in .log. must be one of .* `spool_radius`"),
-        (
-            SEGMENT + LOG + "spool_radius = 0.01",
-            '"deg" or "rad", with a `spool_radius` .* got \'m\'',
-        ),
-        (SEGMENT + LOG + "q_unit = 'mm'\nq_scale = 2", "any name but a length, .* got 'mm'"),
-        (SEGMENT + LOG + "q_scale = 0.0", "`q_scale` in .log. must be positive"),
-        (SEGMENT + LOG + "q_scale = [1, 2]", "`q_scale` in .log. must hold 3 numbers"),
+        (SPOOL + LOG, '`spool_radius` with "deg" or "rad" and without `gain`, got \'1\''),
+        (SPOOL + "gain = 1e-5\n" + LOG + "q_unit = 'deg'", "and without `gain`, got 'deg'"),
+        (GAIN + LOG + "q_unit = 'mm'", "a `q_unit` in .log. that is no length, .* got 'mm'"),
+        (SEGMENT + "gain = 0.0", r"`gain` in \[\[segment\]\] 1 must be positive"),
+        (SEGMENT + "gain = [1, 2]", r"`gain` in \[\[segment\]\] 1 must hold 3 numbers"),
+        (GAIN + SEGMENT, r"`gains` must stand in every \[\[segment\]\] or in none"),
+        (GAIN + LOG + "[limits]\nq_min = 0", 'must be "log" with gains, got "m"'),
         (SEGMENT + "[limits]\nq_min = nan", "`q_min` in .limits. must be a number"),
         (SEGMENT + "[limits]\nq_min = 0\nunit = 'log'", 'must be "m" without .log., got "log"'),
         (LOG + "[limits]\nq_min = 0", 'must be "log" without ..segment.., got "m"'),
@@ -340,13 +341,12 @@ def test_every_value_is_checked(write, text, message):
 
 
 def test_spools_scales_and_signs(write):
-    text = (
-        SEGMENT + LOG + "q_unit = 'deg'\nspool_radius = [0.01, 0.01, 0.02]\nq_sign = [1, -1, 1]\n"
-    )
+    text = SEGMENT + "spool_radius = [0.01, 0.01, 0.02]\nzeros = [90, 0, 45]\n"
+    text += LOG + "q_unit = 'deg'\nq_sign = [1, -1, 1]\n"
     robot = robots.read_description(
         write(text + "[limits]\nunit = 'log'\nq_min = -90\nq_max = [180, 180, 90]\ndq_max = 360\n")
     )
-    radian = math.radians(1.0) * np.array([0.01, -0.01, 0.02])
+    radian = math.radians(1.0) * np.array([1, -1, 1])
     assert robot.log.q_unit == "deg"
     assert robot.log.q_factor == pytest.approx(radian)
     assert robot.limits.q_min == pytest.approx([-90, 180, -90] * radian)
@@ -356,8 +356,27 @@ def test_spools_scales_and_signs(write):
     assert (back.q_min.tolist(), back.dq_max.tolist()) == ([-90] * 3, pytest.approx([360] * 3))
     one_sided = robots.Limits(q_min=np.zeros(3)).scaled(radian)
     assert one_sided.q_max.tolist() == [math.inf, 0.0, math.inf]
-    scaled = robots.read_description(write(SEGMENT + LOG + "q_unit = 'kPa'\nq_scale = 2e-5"))
-    assert (scaled.log.q_unit, float(scaled.log.q_factor)) == ("kPa", 2e-5)
+    assert_close(robot.chain.gains, torch.tensor([0.01, 0.01, 0.02], dtype=torch.float64))
+    zeros = torch.tensor([math.pi / 2, 0.0, math.pi / 4], dtype=torch.float64)
+    assert_close(robot.chain.actuator_zeros, zeros)
+    assert robot.log.reading["q_unit"] == "deg"
+    assert "group_suffix" not in robot.log.reading
+
+
+def test_gains_of_counts_and_pressures(write):
+    text = GAIN + "zeros = [1, 2, 3]\n" + LOG
+    robot = robots.read_description(write(text + "q_unit = 'kPa'"))
+    assert (robot.log.q_unit, float(robot.log.q_factor)) == ("kPa", 1.0)
+    assert robot.log.reading["q_unit"] == "1"
+    assert robot.chain.gains.tolist() == [2e-5] * 3
+    assert robot.chain.actuator_zeros.tolist() == [1.0, 2.0, 3.0]
+    limited = text + "[limits]\nunit = 'log'\nq_min = -500\nq_max = 800\n"
+    assert robots.read_description(write(limited)).limits.q_max.tolist() == [800.0] * 3
+    degrees = robots.from_toml(write(GAIN + LOG + "q_unit = 'deg'"))
+    assert degrees.gains.tolist() == pytest.approx([2e-5 * 180 / math.pi] * 3)
+    assert robots.from_toml(write(SPOOL)).gains.tolist() == [0.006] * 3  # per radian
+    elastic = "model = 'elastic-tendon'\n" + GAIN + "zeros = [1e-4, 0, 0]\n" + LOG
+    assert robots.from_toml(write(elastic)).tendon_zeros.tolist() == [1e-4, 0.0, 0.0]
 
 
 def test_a_robot_of_a_log_alone(write):
@@ -377,7 +396,7 @@ VALUES = """true 0 -1 3 2.5 1e300 1e-300 nan -inf "x" "" "deg" [] [1] [[1]] ["a"
 @pytest.mark.slow
 def test_a_changed_description_is_a_robot_or_an_error_of_ours(write):
     rng = random.Random(0)
-    texts = [TENDONS, ELASTIC, SEGMENT + LOG + "q_unit = 'deg'\nspool_radius = 0.01\n", LOG]
+    texts = [TENDONS, ELASTIC, SPOOL + LOG + "q_unit = 'deg'\n", LOG]
     keys = [line.split(" = ")[0] for text in texts for line in text.splitlines() if " = " in line]
     errors, n_robots = [], 0
     for _ in range(1500):

@@ -324,15 +324,12 @@ def test_csv_angles_and_unitless(log):
     assert data.units["q"] == "1"
 
 
-def test_motor_angles_and_pressures_become_lengths(log):
+def test_counts_stay_counts(log):
     path = log(HEADER + "0,r,90,180,-90,1,2,3\n")
-    radian = np.pi / 180
-    data = load_log(path, **COLUMNS, q_unit="deg", q_scale=0.01 * radian, q_sign=-1)
-    assert_allclose(data.q, [[-0.01 * np.pi / 2, -0.01 * np.pi, 0.01 * np.pi / 2]])
-    assert (data.units["q"], data.file_units["q"]) == ("m", "deg")
-    data = load_log(path, **COLUMNS, q_unit="kPa", q_scale=[1e-5, 2e-5, 1e-5])
-    assert_allclose(data.q, [[9e-4, 3.6e-3, -9e-4]])
-    assert "q from -0.9 to 3.6 mm" in str(check_log(data))
+    data = load_log(path, **COLUMNS, q_unit="1", q_sign=-1)
+    assert_allclose(data.q, [[-90, -180, 90]])
+    assert (data.units["q"], data.file_units["q"]) == ("1", "1")
+    assert "q from -180 to 90," in str(check_log(data))
     angles = check_log(load_log(path, **COLUMNS, q_unit="deg"))
     assert "q from -90 to 180 deg" in str(angles)
 
@@ -375,10 +372,7 @@ def test_csv_invalid_rows_are_counted_or_dropped(log):
         (HEADER, {"q": ["a", "a"]}, "`q` names a column twice"),
         (HEADER, {"q_unit": "inch"}, "`q_unit` must be one of"),
         (HEADER, {"x_unit": "deg"}, "`x_unit` must be one of"),
-        (HEADER, {"q_unit": "kPa"}, "of other units give `q_scale`"),
-        (HEADER, {"q_scale": [1, 2]}, "`q_scale` must be a positive number, or 3"),
-        (HEADER, {"q_scale": -1.0}, "`q_scale` must be a positive number, or 3"),
-        (HEADER, {"q_scale": 1.0, "q_unit": "mm"}, "`q_unit` no length, got 1.0 and 'mm'"),
+        (HEADER, {"q_unit": "kPa"}, "of other units give '1' and the chain `gains`"),
         (HEADER, {"q_sign": 2}, "`q_sign` must be 1 or -1"),
         (HEADER, {"q_sign": [1, -1]}, "`q_sign` must be 1 or -1"),
     ],
@@ -617,7 +611,25 @@ def test_units_that_are_no_lengths():
     assert check_log(Log(**turns)).ok
     steps = {**log, "q": 1e3 * log["q"], "file_units": {"q": "mm", "x": "m"}}
     (finding,) = check_log(Log(**steps), chain=CHAIN).errors
-    assert "`q_scale` (of pressures or steps: metres per unit)" in finding.advice
+    assert "`gain` (of pressures or steps: metres per unit)" in finding.advice
+
+
+def test_logs_in_counts_are_checked_in_metres():
+    gains = np.array([2e-5, -3e-5, 2.5e-5, 1e-5, 4e-5, 2e-5])
+    zeros = torch.full((6,), 512.0, dtype=torch.float64)
+    chain = CHAIN.with_geometry(gains=torch.from_numpy(gains), actuator_zeros=zeros)
+    log, units = tendon_log(), {"q": "1", "x": "m"}
+
+    def findings(sign):
+        counts = {**log, "q": sign * log["q"] / gains + 512, "units": units}
+        metres = {**log, "q": sign * log["q"]}
+        pair = (check_log(Log(**counts), chain=chain), check_log(Log(**metres), chain=CHAIN))
+        return [[f.message for f in report.findings] for report in pair]
+
+    assert findings(1.0)[0] == findings(1.0)[1]
+    found, wanted = findings(-1.0)
+    assert found == wanted
+    assert any("sign of q flipped" in message for message in found)
 
 
 @pytest.mark.parametrize("unit", ["mm", "cm"])

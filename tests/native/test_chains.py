@@ -142,6 +142,21 @@ def test_elastic_tendons(counts, routing):
     check_nan_row(chain, q)
 
 
+@pytest.mark.parametrize("routing", ROUTINGS)
+def test_gains(routing):
+    rng = np.random.default_rng(5)
+    chain, q = elastic(rng, [3, 2, 4], routing)
+    gains = rng.choice([-1.0, 1.0], 9) * rng.uniform(0.2, 3.0, 9)
+    counted = chain.with_geometry(gains=torch.from_numpy(gains))
+    for tip in (3.0, 1.7):
+        x, J = check(counted.with_tip(tip), q / gains, 1e-11)
+        plain = Program(Plan(chain.with_tip(tip).stored())).evaluate(q, jacobian=True)
+        assert np.abs(x - plain[0]).max() < 1e-12
+        assert np.abs(J - plain[1] * gains).max() < 1e-11
+    arcs, q = trunk(rng, [3, 3, 3], routing=routing, gains=gains, actuator_zeros=rng.normal(size=9))
+    check(arcs, q / gains + arcs.actuator_zeros.numpy())
+
+
 def test_elastic_tendons_of_default_stiffness():
     chain, rng = ElasticTendonChain([0.008] * 3, [0.1] * 3), np.random.default_rng(0)
     x, _ = check(chain, rng.uniform(-0.03, 0.03, (1000, 9)), 1e-11)  # bends of several turns

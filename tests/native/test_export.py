@@ -26,8 +26,8 @@ needs_zig = pytest.mark.skipif(ZIG is None, reason="the package ziglang is not t
 
 def limited(model, **settings):
     """Inverse kinematics within limits that suit the small models, 1 kHz."""
-    least = as_forward_model(model).robot.limits["q_min"]
-    low, high = (0.15, 0.35) if torch.as_tensor(least).eq(0.0).all() else (-0.004, 0.004)
+    extensible = getattr(as_forward_model(model).robot, "lengths", 0.1) is None
+    low, high = (0.15, 0.35) if extensible else (-0.004, 0.004)
     settings = {"q_min": low, "q_max": high, "dq_max": 1.0, "dt": 1e-3, **settings}
     return InverseKinematics(model, **settings)
 

@@ -407,11 +407,11 @@ MOTORS = """
 [[segment]]
 radius = 0.005
 length = 0.1
+spool_radius = [0.006, 0.006, 0.012]
 [log]
 q = ["a", "b", "c"]
 x = ["x", "y", "z"]
 q_unit = "deg"
-spool_radius = [0.006, 0.006, 0.012]
 q_sign = -1
 [limits]
 unit = "log"
@@ -426,7 +426,7 @@ def test_motor_angles_from_the_log_to_the_commands(tmp_path, capsys):
     robot = tmp_path / "motors.toml"
     robot.write_text(MOTORS)
     loaded = workflow.open_model(robot)
-    turn = np.radians([0.006, 0.006, 0.012])
+    turn = np.radians([1.0, 1.0, 1.0])
     np.testing.assert_allclose(workflow.path_limits(loaded).q_min, -60 * turn)
     assert main(["describe", str(robot)]) == 0
     printed = capsys.readouterr().out

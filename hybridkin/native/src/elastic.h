@@ -13,8 +13,8 @@ typedef struct {
 } HK(inside);
 
 /* Sizes and numbers of a node. Of a segment these are its stiffnesses (3), its E (3), the arc at
-   rest up to the tip (3), and the shares of t_k and of t_{k-1} in what is up to the tip; of a tendon its zero, the x and y of
-   its w = (1, x, y), and xx, xy, yy. */
+   rest up to the tip (3), and the shares of t_k and of t_{k-1} in what is up to the tip; of a tendon its zero [m], the x and y of
+   its w = (1, x, y), xx, xy, yy, and its gain [m per unit of q]. */
 typedef struct {
     int n, S, tip, same;   /* tendons; segments, and up to the tip; tendons of each if all alike */
     const int32_t *counts; /* tendons that end at each segment */
@@ -26,7 +26,8 @@ typedef struct {
 #define HK_SHARE 9
 #define HK_BEHIND 10
 #define HK_SEGMENT 11 /* numbers of a segment */
-#define HK_TENDON 6   /* numbers of a tendon */
+#define HK_GAIN 6
+#define HK_TENDON 7   /* numbers of a tendon */
 
 static inline HK(elastic_t) HK(elastic_of)(const hk_plan *p, int at) {
     const int32_t *more = p->code + at + HK_MORE;
@@ -101,7 +102,7 @@ HK_INLINE void HK(shape)(
         first -= count;
         for (int i = 0; i < count; i++) {
             const real *of = e.tendons + HK_TENDON * (first + i);
-            const V taut = in->taut[first + i], d = (q[first + i] - of[0]) * taut;
+            const V taut = in->taut[first + i], d = (q[first + i] * of[HK_GAIN] - of[0]) * taut;
             pulled[0] = pulled[0] + taut;
             for (int j = 1; j < 6; j++) pulled[j] = pulled[j] + taut * of[j];
             force[0] = force[0] + d;
@@ -143,7 +144,7 @@ HK_INLINE void HK(settle)(
         for (int k = 0, i = 0; k < e.S; k++)
             for (int last = i + (e.same ? e.same : e.counts[k]); i < last; i++) {
                 const real *of = e.tendons + HK_TENDON * i;
-                const V d = q[i] - of[0], y = t[3 * k + 1] * of[1], z = t[3 * k + 2] * of[2];
+                const V d = q[i] * of[HK_GAIN] - of[0], y = t[3 * k + 1] * of[1], z = t[3 * k + 2] * of[2];
                 const V stretch = t[3 * k] + y + z - d;
                 const M found = stretch >= SPLAT(0.0), was = in->taut[i] > SPLAT(0.0);
                 M turned = found != was;
@@ -189,7 +190,7 @@ HK_INLINE void HK(pull_tendons)(
             for (int last = j + (e.same ? e.same : e.counts[k]); j < last; j++) {
                 const real *of = e.tendons + HK_TENDON * j;
                 const V by = t[3 * k] + t[3 * k + 1] * of[1] + t[3 * k + 2] * of[2];
-                J[j] = J[j] + in->taut[j] * by;
+                J[j] = J[j] + in->taut[j] * by * of[HK_GAIN];
             }
     }
 }

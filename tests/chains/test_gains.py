@@ -1,0 +1,118 @@
+"""Actuators that count in another unit than metres."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain
+from hybridkin.chains.chain import Chain
+
+COUNTS = torch.tensor([2e-5, -3e-5, 2.5e-5, 1e-5, 4e-5, -2e-5], dtype=torch.float64)
+ZEROS = torch.tensor([500.0, -200.0, 0.0, 30.0, 1000.0, 2048.0], dtype=torch.float64)
+KINDS = {
+    "extensible": (ConstantCurvatureChain, {}),
+    "tendons": (ConstantCurvatureChain, {"lengths": [0.1, 0.08], "routing": "base"}),
+    "elastic": (ElasticTendonChain, {"lengths": [0.1, 0.08], "tendon_zeros": 5e-4}),
+}
+
+
+def pair(kind, tip_at=1.6):
+    """Return a chain in metres, the same one in counts, and rows of both."""
+    cls, options = KINDS[kind]
+    given = {"radii": [0.01, 0.008], "rest_bends": 0.05, "offsets": [0.01, 0.02], **options}
+    plain = cls(**given).with_tip(tip_at)
+    zeros = {} if kind == "elastic" else {"actuator_zeros": ZEROS}
+    counted = cls(**given, gains=COUNTS, **zeros).with_tip(tip_at)
+    metres = 0.004 * torch.randn(20, 6, generator=torch.manual_seed(0), dtype=torch.float64)
+    metres = metres + 0.1 * (kind == "extensible")
+    return plain, counted, metres, metres / COUNTS + counted.rest
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_unit_of_q_changes_nothing(kind):
+    plain, counted, metres, q = pair(kind)
+    assert_close(counted.metres(q), metres)
+    for of in ("forward", "pose", "poses", "backbone", "arcs"):
+        assert_close(getattr(counted, of)(q), getattr(plain, of)(metres), atol=1e-12, rtol=0)
+    for of in ("jacobian", "pose_jacobian"):
+        scaled = getattr(plain, of)(metres) * COUNTS
+        assert_close(getattr(counted, of)(q), scaled, atol=1e-16, rtol=1e-9)
+    z, slope = counted.coordinates(q)
+    assert_close(z, plain.coordinates(metres)[0])
+    assert_close(slope, plain.coordinates(metres)[1] * COUNTS)
+    if kind == "elastic":
+        assert_close(counted.tensions(q), plain.tensions(metres))
+        assert counted.slack(q).any()
+    else:
+        assert_close(counted.consistency(q), plain.consistency(metres))
+        assert_close(counted.contradictory(q), plain.contradictory(metres))
+    assert counted.unit_messages(q, "q") == []
+    assert counted(q.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_derivatives_by_gains_and_zeros(kind):
+    _, chain, _, q = pair(kind)
+    names = [name for name in chain.geometry() if name.endswith("zeros")]
+    tangents = {"gains": torch.diag(COUNTS)}
+    tangents |= {name: torch.eye(6, dtype=torch.float64) for name in names}
+    found = chain.geometry_jacobian(q, tangents)
+    assert_close(found, Chain.geometry_jacobian(chain, q, tangents), rtol=1e-8, atol=1e-12)
+    assert found.abs().amax((0, 1)).min() > 0
+
+
+def test_gains_of_all_of_segments_and_of_actuators():
+    def gains(value):
+        return ConstantCurvatureChain([0.01, 0.01], n_actuators=[3, 4], gains=value).gains.tolist()
+
+    assert gains(2.0) == [2.0] * 7
+    assert gains([2.0, -1.0]) == [2.0] * 3 + [-1.0] * 4
+    assert gains(torch.tensor([2.0, -1.0])) == [2.0] * 3 + [-1.0] * 4
+    assert gains([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 7.0]]) == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    assert gains(np.arange(1.0, 8.0)) == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    with pytest.raises(ValueError, match=r"`gains` must not be zero .m per unit of q., got 0"):
+        gains(0.0)
+    with pytest.raises(ValueError, match=r"`gains` must have shape .7,., or be one number"):
+        gains([1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match="`gains` must be finite"):
+        gains(float("nan"))
+
+
+def test_lengths_are_positive_in_metres():
+    chain = ConstantCurvatureChain([0.01], gains=[2e-5, 2e-5, -2e-5], actuator_zeros=100.0)
+    assert chain.limits["q_min"].tolist() == [100.0, 100.0, -np.inf]
+    assert chain.limits["q_max"].tolist() == [np.inf, np.inf, 100.0]
+    assert chain.check_actuators(torch.tensor([[110.0, 120.0, -50.0]])) == []
+    with pytest.raises(ValueError, match=r"positive actuator lengths .m., got -0\.001 in row 1"):
+        chain.check_actuators(torch.tensor([[110.0, 120.0, -50.0], [110.0, 50.0, -50.0]]))
+    (message,) = chain.check_actuators(torch.tensor([[1e6, 120.0, -50.0]]))
+    assert message.startswith("`q` times `gains` reaches 20, which looks like millimetres")
+
+
+def test_elastic_tendons_of_a_counted_chain():
+    _, counted, metres, q = pair("tendons", 2.0)
+    plain = ElasticTendonChain.from_chain(counted.with_geometry(gains=torch.ones_like(COUNTS)))
+    elastic = ElasticTendonChain.from_chain(counted)
+    assert_close(elastic.tendon_zeros, COUNTS * ZEROS)
+    assert_close(elastic(q), plain(metres + plain.tendon_zeros))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gains_are_described_and_may_lack(kind):
+    _, chain, _, q = pair(kind)
+    stored = chain.stored()
+    assert_close(type(chain).from_stored(stored, None)(q), chain(q))
+    del stored.arrays["gains"]  # as in files of before
+    assert (type(chain).from_stored(stored, None).gains == 1).all()
+    assert chain.default_parameters.count("gain") == 1
+
+
+@pytest.mark.parametrize("kind", ["tendons", "elastic"])
+def test_gradients_reach_the_gains(kind):
+    _, chain, _, q = pair(kind)
+
+    def tips(gains):
+        return chain.with_geometry(gains=gains)(q[:3])
+
+    assert torch.autograd.gradcheck(tips, COUNTS.clone().requires_grad_(), eps=1e-10, atol=1e-3)
