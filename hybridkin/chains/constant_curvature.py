@@ -227,8 +227,10 @@ class ConstantCurvatureChain(ArcChain):
         """None for tendons; the actuators of extensible segments have lengths above 0 m."""
         if self.lengths is not None:
             return super().limits
-        low = torch.where(self.gains > 0, self.actuator_zeros, -math.inf)
-        high = torch.where(self.gains < 0, self.actuator_zeros, math.inf)
+        if self.in_metres and not self.actuator_zeros.any():
+            return super().limits | {"q_min": 0.0}
+        low = torch.where(self.gains > 0, self.actuator_zeros, -torch.inf)
+        high = torch.where(self.gains < 0, self.actuator_zeros, torch.inf)
         return super().limits | {"q_min": low, "q_max": high}
 
     def _check_rows(self, rows: Tensor, name: str) -> None:

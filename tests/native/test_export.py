@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from saved_models import FOLDER, tendon_chain
 
 from hybridkin import ConstantCurvatureChain, InverseKinematics, as_forward_model, load_model
