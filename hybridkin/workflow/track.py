@@ -305,7 +305,7 @@ def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
-    columns = log_format.reading | {"groups": None}
+    columns: dict[str, Any] = {**log_format.reading, "groups": None}
     columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
     if {*TARGET} <= {*header}:
         columns["x"] = TARGET
