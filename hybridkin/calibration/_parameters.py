@@ -20,8 +20,8 @@ from hybridkin.chains.chain import Chain
 _Vector = TypeVar("_Vector", NDArray, Tensor)
 
 # Geometry that keeps its sign, and the factor of its start within which it stays, both ways.
-SCALED = dict.fromkeys(("radii", "lengths", "gains"), 5.0)
-SCALED |= dict.fromkeys(("bending_stiffness", "axial_stiffness"), 1e4)
+SCALED: dict[str, float] = {"bending_stiffness": 1e4, "axial_stiffness": 1e4}
+SCALED |= {"radii": 5.0, "lengths": 5.0, "gains": 5.0}
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
 
 
@@ -168,9 +168,9 @@ def parameter(chain: Chain, name: str) -> Parameter:
         labels = tuple(f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z"))
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
-    unit, kind, physical = reach, "m", (-np.inf, np.inf)
+    unit, kind, physical, origin = reach, "m", (-np.inf, np.inf), np.abs(start.numpy().ravel())
     if entry in SCALED:
-        unit, kind, origin = 1.0, "-", np.abs(start.numpy().ravel())
+        unit, kind = 1.0, "-"
         physical = origin / SCALED[entry], origin * SCALED[entry]
     elif entry == "rest_bends":
         unit, kind, physical = 1.0, "rad", (-math.pi, math.pi)
@@ -190,7 +190,7 @@ def parameter(chain: Chain, name: str) -> Parameter:
         shown, shape = np.cumsum(counts) - counts, (len(counts),)
     elif name == "gain":  # a common factor
         directions, shown, shape = np.ones((size, 1)), shown[:1], ()
-        physical = tuple(side[:1] for side in physical)
+        physical = origin[:1] / SCALED[entry], origin[:1] * SCALED[entry]
     elif name != entry:  # "tool", the last of the offsets
         directions, shown, shape = directions[:, -1:], shown[-1:], ()
     labels, size = _labels(name, shape), len(shown)

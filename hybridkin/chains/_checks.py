@@ -69,14 +69,15 @@ def arc_geometry(
     S = radii.numel()
     counts = actuator_counts(n_actuators, S, fewest)
     warn_millimetres("radii", radii, 1.0)
-    if not _is_nested(gains) and np.shape(gains) == (S,):  # one for each segment
-        gains = np.repeat(np.asarray(gains), counts)
+    each = gains
+    if not _is_nested(gains) and np.shape(gains) == (S,):
+        each = np.repeat(real_array(gains, "gains"), counts)
     geometry = {
         "radii": radii,
         "angles": flat_angles(angles, counts, dtype),
         "offsets": filled(offsets, "offsets", dtype, (S,)),
         "rest_bends": filled(rest_bends, "rest_bends", dtype, (S, 2)),
-        "gains": filled(gains, "gains", dtype, (sum(counts),)),
+        "gains": filled(each, "gains", dtype, (sum(counts),)),
         "base": pose(base, "base", dtype),
     }
     if lengths is not None:

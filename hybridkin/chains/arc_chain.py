@@ -74,7 +74,8 @@ class ArcChain(Chain):
     @property
     def rest(self) -> Tensor:
         """The q (n,) at which no tendon is pulled, or chambers have length 0."""
-        return self._buffers.get("actuator_zeros", 0.0 * self.gains)
+        zeros = self._buffers.get("actuator_zeros")
+        return 0.0 * self.gains if zeros is None else zeros
 
     def metres(self, q: Tensor) -> Tensor:
         """Return what q (..., n) means in metres: lengths, or changes of length."""
