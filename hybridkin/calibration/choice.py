@@ -202,7 +202,7 @@ def _best(errors: NDArray, sure: NDArray, enough: NDArray) -> int:
 def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_Rung]:
     """Return the sets to choose from, the smaller ones first."""
     elastic = None
-    if isinstance(chain, ConstantCurvatureChain) and chain.lengths is not None:
+    if isinstance(chain, ConstantCurvatureChain) and not any(chain.extensible):
         if chain.contradictory(q).any():
             elastic = ElasticTendonChain.from_chain(chain)
     if parameters is not None:

@@ -157,17 +157,70 @@ def levers(radii: Tensor, angles: Tensor, counts: Sequence[int]) -> Tensor:
     return torch.stack([radius * angles.cos(), radius * angles.sin()], dim=-2)
 
 
-def reading_matrix(levers: Tensor, counts: Sequence[int], routing: str, extensible: bool) -> Tensor:
-    """Return the linear map from arcs to actuator lengths, (..., n, 3 S) or (..., n, 2 S).
+def reading_matrix(levers: Tensor, counts: Sequence[int], starts: Sequence[int]) -> Tensor:
+    """Return the linear map from arcs to actuator lengths, (..., n, 3 S).
 
-    Columns are the lengths (extensible chains only), then the x- and the y-bendings of all
-    segments.
+    Columns are the lengths, then the x- and the y-bendings of all segments. Actuators of segment k
+    run through the segments from `starts[k]` to k.
     """
-    n_segments = len(counts)
-    spans = levers.new_zeros(sum(counts), n_segments)
+    spans = levers.new_zeros(sum(counts), len(counts))
     row = 0
-    for k, n in enumerate(counts):
-        spans[row : row + n, (0 if routing == "base" else k) : k + 1] = 1.0
+    for k, (n, start) in enumerate(zip(counts, starts, strict=True)):
+        spans[row : row + n, start : k + 1] = 1.0
         row += n
     x, y = (-levers[..., None] * spans).unbind(-3)
-    return torch.cat([spans.expand_as(x), x, y] if extensible else [x, y], dim=-1)
+    return torch.cat([spans.expand_as(x), x, y], dim=-1)
+
+
+def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
+    """Return how the actuators of a segment (n,) read its bending besides its length, (2, n) [-].
+
+    Rows are its x and y; of an extensible segment a common change is one of the length.
+    """
+    at = torch.stack([angles.cos(), angles.sin()])
+    return at - at.mean(dim=1, keepdim=True) if extensible else at
+
+
+def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Sequence[int]) -> Tensor:
+    """Return the projector (3 S, 3 S) on the arcs that the actuators of each segment determine.
+
+    Those are its length if it is extensible, and of its bending both components, none, or the one
+    in the plane of its actuators: `bends` of them.
+    """
+    blocks = []
+    for own, stretches, n in zip(angles, extensible, bends, strict=True):
+        block = 0.5 * n * torch.eye(2, dtype=own.dtype, device=own.device)
+        if n == 1:  # a plane at the angle psi: [[1 + cos 2 psi, sin 2 psi], ...] / 2
+            x, y = bend_readings(own, stretches)
+            a, b = (x * x - y * y).sum(), 2.0 * (x * y).sum()
+            block = block + 0.5 * torch.stack([a, b, b, -a]).reshape(2, 2) / torch.hypot(a, b)
+        blocks.append(block)
+    S = len(blocks)
+    bending = torch.diag_embed(torch.stack(blocks, -1)).transpose(1, 2).reshape(2 * S, 2 * S)
+    length = torch.diag(bending.new_tensor([*extensible, *[0] * (2 * S)]))
+    return length + torch.nn.functional.pad(bending, (S, 0, S, 0))
+
+
+def rolled(poses: Tensor, angle: Tensor) -> Tensor:
+    """Return poses (..., K, 4, 4), all but the first turned by an angle (..., 1) about their z."""
+    moves = torch.arange(poses.shape[-3], device=poses.device) > 0
+    angle = (angle * moves)[..., None, None]
+    c, s = angle.cos(), angle.sin()
+    x, y, rest = poses.split([1, 1, 2], dim=-1)
+    return torch.cat([c * x + s * y, c * y - s * x, rest], dim=-1)
+
+
+def turned_by_first(arcs: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+    """Return arcs (3 S, N) with all bendings turned by an angle [rad] that is their first length.
+
+    That length becomes zero. `slope` (3 S, K, N) are changes of the arcs; those of the turned arcs
+    are returned.
+    """
+    S = len(arcs) // 3
+    c, s, slope = arcs[0].cos(), arcs[0].sin(), slope.expand(-1, -1, arcs.shape[1])
+    turned, moved = [0.0 * arcs[:1], arcs[1:S]], [0.0 * slope[:1], slope[1:S]]
+    (x, y), (dx, dy) = arcs[S:].chunk(2), slope[S:].chunk(2)
+    for a, b, da, db in ((x, -y, dx, -dy), (y, x, dy, dx)):
+        turned.append(c * a + s * b)
+        moved.append(c * da + s * db + (c * b - s * a)[:, None] * slope[0])
+    return torch.cat(turned), torch.cat(moved)

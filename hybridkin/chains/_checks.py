@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Sequence
@@ -13,8 +14,12 @@ from torch import Tensor
 
 from hybridkin._core import arrays
 from hybridkin._core.arrays import Numbers, Transform, real_array
+from hybridkin._core.stored import Stored
 from hybridkin._core.units import warn_millimetres
+from hybridkin.chains._arcs import bend_readings
 
+_ROUTINGS = ("segment", "base")
+_DETERMINED = 1e-6  # least share of a reading that determines a direction
 _MOST_UNLIKE = 1000.0  # radii of one robot; more leave too few digits to the routing "base"
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
@@ -49,17 +54,16 @@ def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]
 
 def arc_geometry(
     radii: Numbers,
-    lengths: Numbers | None,
+    lengths: Numbers | Sequence[float | None] | None,
     n_actuators: int | Sequence[int],
-    fewest: int,
     angles: Numbers | None,
     offsets: Numbers,
     rest_bends: Numbers,
     gains: Numbers,
     base: Numbers | Transform | None,
     dtype: torch.dtype,
-) -> tuple[tuple[int, ...], dict[str, Tensor]]:
-    """Return the actuators of each segment, at least `fewest`, and what all chains of arcs have."""
+) -> tuple[tuple[int, ...], tuple[bool, ...], dict[str, Tensor]]:
+    """Return how many actuators each segment has, if it is extensible, and its geometry."""
     radii = lengths_of(radii, "radii", dtype)
     if radii.max() > _MOST_UNLIKE * radii.min():
         raise ValueError(
@@ -67,7 +71,7 @@ def arc_geometry(
             f"{radii.tolist()} m; check their units."
         )
     S = radii.numel()
-    counts = actuator_counts(n_actuators, S, fewest)
+    counts = actuator_counts(n_actuators, S)
     warn_millimetres("radii", radii, 1.0)
     each = gains
     if not _is_nested(gains) and np.shape(gains) == (S,):
@@ -80,12 +84,78 @@ def arc_geometry(
         "gains": filled(each, "gains", dtype, (sum(counts),)),
         "base": pose(base, "base", dtype),
     }
-    if lengths is not None:
-        geometry["lengths"] = lengths_of(lengths, "lengths", dtype, S)
+    extensible = (lengths is None,) * S
+    if isinstance(lengths, (list, tuple)):
+        extensible = tuple(length is None for length in lengths)
+        lengths = [length for length in lengths if length is not None]
+    if extensible != (True,) * S and lengths is not None:
+        geometry["lengths"] = lengths_of(lengths, "lengths", dtype, S - sum(extensible))
         warn_millimetres("lengths", geometry["lengths"], 10.0)
     if not geometry["gains"].all():
         raise ValueError(f"`gains` must not be zero [m per unit of q], got {gains}.")
-    return counts, geometry
+    return counts, extensible, geometry
+
+
+def path_starts(routing: str, counts: Sequence[int], extensible: Sequence[bool]) -> tuple[int, ...]:
+    """Return the first segment that the actuators of each segment run through.
+
+    What a rigid stage carries starts behind it.
+    """
+    if routing not in _ROUTINGS:
+        raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
+    S = len(counts)
+    if routing == "segment":
+        return (*range(S),)
+    stages = [extensible[k] and counts[k] == 1 for k in range(S)]
+    if len({extensible[k] for k in range(S) if not stages[k]}) > 1:
+        raise ValueError(
+            "`routing` must be 'segment' where tendons would run through extensible segments of "
+            "several actuators, or the reverse, got 'base'; what they read is not defined."
+        )
+    return tuple(itertools.accumulate((k * stages[k - 1] for k in range(S)), max))
+
+
+def bend_counts(angles: Sequence[Tensor], extensible: Sequence[bool]) -> tuple[int, ...]:
+    """Return in how many directions the actuators of each segment bend it: 2, of a plane 1.
+
+    A single actuator of an extensible segment bends nothing.
+    """
+    found = []
+    for own, stretches in zip(angles, extensible, strict=True):
+        seen = torch.linalg.svdvals(bend_readings(own, stretches))
+        most, least = torch.nn.functional.pad(seen, (0, 1))[:2].tolist()
+        planar = least <= 64.0 * torch.finfo(own.dtype).eps * most
+        if stretches and len(own) == 1:
+            found.append(0)
+        elif most > _DETERMINED and (planar or least > _DETERMINED * most):
+            found.append(1 if planar else 2)
+        else:
+            raise ValueError(
+                "`angles` must determine the bending of every segment, got "
+                f"{[row.tolist() for row in angles]}; give the actuators of a segment clearly "
+                "different angles [rad], or lay them in one plane exactly: psi and psi + math.pi."
+            )
+    return tuple(found)
+
+
+def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
+    """Return the arguments of which a stored chain is made, from its entries of these names."""
+    counts = stored.list_of(int, "actuators_per_segment")
+    may_lack = ("lengths", "gains")
+    given: dict[str, Any] = {
+        name: stored.array(name) for name in names if name not in may_lack or name in stored.arrays
+    }
+    if sum(counts) != len(given["angles"]):
+        raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
+    given["angles"] = np.split(given["angles"], np.cumsum(counts)[:-1])
+    if "stage" in stored.settings:  # files of before have neither stages nor planes
+        lengths, flags = iter(given.pop("lengths", ())), stored.list_of(bool, "extensible")
+        given["lengths"] = [None if own else next(lengths, math.nan) for own in flags]
+        given["stage"] = stored.value("stage", (str, None))
+        # A plane stays one where calibrated angles have left it a little.
+        pairs = zip(given["angles"], stored.list_of(int, "bends"), strict=True)
+        given["angles"] = [math.pi * (np.arange(len(a)) % 2) if n == 1 else a for a, n in pairs]
+    return {**given, "routing": stored.value("routing", str), "n_actuators": counts}
 
 
 def numeric(
@@ -118,9 +188,7 @@ def shaped(
     return numeric(arrays.shaped(value, name, need, length), name, dtype, finite=finite)
 
 
-def actuator_counts(
-    n_actuators: int | Sequence[int], n_segments: int, least: int
-) -> tuple[int, ...]:
+def actuator_counts(n_actuators: int | Sequence[int], n_segments: int) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
     given = np.asarray(n_actuators)
     if given.dtype.kind not in "iu" or given.shape not in ((), (n_segments,)):
@@ -129,11 +197,8 @@ def actuator_counts(
             f"in `radii`, got {n_actuators!r}."
         )
     counts = tuple(np.broadcast_to(given, n_segments).tolist())
-    if min(counts) < least:
-        raise ValueError(
-            f"`n_actuators` must be at least {least} on every segment, got {counts}; fewer do not "
-            "determine which way a segment bends."
-        )
+    if min(counts) < 1:
+        raise ValueError(f"`n_actuators` must be at least 1 on every segment, got {counts}.")
     return counts
 
 

@@ -77,6 +77,7 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("segment", "angles_deg zeros", "hold numbers", _many(_is_number)),
     ("segment", "gain spool_radius", *_POSITIVE),
     ("segment", "rest_bend_deg", "hold 2 numbers", _many(_is_number, 2)),
+    ("segment", "stage", *_among("insertion", "rotation")),
     ("segment", "clockwise", "be true or false", lambda value: isinstance(value, bool)),
     ("segment", "actuators repeat", *_WHOLE),
     ("base", "position rotation_vector_deg", "hold 3 numbers", _many(_is_number, 3)),
@@ -143,9 +144,9 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
             f"{len(segments)}; check `repeat`."
         )
     given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
-    for key in ("length", "gains", *(_STIFFNESS if elastic else ())):
+    for key in ("gains", *(("length", *_STIFFNESS) if elastic else ())):
         missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
-        needed = elastic and key == "length"
+        needed = key == "length"
         if missing and (needed or len(missing) < len(segments)):
             raise ValueError(
                 f"`{key}` must stand in every [[segment]]{'' if needed else ' or in none'}, but is "
@@ -155,33 +156,40 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     given |= {"lengths": given.pop("length"), "base": _base(tables.get("base", {}))}
     given["gains"] = given["gains"] or 1.0
     given |= {"routing": tables["routing"]} if "routing" in tables else {}
+    stages = given.pop("stage")
+    if "rotation" in stages[1:]:
+        raise ValueError('`stage` "rotation" must stand in the first [[segment]] alone.')
+    given |= {"stage": "rotation"} if stages[0] == "rotation" else {}
+    radii = [radius for radius in given["radii"] if radius is not None] or [1.0]
+    given["radii"] = [radii[0] if radius is None else radius for radius in given["radii"]]
     return ElasticTendonChain(**given) if elastic else ConstantCurvatureChain(**given)
 
 
 def _segment(table: Mapping[str, Any], where: str, elastic: bool, unit: str) -> dict[str, Any]:
     """Return what a chain is made from for one segment; None for what may be left out."""
-    if "radius" not in table:
+    stage = table.get("stage")
+    if stage is not None and (elastic or not {*table} <= {"stage", "offset", "zeros", "gain"}):
+        raise ValueError(
+            f"`stage` in {where} must stand beside `offset`, `zeros` and `gain` alone, and not in "
+            f"a robot of the model {_ELASTIC!r}."
+        )
+    if "radius" not in table and stage is None:
         raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
     if "angles_deg" in table:
-        key, angles = "angles_deg", np.radians(np.array(table["angles_deg"], dtype=float))
+        angles = np.radians(np.array(table["angles_deg"], dtype=float))
         if beside := {"angle_deg", "actuators", "clockwise"} & {*table}:
             raise ValueError(f"`{min(beside)}` cannot stand beside `angles_deg` in {where}.")
     else:
-        key, n = "actuators", table.get("actuators", 3)
+        n = table.get("actuators", 3 if stage is None else 1)
         step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
         angles = math.radians(table.get("angle_deg", 0.0)) + step * np.arange(n)
-    fewest = 1 if elastic else 3
-    if len(angles) < fewest:
-        raise ValueError(
-            f"`{key}` in {where} must describe at least {fewest} actuators, got {len(angles)}; two "
-            "actuators do not determine which way a segment bends."
-        )
     n = len(angles)
     gains, zeros = _gains(table, where, n, unit), each(table, "zeros", where, n)
     if gains is not None and not elastic:  # as the log counts
         zeros *= UNITS.get(unit, 1.0)
     return {
-        "radii": table["radius"],
+        "radii": table.get("radius"),
+        "stage": stage,
         "length": table.get("length"),
         "offsets": table.get("offset", 0.0),
         "n_actuators": len(angles),

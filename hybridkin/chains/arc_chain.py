@@ -17,8 +17,15 @@ from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
-from hybridkin.chains._arcs import arc_transforms, levers, reading_matrix, tip, tip_and_columns
-from hybridkin.chains._checks import arc_geometry
+from hybridkin.chains._arcs import (
+    arc_transforms,
+    levers,
+    reading_matrix,
+    rolled,
+    tip,
+    tip_and_columns,
+)
+from hybridkin.chains._checks import arc_geometry, path_starts, stored_arguments
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -27,7 +34,6 @@ if TYPE_CHECKING:
 ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 """Names of `calibrate` that move a part of an entry of the geometry, and that entry."""
 
-_ROUTINGS = ("segment", "base")
 Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
 STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "routing": str}
 
@@ -48,23 +54,33 @@ class ArcChain(Chain):
     A kind gives `_arcs_and_slope` and `_arcs_and_change`.
     """
 
-    _structure = ("n_segments", "actuators_per_segment", "n_actuators", "routing", "tip_at")
+    _structure = (*STRUCTURE, "n_segments", "n_actuators", "extensible", "starts")
 
     n_segments: int
     actuators_per_segment: tuple[int, ...]
     routing: str
+    extensible: tuple[bool, ...]  # whether each segment is; the others have lengths
+    starts: tuple[int, ...]  # the first segment that the actuators of each run through
+    stage: str | None = None  # "rotation" where the first segment is one
     tip_at: float  # the point that is steered, in segments from the base
     radii: Tensor  # (S,)
     angles: Tensor  # (n,)
     offsets: Tensor  # (S,)
     rest_bends: Tensor  # (S, 2)
     gains: Tensor  # (n,) metres per unit of q
-    lengths: Tensor | None  # (S,), of extensible segments None
+    lengths: Tensor | None  # of the segments that are not extensible; None without such
 
     @property
     def reach(self) -> Tensor:
         """The natural size of the robot, shape () [m]: its backbone, or else 10 mean radii."""
         return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
+
+    @property
+    def absolute(self) -> Tensor:
+        """Which actuators (n,) have absolute lengths, as those of extensible segments have."""
+        own = np.repeat(self.extensible, self.actuators_per_segment)
+        own[: self.stage is not None] = False
+        return torch.from_numpy(own).to(self.radii.device)
 
     @property
     def in_metres(self) -> bool:
@@ -83,9 +99,9 @@ class ArcChain(Chain):
 
     def _checked(self, routing: str, *given: Any) -> dict[str, Tensor]:
         """Set the structure of the chain, and return its `arc_geometry` of what is given."""
-        if routing not in _ROUTINGS:
-            raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
-        self.actuators_per_segment, geometry = arc_geometry(*given)
+        counts, self.extensible, geometry = arc_geometry(*given)
+        self.actuators_per_segment = counts
+        self.starts = path_starts(routing, counts, self.extensible)
         self.n_segments, self.n_actuators = len(geometry["radii"]), len(geometry["angles"])
         self.routing, self.tip_at = routing, float(self.n_segments)
         return geometry
@@ -124,7 +140,10 @@ class ArcChain(Chain):
         length, bending = self._split(self._to_tip(arcs))
         _, columns = tip_and_columns(length, bending, self._tip_offsets().to(q), angular=True)
         parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
-        return torch.cat(parts, dim=-2)
+        J = torch.cat(parts, dim=-2)
+        if self.stage is not None:  # which turns the tip's frame with all that follows
+            J[..., 3:, 0] = (self.gains[0] * self.base[:3, 2]).to(q)
+        return J
 
     def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivative of the tip along changes of the geometry, in closed form.
@@ -195,12 +214,15 @@ class ArcChain(Chain):
         Tensor of shape (..., S + 1, 4, 4)
             Homogeneous transforms into the measuring frame; the last one is the robot's end.
         """
-        return self._poses(*self.arcs(q), self.offsets)
+        poses = self._poses(*self.arcs(q), self.offsets)
+        return poses if self.stage is None else rolled(poses, self.metres(q)[..., :1])
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
         arcs = self._leading(self._to_tip(self._arcs(q)), q)
-        return self._poses(*arcs, self._tip_offsets())[..., -1, :, :]
+        poses = self._poses(*arcs, self._tip_offsets())[..., -2:, :, :]
+        poses = poses if self.stage is None else rolled(poses, self.metres(q)[..., :1])
+        return poses[..., -1, :, :]
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)`."""
@@ -291,8 +313,10 @@ class ArcChain(Chain):
         name = name if self.in_metres else f"{name}` times `gains"
         # Of limits that are not there, and of speeds, q itself is small.
         metres = torch.minimum((self.gains.to(q) * q).abs(), self.metres(q).abs())
-        limit = 10.0 if self.lengths is None else LONGEST_PULL * float(self.lengths.detach().sum())
-        message = millimetres_message(name, metres, factor * limit)
+        pull = LONGEST_PULL * self.reach.detach()
+        beyond = metres > factor * torch.where(self.absolute, 10.0, pull).to(q)
+        beyond[..., : self.stage is not None] = False  # an angle
+        message = millimetres_message(name, metres[beyond], 0.0)
         return [] if message is None else [message]
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -321,7 +345,7 @@ class ArcChain(Chain):
         at = levers(self.radii, self.angles, counts).to(rows)
         turned = torch.stack([-at[1], at[0]]) * change["angles"][:, None]
         moved = turned + levers(change["radii"], self.angles.to(rows), counts)
-        return change, reading_matrix(moved, counts, self.routing, False)
+        return change, reading_matrix(moved, counts, self.starts)[..., self.n_segments :]
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, 3 m) up to the tip and their derivative, (3 m, n) or (N, 3 m, n).
@@ -423,13 +447,7 @@ class ArcChain(Chain):
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
         """Return the chain of a description."""
-        counts = stored.list_of(int, "actuators_per_segment")
-        may_lack = ("lengths", "gains")
-        names = [name for name in cls._entries if name not in may_lack or name in stored.arrays]
-        entries: dict[str, Any] = {name: stored.array(name) for name in names}
-        if sum(counts) != len(entries["angles"]):
-            raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
-        entries["angles"] = np.split(entries["angles"], np.cumsum(counts)[:-1])
-        entries |= {"routing": stored.value("routing", str), "n_actuators": counts}
-        chain = cls(**entries, dtype=torch.from_numpy(entries["base"]).dtype)
-        return chain.with_tip(stored.value("tip_at", float))
+        given = stored_arguments(stored, cls._entries)
+        chain = cls(**given, dtype=torch.from_numpy(given["base"]).dtype)
+        angles = torch.from_numpy(stored.array("angles"))
+        return chain.with_geometry(angles=angles).with_tip(stored.value("tip_at", float))

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform, identity
 from hybridkin._core.stored import Layout
-from hybridkin.chains._arcs import levers, reading_matrix
-from hybridkin.chains._checks import filled, float_dtype
+from hybridkin.chains._arcs import free_arcs, levers, reading_matrix, turned_by_first
+from hybridkin.chains._checks import bend_counts, filled, float_dtype
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
 
 __all__ = ["ConstantCurvatureChain"]
@@ -34,7 +35,9 @@ class ConstantCurvatureChain(ArcChain):
     radii : array-like of shape (S,)
         Radius of the actuator circle of each segment, base to tip [m].
     n_actuators : int or sequence of S ints, default=3
-        Actuators of each segment, at least 3.
+        Actuators of each segment. Actuators in one plane, as an antagonistic pair, bend a segment
+        in that plane only; across it keeps its rest bend. A single actuator of an extensible
+        segment moves it straight: a rigid insertion stage.
     angles : array-like, optional
         Actuator angles about the backbone, counter-clockwise from the base x-axis [rad]: shape
         ``(n,)`` for all segments alike, ``(S, n)``, or one sequence per segment. Default: evenly
@@ -42,10 +45,12 @@ class ConstantCurvatureChain(ArcChain):
     lengths : array-like of shape (S,), optional
         None for extensible segments: q holds absolute actuator lengths [m] (pneumatic trunk).
         Otherwise backbone lengths [m] of inextensible segments: q holds the *changes* of tendon
-        length from straight [m], negative where a tendon is shortened.
+        length from straight [m], negative where a tendon is shortened. A list with None for some
+        segments mixes both.
     routing : {"segment", "base"}, default="segment"
         "segment": each actuator spans its own segment. "base": actuators of a segment also run
-        through all segments nearer the base, at their own radius and angle.
+        through all segments nearer the base, at their own radius and angle, back to the last stage,
+        which carries them.
     offsets : float or array-like of shape (S,), default=0.0
         Rigid length after each segment along its tangent [m]; the last one is the tool.
     rest_bends : float or array-like of shape (S, 2), default=0.0
@@ -57,6 +62,10 @@ class ConstantCurvatureChain(ArcChain):
         Metres per unit of q, of all actuators, of each segment or of each actuator; negative where
         q counts the other way. q, Jacobians and limits are then in that unit, for example motor
         counts. A list of lists, one per segment, is accepted too.
+    stage : {None, "rotation"}, default=None
+        "rotation": the first segment is a rigid stage of one actuator, an angle [rad] that turns
+        all that follows about the z-axis of the base. Its length is None, and its radius has no
+        effect.
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
         Pose of the robot's base in the measuring frame. Default: identity.
     dtype : torch.dtype, default=torch.float64
@@ -79,9 +88,12 @@ class ConstantCurvatureChain(ArcChain):
     layout = Layout(
         "constant_curvature",
         dict.fromkeys(_entries, ""),
-        STRUCTURE,
+        {**STRUCTURE, "extensible": list, "bends": list, "stage": str},
         derived=("arc_matrix", "arc_offset"),
     )
+    _structure = (*ArcChain._structure, "bends", "stage")
+
+    bends: tuple[int, ...]  # how many directions each segment bends in
 
     def __init__(
         self,
@@ -89,30 +101,31 @@ class ConstantCurvatureChain(ArcChain):
         *,
         n_actuators: int | Sequence[int] = 3,
         angles: Numbers | None = None,
-        lengths: Numbers | None = None,
+        lengths: Numbers | Sequence[float | None] | None = None,
         routing: str = "segment",
         offsets: Numbers = 0.0,
         rest_bends: Numbers = 0.0,
         actuator_zeros: Numbers = 0.0,
         gains: Numbers = 1.0,
+        stage: str | None = None,
         base: Numbers | Transform | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
         dtype = float_dtype(dtype)
         geometry = self._checked(
-            routing, radii, lengths, n_actuators, 3, angles, offsets, rest_bends, gains, base, dtype
+            routing, radii, lengths, n_actuators, angles, offsets, rest_bends, gains, base, dtype
         )
         zeros = filled(actuator_zeros, "actuator_zeros", dtype, (self.n_actuators,))
-        rows = geometry["angles"].split(self.actuators_per_segment)
-        for row in rows:
-            sees = [row.cos(), row.sin(), torch.ones_like(row)]
-            if torch.linalg.cond(torch.stack(sees[: 3 if lengths is None else 2])) > 1e6:
-                raise ValueError(
-                    "`angles` must determine the bending of every segment, got "
-                    f"{[row.tolist() for row in rows]}; give each segment at least 3 actuators at "
-                    "different angles [rad]."
-                )
+        self.bends = bend_counts(
+            geometry["angles"].split(self.actuators_per_segment), self.extensible
+        )
+        self.stage = stage
+        if stage not in (None, "rotation") or (stage and self.bends[0] > 0):
+            raise ValueError(
+                '`stage` must be None or "rotation", which takes a first segment of one actuator '
+                f"and without a length, got {stage!r}."
+            )
         self._set_geometry({**geometry, "actuator_zeros": zeros})
 
     @property
@@ -149,10 +162,8 @@ class ConstantCurvatureChain(ArcChain):
         >>> chain.consistency(q).round(decimals=6)
         tensor([0.0000, 0.0030], dtype=torch.float64)
         """
-        rows, readings = self.metres(self._rows(q)), self._readings().to(q)
-        residual = (
-            rows - rows @ (readings @ (self.arc_matrix / self.gains).to(q)[-readings.shape[1] :]).T
-        )
+        rows = self.metres(self._rows(q))
+        residual = rows - rows @ (self._readings() @ (self.arc_matrix / self.gains)).to(q).T
         return self._by_segment(residual, q)
 
     def contradictory(self, q: Tensor) -> Tensor:
@@ -203,13 +214,11 @@ class ConstantCurvatureChain(ArcChain):
         -------
         str or None
             The number of rows that are `contradictory`, and the worst of them. None where there
-            are none, and for extensible segments.
+            are none; extensible segments do not count.
         """
-        if self.lengths is None:
-            return None
         with torch.no_grad():
             rows = q.reshape(-1, self.n_actuators)
-            wrong = self.contradictory(rows)
+            wrong = self.contradictory(rows) & ~torch.tensor(self.extensible, device=q.device)
             if not wrong.any():
                 return None
             residual = self.consistency(rows) * wrong
@@ -225,17 +234,17 @@ class ConstantCurvatureChain(ArcChain):
     @property
     def limits(self) -> dict[str, Any]:
         """None for tendons; the actuators of extensible segments have lengths above 0 m."""
-        if self.lengths is not None:
+        if not self.absolute.any():
             return super().limits
-        if self.in_metres and not self.actuator_zeros.any():
+        if self.absolute.all() and self.in_metres and not self.actuator_zeros.any():
             return super().limits | {"q_min": 0.0}
-        low = torch.where(self.gains > 0, self.actuator_zeros, -torch.inf)
-        high = torch.where(self.gains < 0, self.actuator_zeros, torch.inf)
+        low = torch.where(self.absolute & (self.gains > 0), self.actuator_zeros, -torch.inf)
+        high = torch.where(self.absolute & (self.gains < 0), self.actuator_zeros, torch.inf)
         return super().limits | {"q_min": low, "q_max": high}
 
     def _check_rows(self, rows: Tensor, name: str) -> None:
-        lengths = self.metres(rows)
-        if self.lengths is None and (lengths <= 0).any():
+        lengths = torch.where(self.absolute.to(rows.device), self.metres(rows), 1.0)
+        if (lengths <= 0).any():
             row = int((lengths <= 0).any(dim=1).nonzero()[0])
             raise ValueError(
                 f"`{name}` must hold positive actuator lengths [m], got {lengths[row].min():.6g} "
@@ -244,22 +253,22 @@ class ConstantCurvatureChain(ArcChain):
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
-        kind = "extensible" if self.lengths is None else "inextensible"
-        return f"{kind}, {super().extra_repr()}"
+        kinds = ["extensible" if own else "inextensible" for own in self.extensible]
+        kinds[0] = kinds[0] if self.stage is None else f"{self.stage} stage"
+        return f"{' and '.join(dict.fromkeys(kinds))}, {super().extra_repr()}"
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         super()._set_geometry(geometry)
-        radii, lengths = self.radii, self.lengths
-        readings = self._readings()
+        radii, free = self.radii, self._free_arcs(self.angles)
         # In bendings times radius: one unit for all, or half of the digits would go.
         units = torch.cat([torch.ones_like(radii), 1.0 / radii, 1.0 / radii])
-        scaled = readings * units[-readings.shape[1] :]
-        inverse = torch.linalg.solve(scaled.mT @ scaled, scaled.mT)
+        scaled = self._readings() * units @ free
+        held = identity(len(free), free) - free
+        inverse = torch.linalg.solve(scaled.mT @ scaled + held, scaled.mT)
         # One step of refinement: the normal equations lose some digits.
-        inverse = inverse + (identity(len(inverse), inverse) - inverse @ scaled) @ inverse
-        matrix = nn.functional.pad(inverse, (0, 0, len(units) - len(inverse), 0))
-        matrix = matrix * units[:, None] * self.gains
-        straight = torch.zeros_like(radii) if lengths is None else lengths
+        inverse = inverse + (free - inverse @ scaled) @ inverse
+        matrix = inverse * units[:, None] * self.gains
+        straight = self._placed(self.lengths, radii)
         offset = torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
         self.register_buffer("arc_matrix", matrix)
         self.register_buffer("arc_offset", offset)
@@ -271,34 +280,53 @@ class ConstantCurvatureChain(ArcChain):
         return torch.stack(norms, dim=-1).reshape(*q.shape[:-1], self.n_segments)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        matrix = self.arc_matrix.to(rows)
-        return torch.addmm(self.arc_offset.to(rows)[:, None], matrix, rows.T), matrix
+        arcs, matrix = self._linear(rows), self.arc_matrix.to(rows)
+        return (arcs, matrix) if self.stage is None else turned_by_first(arcs, matrix[..., None])
+
+    def _linear(self, rows: Tensor) -> Tensor:
+        """Return the arcs (3 S, N) of rows (N, n) before a rotation, whose angle is a length."""
+        return torch.addmm(self.arc_offset.to(rows)[:, None], self.arc_matrix.to(rows), rows.T)
 
     def _readings(self) -> Tensor:
         at = levers(self.radii, self.angles, self.actuators_per_segment)
-        return reading_matrix(at, self.actuators_per_segment, self.routing, self.lengths is None)
+        return reading_matrix(at, self.actuators_per_segment, self.starts)
+
+    def _free_arcs(self, angles: Tensor) -> Tensor:
+        return free_arcs(angles.split(self.actuators_per_segment), self.extensible, self.bends)
+
+    def _placed(self, lengths: Tensor | None, radii: Tensor) -> Tensor:
+        """Return lengths (..., S) of all segments, zero where extensible, from those of others."""
+        if lengths is None:
+            return torch.zeros_like(radii)
+        return lengths @ identity(self.n_segments, lengths)[np.logical_not(self.extensible)]
 
     def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
         def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-            return by_arcs @ self._arc_tangents(rows, tangents).mT
+            moved = self._arc_tangents(rows, tangents).permute(2, 1, 0)
+            if self.stage is not None:
+                moved = turned_by_first(self._linear(rows), moved)[1]
+            return by_arcs @ moved.permute(2, 0, 1)
 
         return self._arcs_and_slope(rows)[0], change
 
     def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
         change, by_reading = self._changes(rows, tangents)
-        readings, S = self._readings().to(rows), self.n_segments
-        by_reading = nn.functional.pad(by_reading, (readings.shape[1] - 2 * S, 0))
-        # The derivative of a least-squares inverse M of B, with M M' = (B' B)^-1.
-        inverse = (self.arc_matrix / self.gains).to(rows)  # of actuators in metres
-        M = inverse[-readings.shape[1] :]
+        readings, free = self._readings().to(rows), self._free_arcs(self.angles).to(rows)
+        by_reading = nn.functional.pad(by_reading, (self.n_segments, 0)) @ free
+        if 1 in self.bends:  # planes turn with their actuators
+            turns = torch.func.jacfwd(self._free_arcs)(self.angles).to(rows)
+            by_reading = by_reading + readings @ (turns @ change["angles"].mT).permute(2, 0, 1)
+        # The derivative of the pseudo-inverse M of the readings B of free arcs, with M B = free
+        # (Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12).
+        M = (self.arc_matrix / self.gains).to(rows)  # of actuators in metres
         contradicted = identity(len(readings), rows) - readings @ M
         by_matrix = M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
-        by_matrix = nn.functional.pad(by_matrix, (0, 0, 3 * S - len(M), 0))
-        straight = change.get("lengths", torch.zeros_like(change["radii"]))
+        by_matrix = by_matrix + (identity(len(free), free) - free) @ by_reading.mT @ M.mT @ M
+        straight = self._placed(change.get("lengths"), change["radii"])
         rest = torch.cat([straight, *change["rest_bends"].unbind(-1)], dim=-1)
         shift = rest - change["actuator_zeros"] @ self.arc_matrix.to(rows).T
         moving = (self.metres(rows) @ by_matrix.flatten(0, 1).T).unflatten(1, by_matrix.shape[:2])
         if "gains" in tangents:
-            moving = moving + ((rows - self.rest.to(rows))[:, None] * change["gains"]) @ inverse.T
+            moving = moving + ((rows - self.rest.to(rows))[:, None] * change["gains"]) @ M.T
         return moving + shift

@@ -124,11 +124,11 @@ class ElasticTendonChain(ArcChain):
     ) -> None:
         super().__init__()
         dtype = float_dtype(dtype)
-        if lengths is None:
-            raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
         geometry = self._checked(
-            routing, radii, lengths, n_actuators, 1, angles, offsets, rest_bends, gains, base, dtype
+            routing, radii, lengths, n_actuators, angles, offsets, rest_bends, gains, base, dtype
         )
+        if any(self.extensible):
+            raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
         if self.n_actuators > _slack.MOST:
             raise ValueError(
                 f"`n_actuators` must be at most {_slack.MOST} in all, got {self.n_actuators}."
@@ -166,9 +166,10 @@ class ElasticTendonChain(ArcChain):
         >>> ElasticTendonChain.from_chain(plain).lengths
         tensor([0.1000], dtype=torch.float64)
         """
-        if chain.lengths is None:
+        if any(chain.extensible):
             raise ValueError(
-                "`chain` must have `lengths`: the actuators of extensible segments are no tendons."
+                "`chain` must have `lengths` in all segments: the actuators of extensible segments "
+                "are no tendons."
             )
         geometry, counts = chain.geometry(), chain.actuators_per_segment
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
@@ -218,7 +219,7 @@ class ElasticTendonChain(ArcChain):
         at = levers(self.radii, self.angles, counts)
         one = torch.ones_like(self.radii)
         return _slack.Elasticity(
-            reading_matrix(at, counts, self.routing, True),
+            reading_matrix(at, counts, self.starts),
             torch.cat([one, 1.0 / self.radii, 1.0 / self.radii]),
             torch.cat([self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]),
             torch.cat([0.0 * one, *self.rest_bends.unbind(-1)]),

@@ -63,6 +63,8 @@ class _Robot:
         self.extensible = chain.lengths is None
         self.length = 0.0 if self.extensible else float(chain.lengths.detach().sum())
         self.ends = np.cumsum(chain.actuators_per_segment)[:-1]
+        self.absolute = chain.absolute.cpu().numpy()
+        self.pulled = ~np.repeat(chain.extensible, chain.actuators_per_segment)
 
     def tips(self, q: NDArray) -> NDArray:
         """Return the tips (N, 3) of rows q [m]."""
@@ -75,10 +77,9 @@ class _Robot:
         All bends by a factor, as radii that are off make them; an offset or a drift of one
         actuator, in standard deviations.
         """
-        found, rest, t = {}, np.zeros_like(q), np.linspace(0.0, 1.0, len(q))
-        if self.extensible:
-            parts = np.split(q, self.ends, axis=1)
-            rest = np.hstack([0.0 * part + part.mean(axis=1, keepdims=True) for part in parts])
+        found, t, parts = {}, np.linspace(0.0, 1.0, len(q)), np.split(q, self.ends, axis=1)
+        rest = np.hstack([0.0 * part + part.mean(axis=1, keepdims=True) for part in parts])
+        rest[:, self.pulled] = 0.0
         for by in _BENDS:
             found["size", by, 0.0] = rest + by * (q - rest)
         for kind, way in (("offset", np.ones(len(q))), ("drift", t)):
@@ -113,28 +114,31 @@ def _kind_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         yield LogFinding("units", "error", message, f"{_CONVERT}.")
         return
     what, kind, advice = "tendons, whose q are changes of length", "geometry", _ADVICE["whole"]
-    if robot.extensible:
+    own, wrong = robot.pulled, robot.pulled.any() and (low > 0.1 * high)[robot.pulled].all()
+    if not (low > 0)[robot.absolute].all():
         what, advice = "chambers, whose q are positive lengths", _ADVICE["changes"]
-        if ((low > 0) | (high < 0)).all():
-            kind, advice = "sign", _sign_advice(log, _signs(np.where(high < 0, -1, 1)))
-    if not (low > 0).all() if robot.extensible else (low > 0.1 * high).all():
-        span = f"lies between {1e3 * low.min():.4g} and {1e3 * high.max():.4g} mm"
+        own, wrong, turned = robot.absolute, True, robot.absolute & (high < 0)
+        if ((low > 0) | (high < 0))[own].all():
+            kind, advice = "sign", _sign_advice(log, _signs(np.where(turned, -1, 1)))
+    if wrong:
+        span = f"lies between {1e3 * low[own].min():.4g} and {1e3 * high[own].max():.4g} mm"
         message = f"the robot is described with {what}, but q {span}."
         yield LogFinding(kind, "error", message, advice)
 
 
 def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
-    q, radii, length = log.q, robot.radii, robot.length
+    q, radii, own = log.q, robot.radii, robot.absolute
+    length = robot.length + sum(part.mean() for part in np.split(own * q, robot.ends, axis=1))
     if robot.extensible:
-        size, radius, (low, usual, high) = float(np.median(q)), radii.mean(), _LONG
+        size, radius, (low, usual, high) = float(np.median(q[:, own])), radii.mean(), _LONG
         # As long as q says; in which unit is asked next.
-        length = sum(part.mean() for part in np.split(q, robot.ends, axis=1))
         length /= 1.0 if low <= size / radius <= high else _factor(size / radius, usual)
     else:
         # A tendon bends its own segment, with routing "base" all before it too.
         spans = np.cumsum(radii) if robot.chain.routing == "base" else radii
         pulls, spans = np.abs(q).max(axis=0), np.repeat(spans, robot.chain.actuators_per_segment)
-        size, radius = max(zip(pulls, spans, strict=True), key=lambda pair: pair[0] / pair[1])
+        pairs = zip(pulls[robot.pulled], spans[robot.pulled], strict=True)
+        size, radius = max(pairs, key=lambda pair: pair[0] / pair[1])
         low, usual, high = _BEND
     stroke, spread = size / radius, float(np.linalg.norm(np.ptp(log.x, axis=0)))
     reach = spread / (length + robot.offsets)
@@ -180,8 +184,9 @@ def _sign_advice(log: Log, way: Way) -> str:
 
 
 def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterator[LogFinding]:
-    chain, flip = robot.chain, _sign_advice(log, _signs(np.full(log.q.shape[1], -1)))
-    if not robot.extensible and log.q.max() > 20 * max(-log.q.min(), 0.0):
+    chain, flip = robot.chain, _sign_advice(log, _signs(np.where(robot.pulled, -1, 1)))
+    pulls = log.q[:, robot.pulled]
+    if not robot.extensible and pulls.max() > 20 * max(-pulls.min(), 0.0):
         message = "the tendons are only ever lengthened; shortening must be negative."
         yield LogFinding("sign", "warning", message, flip)
         return

@@ -116,7 +116,7 @@ def better_way(chain: Any, q: NDArray, x: NDArray, base_is_free: bool) -> tuple[
 
     Changes are tried one after the other, from the best few of the round before.
     """
-    counts, signed = chain.actuators_per_segment, chain.lengths is not None
+    counts, signed = chain.actuators_per_segment, not any(chain.extensible)
     rows = np.linspace(0, len(q) - 1, min(len(q), _ROWS)).astype(int)
     q, x, tried = q[rows], x[rows], [*changes(counts, signed)]
     kept = [as_declared(sum(counts))]

@@ -128,6 +128,8 @@ def whole_chain(plan: Plan, stored: Stored) -> int:
 
 def _constant_curvature(plan: Plan, stored: Stored) -> int:
     given, radii = stored.arrays.get("lengths"), stored.array("radii")
+    if stored.settings.get("stage") is not None:
+        raise NoKernel("a chain on a rotation stage has no kernel")
     frame, share = _frame(plan, stored, 10.0 * radii.mean() if given is None else given.sum())
     m, S = len(share), len(radii)
     # Segment by segment: lengths, x-, y-bendings.

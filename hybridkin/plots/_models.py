@@ -77,6 +77,8 @@ def _around_arcs(
     """Return the actuators, each (K, P_i, 3), and the rims of the disks (K, S + 1, C, 3)."""
     bending, frames, offsets = map(plain, (chain.arcs(q)[1], chain.poses(q), chain.offsets))
     radii, S = plain(chain.radii), chain.n_segments
+    if chain.stage is not None:  # into the frames that turn with it
+        bending = bending @ (frames[:, 0, :3, :3].swapaxes(1, 2) @ frames[:, 1, :3, :3])[:, :2, :2]
     n_points = (points.shape[1] - 1) // S
     angles = np.split(plain(chain.angles), np.cumsum(chain.actuators_per_segment)[:-1])
     t = np.linspace(0.0, 1.0, n_points + 1)
@@ -98,10 +100,9 @@ def _around_arcs(
 
     actuators, disks = [], [disk(0, 0, radii[0])]
     for s in range(S):
-        first = 0 if chain.routing == "base" else s
         for angle in angles[s]:
             at = radii[s] * np.array([np.cos(angle), np.sin(angle), 0.0])
-            path = [centres[k] + turns[k] @ at for k in range(first, s + 1)]
+            path = [centres[k] + turns[k] @ at for k in range(chain.starts[s], s + 1)]
             actuators.append(np.concatenate(path, axis=1))
         disks.append(disk(s, -1, radii[s:].max() if chain.routing == "base" else radii[s]))
     return actuators, np.stack(disks, axis=1)

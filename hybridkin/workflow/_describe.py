@@ -90,9 +90,10 @@ def geometry(chain: Chain) -> dict[str, Any]:
         return found
     parts = {name: real_array(value, name) for name, value in chain.geometry().items()}
     angles = np.split(np.degrees(parts["angles"]), np.cumsum(chain.actuators_per_segment)[:-1])
+    lengths = iter(parts.get("lengths", ()))
     columns = {
         "radius": parts["radii"],
-        "length": parts.get("lengths", [None] * len(angles)),
+        "length": [None if own else next(lengths) for own in chain.extensible],
         "offset": parts["offsets"],
         "angles_deg": angles,
         "rest_bend_deg": np.degrees(parts["rest_bends"].reshape(-1, 2)),
@@ -104,15 +105,16 @@ def geometry(chain: Chain) -> dict[str, Any]:
             columns[name] = parts[name].ravel()
     rows = zip(*columns.values(), strict=True)
     segments = [dict(zip(columns, row, strict=True)) for row in rows]
-    return {**found, "routing": chain.routing, "segments": segments}
+    stage = {} if chain.stage is None else {"stage": chain.stage}
+    return {**found, **stage, "routing": chain.routing, "segments": segments}
 
 
 def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
     if geometry is None:
         report.text("No mechanical model.")
         return
-    routing = f", routing {geometry['routing']}" if "routing" in geometry else ""
-    report.text(f"Mechanical model: {geometry['kind']}{routing}.")
+    parts = [f", {key} {geometry[key]}" for key in ("stage", "routing") if key in geometry]
+    report.text(f"Mechanical model: {geometry['kind']}{''.join(parts)}.")
     rows = []
     for k, entry in enumerate(geometry.get("segments", [])):
         length = "extensible" if entry["length"] is None else f"{1e3 * entry['length']:.2f}"

@@ -18,6 +18,7 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.workflow.model import LoadedModel
 
 _WALKERS, _STEPS, _STEP = 256, 60, 0.12  # length of a step, as a share of the range
+_PLANAR = 1e-9  # of singular values: tendons in one plane
 _EASE = 0.5  # domain distance from which the posture turns back; 1 is the edge of the domain
 
 
@@ -136,7 +137,7 @@ class Domain:
     def tendons(self) -> ArcChain | None:
         """The chain, where the robot is one of tendons."""
         chain = self.loaded.chain
-        return chain if isinstance(chain, ArcChain) and chain.lengths is not None else None
+        return chain if isinstance(chain, ArcChain) and not any(chain.extensible) else None
 
     @property
     def rest(self) -> NDArray:
@@ -186,7 +187,7 @@ class Domain:
         ends, angles = np.cumsum(chain.actuators_per_segment), as_array(chain.angles.detach())
         for own in np.split(np.arange(len(low)), ends[:-1]):
             axes = np.stack([np.cos(angles[own]), np.sin(angles[own])], axis=1)
-            q[:, own] = q[:, own] @ axes @ np.linalg.pinv(axes)
+            q[:, own] = q[:, own] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
             q[:, own] -= (q[:, own] - high[own]).max(axis=1, keepdims=True).clip(min=0.0)
         return rest + q[((q >= low) & (q <= high)).all(axis=1)] / gains
 
@@ -198,11 +199,11 @@ class Domain:
         each other.
         """
         chain = self.loaded.chain
-        if not isinstance(chain, ConstantCurvatureChain) or chain.lengths is None:
+        if not isinstance(chain, ConstantCurvatureChain) or any(chain.extensible):
             return np.eye(self.loaded.n_actuators)
         zero = torch.from_numpy(np.zeros(chain.n_actuators))
         slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
-        return (torch.linalg.pinv(slopes) @ slopes).numpy()
+        return (torch.linalg.pinv(slopes, rtol=_PLANAR) @ slopes).numpy()
 
     def posture(self, pull: float) -> Callable[[Tensor], Tensor] | NDArray:
         """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.

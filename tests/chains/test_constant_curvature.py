@@ -68,6 +68,31 @@ CHAINS = {
         0.0,
         0.005,
     ),
+    "pairs": (
+        ConstantCurvatureChain(
+            [0.1, 0.08, 0.09],
+            n_actuators=[2, 3, 2],
+            angles=[[0.4, 0.4 + math.pi], [0.0, 2.0, 4.0], [1.9, 1.9 + math.pi]],
+            routing="base",
+            rest_bends=[[0.2, -0.1], [0.0, 0.3], [-0.4, 0.0]],
+            offsets=0.01,
+        ),
+        0.25,
+        0.06,
+    ),
+    "on a rotating and moving stage": (
+        ConstantCurvatureChain(
+            [0.1, 0.1, 0.1, 0.08],
+            n_actuators=[1, 1, 3, 2],
+            lengths=[None, None, 0.2, 0.3],
+            routing="base",
+            offsets=[0.1, 0.0, 0.02, 0.0],
+            stage="rotation",
+            base=pose(rotation_z(0.7), [0.1, 0.2, 0.3]),
+        ),
+        0.25,
+        0.06,
+    ),
 }
 each_chain = pytest.mark.parametrize(("chain", "center", "width"), CHAINS.values(), ids=CHAINS)
 
@@ -794,7 +819,7 @@ def test_reverse_mode_jacobian_of_any_module(rng):
         (lambda: ConstantCurvatureChain([[0.1]]), r"`radii` must have shape \(n,\)"),
         (lambda: ConstantCurvatureChain([0.1, float("nan")]), "`radii` must be finite"),
         (lambda: ConstantCurvatureChain(["a"]), "`radii` must be numeric"),
-        (lambda: bha(n_actuators=2), "at least 3 on every segment"),
+        (lambda: bha(n_actuators=[3, 0, 3]), "at least 1 on every segment"),
         (lambda: bha(n_actuators=2.5), "`n_actuators` must be one whole number .* got 2.5"),
         (lambda: bha(n_actuators=[3, 3]), "`n_actuators` must be one whole number or 3"),
         (lambda: bha(angles=[0.0, 0.0, 0.0]), "`angles` must determine the bending"),

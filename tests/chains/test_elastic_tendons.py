@@ -51,7 +51,7 @@ def change_of_shape(chain, q):
 def least_energy(chain, q):
     """Return the shapes of least energy by bounded least squares, slackness as an unknown."""
     at = levers(chain.radii, chain.angles, chain.actuators_per_segment)
-    B = reading_matrix(at, chain.actuators_per_segment, chain.routing, True).numpy()
+    B = reading_matrix(at, chain.actuators_per_segment, chain.starts).numpy()
     bending = chain.bending_stiffness
     root = torch.cat([chain.axial_stiffness, bending, bending]).sqrt().numpy()
     rest = np.concatenate([np.zeros(chain.n_segments), *chain.rest_bends.T.numpy()])
@@ -104,7 +104,7 @@ def test_forces_balance_where_it_rests(chain, rng):
     q = random_q(rng, 200, chain.n_actuators)
     shape, tension = change_of_shape(chain, q), chain.tensions(q)
     at = levers(chain.radii, chain.angles, chain.actuators_per_segment)
-    B = reading_matrix(at, chain.actuators_per_segment, chain.routing, True)
+    B = reading_matrix(at, chain.actuators_per_segment, chain.starts)
     stretch = shape @ B.T - q + chain.tendon_zeros
     assert_close(tension, stretch.relu(), rtol=0, atol=1e-15)
     assert torch.equal(chain.slack(q) & (tension > 0), torch.zeros_like(tension > 0))
