@@ -131,7 +131,7 @@ def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:
     return [zero, zero, zero, *by_x, *by_y]
 
 
-def arc_transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
+def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     """Return the transforms (..., S, 4, 4) from segment ends, offsets included, to their starts."""
     arc = stumpff(bending.square().sum(-1))
     x, y = bending.unbind(-1)

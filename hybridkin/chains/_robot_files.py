@@ -160,8 +160,8 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     if "rotation" in stages[1:]:
         raise ValueError('`stage` "rotation" must stand in the first [[segment]] alone.')
     given |= {"stage": "rotation"} if stages[0] == "rotation" else {}
-    radii = [radius for radius in given["radii"] if radius is not None] or [1.0]
-    given["radii"] = [radii[0] if radius is None else radius for radius in given["radii"]]
+    any_radius = next(filter(None, given["radii"]), 1.0)  # of stages it has no effect
+    given["radii"] = [radius or any_radius for radius in given["radii"]]
     return ElasticTendonChain(**given) if elastic else ConstantCurvatureChain(**given)
 
 

@@ -17,14 +17,7 @@ from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
-from hybridkin.chains._arcs import (
-    arc_transforms,
-    levers,
-    reading_matrix,
-    rolled,
-    tip,
-    tip_and_columns,
-)
+from hybridkin.chains._arcs import levers, reading_matrix, rolled, tip, tip_and_columns, transforms
 from hybridkin.chains._checks import arc_geometry, path_starts, stored_arguments
 from hybridkin.chains.chain import Chain
 
@@ -214,15 +207,12 @@ class ArcChain(Chain):
         Tensor of shape (..., S + 1, 4, 4)
             Homogeneous transforms into the measuring frame; the last one is the robot's end.
         """
-        poses = self._poses(*self.arcs(q), self.offsets)
-        return poses if self.stage is None else rolled(poses, self.metres(q)[..., :1])
+        return self._poses(*self.arcs(q), self.offsets, q)
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
         arcs = self._leading(self._to_tip(self._arcs(q)), q)
-        poses = self._poses(*arcs, self._tip_offsets())[..., -2:, :, :]
-        poses = poses if self.stage is None else rolled(poses, self.metres(q)[..., :1])
-        return poses[..., -1, :, :]
+        return self._poses(*arcs, self._tip_offsets(), q)[..., -1, :, :]
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)`."""
@@ -406,11 +396,16 @@ class ArcChain(Chain):
         parts = parts.reshape(*q.shape[:-1], *parts.shape[1:])
         return parts[..., 0], parts[..., 1:]
 
-    def _poses(self, length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
-        steps = arc_transforms(length, bending, offsets.to(length))
+    def _poses(
+        self, length: Tensor, bending: Tensor, offsets: Tensor, q: Tensor | None = None
+    ) -> Tensor:
+        """Return the poses of the base and after all arcs; at a q turned with the stage."""
+        steps = transforms(length, bending, offsets.to(length))
         base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
         poses = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
-        return torch.stack([*poses], dim=-3)
+        poses = torch.stack([*poses], dim=-3)
+        turns = q is not None and self.stage is not None
+        return rolled(poses, self.metres(q)[..., :1]) if turns else poses
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         return (self._tip_of(self._to_tip(self._arcs(q)), q),)

@@ -268,7 +268,7 @@ class ConstantCurvatureChain(ArcChain):
         # One step of refinement: the normal equations lose some digits.
         inverse = inverse + (free - inverse @ scaled) @ inverse
         matrix = inverse * units[:, None] * self.gains
-        straight = self._placed(self.lengths, radii)
+        straight = self._placed(radii[:0] if self.lengths is None else self.lengths)
         offset = torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
         self.register_buffer("arc_matrix", matrix)
         self.register_buffer("arc_offset", offset)
@@ -294,10 +294,8 @@ class ConstantCurvatureChain(ArcChain):
     def _free_arcs(self, angles: Tensor) -> Tensor:
         return free_arcs(angles.split(self.actuators_per_segment), self.extensible, self.bends)
 
-    def _placed(self, lengths: Tensor | None, radii: Tensor) -> Tensor:
+    def _placed(self, lengths: Tensor) -> Tensor:
         """Return lengths (..., S) of all segments, zero where extensible, from those of others."""
-        if lengths is None:
-            return torch.zeros_like(radii)
         return lengths @ identity(self.n_segments, lengths)[np.logical_not(self.extensible)]
 
     def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
@@ -323,7 +321,7 @@ class ConstantCurvatureChain(ArcChain):
         contradicted = identity(len(readings), rows) - readings @ M
         by_matrix = M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
         by_matrix = by_matrix + (identity(len(free), free) - free) @ by_reading.mT @ M.mT @ M
-        straight = self._placed(change.get("lengths"), change["radii"])
+        straight = self._placed(change.get("lengths", change["radii"][:, :0]))
         rest = torch.cat([straight, *change["rest_bends"].unbind(-1)], dim=-1)
         shift = rest - change["actuator_zeros"] @ self.arc_matrix.to(rows).T
         moving = (self.metres(rows) @ by_matrix.flatten(0, 1).T).unflatten(1, by_matrix.shape[:2])
