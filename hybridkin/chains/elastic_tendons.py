@@ -124,11 +124,11 @@ class ElasticTendonChain(ArcChain):
     ) -> None:
         super().__init__()
         dtype = float_dtype(dtype)
+        if lengths is None or (isinstance(lengths, (list, tuple)) and None in lengths):
+            raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
         geometry = self._checked(
             routing, radii, lengths, n_actuators, angles, offsets, rest_bends, gains, base, dtype
         )
-        if any(self.extensible):
-            raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
         if self.n_actuators > _slack.MOST:
             raise ValueError(
                 f"`n_actuators` must be at most {_slack.MOST} in all, got {self.n_actuators}."

@@ -9,6 +9,11 @@ from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
+    ElasticTendonChain,
+    HybridForwardModel,
+    InverseKinematics,
+    calibrate,
+    datasets,
     load_model,
     save_model,
 )
@@ -201,3 +206,155 @@ def test_saved_and_loaded(robot, tmp_path):
         q = 0.2 + 0.01 * torch.randn(5, chain.n_actuators, dtype=torch.float64)
         assert_close(again(q), chain(q), rtol=0, atol=0)
         assert repr(again) == repr(chain)
+
+
+def planted(robot, seed, n=150, noise=3e-4, bent=0.0):
+    """Return noisy rows (q, x) of a robot whose radii are up to 10 % off, and the robot."""
+    rng, chain = np.random.default_rng(seed), robot.chain
+    q = torch.stack([robot.actuators(c) for c in robot.free(rng, n)])
+    radii = chain.radii * torch.from_numpy(rng.uniform(0.9, 1.1, len(chain.radii)))
+    truth = chain.with_geometry(radii=radii)
+    x = truth(q).numpy()
+    x[:, 2] -= bent * np.square(x[:, :2]).sum(1)
+    return q.numpy(), x + noise * rng.normal(size=x.shape), truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tendon pairs, through", "mixed", "rotation and insertion"])
+def test_calibration_finds_the_radii_to_their_standard_errors(name):
+    robot, scores = ROBOTS[name], []
+    bends = np.array(robot.chain.bends) > 0
+    for seed in range(5):
+        q, x, truth = planted(robot, seed, n=60)
+        result = calibrate(robot.chain, q, x, ("radii", "base"))
+        off = result.values["radii"] - truth.radii.numpy()
+        scores.append((off / result.std_errors["radii"])[bends])
+        assert (result.identifiable["radii"] == bends).all()
+    # 10 to 20 normal scores: each within 4, and their mean square near one.
+    assert np.abs(scores).max() < 4.0
+    assert 0.3 < np.mean(np.square(scores)) < 2.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["chamber pairs", "insertion", "rotation"])
+@pytest.mark.parametrize("coupling", ["parallel", "serial"])
+def test_hybrids_learn_what_the_chain_leaves(name, coupling):
+    robot = ROBOTS[name]
+    q, x, _ = planted(robot, 0, n=300, bent=0.1)
+    model = HybridForwardModel(robot.chain, "quadratic", coupling=coupling, calibrate=("radii",))
+    model.fit(q[:240], x[:240])
+    found = model.predict(q[240:])
+    left, mechanical = (
+        np.linalg.norm(tips - x[240:], axis=1).mean()
+        for tips in (found, model.predict_mechanical(q[240:]))
+    )
+    assert left < 0.7 * mechanical
+    J, step = model.jacobian(q[240:241])[0], 1e-6 * np.eye(q.shape[1])
+    right = (model.predict(q[240] + step) - model.predict(q[240] - step)).T / 2e-6
+    assert_close(J, right, rtol=0, atol=1e-6 * np.abs(J).max())
+
+
+@pytest.mark.parametrize("name", ["insertion", "rotation and insertion"])
+def test_inverse_kinematics_keeps_lengths_positive_and_turns_freely(name):
+    robot = ROBOTS[name]
+    free = robot.free(np.random.default_rng(3), 20)
+    q = torch.stack([robot.actuators(c) for c in free])
+    ik = InverseKinematics(robot.chain)
+    least = [0.0 if own else -np.inf for own in robot.chain.absolute]
+    assert ik.settings.q_min.tolist() == least
+    found = ik.solve(robot.chain(q), q0=q + 0.02 * torch.sin(torch.arange(q.numel()).view_as(q)))
+    assert found.converged.all()
+    assert_close(robot.chain(found.q), robot.chain(q), rtol=0, atol=1e-4)
+    with pytest.raises(ValueError, match="positive actuator lengths"):
+        robot.chain.check_actuators(-q.abs())
+    (message,) = robot.chain.check_actuators(1e3 * q.abs())
+    assert "looks like millimetres" in message
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: ConstantCurvatureChain([0.01] * 2, lengths=[None, 0.1], routing="base"),
+            "`routing` must be 'segment' where tendons would run through",
+        ),
+        (
+            lambda: ConstantCurvatureChain(
+                [0.01], n_actuators=2, lengths=[0.1], angles=[0.0, 3.14159265]
+            ),
+            "in one plane exactly: psi and psi",
+        ),
+        (
+            lambda: ConstantCurvatureChain([0.01], angles=[1.0, 1.0, 1.0]),
+            "`angles` must determine the bending",
+        ),
+        (
+            lambda: ConstantCurvatureChain([0.01] * 2, stage="rotation"),
+            "takes a first segment of one actuator",
+        ),
+        (
+            lambda: ConstantCurvatureChain(
+                [0.01] * 2, n_actuators=[1, 3], lengths=[0.1, 0.1], stage="rotation"
+            ),
+            "and without a length",
+        ),
+        (
+            lambda: ConstantCurvatureChain([0.01] * 2, n_actuators=[1, 3], stage="turn"),
+            "`stage` must be None or .* got 'turn'",
+        ),
+        (
+            lambda: ConstantCurvatureChain([0.01] * 3, lengths=[None, 0.1]),
+            r"`lengths` must have shape \(2,\)",
+        ),
+        (
+            lambda: ElasticTendonChain([0.01] * 2, [None, 0.1]),
+            "`lengths` must hold the backbone length of every segment",
+        ),
+        (
+            lambda: ElasticTendonChain.from_chain(ROBOTS["mixed"].chain),
+            "`chain` must have `lengths` in all segments",
+        ),
+    ],
+)
+def test_what_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_only_tendons_contradict_each_other():
+    chain = ROBOTS["mixed"].chain
+    q = torch.full((1, chain.n_actuators), 0.25, dtype=torch.float64)
+    q[:, 3:6] = q[:, 8:] = 0.0
+    assert chain.contradiction(q) is None
+    q[:, 8:] = -0.01  # a common pull of a pair
+    assert "segment 4, 10 mm rms" in chain.contradiction(q)
+
+
+def test_two_pairs_elsewhere_in_the_plane_are_one():
+    angles = [0.3, 0.3 + PI, 0.3 + 2 * PI]
+    one = ConstantCurvatureChain([0.01], n_actuators=3, angles=angles, lengths=[0.1])
+    two = ConstantCurvatureChain([0.01], n_actuators=2, angles=angles[:2], lengths=[0.1])
+    q = torch.tensor([[0.01, -0.01]], dtype=torch.float64)
+    assert_close(one(torch.cat([q, q[:, :1]], 1)), two(q), rtol=0, atol=1e-16)
+    assert one.float().with_geometry().bends == (1,)
+    assert ConstantCurvatureChain(
+        [0.01], n_actuators=2, angles=angles[:2], dtype="float32"
+    ).bends == (1,)
+
+
+@pytest.mark.parametrize("name", ["mixed", "rotation and insertion", "tendon pairs, through"])
+def test_checks_of_a_log(name):
+    robot = ROBOTS[name]
+    q, x, _ = planted(robot, 0, n=200)
+    groups = np.arange(200) // 10
+
+    def kinds(q):
+        log = datasets.Log(q=q, x=x, groups=groups)
+        return {finding.kind for finding in datasets.check_log(log, chain=robot.chain).findings}
+
+    assert not kinds(q)
+    tendons = ~np.repeat(robot.chain.extensible, robot.chain.actuators_per_segment)
+    assert kinds(np.where(tendons, 1e3 * q, q)) == {"units"}
+    assert kinds(np.where(tendons, q + 1.0, q)) == {"geometry"}
+    if robot.chain.absolute.any():
+        assert kinds(np.where(robot.chain.absolute, -q, q)) == {"sign"}

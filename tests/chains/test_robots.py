@@ -166,6 +166,44 @@ def test_elastic_tendons(write):
     assert_close(robots.from_toml(write(ELASTIC))(q), expected(q), rtol=1e-13, atol=1e-15)
 
 
+def test_pairs_mixed_segments_and_stages(write):
+    text = """
+        routing = "base"
+        [[segment]]
+        stage = "rotation"
+        offset = 0.1
+        [[segment]]
+        stage = "insertion"
+        [[segment]]
+        radius = 0.005
+        length = 0.1
+        actuators = 2
+        angle_deg = 30
+        repeat = 2
+    """
+    angles = [[0.0], [0.0], *[[math.pi / 6, math.pi / 6 + math.pi]] * 2]
+    expected = ConstantCurvatureChain(
+        [0.005] * 4,
+        n_actuators=[1, 1, 2, 2],
+        angles=angles,
+        lengths=[None, None, 0.1, 0.1],
+        routing="base",
+        offsets=[0.1, 0.0, 0.0, 0.0],
+        stage="rotation",
+    )
+    q = torch.tensor([1.0, 0.2, -0.003, 0.003, 0.001, -0.001], dtype=torch.float64)
+    chain = robots.from_toml(write(text))
+    assert_close(chain.pose(q), expected.pose(q), rtol=1e-14, atol=1e-15)
+    assert repr(chain) == repr(expected)
+    mixed = robots.from_toml(write("[[segment]]\nradius = 0.02\n" + SEGMENT.replace("0.1", "0.02")))
+    assert mixed.extensible == (True, False)
+    counts = "[log]\nq = ['a', 'b', 'c', 'd']\nx = ['x', 'y', 'z']\nq_unit = 'deg'\n"
+    stage = "[[segment]]\nstage = 'rotation'\ngain = 0.5\n" + SEGMENT + "spool_radius = 0.01\n"
+    turned = robots.from_toml(write(stage + counts))
+    q = torch.tensor([2.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    assert_close(turned.metres(q)[0], torch.tensor(math.degrees(1.0)).double(), rtol=1e-7, atol=0)
+
+
 def test_elastic_tendons_by_default(write):
     text = "model = 'elastic-tendon'\nrouting = 'segment'\ncalibrate = ['base']\n"
     robot = robots.read_description(write(text + "[[segment]]\nradius = 0.01\nlength = 0.1\n"))

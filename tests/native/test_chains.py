@@ -111,6 +111,32 @@ def test_arcs(counts, routing):
     check_nan_row(chain, q)
 
 
+@pytest.mark.parametrize("routing", ROUTINGS)
+@pytest.mark.parametrize("lengths", [None, [0.1] * 3, [None, 0.1, 0.1]])
+def test_pairs_and_insertions(lengths, routing):
+    counts = [3, 2, 4] if lengths is None or lengths[0] else [1, 2, 3]
+    rng = np.random.default_rng(0)
+    chain = ConstantCurvatureChain(
+        rng.uniform(0.05, 0.1, 3),
+        n_actuators=counts,
+        lengths=lengths,
+        routing=routing,
+        base=pose_of(rng),
+        offsets=rng.uniform(0.0, 0.1, 3),
+        rest_bends=rng.normal(size=(3, 2)),
+        gains=rng.uniform(0.5, 2.0, sum(counts)),
+    )
+    q = STRAIGHT + 0.06 * rng.uniform(-1, 1, (203, sum(counts)))
+    for tip in (3.0, 1.5, 0.4):
+        check(chain.with_tip(tip), q)
+
+
+def test_a_rotation_stage_is_left_to_torch():
+    chain = ConstantCurvatureChain([0.01] * 2, n_actuators=[1, 3], stage="rotation")
+    with pytest.raises(NoKernel, match="rotation stage"):
+        Plan(chain.stored())
+
+
 def test_a_quarter_circle():
     chain = ConstantCurvatureChain([0.01], lengths=[0.1])
     q = -0.01 * 0.5 * np.pi * np.array([1.0, -0.5, -0.5])
