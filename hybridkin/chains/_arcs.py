@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hybridkin._core.arrays import identity
 from hybridkin._core.stumpff import Stumpff, stumpff
 
 Vector = tuple[Tensor, Tensor, Tensor]  # x, y, z
@@ -187,18 +188,16 @@ def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Seque
     Those are its length if it is extensible, and of its bending both components, none, or the one
     in the plane of its actuators: `bends` of them.
     """
-    blocks = []
-    for own, stretches, n in zip(angles, extensible, bends, strict=True):
-        block = 0.5 * n * torch.eye(2, dtype=own.dtype, device=own.device)
-        if n == 1:  # a plane at the angle psi: [[1 + cos 2 psi, sin 2 psi], ...] / 2
-            x, y = bend_readings(own, stretches)
-            a, b = (x * x - y * y).sum(), 2.0 * (x * y).sum()
-            block = block + 0.5 * torch.stack([a, b, b, -a]).reshape(2, 2) / torch.hypot(a, b)
-        blocks.append(block)
-    S = len(blocks)
-    bending = torch.diag_embed(torch.stack(blocks, -1)).transpose(1, 2).reshape(2 * S, 2 * S)
-    length = torch.diag(bending.new_tensor([*extensible, *[0] * (2 * S)]))
-    return length + torch.nn.functional.pad(bending, (S, 0, S, 0))
+    S = len(bends)
+    free = torch.diag(angles[0].new_tensor([*extensible, *(0.5 * n for n in (*bends, *bends))]))
+    for k in (k for k in range(S) if bends[k] == 1):
+        # In a plane at the angle psi: [[1 + cos 2 psi, sin 2 psi], [sin 2 psi, 1 - cos 2 psi]] / 2.
+        x, y = bend_readings(angles[k], extensible[k])
+        a, b = (x * x - y * y).sum(), 2.0 * (x * y).sum()
+        plane = torch.stack([a, b, b, -a]).reshape(2, 2) / (2.0 * torch.hypot(a, b))
+        at = identity(3 * S, free)[[S + k, 2 * S + k]]
+        free = free + at.T @ plane @ at
+    return free
 
 
 def rolled(poses: Tensor, angle: Tensor) -> Tensor:

@@ -312,15 +312,16 @@ class ConstantCurvatureChain(ArcChain):
         change, by_reading = self._changes(rows, tangents)
         readings, free = self._readings().to(rows), self._free_arcs(self.angles).to(rows)
         by_reading = nn.functional.pad(by_reading, (self.n_segments, 0)) @ free
-        if 1 in self.bends:  # planes turn with their actuators
-            turns = torch.func.jacfwd(self._free_arcs)(self.angles).to(rows)
-            by_reading = by_reading + readings @ (turns @ change["angles"].mT).permute(2, 0, 1)
         # The derivative of the pseudo-inverse M of the readings B of free arcs, with M B = free
         # (Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12).
-        M = (self.arc_matrix / self.gains).to(rows)  # of actuators in metres
+        M, by_matrix = (self.arc_matrix / self.gains).to(rows), 0.0  # of actuators in metres
+        if 1 in self.bends:  # planes turn with their actuators
+            turns = torch.func.jacfwd(self._free_arcs)(self.angles).to(rows)
+            turns = (turns @ change["angles"].mT).permute(2, 0, 1)
+            by_reading = by_reading + readings @ turns
+            by_matrix = (identity(len(free), free) - free) @ turns @ readings.mT @ M.mT @ M
         contradicted = identity(len(readings), rows) - readings @ M
-        by_matrix = M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
-        by_matrix = by_matrix + (identity(len(free), free) - free) @ by_reading.mT @ M.mT @ M
+        by_matrix = by_matrix + M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
         straight = self._placed(change.get("lengths", change["radii"][:, :0]))
         rest = torch.cat([straight, *change["rest_bends"].unbind(-1)], dim=-1)
         shift = rest - change["actuator_zeros"] @ self.arc_matrix.to(rows).T

@@ -25,6 +25,7 @@ from hybridkin import (
     robots,
     trajectories,
 )
+from hybridkin.plots._models import body_of
 
 SPACE = {"projection": "3d"}
 SHIFT = np.array([0.0, 0.01, -0.02])
@@ -118,6 +119,23 @@ def test_boxes_name_every_model(tmp_path):
     plots.ErrorBoxDisplay({"a": [0.01, 0.02], "b": [0.03, 0.05]}).plot(ax)
     assert {t.get_text() for t in ax.get_yticklabels()} == {"a", "b"}
     assert drawn(figure, tmp_path)
+
+
+def test_tendons_on_stages_are_drawn_as_long_as_they_are():
+    lengths = [None, None, 0.1, 0.12]
+    chain = ConstantCurvatureChain(
+        [0.01] * 4,
+        n_actuators=[1, 1, 2, 3],
+        lengths=lengths,
+        routing="base",
+        offsets=[0.1, 0.05, 0.0, 0.0],
+        stage="rotation",
+    )
+    q = np.array([[2.0, 0.2, -0.006, 0.006, 0.01, -0.005, -0.005]])
+    actuators = body_of(chain, q, 400)["actuators"]
+    drawn = [np.linalg.norm(np.diff(path[0], axis=0), axis=1).sum() for path in actuators]
+    straight = np.repeat([0.0, 0.0, 0.1, 0.22], chain.actuators_per_segment)
+    np.testing.assert_allclose(drawn[2:], (straight + q[0])[2:], rtol=1e-5)
 
 
 # Learning curves
