@@ -190,7 +190,8 @@ class ArcChain(Chain):
         length : Tensor of shape (..., S)
             Centre-line lengths [m].
         bending : Tensor of shape (..., S, 2)
-            Bending vectors [rad]: their norm is the bend angle, they point where it bends.
+            Bending vectors [rad]: their norm is the bend angle, they point where it bends. On a
+            rotation stage they are turned with it.
         """
         return self._leading(self._arcs(q), q)
 

@@ -243,7 +243,9 @@ def read_description(path: str | Path) -> RobotDescription:
             [[segment]]                     # base to tip
             radius = 0.0045                 # of the actuator circle [m]
             length = 0.060                  # [m]; leave out for extensible segments
-            actuators = 3                   # the default
+            stage = "rotation"              # of the first segment, or "insertion": a rigid stage of
+                                            # one actuator; beside offset, zeros and gain alone
+            actuators = 3                   # the default; 2 at opposite angles bend in a plane
             angle_deg = 0.0                 # of the first actuator; or angles_deg = [0, 120, 240]
             clockwise = false               # which way the others follow
             offset = 0.0                    # rigid length after the segment [m]
