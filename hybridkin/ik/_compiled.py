@@ -22,9 +22,9 @@ from hybridkin.native.library import Program, in_chunks, library, program_of
 from hybridkin.native.plan import NoKernel, Plan
 
 # The state of `ik_tick`, see native/src/ik_step.h.
-_MODE, _PERIOD, _MEMORY, _SIGMA_MIN, _DAMPING, _DISTANCE = range(6)
-_TARGET, _FEED, _TIP, _OFFSET, _X, _ERROR, _Q = range(6, 25, 3)
-_HAS_TARGET, _HAS_FEED, _HAS_TIP, _MUST_SEE = 1, 2, 4, 8
+_MODE, _PERIOD, _MEMORY, _LAST, _SIGMA_MIN, _DAMPING, _DISTANCE = range(7)
+_TARGET, _FEED, _TIP, _OFFSET, _X, _ERROR, _Q = range(7, 26, 3)
+_HAS_TARGET, _HAS_FEED, _HAS_TIP, _MUST_SEE, _FROM_REST = 1, 2, 4, 8, 16
 # What `hk_ik_find` does and finds, see native/src/ik_search.h.
 _LOWER, _TO_DOMAIN, _TO_POSTURE = 1, 2, 4
 _REACHED, _AT_REST, _HELD = 1, 2, 4
@@ -94,11 +94,14 @@ class Core:
     def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, Program]]:
         return Core, self._made_of
 
-    def step(self, q: Any, target: Any, dx: Any, tip: Any) -> tuple[NDArray, dict] | None:
-        """Return a `Step` of one row of plain arrays and where its fields are, None for others."""
-        if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
+    def step(
+        self, q: Any, target: Any, dx: Any, tip: Any, last: Any
+    ) -> tuple[NDArray, dict] | None:
+        """Return a `Step` of one row of plain arrays from rest and where its fields are, or None."""
+        plain = type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == (self.n,)
+        if not plain or last is not None:
             return None
-        follower = self._idle.pop() if self._idle else Follower(self, None, _MUST_SEE)
+        follower = self._idle.pop() if self._idle else Follower(self, None, _MUST_SEE + _FROM_REST)
         follower.q[...] = q
         found = (follower.state.copy(), self._places) if follower.tick(target, dx, tip) else None
         self._idle.append(follower)
@@ -107,10 +110,10 @@ class Core:
     def steps(self, q: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
         """Return dq, x, error, sigma_min, damping and what is held, of rows q (N, n).
 
-        `given` is the target, its motion in a period, and the measured tip.
+        `given` is the target, its motion in a period, the measured tip, and the step before.
         """
         n, mode = self.n, _MUST_SEE
-        for bit, a in zip((_HAS_TARGET, _HAS_FEED, _HAS_TIP), given, strict=True):
+        for bit, a in zip((_HAS_TARGET, _HAS_FEED, _HAS_TIP), given[:3], strict=True):
             mode += 0 if a is None else bit
         out, held = np.empty((len(q), n + 6)), np.empty((len(q), n), dtype=bool)
         arrays = [None if a is None else _plain(a) for a in (q, *given)]
@@ -189,6 +192,7 @@ class Follower:
         state[_SIGMA_MIN:] = 0.0
         state[[_SIGMA_MIN, _DISTANCE, *range(_ERROR, _Q)]] = math.nan
         state[_X:_ERROR] = self.core.settings.evaluate(q)[0][0]
+        state[_LAST] = 0.0
         self.q[:] = state[_Q + 2 * n : _Q + 3 * n] = q[0]
 
     def tick(self, target: Any, dx: Any, tip: Any) -> bool:

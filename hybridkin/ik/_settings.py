@@ -47,6 +47,12 @@ def require(good: bool | Tensor, message: str) -> None:
         raise ValueError(message)
 
 
+def stopping(way: Tensor, change: Tensor) -> Tensor:
+    """Return the largest first step from which steps that shrink by `change` stop within `way`."""
+    stops = 2.0 * way / (1.0 + (1.0 + 2.0 * way.clamp_min(0.0) / change).sqrt())
+    return torch.where(torch.isfinite(way), stops, way)
+
+
 _FAST = 5.0  # times the largest plausible q in a second is too fast
 
 
@@ -63,6 +69,7 @@ class StepSettings(Portable):
     q_min: Tensor
     q_max: Tensor
     dq_max: Tensor
+    ddq_max: Tensor
     q_pref: Tensor | Posture | None
     beta: float
     gain: float | None
@@ -126,6 +133,11 @@ class StepSettings(Portable):
         return middle if torch.isfinite(middle).all() else None
 
     @property
+    def accelerates(self) -> bool:
+        """Whether there is a limit of acceleration."""
+        return self.limits != "off" and bool(torch.isfinite(self.ddq_max).any())
+
+    @property
     def has_posture(self) -> bool:
         """Whether there is a preferred configuration to go to."""
         return self.posture is not None and self.beta > 0.0
@@ -146,11 +158,12 @@ class StepSettings(Portable):
             "q_min": self.q_min,
             "q_max": self.q_max,
             "dq_max": self.dq_max,
+            "ddq_max": self.ddq_max,
             "posture": 0.0 if self.posture is None else self.posture,
             "weights": 1.0 if self.weights is None else self.weights,
         }
         arrays = {name: np.broadcast_to(as_array(a), n) for name, a in arrays.items()}
-        names = ("beta", "gain", "damping", "limits", "dt", "has_posture")
+        names = ("beta", "gain", "damping", "limits", "dt", "has_posture", "accelerates")
         settings = {name: getattr(self, name) for name in names}
         return Stored.of("inverse_kinematics", arrays, {"model": model.stored()}, **settings)
 
@@ -204,21 +217,38 @@ class StepSettings(Portable):
         """Return q moved into the limits."""
         return torch.clamp(q, *self.box(q))
 
-    def step_bounds(self, q: Tensor, largest: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the bounds of dq: position and speed intersected, never empty.
+    def step_bounds(
+        self, q: Tensor, period: float | None = None, last: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the bounds of dq: position, and for a period [s] speed and acceleration.
 
-        From outside the limits both bounds meet at the way back, at most the largest step. The
-        nextafter makes q + upper <= q_max hold after rounding, and with it q + dq for every dq.
+        They are intersected and never empty. `last` is the step before, for a period as long as
+        this one; None is at rest. From outside the limits both bounds meet at the way back, at most
+        the largest step; where the speed cannot be stopped in time they meet at the hardest
+        braking. The nextafter makes q + upper <= q_max hold after rounding, and with it q + dq for
+        every dq.
+
+        With speed u = dq / period and acceleration a the way until the robot stands is at most
+        u period + u^2 / (2 a), whatever the periods to come: within d it can stop if
+        dq <= 2 d / (1 + sqrt(1 + 2 d / (a period^2))). Braking in the next period keeps this.
         """
         q_min, q_max = self.box(q)
         lower, upper = q_min - q, q_max - q
         up, down = torch.full_like(q, math.inf), torch.full_like(q, -math.inf)
         upper = torch.where(q + upper > q_max, torch.nextafter(upper, down), upper)
         lower = torch.where(q + lower < q_min, torch.nextafter(lower, up), lower)
-        if self.limits != "off" and largest is not None:
-            lower = torch.clamp(lower, -largest, largest)
-            upper = torch.clamp(upper, -largest, largest)
-        return lower, upper
+        if self.limits == "off" or period is None:
+            return lower, upper
+        most = self.dq_max.to(q) * period
+        if not self.accelerates:
+            return torch.clamp(lower, -most, most), torch.clamp(upper, -most, most)
+        change = self.ddq_max.to(q) * period**2
+        least, largest = (-change, change) if last is None else (last - change, last + change)
+        lower, upper = (
+            torch.clamp(side * stopping(side * end, change), -most, most)
+            for side, end in ((-1.0, lower), (1.0, upper))
+        )
+        return torch.clamp(lower, least, largest), torch.clamp(upper, least, largest)
 
     def margin(self, q: Tensor) -> Tensor:
         """Return the smallest distance of an actuator to its limits."""

@@ -36,8 +36,11 @@ def control_step(
     e: Tensor,
     feed_forward: Tensor | None = None,
     period: float | None = None,
+    last: Tensor | None = None,
 ) -> StepRows:
     """Return eq. (1) for one period, v = dx dt + gain dt e; rows that are not finite hold still.
+
+    With a limit of acceleration these brake until they stand.
 
     Parameters
     ----------
@@ -53,6 +56,8 @@ def control_step(
         Motion of the targets in this period [m]. Default: none.
     period : float, optional
         Time to the next step [s]. Default: `settings.dt`.
+    last : Tensor of shape (N, n), optional
+        Step before, for a period as long as this one. Default: at rest.
 
     Returns
     -------
@@ -62,12 +67,13 @@ def control_step(
     gain, beta, seconds = settings.rates(period)
     v = gain * e if feed_forward is None else feed_forward + gain * e
     fine = torch.isfinite(q).all(-1) & torch.isfinite(J).all(-1).all(-1)
-    fine = (fine & torch.isfinite(v).all(-1))[:, None]
+    fine &= torch.isfinite(v).all(-1)
+    fine = (fine if last is None else fine & torch.isfinite(last).all(-1))[:, None]
     at = torch.where(fine, q, 0.0)
     posture = None
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
-    bounds = settings.step_bounds(q, settings.dq_max.to(q) * seconds)
+    bounds = settings.step_bounds(q, seconds, last)
     J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
     step = limited_step(settings, J, v, posture, *bounds)
     return step._replace(

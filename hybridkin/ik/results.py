@@ -84,7 +84,7 @@ class Step(Generic[ArrayT]):
     damping : array of shape (...,)
         lambda used, in the unit of `sigma_min`; 0 where the step is the pseudo-inverse's.
     saturated : bool array of shape (..., n)
-        Actuators held at a limit of position or speed by this step.
+        Actuators held at a limit of position, speed or acceleration by this step.
     """
 
     dq: ArrayT

@@ -55,6 +55,10 @@ class InverseKinematics:
     dq_max : float or array-like of shape (n,), optional
         Largest speed of every actuator [unit of q per second]: a step is at most ``dq_max dt``.
         Default: that of the model, as of a URDF; infinity switches it off.
+    ddq_max : float or array-like of shape (n,), optional
+        Largest acceleration of every actuator [unit of q per second squared]: the speed changes by
+        at most ``ddq_max dt`` from step to step, and always lets it stop within `q_min` and
+        `q_max`.
     q_pref : float, array-like of shape (n,) or callable, optional
         Preferred configuration, or a function that gives it for configurations (..., n), torch to
         torch, such as a step against a gradient. Default: the middle of the limits where both are
@@ -93,7 +97,9 @@ class InverseKinematics:
     damped task is solved in the box without posture first, and the posture then only chooses
     among the steps that move the tip the same way (to 1e-8 of the step; where v is also out of
     reach, up to 1e-3 was seen). A start outside the limits walks back at
-    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q.
+    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q. With `ddq_max` a step
+    that could not be stopped within the limits is not taken; where the speed that is given cannot
+    be stopped, the step brakes as hard as it may, beyond a limit if it must.
 
     References
     ----------
@@ -120,6 +126,7 @@ class InverseKinematics:
         q_min: Array | None = None,
         q_max: Array | None = None,
         dq_max: Array | None = None,
+        ddq_max: Array | None = None,
         q_pref: Array | Posture | None = None,
         beta: float = 1.0,
         gain: float | None = None,
@@ -139,6 +146,7 @@ class InverseKinematics:
             bound(given["q_min"], "q_min"),
             bound(given["q_max"], "q_max"),
             bound(given["dq_max"], "dq_max", positive=True),
+            bound(math.inf if ddq_max is None else ddq_max, "ddq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
             number(beta, "beta"),
             None if gain is None else number(gain, "gain"),
@@ -176,7 +184,13 @@ class InverseKinematics:
         return self.settings.stored()
 
     def step(
-        self, q: Array, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
+        self,
+        q: Array,
+        x_target: Array,
+        dx: Array | None = None,
+        *,
+        x_measured: Array | None = None,
+        dq: Array | None = None,
     ) -> Step:
         """Return the change of q for one period, eq. (1).
 
@@ -190,23 +204,32 @@ class InverseKinematics:
             Velocities of the targets [m/s], one for every row of the task. Default: at rest.
         x_measured : array-like of shape (..., 3), optional
             Measured tips [m], to close the loop on. Default: the model's tips.
+        dq : array-like of shape (..., n), optional
+            The steps before, from which `ddq_max` counts. Default: at rest.
 
         Returns
         -------
         Step
-            `dq` and what came with it. A row with a NaN or infinite input holds still.
+            `dq` and what came with it. A row with a NaN or infinite input holds still, with
+            `ddq_max` after it has braked.
         """
         core = core_of(self.settings)
-        found = None if core is None else core.step(q, x_target, dx, x_measured)
+        found = None if core is None else core.step(q, x_target, dx, x_measured, dq)
         if found is None:
-            return self._steps(core, q, x_target, dx, x_measured)
+            return self._steps(core, q, x_target, dx, x_measured, dq)
         step = object.__new__(Step)  # its constructor takes longer than the step
         vars(step)["_row"] = found
         return step
 
     @torch.no_grad()
     def _steps(
-        self, core: Core | None, q: Array, x_target: Array, dx: Array | None, tip: Array | None
+        self,
+        core: Core | None,
+        q: Array,
+        x_target: Array,
+        dx: Array | None,
+        tip: Array | None,
+        last: Array | None,
     ) -> Step:
         settings, task = self.settings, self.settings.task
         as_numpy, axes = is_numpy(q), len(task.shape)
@@ -216,16 +239,19 @@ class InverseKinematics:
             given.append((settings.points(tip, "x_measured", rows), axes))
         if dx is not None:
             given.append((settings.points(dx, "dx", rows, shape=(sum(task.parts),)), 1))
+        if last is not None:
+            given.append((settings.configurations(last, "dq").to(rows), 1))
         lead = leading(given)
         rows, target, *others = (rows_of(a, lead, trailing) for a, trailing in given)
+        before = None if last is None else others.pop()
         feed_forward = None if dx is None else settings.dt * others.pop()
         measured = others.pop() if others else None
         if core is not None and as_numpy and rows.dtype == torch.float64:
-            parts = core.steps(rows, target, feed_forward, measured)
+            parts = core.steps(rows, target, feed_forward, measured, before)
             return Step(*give_back(parts, lead, as_numpy))
         x, J = settings.evaluate(rows)
         e = task.difference(x if measured is None else measured, target)
-        step = control_step(settings, rows, J, e, feed_forward)
+        step = control_step(settings, rows, J, e, feed_forward, last=before)
         parts = (step.dq, x, e.norm(dim=-1), step.sigma_min, step.damping, step.saturated)
         return Step(*give_back(parts, lead, as_numpy))
 

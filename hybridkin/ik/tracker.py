@@ -44,7 +44,7 @@ class Tracker:
         Distance from the tip, the measured one where it was given, to the target before the last
         step [m]; NaN where it is not known.
     saturated : bool array of shape (n,)
-        Actuators that the last step held at a limit of position or speed.
+        Actuators that the last step held at a limit of position, speed or acceleration.
     sigma_min : float
         Smallest singular value of the Jacobian there, NaN where an input was not finite.
     damping : float
@@ -105,7 +105,7 @@ class Tracker:
         return IKStatus.SINGULAR if robot.damping > 0.0 else IKStatus.MAX_ITER
 
     def reset(self, q: Array) -> None:
-        """Start anew from an actuator vector, as read from the robot.
+        """Start anew, at rest, from an actuator vector, as read from the robot.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class Tracker:
         -------
         array of shape (n,)
             The command, within the limits to the last bit; the caller's to keep. Where `x_target`
-            or `dx` is not finite the robot holds still.
+            or `dx` is not finite the robot holds still, with `ddq_max` after it has braked.
         """
         settings, like, robot = self._settings, self._like, self._robot
         if robot.tick(x_target, dx, x_measured):
@@ -224,6 +224,7 @@ class _InTorch:
         self._offset = x.new_zeros(1, sum(self.task.parts))  # of the model at the last reading
         unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(q)
         step = StepRows(none, unknown[:, 0], none[:, 0], none > 0.0)
+        self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 
     def tick(self, target: Array, dx: Array | None, tip: Array | None) -> bool:
@@ -256,10 +257,12 @@ class _InTorch:
                 remembered = used if self._memory is None else self._offset
                 used = torch.where(seen, error, used - remembered)
                 self._offset = torch.where(seen, offset, self._offset)
-        step = control_step(settings, self._q, J, used, feed_forward, period)
+        seconds = period or settings.dt
+        last = self._last.step.dq * (seconds / self._period)
+        step = control_step(settings, self._q, J, used, feed_forward, seconds, last)
         if self._memory is not None:
-            self._offset = math.exp(-(period or settings.dt) / self._memory) * self._offset
-        self._last = Tick(self._q, x, J, error, step)
+            self._offset = math.exp(-seconds / self._memory) * self._offset
+        self._last, self._period = Tick(self._q, x, J, error, step), seconds
         self._q = self._q + step.dq
         return self._last
 

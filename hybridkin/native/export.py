@@ -148,11 +148,11 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
         "OPERATIONS": f"{_operations(plan):,}",
     }
     if steps:
-        (low, high, fast), dt = _limits(plan)
-        words = (", ".join(f"{v:.6g}" for v in row) for row in (low, high, fast))
-        found |= zip(("Q_MIN", "Q_MAX", "DQ_MAX"), words, strict=True)
+        limits, dt = _limits(plan)
+        words = (", ".join(f"{v:.6g}" for v in row) for row in limits)
+        found |= zip(("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX"), words, strict=True)
         found |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
-        found["NEWTON"] = f"{10 * len(low) ** 2 + 80 * len(low):,}"
+        found["NEWTON"] = f"{10 * plan.n_inputs**2 + 80 * plan.n_inputs:,}"
     return found
 
 
@@ -168,9 +168,9 @@ def _operations(plan: Plan) -> int:
 
 
 def _limits(plan: Plan) -> tuple[NDArray, float]:
-    """Return least, largest and fastest q, shape (3, n), and the period of inverse kinematics."""
+    """Return q_min, q_max, dq_max, ddq_max, shape (4, n), and the period of inverse kinematics."""
     n, numbers = plan.n_inputs, plan.data[plan.code[plan.root + 3] :]
-    return numbers[: 3 * n].reshape(3, n), float(numbers[5 * n + 2])
+    return numbers[: 4 * n].reshape(4, n), float(numbers[6 * n + 2])
 
 
 def _literals(values: NDArray) -> str:
@@ -190,7 +190,7 @@ def _vectors(
     double, rng = copy.deepcopy(module).double(), np.random.default_rng(0)
     center, half = _usual(double, plan.n_inputs)
     if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
-        low, high, _ = _limits(plan)[0]
+        low, high, *_ = _limits(plan)[0]
         center, half = 0.5 * (low + high), 0.5 * (high - low)
     # Eight usual rows, then rows further and further out; the last one is NaN.
     far = np.concatenate([np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]])
@@ -226,7 +226,7 @@ def _runs(
     controller: _Controller, plan: Plan, starts: NDArray, tips: NDArray, dtype: str
 ) -> dict[str, NDArray]:
     """Return runs of steps, from within the limits and from their edges, and what came out."""
-    rng, ((low, high, _), dt) = np.random.default_rng(1), _limits(plan)
+    rng, ((low, high, *_), dt) = np.random.default_rng(1), _limits(plan)
     low, high = low.astype(dtype), high.astype(dtype)
     starts = starts.clip(low, high)
     starts[4:, ::2] = np.where(np.isfinite(high), high, starts[4:])[:, ::2]

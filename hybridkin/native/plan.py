@@ -364,13 +364,13 @@ def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     n, m = plan._code[model + 1 : model + 3]
     if m != 3:
         raise NoKernel(f"a step is computed for tips of 3 coordinates, got {m}")
-    names = ("q_min", "q_max", "dq_max", "posture")
+    names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
     vectors = [stored.array(name, [n], finite=False) for name in names]
     gain, beta, dt, damping = (stored.settings[name] for name in ("gain", "beta", "dt", "damping"))
     rates = [-1.0 if gain is None else gain, beta, dt, -1.0 if damping == "adaptive" else damping]
     weights = stored.array("weights", [n])
     flags = (stored.settings["limits"] == "saturate") + 2 * stored.settings["has_posture"]
-    flags += 4 * bool((weights != 1.0).any())
+    flags += 4 * bool((weights != 1.0).any()) + 8 * stored.settings["accelerates"]
     return plan.node(IK, n, 3, [*vectors, weights**-0.5, np.array(rates)], model, flags)
 
 

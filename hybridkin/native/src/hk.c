@@ -100,10 +100,10 @@ HK_API void hk_ik_tick(const ik_follower *f) {
 }
 
 /* Single ticks for rows of q (rows, n), targets, and with the mode their motions and measured tips
-   (rows, 3). `out` (rows, n + 6) holds dq, x, |e|, sigma_min, damping; held (rows, n). */
+   (rows, 3); `last` (rows, n) are the steps before. `out` (rows, n + 6) holds dq, x, |e|, sigma_min, damping; held (rows, n). */
 HK_API void hk_ik_steps(const int32_t *code, const real *data, int32_t at, int64_t rows, int32_t mode,
                      const real *q, const real *target, const real *feed, const real *tip,
-                     real *out, unsigned char *held) {
+                     const real *last, real *out, unsigned char *held) {
     const ik_settings ik = ik_settings_of(code, data, at);
     const int n = ik.n;
     real state[IK_STATE] = {mode, ik.dt};
@@ -113,7 +113,10 @@ HK_API void hk_ik_steps(const int32_t *code, const real *data, int32_t at, int64
             if (feed) state[IK_FEED + i] = feed[3 * r + i];
             if (tip) state[IK_TIP + i] = tip[3 * r + i];
         }
-        for (int j = 0; j < n; j++) state[IK_Q + j] = q[n * r + j];
+        for (int j = 0; j < n; j++) {
+            state[IK_Q + j] = q[n * r + j];
+            state[IK_Q + n + j] = last ? last[n * r + j] : 0.0;
+        }
         ik_tick(&ik, state);
         for (int j = 0; j < n; j++) {
             out[j] = state[IK_Q + n + j];

@@ -81,7 +81,7 @@ static void ik_wish(const ik_search_t *s, const ik_point *at, real *wish, real *
 static void ik_slide_on(const ik_search_t *s, ik_row *r, int phase) {
     const int n = s->ik.n, slides = phase == IK_SLIDE && r->iteration < IK_NULL_STEPS - 1;
     if (phase == IK_POLISH) r->live = r->best;
-    ik_step_bounds(&s->ik, r->live.q, R(0.0), &r->step);
+    ik_step_bounds(&s->ik, r->live.q, R(0.0), NULL, &r->step);
     for (int j = 0; j < n; j++) {
         real *lower = r->step.lower + j, *upper = r->step.upper + j;
         r->step.posture[j] = r->share * r->free[j];
@@ -117,7 +117,7 @@ static void ik_lower_on(const ik_search_t *s, ik_row *r) {
     /* Damping in proportion to the error, so that the last iterations are Gauss-Newton's. */
     const real trust = r->nu * (r->live.error / r->start);
     real moved[3];
-    ik_step_bounds(&s->ik, r->live.q, R(0.0), &r->step);
+    ik_step_bounds(&s->ik, r->live.q, R(0.0), NULL, &r->step);
     ik_limited_step(&s->ik, r->live.J, r->live.e, 0, &trust, &r->step);
     ik_rows_of(n, r->live.J, r->step.dq, moved);
     for (int i = 0; i < 3; i++) moved[i] = r->live.e[i] - moved[i];

@@ -7,13 +7,14 @@
 enum { IK_NEWTON = 60, IK_PROXIMAL = 2 };
 #define IK_HEALTHY R(0.02) /* sigma_min / sigma_max above which no damping is needed */
 
-enum { IK_LIMITED = 1, IK_POSTURE = 2, IK_WEIGHTS = 4 };
+enum { IK_LIMITED = 1, IK_POSTURE = 2, IK_WEIGHTS = 4, IK_ACCELERATES = 8 };
 
-/* The settings: limits of q and of its speed, posture, and units in which nothing has a weight. */
+/* The settings: limits of q, of its speed and acceleration, posture, and units in which nothing has
+   a weight. */
 typedef struct {
     hk_plan plan;
     int model, n, flags;
-    const real *low, *high, *speed, *posture, *unit;
+    const real *low, *high, *speed, *accel, *posture, *unit;
     real gain, beta, dt, damping; /* gain < 0: 1 / dt; damping < 0: adaptive */
 } ik_settings;
 
@@ -27,9 +28,9 @@ typedef struct {
 static inline ik_settings ik_settings_of(const int32_t *code, const real *data, int at) {
     const int32_t *node = code + at;
     const int n = node[HK_N];
-    const real *a = data + node[HK_DATA], *b = a + 5 * n;
+    const real *a = data + node[HK_DATA], *b = a + 6 * n;
     const ik_settings ik = {{code, data}, node[HK_MORE], n, node[HK_MORE + 1], a, a + n, a + 2 * n,
-                      a + 3 * n, a + 4 * n, b[0], b[1], b[2], b[3]};
+                      a + 3 * n, a + 4 * n, a + 5 * n, b[0], b[1], b[2], b[3]};
     return ik;
 }
 
@@ -329,19 +330,38 @@ static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, co
     }
 }
 
-/* The bounds of a step: position, and speed for `seconds` > 0, intersected, never empty. From
-   outside the limits both meet at the way back. q + dq stays in the limits after rounding. */
-static inline void ik_step_bounds(const ik_settings *ik, const real *q, real seconds, ik_step_t *s) {
+/* The largest first step from which steps that shrink by `change` stop within `way`. */
+static inline real ik_stopping(real way, real change) {
+    const real ahead = way > R(0.0) ? way : R(0.0);
+    if (!(ahead < R(INFINITY))) return way;
+    return R(2.0) * way / (R(1.0) + HK_MATH(sqrt)(R(1.0) + R(2.0) * ahead / change));
+}
+
+/* The bounds of a step: position, and for `seconds` > 0 speed and acceleration from the step
+   `last` (NULL: at rest), intersected, never empty. From outside the limits both meet at the way
+   back, of a speed that cannot be stopped at the hardest braking. q + dq stays in the limits after
+   rounding. */
+static inline void ik_step_bounds(const ik_settings *ik, const real *q, real seconds,
+                                  const real *last, ik_step_t *s) {
     const real far = R(INFINITY);
+    const int accelerates = ik->flags & IK_ACCELERATES && seconds > R(0.0);
     for (int j = 0; j < ik->n; j++) {
         real lower = -far, upper = far;
         if (ik->flags & IK_LIMITED) {
+            const real change = accelerates ? ik->accel[j] * seconds * seconds : far;
+            const real from = last ? last[j] : R(0.0);
             lower = ik->low[j] - q[j], upper = ik->high[j] - q[j];
             if (q[j] + upper > ik->high[j]) upper = HK_MATH(nextafter)(upper, -far);
             if (q[j] + lower < ik->low[j]) lower = HK_MATH(nextafter)(lower, far);
+            if (accelerates)
+                lower = -ik_stopping(-lower, change), upper = ik_stopping(upper, change);
             if (seconds > R(0.0)) {
                 const real most = ik->speed[j] * seconds;
                 lower = ik_clip(lower, -most, most), upper = ik_clip(upper, -most, most);
+            }
+            if (accelerates) {
+                lower = ik_clip(lower, from - change, from + change);
+                upper = ik_clip(upper, from - change, from + change);
             }
         }
         s->lower[j] = lower, s->upper[j] = upper;
@@ -349,23 +369,25 @@ static inline void ik_step_bounds(const ik_settings *ik, const real *q, real sec
 }
 
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
-   taken back. What is not finite holds still. */
+   taken back. What is not finite holds still, with a limit of acceleration after it has braked. */
 static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *J,
-                                   const real *e, const real *feed, real seconds, ik_step_t *s) {
+                                   const real *e, const real *feed, real seconds,
+                                   const real *last, ik_step_t *s) {
     const int n = ik->n;
     real v[3], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds, beta = ik->beta * seconds;
     gain = gain > R(1.0) ? R(1.0) : gain;
     beta = beta > R(1.0) ? R(1.0) : beta;
     for (int i = 0; i < 3; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));
-    ik_step_bounds(ik, q, seconds, s);
-    if (ik_finite(n, q) && ik_finite(3 * n, J) && ik_finite(3, v)) {
+    ik_step_bounds(ik, q, seconds, last, s);
+    const int known = !last || ik_finite(n, last);
+    if (known && ik_finite(n, q) && ik_finite(3 * n, J) && ik_finite(3, v)) {
         for (int j = 0; j < n; j++) s->posture[j] = beta * (ik->posture[j] - q[j]);
         ik_limited_step(ik, J, v, ik->flags & IK_POSTURE, NULL, s);
         return;
     }
     const real still[3 * HK_MAX_N] = {R(0.0)};
     ik_limited_step(ik, still, still, 0, NULL, s);
-    for (int j = 0; j < n; j++) s->dq[j] = q[j] == q[j] ? s->dq[j] : R(0.0);
+    for (int j = 0; j < n; j++) s->dq[j] = known && q[j] == q[j] ? s->dq[j] : R(0.0);
     s->sigma_min = R(NAN);
 }
 
@@ -374,11 +396,12 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
 static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance);
 
 /* The state of a robot that follows targets, one array: what goes in, what comes out, and what is
-   kept from tick to tick, the offset of the measured tip and q. */
+   kept from tick to tick, the offset of the measured tip, q and dq. */
 enum {
-    IK_MODE, /* sum of the last four below */
+    IK_MODE, /* sum of the last five below */
     IK_PERIOD,
     IK_MEMORY, /* seconds, 0 for none */
+    IK_LAST, /* period of the tick before, 0 for none */
     IK_SIGMA_MIN,
     IK_DAMPING,
     IK_DISTANCE, /* of the error */
@@ -391,7 +414,7 @@ enum {
     IK_Q = IK_ERROR + 3, /* then dq, q before, whether it was held (n each), and J (3 n) */
     IK_STATE = IK_Q + 7 * HK_MAX_N
 };
-enum { IK_HAS_TARGET = 1, IK_HAS_FEED = 2, IK_HAS_TIP = 4, IK_MUST_SEE = 8 };
+enum { IK_HAS_TARGET = 1, IK_HAS_FEED = 2, IK_HAS_TIP = 4, IK_MUST_SEE = 8, IK_FROM_REST = 16 };
 
 static inline void ik_tick(const ik_settings *ik, real *state) {
     const int n = ik->n, mode = (int)state[IK_MODE];
@@ -399,7 +422,7 @@ static inline void ik_tick(const ik_settings *ik, real *state) {
     real *q = state + IK_Q, *dq = q + n, *before = q + 2 * n, *held = q + 3 * n, *J = q + 4 * n;
     real *x = state + IK_X, *error = state + IK_ERROR, *offset = state + IK_OFFSET;
     const real memory = state[IK_MEMORY];
-    real used[3] = {R(0.0), R(0.0), R(0.0)};
+    real used[3] = {R(0.0), R(0.0), R(0.0)}, *last = NULL, moved[HK_MAX_N];
     ik_step_t step;
     ik_model(ik, q, x, J, NULL);
     for (int i = 0; i < 3; i++) error[i] = R(NAN);
@@ -420,7 +443,13 @@ static inline void ik_tick(const ik_settings *ik, real *state) {
             }
         }
     }
-    ik_control(ik, q, J, used, mode & IK_HAS_FEED ? state + IK_FEED : NULL, period, &step);
+    if (ik->flags & IK_ACCELERATES && !(mode & IK_FROM_REST)) {
+        const real ratio = state[IK_LAST] > R(0.0) ? period / state[IK_LAST] : R(1.0);
+        last = moved;
+        for (int j = 0; j < n; j++) last[j] = ratio * dq[j];
+    }
+    ik_control(ik, q, J, used, mode & IK_HAS_FEED ? state + IK_FEED : NULL, period, last, &step);
+    state[IK_LAST] = period;
     if (memory > R(0.0))
         for (int i = 0; i < 3; i++) offset[i] *= HK_MATH(exp)(-period / memory);
     state[IK_SIGMA_MIN] = step.sigma_min;

@@ -24,7 +24,10 @@ void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
         all[IK_TIP + i] = measured ? measured[i] : (real)0;
         all[IK_OFFSET + i] = state->offset[i];
     }
-    for (int j = 0; j < @N@; j++) all[IK_Q + j] = state->q[j];
+    for (int j = 0; j < @N@; j++) {
+        all[IK_Q + j] = state->q[j];
+        all[IK_Q + @N@ + j] = state->dq[j];
+    }
     all[IK_MODE] = (real)(IK_HAS_TARGET + (dx ? IK_HAS_FEED : 0) + (measured ? IK_HAS_TIP : 0));
     all[IK_PERIOD] = ik.dt;
     all[IK_MEMORY] = state->memory;
@@ -38,6 +41,7 @@ void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
     state->damping = all[IK_DAMPING];
     for (int j = 0; j < @N@; j++) {
         state->q[j] = all[IK_Q + j];
+        state->dq[j] = all[IK_Q + @N@ + j];
         state->held[j] = all[IK_Q + 3 * @N@ + j] > (real)0;
     }
 }
