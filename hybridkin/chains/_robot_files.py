@@ -88,7 +88,7 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("log", "x_unit", *_among(*METRES)),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
     ("limits", "q_min q_max", "be a number, or a list of numbers", _one_or_many(_is_number)),
-    ("limits", "dq_max", *_POSITIVE),
+    ("limits", "dq_max ddq_max", *_POSITIVE),
     ("limits", "unit", *_among("m", "log")),
 ]
 

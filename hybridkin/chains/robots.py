@@ -110,13 +110,14 @@ class Limits:
     ----------
     q_min, q_max : ndarray of shape (n,) or None
         Least and largest value of every actuator, as the chain counts them [unit of q].
-    dq_max : ndarray of shape (n,) or None
-        Largest speed [unit of q per s].
+    dq_max, ddq_max : ndarray of shape (n,) or None
+        Largest speed [unit of q per s] and acceleration [unit of q per s^2].
     """
 
     q_min: np.ndarray | None = None
     q_max: np.ndarray | None = None
     dq_max: np.ndarray | None = None
+    ddq_max: np.ndarray | None = None
 
     def intersect(self, other: Limits) -> Limits:
         """Return the limits that keep to both; what one does not know the other decides."""
@@ -137,15 +138,17 @@ class Limits:
         return Limits(
             None if np.isinf(low).all() else low,
             None if np.isinf(high).all() else high,
-            None if self.dq_max is None else np.multiply(np.abs(factor), self.dq_max),
+            *(
+                None if rate is None else np.multiply(np.abs(factor), rate)
+                for rate in (self.dq_max, self.ddq_max)
+            ),
         )
 
     def narrowed(self, by: float | np.ndarray) -> Limits:
         """Return the limits with the range of every actuator smaller by `by` at both ends [m]."""
         low, high = self.q_min, self.q_max
-        return Limits(
-            None if low is None else low + by, None if high is None else high - by, self.dq_max
-        )
+        ends = None if low is None else low + by, None if high is None else high - by
+        return replace(self, q_min=ends[0], q_max=ends[1])
 
 
 @dataclass(frozen=True)
@@ -278,6 +281,7 @@ def read_description(path: str | Path) -> RobotDescription:
             q_min = -0.010                  # as the chain counts them: shortening < 0 [m]
             q_max = 0.010
             dq_max = 0.020                  # [m/s]
+            ddq_max = 0.200                 # [m/s^2]
             unit = "m"                      # the default; "log": in unit and sign of [log], which
                                             # it must be with a gain
 

@@ -305,6 +305,7 @@ def _add_limits(command: argparse.ArgumentParser) -> None:
     add("--q-min", type=_numbers, help="least q, in the unit and sign of the log")
     add("--q-max", type=_numbers, help="largest q")
     add("--dq-max", type=_numbers, help="largest speed of an actuator, per second")
+    add("--ddq-max", type=_numbers, help="largest acceleration, per second squared")
 
 
 def _add_work(command: argparse.ArgumentParser) -> None:

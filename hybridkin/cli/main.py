@@ -253,9 +253,9 @@ _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 def _limits(arguments: argparse.Namespace, loaded: LoadedModel, **options: bool) -> PathLimits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
-    asked = hybridkin.robots.Limits(arguments.q_min, arguments.q_max, arguments.dq_max)
-    factor = loaded.log_format().q_factor
-    return hybridkin.workflow.path_limits(loaded, **vars(asked.scaled(factor)), **options)
+    asked = {name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max", "ddq_max")}
+    scaled = hybridkin.robots.Limits(**asked).scaled(loaded.log_format().q_factor)
+    return hybridkin.workflow.path_limits(loaded, **vars(scaled), **options)
 
 
 def _read(

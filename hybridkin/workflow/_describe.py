@@ -152,7 +152,7 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
         for name, value in vars(shown).items():
             if value is not None:
                 unit = "" if log_format.q_unit == "1" else f" {log_format.q_unit}"
-                unit += "/s" if name == "dq_max" else ""
+                unit += {"dq_max": "/s", "ddq_max": "/s^2"}.get(name, "")
                 report.text(f"{what} {name} = {', '.join(f'{v:.4g}' for v in value)}{unit}.")
     if record["log_format"] is not None:
         q, x, q_unit, x_unit, q_sign, *_ = record["log_format"].values()

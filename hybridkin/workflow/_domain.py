@@ -30,8 +30,8 @@ class PathLimits:
     ----------
     q_min, q_max : ndarray of shape (n,)
         Least and largest value of every actuator [m]; with play of what the actuators do.
-    dq_max : ndarray of shape (n,) or None
-        Largest speed [m/s].
+    dq_max, ddq_max : ndarray of shape (n,) or None
+        Largest speed [m/s] and acceleration [m/s^2].
     source : str
         Where the first two come from.
     """
@@ -39,6 +39,7 @@ class PathLimits:
     q_min: NDArray
     q_max: NDArray
     dq_max: NDArray | None
+    ddq_max: NDArray | None
     source: str
 
 
@@ -47,6 +48,7 @@ def path_limits(
     q_min: ArrayLike | None = None,
     q_max: ArrayLike | None = None,
     dq_max: ArrayLike | None = None,
+    ddq_max: ArrayLike | None = None,
     *,
     within_fit: bool = True,
 ) -> PathLimits:
@@ -58,8 +60,8 @@ def path_limits(
     ----------
     loaded : LoadedModel
         The model, as from `open_model`.
-    q_min, q_max, dq_max : float or array-like of shape (n,), optional
-        Limits of the commands [m], and of their speed [m/s].
+    q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
+        Limits of the commands [m], of their speed [m/s] and acceleration [m/s^2].
     within_fit : bool, default=True
         Whether to stay within the range of the fit also where the description gives limits.
 
@@ -77,7 +79,7 @@ def path_limits(
     described = robots.Limits() if loaded.description is None else loaded.description.limits
     open_end = described.q_min is None or described.q_max is None
     trained = (loaded.trained_range if within_fit or open_end else None) or robots.Limits()
-    given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
+    given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max, "ddq_max": ddq_max}
     asked = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
     overrides = vars(robots.Limits(**asked).narrowed(half_play))
     found = described.narrowed(half_play).intersect(trained)
@@ -92,7 +94,10 @@ def path_limits(
         if value.shape not in ((), (1,), (n,)):
             raise ValueError(f"`{name}` must be one number or {n}, got {value.size}.")
     low, high = (np.broadcast_to(v, n).astype(float) for v in (found.q_min, found.q_max))
-    fast = None if found.dq_max is None else np.broadcast_to(found.dq_max, n).astype(float)
+    rates = (
+        None if rate is None else np.broadcast_to(rate, n).astype(float)
+        for rate in (found.dq_max, found.ddq_max)
+    )
     if (low > high).any():
         raise ValueError(
             "`q_min` must not exceed `q_max`, with half the play and the range of the fit counted "
@@ -102,7 +107,7 @@ def path_limits(
     known = (words for words, limits in sources.items() if limits.q_min is not None)
     ends = len({"q_min", "q_max"} & {*asked})
     parts = ["given"] * (ends > 0) + [", within the ".join(known)] * (ends < 2)
-    return PathLimits(low, high, fast, " and ".join(parts))
+    return PathLimits(low, high, *rates, " and ".join(parts))
 
 
 @dataclass(frozen=True, eq=False)

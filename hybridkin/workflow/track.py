@@ -33,7 +33,7 @@ TIME = "t"
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
 _GUESSES = 16
-_PEAK = 1.875  # of the speed of `min_jerk` over its mean
+_PEAK, _PUSH = 1.875, 10.0 / math.sqrt(3.0)  # of `min_jerk`: speed and acceleration
 _SLOW, _DT = 0.1, 0.02  # without known limits: share of the range per second; period [s]
 _PULLS = (0.2, 0.0, 0.0, 0.2)  # to the preferred configuration, one attempt at the path each
 
@@ -55,10 +55,10 @@ def track_path(
     commands, the model's tip, the target, the error and its status. Figures and the report come
     with it. Points far apart are passed in several steps on a straight line; where points are
     missed, other starts and postures are tried, and the track that reaches most within the domain
-    is kept. Rows with the status LEAD_IN lead from `start` to the path, within ``dq_max`` of the
-    limits or, where that is not known, a tenth of the largest range per second. Of a model with
-    play the commands are those to send, which lead or trail what the actuators do by half its
-    width, and further columns ``effective_NAME`` hold the latter.
+    is kept. Rows with the status LEAD_IN lead from `start` to the path, within ``dq_max`` and
+    ``ddq_max`` of the limits; an unknown speed is a tenth of the largest range per second. Of a
+    model with play the commands are those to send, which lead or trail what the actuators do by
+    half its width, and further columns ``effective_NAME`` hold the latter.
 
     Parameters
     ----------
@@ -160,8 +160,11 @@ def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[
     dt = float(track.t[1] - track.t[0]) if len(track.t) > 1 else _DT
     widest = max((limits.q_max - limits.q_min).max(), np.abs(way).max())
     speed = _SLOW * widest if limits.dq_max is None else limits.dq_max
-    n = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
-    q = track.q[0] - (1.0 - trajectories.min_jerk(np.arange(n) / max(n, 1)))[:, None] * way
+    n = moves = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
+    if limits.ddq_max is not None:
+        moves = max(n, math.ceil(np.sqrt(_PUSH * np.abs(way) / limits.ddq_max).max() / dt))
+        n = moves + 1  # the path begins at rest
+    q = track.q[0] - (1.0 - trajectories.min_jerk(np.arange(n) / max(moves, 1)))[:, None] * way
     x = domain.loaded.tips(q)
     before = {"q": q, "x": x, "target": x, "error": np.zeros(n)}
     rows = {name: np.concatenate([rows, vars(track)[name]]) for name, rows in before.items()}
@@ -177,7 +180,7 @@ def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress)
     every = max(1, math.ceil(way / (_STEP * extent)))
     fine = _in_steps(path, every)
     dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
-    bounds: Any = {name: vars(domain.limits)[name] for name in ("q_min", "q_max", "dq_max")}
+    bounds: Any = {k: v for k, v in vars(domain.limits).items() if k != "source"}
     tracks: list[Track] = []
     for attempt, pull in enumerate(_PULLS):
         options = {"q_pref": domain.posture(pull), "beta": min(1.0, 1.0 / dt), "dt": dt}
