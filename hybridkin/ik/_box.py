@@ -1,4 +1,4 @@
-"""Steps within a box of limits: the exact least-squares optimum."""
+"""Steps within a box of limits, the exact least-squares optimum, and points within half-spaces."""
 
 from __future__ import annotations
 
@@ -43,6 +43,41 @@ class BoxProblem(NamedTuple):
         """Return y = z + J^T mu, and dq, which is y clipped to the box."""
         y = self.z + apply_columns(self.J, mu)
         return y, torch.clamp(y, self.lower, self.upper)
+
+
+class HalfSpaces(NamedTuple):
+    """Where the tip must stay: normals x <= offsets, with normals (k, m) of length one."""
+
+    normals: Tensor
+    offsets: Tensor
+
+    def __repr__(self) -> str:
+        """Return how many they are."""
+        return f"{len(self.offsets)} half-spaces"
+
+    def room(self, x: Tensor) -> Tensor:
+        """Return the distances (N, k) of points (N, m) to the planes, negative outside."""
+        return self.offsets.to(x) - self.along(x)
+
+    def along(self, way: Tensor) -> Tensor:
+        """Return the parts (N, k) of ways (N, m) along the normals."""
+        return way @ self.normals.to(way).T
+
+    def way_in(self, room: Tensor) -> Tensor:
+        """Return the shortest ways (N, m) with along(way) <= room.
+
+        The way is -normals^T nu, and nu >= 0 minimises |normals^T nu|^2 / 2 + nu . room. A change
+        of nu is a box-limited step, whose damping proximal rounds take out.
+        """
+        J = self.normals.to(room).T.expand(len(room), -1, -1)
+        way, nu = room.new_zeros(len(room), J.shape[1]), torch.zeros_like(room)
+        small = room.new_full((len(room),), max(1e-6, math.sqrt(torch.finfo(room.dtype).eps)))
+        for _ in range(1 + _PROXIMAL_ROUNDS):
+            z = (self.along(way) - room) / small[:, None]
+            problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
+            change = box_limited_step(problem, small)[0]
+            nu, way = nu + change, way - apply_rows(J, change)
+        return way
 
 
 def box_limited_step(

@@ -97,7 +97,7 @@ class Core:
     def step(
         self, q: Any, target: Any, dx: Any, tip: Any, last: Any
     ) -> tuple[NDArray, dict] | None:
-        """Return a `Step` of one row of plain arrays from rest and where its fields are, or None."""
+        """Return a `Step` of a row of plain arrays and where its fields are, None for others."""
         plain = type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == (self.n,)
         if not plain or last is not None:
             return None
@@ -247,6 +247,7 @@ class Follower:
 
     command = property(lambda self: self.q.copy())
     x = property(lambda self: self.state[_X:_ERROR].copy())
+    stopped = False  # by limits of the tip, which have no kernel
     saturated = property(lambda self: self._held.astype(bool))
     error = property(lambda self: float(self.state[_DISTANCE]))
     sigma_min = property(lambda self: float(self.state[_SIGMA_MIN]))

@@ -21,6 +21,7 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.model import Portable
 from hybridkin._core.stored import Stored
+from hybridkin.ik._box import HalfSpaces
 from hybridkin.ik.tasks import PositionTask, Task, Tolerance
 
 Array: TypeAlias = Numbers | Transform  # what comes in
@@ -39,6 +40,23 @@ def bound(value: Array, name: str, *, finite: bool = False, positive: bool = Fal
         (a > 0.0).all() or not positive, f"`{name}` must be positive, got {a.tolist()}; {lock}."
     )
     return a
+
+
+def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
+    """Return limits of the tip, a pair (A, b) with A x <= b, with normals of length one."""
+    need, m, got = "`tip_limits` must be a pair (A, b)", task.shape[0], type(task).__name__
+    require(isinstance(task, PositionTask), f"`tip_limits` needs a PositionTask, got a {got}.")
+    require(isinstance(given, Sequence) and len(given) == 2, f"{need}, got {given!r:.200}.")
+    A, b = (as_tensor(a, "tip_limits").cpu().double() for a in given)
+    size = A.norm(dim=-1)
+    good = A.shape == (b.numel(), m) and b.ndim == 1 and bool(torch.isfinite(b).all())
+    good = good and bool((size > 0.0).all() and torch.isfinite(size).all())
+    shapes = f"of shapes (k, {m}) and (k,), finite, with a direction in every row of A"
+    require(good, f"{need} {shapes}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
+    found = HalfSpaces(A / size[:, None], b / size)
+    inside = found.room(found.way_in(found.offsets[None])) >= -1e-9
+    require(inside.all(), "`tip_limits` must leave a point; these half-spaces have none in common.")
+    return found
 
 
 def require(good: bool | Tensor, message: str) -> None:
@@ -78,6 +96,7 @@ class StepSettings(Portable):
     dt: float
     weights: Tensor | None
     of_model: tuple[str, ...]
+    tip_limits: HalfSpaces | None
     posture: Tensor | Posture | None = field(init=False)
 
     def __post_init__(self) -> None:
@@ -149,10 +168,11 @@ class StepSettings(Portable):
         ------
         TypeError
             Where they could only be stored as code: other tasks than a `PositionTask`, or a posture
-            that is a function.
+            that is a function; and with limits of the tip.
         """
         model, n = self.task.models[0], self.n_actuators
-        if type(self.task) is not PositionTask or callable(self.posture) or n is None:
+        of_code = callable(self.posture) or self.tip_limits is not None
+        if type(self.task) is not PositionTask or of_code or n is None:
             raise TypeError("only a PositionTask with a fixed posture can be described as data")
         arrays = {
             "q_min": self.q_min,

@@ -12,12 +12,16 @@ from hybridkin.ik._box import BoxProblem, strict_box_step
 from hybridkin.ik._gram import (
     adaptive_damping,
     apply_columns,
+    apply_rows,
     damped_solve,
     null_projection,
     quick_gram,
     row_gram,
 )
-from hybridkin.ik._settings import StepSettings
+from hybridkin.ik._settings import StepSettings, stopping
+
+_PROJECTIONS, _EXCESS = 8, 1.5  # of a step that would leave the limits of the tip
+_LARGE = 1e30  # in place of infinite
 
 
 class StepRows(NamedTuple):
@@ -27,6 +31,7 @@ class StepRows(NamedTuple):
     sigma_min: Tensor
     damping: Tensor
     saturated: Tensor
+    stopped: Tensor | bool = False  # by a limit of the tip
 
 
 def control_step(
@@ -37,6 +42,7 @@ def control_step(
     feed_forward: Tensor | None = None,
     period: float | None = None,
     last: Tensor | None = None,
+    tip: Tensor | None = None,
 ) -> StepRows:
     """Return eq. (1) for one period, v = dx dt + gain dt e; rows that are not finite hold still.
 
@@ -58,6 +64,8 @@ def control_step(
         Time to the next step [s]. Default: `settings.dt`.
     last : Tensor of shape (N, n), optional
         Step before, for a period as long as this one. Default: at rest.
+    tip : Tensor of shape (N, m), optional
+        Where the tip is, for limits of it.
 
     Returns
     -------
@@ -75,11 +83,61 @@ def control_step(
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
     bounds = settings.step_bounds(q, seconds, last)
     J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
-    step = limited_step(settings, J, v, posture, *bounds)
+    if tip is None or settings.tip_limits is None or settings.limits == "off":
+        step = limited_step(settings, J, v, posture, *bounds)
+    else:
+        room = settings.tip_limits.room(torch.where(fine, tip, 0.0))
+        if settings.accelerates:
+            # Half of the braking, for the other half may have to serve other directions.
+            change = (settings.ddq_max.to(q) * seconds**2).clamp_max(_LARGE).expand(J.shape[-1])
+            brake = 0.5 * (settings.tip_limits.normals.to(J) @ J).abs() @ change
+            room = stopping(room, brake.clamp_min(1.0 / _LARGE))
+        step = _step_inside(settings, J, v, posture, bounds, room)
     return step._replace(
         dq=torch.where(torch.isnan(step.dq), 0.0, step.dq),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
     )
+
+
+def _step_inside(
+    settings: StepSettings,
+    J: Tensor,
+    v: Tensor,
+    posture: Tensor | None,
+    bounds: tuple[Tensor, Tensor],
+    room: Tensor,
+) -> StepRows:
+    """Return a step within the bounds after which, to first order, the tip is within its limits.
+
+    The wanted motion v is projected onto what the half-spaces allow. Where the bounds turn the
+    motion J dq out of them, alternating projections between both look for one that keeps them, with
+    some excess, so that they end. What they leave is taken out by going part of the way from a step
+    that stays or returns.
+    """
+    limits, close = settings.tip_limits, 32.0 * torch.finfo(v.dtype).eps  # [m]
+    assert limits is not None
+
+    def taken(way: Tensor, posture: Tensor | None) -> tuple[StepRows, Tensor]:
+        step = limited_step(settings, J, way, posture, *bounds)
+        return step, limits.along(apply_rows(J, step.dq)) - room
+
+    wanted = v + limits.way_in(room - limits.along(v))
+    step, over = taken(wanted, posture)
+    for _ in range(_PROJECTIONS):
+        out = (over > close).any(-1, keepdim=True)
+        if not out.any():
+            break
+        back = apply_rows(J, step.dq) + _EXCESS * limits.way_in(-over)
+        wanted = torch.where(out, back, wanted)
+        step, over = taken(wanted, posture)
+    else:
+        stay, least = taken(limits.way_in(room), None)
+        share = ((close - least) / (over - least)).clamp(0.0, 1.0)
+        share = torch.where(over > close, share, 1.0).amin(-1, keepdim=True)
+        dq = torch.clamp(stay.dq + share * (step.dq - stay.dq), *bounds)
+        held = (dq <= bounds[0]) | (dq >= bounds[1])
+        step = step._replace(dq=torch.where(share < 1.0, dq, step.dq), saturated=held)
+    return step._replace(stopped=((wanted - v).abs() > close).any(-1))
 
 
 def limited_step(

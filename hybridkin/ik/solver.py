@@ -25,7 +25,7 @@ from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
-from hybridkin.ik._settings import Array, Posture, StepSettings, bound, require
+from hybridkin.ik._settings import Array, Posture, StepSettings, bound, half_spaces, require
 from hybridkin.ik._step import control_step
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
@@ -79,6 +79,11 @@ class InverseKinematics:
     weights : float or array-like of shape (n,), optional
         What a unit of every actuator's motion costs: steps minimise ``sum_i weights_i dq_i^2``,
         and the preferred configuration is the nearest one in that measure. Default: all alike.
+
+    tip_limits : tuple of array-like of shape (k, 3) and (k,), optional
+        Half-spaces (A, b) in which the tip must stay, ``A x <= b`` [m], in the frame of x; of a
+        `PositionTask` only. A box ``low <= x <= high`` is
+        ``(np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]))``.
 
     Attributes
     ----------
@@ -134,6 +139,7 @@ class InverseKinematics:
         limits: str = "saturate",
         dt: float = 0.01,
         weights: Array | None = None,
+        tip_limits: Sequence[Array] | None = None,
     ) -> None:
         self.model, task = model, as_task(model)
         own, given = task.models[0].robot.limits, {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
@@ -146,7 +152,7 @@ class InverseKinematics:
             bound(given["q_min"], "q_min"),
             bound(given["q_max"], "q_max"),
             bound(given["dq_max"], "dq_max", positive=True),
-            bound(math.inf if ddq_max is None else ddq_max, "ddq_max", positive=True),
+            bound(np.inf if ddq_max is None else ddq_max, "ddq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
             number(beta, "beta"),
             None if gain is None else number(gain, "gain"),
@@ -155,6 +161,7 @@ class InverseKinematics:
             number(dt, "dt"),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
             tuple(own),
+            None if tip_limits is None else half_spaces(tip_limits, task),
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
@@ -222,16 +229,8 @@ class InverseKinematics:
         return step
 
     @torch.no_grad()
-    def _steps(
-        self,
-        core: Core | None,
-        q: Array,
-        x_target: Array,
-        dx: Array | None,
-        tip: Array | None,
-        last: Array | None,
-    ) -> Step:
-        settings, task = self.settings, self.settings.task
+    def _steps(self, core: Core | None, q: Array, x_target: Array, *more: Array | None) -> Step:
+        settings, task, (dx, tip, last) = self.settings, self.settings.task, more
         as_numpy, axes = is_numpy(q), len(task.shape)
         rows = settings.configurations(q, "q")
         given = [(rows, 1), (settings.points(x_target, "x_target", rows), axes)]
@@ -250,8 +249,9 @@ class InverseKinematics:
             parts = core.steps(rows, target, feed_forward, measured, before)
             return Step(*give_back(parts, lead, as_numpy))
         x, J = settings.evaluate(rows)
-        e = task.difference(x if measured is None else measured, target)
-        step = control_step(settings, rows, J, e, feed_forward, last=before)
+        seen = x if measured is None else measured
+        e = task.difference(seen, target)
+        step = control_step(settings, rows, J, e, feed_forward, last=before, tip=seen)
         parts = (step.dq, x, e.norm(dim=-1), step.sigma_min, step.damping, step.saturated)
         return Step(*give_back(parts, lead, as_numpy))
 

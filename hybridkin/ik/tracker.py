@@ -100,7 +100,7 @@ class Tracker:
             return IKStatus.INVALID_INPUT
         if robot.reached(self._tol):
             return IKStatus.CONVERGED if robot.in_domain() else IKStatus.OUT_OF_DOMAIN
-        if robot.saturated.any():
+        if robot.saturated.any() or robot.stopped:
             return IKStatus.AT_LIMITS
         return IKStatus.SINGULAR if robot.damping > 0.0 else IKStatus.MAX_ITER
 
@@ -189,7 +189,8 @@ class Tracker:
             ahead_now, target = ahead[i : i + 1], target if known[i] else None
             tick = self._robot.advance(periods[i], target, ahead_now, used)
             rows.append((tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped))
-            held, damped = tick.step.saturated.any(-1), tick.step.damping > 0.0
+            held = tick.step.saturated.any(-1) | tick.step.stopped
+            damped = tick.step.damping > 0.0
         q, x, seen, J, held, damped = (torch.cat(parts) for parts in zip(*rows, strict=True))
         return [q, x, seen, row_gram(J).sigma_min, held, damped]
 
@@ -246,6 +247,7 @@ class _InTorch:
         settings, task = self._settings, self.task
         x, J = settings.evaluate(self._q)
         error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
+        shift = used  # from the model's tip
         if target is not None:
             error = used = task.difference(x, target)
             if tip is not None:
@@ -254,12 +256,15 @@ class _InTorch:
                 error = task.difference(tip, target)
                 offset = used - error
                 seen = torch.isfinite(offset).all(-1, keepdim=True)
+                kept = 0.0 * self._offset if self._memory is None else self._offset
                 remembered = used if self._memory is None else self._offset
                 used = torch.where(seen, error, used - remembered)
+                shift = torch.where(seen, offset, kept)
                 self._offset = torch.where(seen, offset, self._offset)
         seconds = period or settings.dt
         last = self._last.step.dq * (seconds / self._period)
-        step = control_step(settings, self._q, J, used, feed_forward, seconds, last)
+        at = None if settings.tip_limits is None else x + shift
+        step = control_step(settings, self._q, J, used, feed_forward, seconds, last, at)
         if self._memory is not None:
             self._offset = math.exp(-seconds / self._memory) * self._offset
         self._last, self._period = Tick(self._q, x, J, error, step), seconds
@@ -278,6 +283,7 @@ class _InTorch:
     command = property(lambda self: self._given_back(self._q))
     x = property(lambda self: self._given_back(self._last.x))
     saturated = property(lambda self: self._given_back(self._last.step.saturated))
+    stopped = property(lambda self: bool(self._last.step.stopped))
     error = property(lambda self: float(self._last.e.norm(dim=-1)))
     sigma_min = property(lambda self: float(self._last.step.sigma_min))
     damping = property(lambda self: float(self._last.step.damping))
