@@ -237,6 +237,10 @@ class StepSettings(Portable):
         """Return q moved into the limits."""
         return torch.clamp(q, *self.box(q))
 
+    def change(self, q: Tensor, period: float) -> Tensor:
+        """Return by how much a step may differ from the one before."""
+        return self.ddq_max.to(q) * period**2
+
     def step_bounds(
         self, q: Tensor, period: float | None = None, last: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
@@ -262,7 +266,7 @@ class StepSettings(Portable):
         most = self.dq_max.to(q) * period
         if not self.accelerates:
             return torch.clamp(lower, -most, most), torch.clamp(upper, -most, most)
-        change = self.ddq_max.to(q) * period**2
+        change = self.change(q, period)
         least, largest = (-change, change) if last is None else (last - change, last + change)
         lower, upper = (
             torch.clamp(side * stopping(side * end, change), -most, most)

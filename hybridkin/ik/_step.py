@@ -21,7 +21,6 @@ from hybridkin.ik._gram import (
 from hybridkin.ik._settings import StepSettings, stopping
 
 _PROJECTIONS, _EXCESS = 8, 1.5  # of a step that would leave the limits of the tip
-_LARGE = 1e30  # in place of infinite
 
 
 class StepRows(NamedTuple):
@@ -73,30 +72,48 @@ def control_step(
         With sigma_min NaN where a row held still.
     """
     gain, beta, seconds = settings.rates(period)
-    v = gain * e if feed_forward is None else feed_forward + gain * e
+    feed = torch.zeros_like(e) if feed_forward is None else feed_forward
     fine = torch.isfinite(q).all(-1) & torch.isfinite(J).all(-1).all(-1)
-    fine &= torch.isfinite(v).all(-1)
+    fine &= torch.isfinite(feed + e).all(-1)
     fine = (fine if last is None else fine & torch.isfinite(last).all(-1))[:, None]
-    at = torch.where(fine, q, 0.0)
+    at, e, J = (
+        torch.where(fine, q, 0.0),
+        torch.where(fine, e, 0.0),
+        torch.where(fine[..., None], J, 0.0),
+    )
     posture = None
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
+    share = gain
+    if settings.accelerates:
+        # No faster towards the target, and the posture, than the actuators can brake in time.
+        change = settings.change(q, seconds)
+        brake = _braking(settings, J, e, change)
+        share = stopping(torch.ones_like(brake), brake).clamp_max(gain)[:, None]
+        if posture is not None:
+            most = stopping((posture / beta).abs(), change)
+            posture = torch.clamp(posture, -most, most)
+    v = torch.where(fine, feed + share * e, 0.0)
     bounds = settings.step_bounds(q, seconds, last)
-    J, v = torch.where(fine[..., None], J, 0.0), torch.where(fine, v, 0.0)
     if tip is None or settings.tip_limits is None or settings.limits == "off":
         step = limited_step(settings, J, v, posture, *bounds)
     else:
         room = settings.tip_limits.room(torch.where(fine, tip, 0.0))
         if settings.accelerates:
-            # Half of the braking, for the other half may have to serve other directions.
-            change = (settings.ddq_max.to(q) * seconds**2).clamp_max(_LARGE).expand(J.shape[-1])
-            brake = 0.5 * (settings.tip_limits.normals.to(J) @ J).abs() @ change
-            room = stopping(room, brake.clamp_min(1.0 / _LARGE))
+            normals = settings.tip_limits.normals.to(J)
+            brakes = [_braking(settings, J, a.expand(len(J), -1), change) for a in normals]
+            room = stopping(room, torch.stack(brakes, dim=-1))
         step = _step_inside(settings, J, v, posture, bounds, room)
     return step._replace(
         dq=torch.where(torch.isnan(step.dq), 0.0, step.dq),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
     )
+
+
+def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
+    """Return by how many `way` the motion of the tip in a period can change to the next (N,)."""
+    free = torch.full_like(J[:, 0], math.inf)
+    return (change / limited_step(settings, J, way, None, -free, free).dq.abs()).amin(-1)
 
 
 def _step_inside(

@@ -368,6 +368,22 @@ static inline void ik_step_bounds(const ik_settings *ik, const real *q, real sec
     }
 }
 
+/* No faster towards the target, and the posture, than the actuators can brake in time: shorten the
+   posture step, and return the share of the error e that may be taken back. */
+static inline real ik_brake(const ik_settings *ik, const real *q, const real *J, const real *e,
+                            real seconds, ik_step_t *s) {
+    real least = R(INFINITY);
+    for (int j = 0; j < ik->n; j++) s->lower[j] = -least, s->upper[j] = least;
+    ik_limited_step(ik, J, e, 0, NULL, s);
+    for (int j = 0; j < ik->n; j++) {
+        const real change = ik->accel[j] * seconds * seconds, ratio = change / ik_abs(s->dq[j]);
+        const real most = ik_stopping(ik_abs(ik->posture[j] - q[j]), change);
+        least = ratio < least ? ratio : least;
+        s->posture[j] = ik_clip(s->posture[j], -most, most);
+    }
+    return ik_stopping(R(1.0), least);
+}
+
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
    taken back. What is not finite holds still, with a limit of acceleration after it has braked. */
 static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *J,
@@ -378,14 +394,20 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
     gain = gain > R(1.0) ? R(1.0) : gain;
     beta = beta > R(1.0) ? R(1.0) : beta;
     for (int i = 0; i < 3; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));
-    ik_step_bounds(ik, q, seconds, last, s);
     const int known = !last || ik_finite(n, last);
     if (known && ik_finite(n, q) && ik_finite(3 * n, J) && ik_finite(3, v)) {
         for (int j = 0; j < n; j++) s->posture[j] = beta * (ik->posture[j] - q[j]);
+        if (ik->flags & IK_ACCELERATES) {
+            const real share = ik_brake(ik, q, J, e, seconds, s);
+            for (int i = 0; i < 3; i++)
+                v[i] = (share < gain ? share : gain) * e[i] + (feed ? feed[i] : R(0.0));
+        }
+        ik_step_bounds(ik, q, seconds, last, s);
         ik_limited_step(ik, J, v, ik->flags & IK_POSTURE, NULL, s);
         return;
     }
     const real still[3 * HK_MAX_N] = {R(0.0)};
+    ik_step_bounds(ik, q, seconds, last, s);
     ik_limited_step(ik, still, still, 0, NULL, s);
     for (int j = 0; j < n; j++) s->dq[j] = known && q[j] == q[j] ? s->dq[j] : R(0.0);
     s->sigma_min = R(NAN);
