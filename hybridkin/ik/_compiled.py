@@ -94,12 +94,9 @@ class Core:
     def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, Program]]:
         return Core, self._made_of
 
-    def step(
-        self, q: Any, target: Any, dx: Any, tip: Any, last: Any
-    ) -> tuple[NDArray, dict] | None:
-        """Return a `Step` of a row of plain arrays and where its fields are, None for others."""
-        plain = type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == (self.n,)
-        if not plain or last is not None:
+    def step(self, q: Any, target: Any, dx: Any, tip: Any) -> tuple[NDArray, dict] | None:
+        """Return a `Step` of one row of plain arrays and where its fields are, None for others."""
+        if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
             return None
         follower = self._idle.pop() if self._idle else Follower(self, None, _MUST_SEE + _FROM_REST)
         follower.q[...] = q

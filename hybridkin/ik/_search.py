@@ -25,6 +25,7 @@ _NULL_GAIN = 1e-8  # of the square of what is left to go; the descent ends where
 _INSIDE = 0.98  # domain distance to go to from outside the domain
 _OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
 _FIRST = 4  # further starts before all the others
+_RETURNS = 8  # from where the limits of the tip exclude, to the nearest point that they allow
 _ROWS = 256  # that start elsewhere at once
 
 RowsT = TypeVar("RowsT", bound="Point")
@@ -96,7 +97,7 @@ class Search:
     def solve(self, q: Tensor, target: Tensor, cold: bool, restarts: int) -> Found:
         """Return the best points from starts q (N, n), and from further ones where they fail."""
         settings = self.settings
-        q = settings.inside(q)
+        q, target = settings.inside(q), settings.allowed(target)
         if cold and len(q) > 0 and row_gram(settings.evaluate(q[:1])[1]).is_singular.all():
             # A straight backbone: motions that cancel to first order would be missed.
             at_start = self._start(q, target)
@@ -113,9 +114,17 @@ class Search:
             for part in starts.tensor_split([_FIRST], dim=1):  # a few, then the others
                 open_rows = self._cost(found)[some] > _DONE
                 self._try_again(found, some[open_rows], part[open_rows])
+        for _ in range(_RETURNS if settings.tip_limits is not None else 0):
+            away = (settings.allowed(found.x) - found.x).norm(dim=-1) > self._metres
+            rows = (~found.reached & away).nonzero()[:, 0]
+            found.put(rows, self._attempt(found.q[rows], settings.allowed(found.x[rows])))
         if settings.has_posture:
             self._to_posture(found)
         return found
+
+    @property
+    def _metres(self) -> float:
+        return self.tol[0] if isinstance(self.tol, tuple) else self.tol
 
     def _to_posture(self, found: Found) -> None:
         self._descend(found, lambda q: self.settings.preferred(q) - q)
@@ -194,8 +203,7 @@ class Search:
             less = live.nu * (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
             live.nu = torch.where(better, less, live.nu * live.growth)
             live.growth = torch.where(better, 2.0, 2.0 * live.growth)
-            metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
-            little = better & (error - error_new < 0.01 * metres)
+            little = better & (error - error_new < 0.01 * self._metres)
             live.slow = torch.where(little, live.slow + 1.0, 0.0)
             live.held = step.saturated.any(-1)
             taken = better.nonzero()[:, 0]

@@ -237,17 +237,22 @@ class StepSettings(Portable):
         """Return q moved into the limits."""
         return torch.clamp(q, *self.box(q))
 
+    def allowed(self, x: Tensor) -> Tensor:
+        """Return the points nearest to x where the tip may be."""
+        limits = self.tip_limits
+        return x if limits is None else x + limits.way_in(limits.room(x))
+
     def change(self, q: Tensor, period: float) -> Tensor:
         """Return by how much a step may differ from the one before."""
         return self.ddq_max.to(q) * period**2
 
     def step_bounds(
-        self, q: Tensor, period: float | None = None, last: Tensor | None = None
+        self, q: Tensor, period: float | None = None, last: Tensor | float = 0.0
     ) -> tuple[Tensor, Tensor]:
         """Return the bounds of dq: position, and for a period [s] speed and acceleration.
 
         They are intersected and never empty. `last` is the step before, for a period as long as
-        this one; None is at rest. From outside the limits both bounds meet at the way back, at most
+        this one. From outside the limits both bounds meet at the way back, at most
         the largest step; where the speed cannot be stopped in time they meet at the hardest
         braking. The nextafter makes q + upper <= q_max hold after rounding, and with it q + dq for
         every dq.
@@ -264,15 +269,12 @@ class StepSettings(Portable):
         if self.limits == "off" or period is None:
             return lower, upper
         most = self.dq_max.to(q) * period
-        if not self.accelerates:
-            return torch.clamp(lower, -most, most), torch.clamp(upper, -most, most)
-        change = self.change(q, period)
-        least, largest = (-change, change) if last is None else (last - change, last + change)
-        lower, upper = (
-            torch.clamp(side * stopping(side * end, change), -most, most)
-            for side, end in ((-1.0, lower), (1.0, upper))
-        )
-        return torch.clamp(lower, least, largest), torch.clamp(upper, least, largest)
+        ends = -most, most
+        if self.accelerates:
+            change = self.change(q, period)
+            lower, upper = -stopping(-lower, change), stopping(upper, change)
+            ends = [torch.clamp(end, last - change, last + change) for end in ends]
+        return torch.clamp(lower, *ends), torch.clamp(upper, *ends)
 
     def margin(self, q: Tensor) -> Tensor:
         """Return the smallest distance of an actuator to its limits."""

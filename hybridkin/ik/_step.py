@@ -72,30 +72,23 @@ def control_step(
         With sigma_min NaN where a row held still.
     """
     gain, beta, seconds = settings.rates(period)
-    feed = torch.zeros_like(e) if feed_forward is None else feed_forward
-    fine = torch.isfinite(q).all(-1) & torch.isfinite(J).all(-1).all(-1)
-    fine &= torch.isfinite(feed + e).all(-1)
-    fine = (fine if last is None else fine & torch.isfinite(last).all(-1))[:, None]
-    at, e, J = (
-        torch.where(fine, q, 0.0),
-        torch.where(fine, e, 0.0),
-        torch.where(fine[..., None], J, 0.0),
-    )
-    posture = None
+    given = [a for a in (q, J.flatten(1), e, feed_forward, last) if a is not None]
+    fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
+    at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
+    J, posture = torch.where(fine[..., None], J, 0.0), None
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
-    share = gain
     if settings.accelerates:
         # No faster towards the target, and the posture, than the actuators can brake in time.
         change = settings.change(q, seconds)
         brake = _braking(settings, J, e, change)
-        share = stopping(torch.ones_like(brake), brake).clamp_max(gain)[:, None]
+        gain = stopping(torch.ones_like(brake), brake).clamp_max(gain)[:, None]
         if posture is not None:
             most = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -most, most)
-    v = torch.where(fine, feed + share * e, 0.0)
-    bounds = settings.step_bounds(q, seconds, last)
-    if tip is None or settings.tip_limits is None or settings.limits == "off":
+    v = gain * e if feed_forward is None else torch.where(fine, feed_forward + gain * e, 0.0)
+    bounds = settings.step_bounds(q, seconds, 0.0 if last is None else last)
+    if tip is None or settings.tip_limits is None:
         step = limited_step(settings, J, v, posture, *bounds)
     else:
         room = settings.tip_limits.room(torch.where(fine, tip, 0.0))
@@ -103,7 +96,7 @@ def control_step(
             normals = settings.tip_limits.normals.to(J)
             brakes = [_braking(settings, J, a.expand(len(J), -1), change) for a in normals]
             room = stopping(room, torch.stack(brakes, dim=-1))
-        step = _step_inside(settings, J, v, posture, bounds, room)
+        step = _step_inside(settings, room, J, v, posture, *bounds)
     return step._replace(
         dq=torch.where(torch.isnan(step.dq), 0.0, step.dq),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
@@ -117,12 +110,7 @@ def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> 
 
 
 def _step_inside(
-    settings: StepSettings,
-    J: Tensor,
-    v: Tensor,
-    posture: Tensor | None,
-    bounds: tuple[Tensor, Tensor],
-    room: Tensor,
+    settings: StepSettings, room: Tensor, J: Tensor, v: Tensor, z: Tensor | None, *bounds: Tensor
 ) -> StepRows:
     """Return a step within the bounds after which, to first order, the tip is within its limits.
 
@@ -134,19 +122,19 @@ def _step_inside(
     limits, close = settings.tip_limits, 32.0 * torch.finfo(v.dtype).eps  # [m]
     assert limits is not None
 
-    def taken(way: Tensor, posture: Tensor | None) -> tuple[StepRows, Tensor]:
-        step = limited_step(settings, J, way, posture, *bounds)
+    def taken(way: Tensor, z: Tensor | None = z) -> tuple[StepRows, Tensor]:
+        step = limited_step(settings, J, way, z, *bounds)
         return step, limits.along(apply_rows(J, step.dq)) - room
 
     wanted = v + limits.way_in(room - limits.along(v))
-    step, over = taken(wanted, posture)
+    step, over = taken(wanted)
     for _ in range(_PROJECTIONS):
         out = (over > close).any(-1, keepdim=True)
         if not out.any():
             break
         back = apply_rows(J, step.dq) + _EXCESS * limits.way_in(-over)
         wanted = torch.where(out, back, wanted)
-        step, over = taken(wanted, posture)
+        step, over = taken(wanted)
     else:
         stay, least = taken(limits.way_in(room), None)
         share = ((close - least) / (over - least)).clamp(0.0, 1.0)

@@ -161,7 +161,7 @@ class InverseKinematics:
             number(dt, "dt"),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
             tuple(own),
-            None if tip_limits is None else half_spaces(tip_limits, task),
+            None if tip_limits is None or limits == "off" else half_spaces(tip_limits, task),
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
@@ -221,7 +221,7 @@ class InverseKinematics:
             `ddq_max` after it has braked.
         """
         core = core_of(self.settings)
-        found = None if core is None else core.step(q, x_target, dx, x_measured, dq)
+        found = None if core is None or dq is not None else core.step(q, x_target, dx, x_measured)
         if found is None:
             return self._steps(core, q, x_target, dx, x_measured, dq)
         step = object.__new__(Step)  # its constructor takes longer than the step
@@ -328,18 +328,19 @@ class InverseKinematics:
             search, settings = core.search(tolerance, max_iter), core.settings
             task = settings.task
         found = search.solve(q, target, q0 is None, restarts)
-        q = found.q
+        q, moved = found.q, (found.target != target).flatten(1).any(-1)  # by limits of the tip
         if differentiable:
             with torch.enable_grad():
                 goal = rows_of(torch.as_tensor(x_target, device=q.device).to(q), lead, axes)
-                q = with_derivatives(settings, q, goal, found.reached)
+                q = with_derivatives(settings, q, goal, found.reached & ~moved)
         # The error and the status are those of the q that is returned.
         x, J = settings.evaluate(q.detach())
         e = task.difference(x, target)
         error, gram = e.norm(dim=-1), row_gram(J)
         reached = task.reached(e, tolerance)
         status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
-        status[found.stationary & ~reached & torch.isfinite(error)] = IKStatus.UNREACHABLE
+        ended = found.stationary | (found.reached & moved)
+        status[ended & ~reached & torch.isfinite(error)] = IKStatus.UNREACHABLE
         margin = settings.margin(q.detach())
         results = (q, x, error, status, found.n_iter, found.n_starts, gram.sigma_min, margin)
         with torch.set_grad_enabled(differentiable):

@@ -155,7 +155,7 @@ class Tracker:
         feed_forward, tip = None, None
         if dx is not None:
             rows = (sum(settings.task.parts),)
-            feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)
+            feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)[None]
         if x_measured is not None:
             tip = settings.points(x_measured, "x_measured", like, lead="")[None]
         robot.advance(None, target, feed_forward, tip)
@@ -247,7 +247,6 @@ class _InTorch:
         settings, task = self._settings, self.task
         x, J = settings.evaluate(self._q)
         error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
-        shift = used  # from the model's tip
         if target is not None:
             error = used = task.difference(x, target)
             if tip is not None:
@@ -256,14 +255,12 @@ class _InTorch:
                 error = task.difference(tip, target)
                 offset = used - error
                 seen = torch.isfinite(offset).all(-1, keepdim=True)
-                kept = 0.0 * self._offset if self._memory is None else self._offset
                 remembered = used if self._memory is None else self._offset
                 used = torch.where(seen, error, used - remembered)
-                shift = torch.where(seen, offset, kept)
                 self._offset = torch.where(seen, offset, self._offset)
         seconds = period or settings.dt
         last = self._last.step.dq * (seconds / self._period)
-        at = None if settings.tip_limits is None else x + shift
+        at = None if settings.tip_limits is None else x + self._offset
         step = control_step(settings, self._q, J, used, feed_forward, seconds, last, at)
         if self._memory is not None:
             self._offset = math.exp(-seconds / self._memory) * self._offset
