@@ -25,7 +25,7 @@ _NULL_GAIN = 1e-8  # of the square of what is left to go; the descent ends where
 _INSIDE = 0.98  # domain distance to go to from outside the domain
 _OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
 _FIRST = 4  # further starts before all the others
-_RETURNS = 8  # from where the limits of the tip exclude, to the nearest point that they allow
+_RETURNS = 30  # of rows that ended outside the limits of the tip, towards these
 _ROWS = 256  # that start elsewhere at once
 
 RowsT = TypeVar("RowsT", bound="Point")
@@ -115,9 +115,11 @@ class Search:
                 open_rows = self._cost(found)[some] > _DONE
                 self._try_again(found, some[open_rows], part[open_rows])
         for _ in range(_RETURNS if settings.tip_limits is not None else 0):
-            away = (settings.allowed(found.x) - found.x).norm(dim=-1) > self._metres
-            rows = (~found.reached & away).nonzero()[:, 0]
-            found.put(rows, self._attempt(found.q[rows], settings.allowed(found.x[rows])))
+            way = settings.allowed(found.x) - found.x
+            rows = (~found.reached & (way.norm(dim=-1) > self._metres)).nonzero()[:, 0]
+            if rows.numel() == 0:
+                break
+            found.put(rows, self._attempt(found.q[rows], (found.x + 1.5 * way)[rows]))
         if settings.has_posture:
             self._to_posture(found)
         return found

@@ -73,6 +73,7 @@ def control_step(
     """
     gain, beta, seconds = settings.rates(period)
     given = [a for a in (q, J.flatten(1), e, feed_forward, last) if a is not None]
+    last = 0.0 if last is None else torch.where(torch.isfinite(last).all(-1)[:, None], last, 0.0)
     fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
     at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
     J, posture = torch.where(fine[..., None], J, 0.0), None
@@ -87,7 +88,7 @@ def control_step(
             most = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -most, most)
     v = gain * e if feed_forward is None else torch.where(fine, feed_forward + gain * e, 0.0)
-    bounds = settings.step_bounds(q, seconds, 0.0 if last is None else last)
+    bounds = settings.step_bounds(q, seconds, last)
     if tip is None or settings.tip_limits is None:
         step = limited_step(settings, J, v, posture, *bounds)
     else:

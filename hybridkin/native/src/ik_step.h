@@ -407,9 +407,9 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
         return;
     }
     const real still[3 * HK_MAX_N] = {R(0.0)};
-    ik_step_bounds(ik, q, seconds, last, s);
+    ik_step_bounds(ik, q, seconds, known ? last : NULL, s);
     ik_limited_step(ik, still, still, 0, NULL, s);
-    for (int j = 0; j < n; j++) s->dq[j] = known && q[j] == q[j] ? s->dq[j] : R(0.0);
+    for (int j = 0; j < n; j++) s->dq[j] = q[j] == q[j] ? s->dq[j] : R(0.0);
     s->sigma_min = R(NAN);
 }
 
