@@ -64,7 +64,7 @@ def inverse(build, q):
     chain = build()
     x = chain(torch.from_numpy(q)).numpy()
     box = {"q_min": q.min(0) - 1e-3, "q_max": q.max(0) + 1e-3}
-    ik = InverseKinematics(chain, **box, dq_max=0.1)
+    ik = InverseKinematics(chain, **box, dq_max=0.1, ddq_max=10.0)
     path = np.linspace(x[0], x[1], 3)
     tracker = ik.tracker(q[0])
     tracker.step(x[1], np.zeros(3), x_measured=x[0])
@@ -77,6 +77,7 @@ def inverse(build, q):
         ik.solve(target, differentiable=True, max_iter=5).q.detach().numpy(),
         ik.step(q, x + 1e-3, dx=0 * x, x_measured=x).dq,
         ik.track(path).q,
+        InverseKinematics(chain, **box, tip_limits=([[0.0, 0.0, 1.0]], x[:1, 2])).track(path).q,
         measured.q,
         tracker.q,
         pose.solve(chain.pose(torch.from_numpy(q)).numpy(), max_iter=3).q,

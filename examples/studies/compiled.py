@@ -140,6 +140,7 @@ def random_settings(low: NDArray, high: NDArray, rng: np.random.Generator) -> di
         "gain": 50.0,
         "limits": "off",
         "q_pref": rng.uniform(low, high, n),
+        "ddq_max": span * 10.0 ** rng.uniform(1.0, 4.0, n),
     }
     return chosen | {name: value for name, value in more.items() if rng.random() < 0.3}
 

@@ -73,17 +73,18 @@ def test_a_thousand_random_tracks_keep_all_limits_and_stop():
     assert braked > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.needs_core
 def test_core_and_torch_agree():
     largest, braked = 0.0, 0
-    for ik, q, before, dq, target in runs(np.random.default_rng(1), 30, 20):
+    for ik, q, before, dq, target in runs(np.random.default_rng(1), 9, 20):
         ours = ik.step(q, target, dq=before).dq
         theirs = ik.step(*map(torch.from_numpy, (q, target)), dq=torch.from_numpy(before)).dq
         largest = max(largest, np.abs(ours - theirs.numpy()).max())
         np.testing.assert_allclose(dq, ours, rtol=0.0, atol=1e-9)  # `before` is rounded
         braked += np.isnan(target).any()
     assert largest < 1e-9
-    assert braked > 50
+    assert braked > 20
 
 
 def test_the_speed_stops_at_a_limit_whatever_the_periods():
@@ -156,6 +157,19 @@ def test_rows_that_are_not_finite_hold_still_or_brake():
         np.testing.assert_allclose(step.dq[0], np.full(9, 9e-4), atol=1e-17)
         assert step.dq[1, 0] == 0.0
         np.testing.assert_array_equal(step.dq[2], np.zeros(9))
+
+
+@pytest.mark.parametrize("limits", [{"ddq_max": 0.5}, {"tip_limits": ([[1.0, 0.0, 0.0]], [0.03])}])
+def test_single_precision_stays_single(limits):
+    ik = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4, dq_max=1.0, **limits)
+    q, x = (torch.from_numpy(a).float() for a in (HOME, TRUNK(torch.from_numpy(HOME)).numpy()))
+    tracker, double = ik.tracker(q), ik.tracker(HOME)
+    for _ in range(12):
+        found, expected = tracker.step(x + 0.05), double.step(x.double().numpy() + 0.05)
+        assert found.dtype == torch.float32
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=2e-3)
+    if "tip_limits" in limits:
+        assert tracker.x[0] == pytest.approx(0.03, abs=1e-5)
 
 
 def test_reset_starts_at_rest():

@@ -27,7 +27,7 @@ def limited(model, **settings):
     """Inverse kinematics within limits that suit the small models, 1 kHz."""
     extensible = getattr(as_forward_model(model).robot, "lengths", 0.1) is None
     low, high = (0.15, 0.35) if extensible else (-0.004, 0.004)
-    settings = {"q_min": low, "q_max": high, "dq_max": 1.0, "dt": 1e-3, **settings}
+    settings = {"q_min": low, "q_max": high, "dq_max": 1.0, "dt": 1e-3, "ddq_max": 2e3, **settings}
     return InverseKinematics(model, **settings)
 
 
@@ -136,11 +136,13 @@ def test_command_line(tmp_path, capsys):
     robot = tmp_path / "robot.toml"
     robot.write_text(
         "[[segment]]\nradius = 0.005\nlength = 0.1\nrepeat = 2\n"
-        "[limits]\nq_min = -0.004\nq_max = 0.004\ndq_max = 0.1\n"
+        "[limits]\nq_min = -0.004\nq_max = 0.004\ndq_max = 0.1\nddq_max = 5.0\n"
     )
     out = str(tmp_path / "c")
     options = ["--out", out, "--name", "robot", "--dtype", "float32", "--dt", "0.002"]
     assert main(["export", str(robot), *options]) == 0
     assert "Steps of 0.002 s within limits: robot description." in capsys.readouterr().out
-    assert "every 0.002 s" in Path(out, "README.md").read_text()
+    readme = Path(out, "README.md").read_text()
+    assert "every 0.002 s" in readme
+    assert "change of\nthat speed below (5, 5, 5, 5, 5, 5) per second" in readme
     assert subprocess.run([built(Path(out))], capture_output=True).returncode == 0

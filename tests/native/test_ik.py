@@ -85,7 +85,7 @@ def test_steps_are_those_of_torch(name):
 
 def test_a_row_is_a_tick_is_a_row_of_a_batch():
     draw = np.random.default_rng(1)
-    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=5.0)
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=5.0, ddq_max=100.0)
     q, x = random_rows(draw, BHA, 0.1, 0.4, 40, {"q_min": 0.1})
     dx, tip = draw.standard_normal((2, 40, 3))
     for given in ((None, None), (dx, None), (None, tip), (dx, tip)):
@@ -148,7 +148,7 @@ def test_solutions_are_those_of_torch(name):
 
 
 def test_a_track_is_that_of_torch():
-    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=1.0, dt=0.02)
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=1.0, ddq_max=20.0, dt=0.02)
     phase = np.linspace(0.0, 2.0 * np.pi, 60)
     path = np.stack([0.1 * np.sin(phase), 0.06 * np.sin(2 * phase), 0.75 + 0 * phase], axis=1)
     path[20], t = np.nan, np.cumsum(0.01 + 0.01 * (np.arange(60) % 2))
@@ -172,6 +172,7 @@ def test_what_has_no_kernel_runs_in_torch():
         InverseKinematics(BHA, q_pref=lambda q: 0.9 * q, **limits),
         InverseKinematics(PoseTask(BHA), **limits),
         InverseKinematics(lambda q: BHA(q), **limits),
+        InverseKinematics(BHA, tip_limits=(np.eye(3), np.ones(3)), **limits),
     ]
     for ik in others:
         assert ik.tracker(q).backend == "torch"

@@ -376,7 +376,8 @@ def test_a_model_that_does_not_know_its_rows_says_so(log, tmp_path):
 
 def test_limits_intersect_where_both_are_known():
     one = robots.Limits(q_min=np.array([-1.0, 0.0]), q_max=np.array([2.0, 3.0]))
-    other = robots.Limits(q_max=np.array([1.0, 4.0]), dq_max=np.array([0.5, 0.5]))
+    rates = {"dq_max": np.array([0.5, 0.5]), "ddq_max": np.array([2.0, 3.0])}
+    other = robots.Limits(q_max=np.array([1.0, 4.0]), **rates)
     both = one.intersect(other)
     assert both.q_min.tolist() == [-1.0, 0.0]
     assert both.q_max.tolist() == [1.0, 3.0]
@@ -385,6 +386,8 @@ def test_limits_intersect_where_both_are_known():
     assert narrow.q_min.tolist() == [-0.75, 0.25]
     assert narrow.q_max.tolist() == [0.75, 2.75]
     assert narrow.dq_max.tolist() == [0.5, 0.5]
+    assert narrow.ddq_max.tolist() == [2.0, 3.0]
+    assert narrow.scaled(-2.0).ddq_max.tolist() == [4.0, 6.0]
 
 
 def test_given_limits_replace_those_of_the_description():
@@ -392,10 +395,12 @@ def test_given_limits_replace_those_of_the_description():
     limits = robots.Limits(np.full(3, -0.01), np.full(3, 0.01), np.full(3, 0.02))
     robot = robots.RobotDescription("robot", chain, (), None, limits)
     loaded = workflow.LoadedModel("robot", Path("robot.toml"), chain, robot)
-    found = workflow.path_limits(loaded, q_max=0.002)
+    found = workflow.path_limits(loaded, q_max=0.002, ddq_max=0.5)
     assert found.q_min.tolist() == [-0.01] * 3
     assert found.q_max.tolist() == [0.002] * 3
     assert found.dq_max.tolist() == [0.02] * 3
+    assert found.ddq_max.tolist() == [0.5] * 3
+    assert workflow.path_limits(loaded).ddq_max is None
     assert found.source == "given and robot description"
     with pytest.raises(ValueError, match="`q_min` must not exceed `q_max`"):
         workflow.path_limits(loaded, q_min=0.02)
@@ -418,6 +423,7 @@ unit = "log"
 q_min = -60
 q_max = 60
 dq_max = 90
+ddq_max = 360
 """
 
 
@@ -432,6 +438,7 @@ def test_motor_angles_from_the_log_to_the_commands(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "Limits: q_min = -60, -60, -60 deg." in printed
     assert "Limits: dq_max = 90, 90, 90 deg/s." in printed
+    assert "Limits: ddq_max = 360, 360, 360 deg/s^2." in printed
     points, out = tmp_path / "points.csv", tmp_path / "track"
     angles = np.array([[0.0, 10.0, -5.0], [0.0, 9.0, -5.0]])
     np.savetxt(points, loaded.predict(-turn * angles), delimiter=",")
