@@ -235,8 +235,8 @@ ARRAYS = {
     "ik.ddq_max": ("ddq_max", HALF, lambda v: solver(ddq_max=v)),
     "ik.tip_limits": (
         "tip_limits",
-        X[:, 0].max() + HALF[:1],
-        lambda v: solver(tip_limits=([[1.0, 0.0, 0.0]], v)),
+        X[0] - HALF / 1e3,
+        lambda v: solver(tip_limits=(np.eye(3), v)),
     ),
     "ik.q_pref": ("q_pref", 0.2 + HALF / 100, lambda v: solver(q_pref=v)),
     "ik.weights": ("weights", HALF, lambda v: solver(weights=v)),
