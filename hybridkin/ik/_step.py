@@ -73,22 +73,24 @@ def control_step(
     """
     gain, beta, seconds = settings.rates(period)
     given = [a for a in (q, J.flatten(1), e, feed_forward, last) if a is not None]
-    last = 0.0 if last is None else torch.where(torch.isfinite(last).all(-1)[:, None], last, 0.0)
+    before = 0.0
+    if last is not None:
+        before = torch.where(torch.isfinite(last).all(-1, keepdim=True), last, 0.0)
     fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
     at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
     J, posture = torch.where(fine[..., None], J, 0.0), None
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
+    change = settings.change(q, seconds)
     if settings.accelerates:
         # No faster towards the target, and the posture, than the actuators can brake in time.
-        change = settings.change(q, seconds)
         brake = _braking(settings, J, e, change)
         gain = stopping(torch.ones_like(brake), brake).clamp_max(gain)[:, None]
         if posture is not None:
             most = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -most, most)
     v = gain * e if feed_forward is None else torch.where(fine, feed_forward + gain * e, 0.0)
-    bounds = settings.step_bounds(q, seconds, last)
+    bounds = settings.step_bounds(q, seconds, before)
     if tip is None or settings.tip_limits is None:
         step = limited_step(settings, J, v, posture, *bounds)
     else:

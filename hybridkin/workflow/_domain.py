@@ -94,7 +94,7 @@ def path_limits(
         if value.shape not in ((), (1,), (n,)):
             raise ValueError(f"`{name}` must be one number or {n}, got {value.size}.")
     low, high = (np.broadcast_to(v, n).astype(float) for v in (found.q_min, found.q_max))
-    rates = (
+    fast, hard = (
         None if rate is None else np.broadcast_to(rate, n).astype(float)
         for rate in (found.dq_max, found.ddq_max)
     )
@@ -107,7 +107,7 @@ def path_limits(
     known = (words for words, limits in sources.items() if limits.q_min is not None)
     ends = len({"q_min", "q_max"} & {*asked})
     parts = ["given"] * (ends > 0) + [", within the ".join(known)] * (ends < 2)
-    return PathLimits(low, high, *rates, " and ".join(parts))
+    return PathLimits(low, high, fast, hard, " and ".join(parts))
 
 
 @dataclass(frozen=True, eq=False)
