@@ -138,10 +138,8 @@ class Limits:
         return Limits(
             None if np.isinf(low).all() else low,
             None if np.isinf(high).all() else high,
-            *(
-                None if rate is None else np.multiply(np.abs(factor), rate)
-                for rate in (self.dq_max, self.ddq_max)
-            ),
+            None if self.dq_max is None else np.multiply(np.abs(factor), self.dq_max),
+            None if self.ddq_max is None else np.multiply(np.abs(factor), self.ddq_max),
         )
 
     def narrowed(self, by: float | np.ndarray) -> Limits:

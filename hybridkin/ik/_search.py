@@ -116,17 +116,13 @@ class Search:
                 self._try_again(found, some[open_rows], part[open_rows])
         for _ in range(_RETURNS if settings.tip_limits is not None else 0):
             way = settings.allowed(found.x) - found.x
-            rows = (~found.reached & (way.norm(dim=-1) > self._metres)).nonzero()[:, 0]
+            rows = (~found.reached & ~self._within(way)).nonzero()[:, 0]
             if rows.numel() == 0:
                 break
             found.put(rows, self._attempt(found.q[rows], (found.x + 1.5 * way)[rows]))
         if settings.has_posture:
             self._to_posture(found)
         return found
-
-    @property
-    def _metres(self) -> float:
-        return self.tol[0] if isinstance(self.tol, tuple) else self.tol
 
     def _to_posture(self, found: Found) -> None:
         self._descend(found, lambda q: self.settings.preferred(q) - q)
@@ -205,7 +201,8 @@ class Search:
             less = live.nu * (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
             live.nu = torch.where(better, less, live.nu * live.growth)
             live.growth = torch.where(better, 2.0, 2.0 * live.growth)
-            little = better & (error - error_new < 0.01 * self._metres)
+            metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
+            little = better & (error - error_new < 0.01 * metres)
             live.slow = torch.where(little, live.slow + 1.0, 0.0)
             live.held = step.saturated.any(-1)
             taken = better.nonzero()[:, 0]

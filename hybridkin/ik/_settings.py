@@ -308,6 +308,19 @@ class StepSettings(Portable):
             self.task.check(x, name)
         return x if like is None else x.to(like)
 
+    def times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
+        """Return the times of a path's points, and the period that follows each."""
+        n, dt = len(target), self.dt
+        if t is None:
+            return dt * torch.arange(n, dtype=target.dtype, device=target.device), [dt] * n
+        times = as_tensor(t, "t", target.device)
+        check_shape(times, "t", [n], "one time per point of `path`")
+        periods = times.diff().tolist()
+        increasing = bool(torch.isfinite(times).all()) and min(periods, default=dt) > 0.0
+        require(increasing, "`t` must be finite and increasing [s]; sort it, drop repeated times.")
+        self.rates(max(periods, default=dt))
+        return times, [*periods, dt]
+
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
         """Return one tolerance [m], or one for every part of the task."""
         given = np.atleast_1d(real_array(tol, "tol").astype(float))

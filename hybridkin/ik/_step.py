@@ -73,9 +73,7 @@ def control_step(
     """
     gain, beta, seconds = settings.rates(period)
     given = [a for a in (q, J.flatten(1), e, feed_forward, last) if a is not None]
-    before = 0.0
-    if last is not None:
-        before = torch.where(torch.isfinite(last).all(-1, keepdim=True), last, 0.0)
+    before = 0.0 if last is None else torch.where(torch.isfinite(last).all(-1)[:, None], last, 0.0)
     fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
     at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
     J, posture = torch.where(fine[..., None], J, 0.0), None

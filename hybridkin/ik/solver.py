@@ -12,8 +12,6 @@ from torch import Tensor
 
 from hybridkin._core.arrays import (
     as_array,
-    as_tensor,
-    check_shape,
     give_back,
     is_numpy,
     leading,
@@ -409,7 +407,7 @@ class InverseKinematics:
         require(len(target) > 0, f"`path` must hold at least one point, got {tuple(target.shape)}.")
         for message in [] if q0 is None else settings.far_messages(target, "path"):
             warnings.warn(message, stacklevel=3)
-        times, periods = self._times(t, target)
+        times, periods = settings.times(t, target)
         start = self.solve(target[0], tol=tol).q if q0 is None else q0
         q = settings.configurations(start, "q0", target)
         target = target.to(q.dtype)
@@ -448,16 +446,3 @@ class InverseKinematics:
             command.
         """
         return Tracker(self.settings, q0, self.settings.tolerance(tol), memory)
-
-    def _times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
-        """Return the times of a path's points, and the period that follows each."""
-        n, dt = len(target), self.settings.dt
-        if t is None:
-            return dt * torch.arange(n, dtype=target.dtype, device=target.device), [dt] * n
-        times = as_tensor(t, "t", target.device)
-        check_shape(times, "t", [n], "one time per point of `path`")
-        periods = times.diff().tolist()
-        increasing = bool(torch.isfinite(times).all()) and min(periods, default=dt) > 0.0
-        require(increasing, "`t` must be finite and increasing [s]; sort it, drop repeated times.")
-        self.settings.rates(max(periods, default=dt))
-        return times, [*periods, dt]

@@ -94,10 +94,8 @@ def path_limits(
         if value.shape not in ((), (1,), (n,)):
             raise ValueError(f"`{name}` must be one number or {n}, got {value.size}.")
     low, high = (np.broadcast_to(v, n).astype(float) for v in (found.q_min, found.q_max))
-    fast, hard = (
-        None if rate is None else np.broadcast_to(rate, n).astype(float)
-        for rate in (found.dq_max, found.ddq_max)
-    )
+    fast = None if found.dq_max is None else np.broadcast_to(found.dq_max, n).astype(float)
+    hard = None if found.ddq_max is None else np.broadcast_to(found.ddq_max, n).astype(float)
     if (low > high).any():
         raise ValueError(
             "`q_min` must not exceed `q_max`, with half the play and the range of the fit counted "
