@@ -54,7 +54,7 @@ def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]
 
 def arc_geometry(
     radii: Numbers,
-    lengths: Numbers | Sequence[float | None] | None,
+    lengths: Any,
     n_actuators: int | Sequence[int],
     angles: Numbers | None,
     offsets: Numbers,

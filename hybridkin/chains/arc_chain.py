@@ -405,8 +405,8 @@ class ArcChain(Chain):
         base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
         poses = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
         poses = torch.stack([*poses], dim=-3)
-        turns = q is not None and self.stage is not None
-        return rolled(poses, self.metres(q)[..., :1]) if turns else poses
+        turned = None if self.stage is None else q
+        return poses if turned is None else rolled(poses, self.metres(turned)[..., :1])
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         return (self._tip_of(self._to_tip(self._arcs(q)), q),)
