@@ -84,13 +84,12 @@ for name, values in errors.errors.items():
     print(f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.1f} mm")
 
 # %%
-# A circle, drawn with the last model within the joint limits of the URDF.
+# A circle, drawn with the last model within the limits of the URDF, which are
+# the default.
 
 model = models["+ error at the joints"].fit(q, x)
 circle = trajectories.spiral((0.45, 0.0, 0.45), (0.15, 0.15), turns=1.0, dt=0.1)
-ik = InverseKinematics(
-    model, q_min=nominal.q_min, q_max=nominal.q_max, q_pref=[0, 0.3, 0.8, 0, 0.5, 0], dt=0.1
-)
+ik = InverseKinematics(model, q_pref=[0, 0.3, 0.8, 0, 0.5, 0], dt=0.1)
 track = ik.track(circle)
 with torch.no_grad():
     reached = real(settled(torch.from_numpy(track.q))).numpy()

@@ -74,7 +74,7 @@ def test_equations_are_numbered_as_they_come():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["getting_started.md", "your_robot.md"])
+@pytest.mark.parametrize("page", ["getting_started.md", "your_robot.md", "rigid_arms.md"])
 def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for block in blocks(page, "toml"):
@@ -86,6 +86,10 @@ def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
         errors = dict(re.findall(r"(\w+): mean ([\d.]+) mm", capsys.readouterr().out))
         assert float(errors["hybrid"]) < 0.6 * float(errors["mechanical"])
         assert len(Path("commands.csv").read_text().splitlines()) == len(space["path"].x)
+    if page == "rigid_arms.md":
+        assert "q_max=1.5 to 2 of the model, dq_max=3 to 4 of the model" in capsys.readouterr().out
+        assert "<!-- measured in May -->" in Path("calibrated.urdf").read_text()
+        assert space["result"].rmse < 2.5e-4
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in DOCS.glob("*.md")))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -21,7 +22,7 @@ def in_blocks(
     check_tensor(q, "q")
     if q.ndim == 0:
         return function(q)  # which raises
-    blocks = q.reshape(-1, q.shape[-1]).split(size)
+    blocks = q.reshape(math.prod(q.shape[:-1]), q.shape[-1]).split(size)
     found = [function(rows) for rows in blocks]
     whole = [torch.cat([a.flatten(1) for a in part]) for part in zip(*found, strict=True)]
     pairs = zip(whole, found[0], strict=True)

@@ -16,6 +16,7 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.rotations import cross_matrix, rotation
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.rigid import RigidChain
 
 _Vector = TypeVar("_Vector", NDArray, Tensor)
 
@@ -169,6 +170,8 @@ def parameter(chain: Chain, name: str) -> Parameter:
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
     unit, kind, physical, origin = reach, "m", (-np.inf, np.inf), np.abs(start.numpy().ravel())
+    joints = chain.units if isinstance(chain, RigidChain) else []
+    kinds = tuple(joints) if entry == "joint_zeros" else ()
     if entry in SCALED:
         unit, kind = 1.0, "-"
         physical = origin / SCALED[entry], origin * SCALED[entry]
@@ -178,6 +181,8 @@ def parameter(chain: Chain, name: str) -> Parameter:
         unit, kind = 1.0, "rad"
     elif entry == "offsets":
         physical = (_SHORTEST * reach, np.inf)
+    elif kinds:
+        unit = np.where(np.array(kinds) == "m", reach, 1.0)
     elif entry == "tendon_zeros":
         unit = float(geometry["radii"].mean())
     elif entry == "actuator_zeros":
@@ -194,13 +199,13 @@ def parameter(chain: Chain, name: str) -> Parameter:
     elif name != entry:  # "tool", the last of the offsets
         directions, shown, shape = directions[:, -1:], shown[-1:], ()
     labels, size = _labels(name, shape), len(shown)
-    basic = name, entry, start, labels, np.full(size, unit), (kind,) * size
+    basic = name, entry, start, labels, np.broadcast_to(unit, size), kinds or (kind,) * size
     return Entries(*basic, directions, physical, shown, shape, log=entry in SCALED)
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
-    if len(shape) == 2 and shape[1] == 2:
-        return tuple(f"{name}[{k}, {axis}]" for k in range(shape[0]) for axis in "xy")
+    if len(shape) == 2 and shape[1] in (2, 3):
+        return tuple(f"{name}[{k}, {axis}]" for k in range(shape[0]) for axis in "xyz"[: shape[1]])
     if not shape:
         return (name,)
     return tuple(f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(*shape))

@@ -138,9 +138,10 @@ def calibrate(
     parameters : sequence of str, default=("radii", "base")
         Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
         chains), "offsets", "rest_bends", "actuator_zeros", "gains", "base" (pose), of elastic
-        tendon chains "bending_stiffness", "axial_stiffness" and "tendon_zeros"; or instead of all
-        angles "turns", of each segment's ring of actuators as a whole, instead of all offsets
-        "tool", the last one, and instead of all gains "gain", their common factor.
+        tendon chains "bending_stiffness", "axial_stiffness" and "tendon_zeros", of rigid arms
+        "joint_zeros", "links" and "tool"; or instead of all angles "turns", of each segment's ring
+        of actuators as a whole, instead of all offsets "tool", the last one, and instead of all
+        gains "gain", their common factor.
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
         All but "linear" bound the influence of outliers: ``rho(|e|^2 / 3)`` of SciPy's
         ``least_squares``, with the distance ``|e|`` of a row over the noise, times its weight.
@@ -151,9 +152,9 @@ def calibrate(
     prior : float or dict of str to float, default=0.5
         Standard deviation of the weak prior in natural units: a fraction of radii, lengths, gains
         and stiffnesses, of the mean radius (over the mean gain, where q is no length) for
-        actuator and tendon zeros, of the robot's length for
-        "offsets", "tool" and the base position, radians for angles, rest bends and the base
-        orientation. ``inf`` turns it off.
+        actuator and tendon zeros, of the robot's length for "offsets", "links", "tool", sliding
+        joints' zeros and the base position, radians for angles, rest bends, turning joints' zeros
+        and the base orientation. ``inf`` turns it off.
     groups : array-like of shape (N,), optional
         Motion of every row; asks for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional

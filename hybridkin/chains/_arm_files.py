@@ -1,12 +1,10 @@
-"""Rigid arms as files describe them: the joints from a root to an end, of URDF, MJCF and chains."""
+"""Rigid arms as others describe them: the joints from a root to an end, of MJCF and chains."""
 
 from __future__ import annotations
 
 import difflib
 import math
-import warnings
 from collections.abc import Sequence
-from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -19,15 +17,7 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain
 
-_UNLIMITED = (-math.inf, math.inf)
-_MISSING = (
-    "have no <limit>, which URDF requires; they are taken as unlimited. Add <limit>, or set "
-    'type="continuous" if they turn without end.'
-)
-_LOCKED = (
-    "are locked at 0: their limits are 0 and 0, as URDF has it where `lower` and `upper` are left "
-    "out. Give both if they move."
-)
+UNLIMITED = (-math.inf, math.inf)
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 
 
@@ -36,9 +26,11 @@ class Joint(NamedTuple):
 
     origin: NDArray
     kind: str = "fixed"
-    axis: NDArray | tuple[float, float, float] = (0.0, 0.0, 1.0)
-    name: str = ""
-    limits: Sequence[float] | None = None
+    axis: ArrayLike = (0.0, 0.0, 1.0)
+    name: str = ""  # of the actuator that moves it, which is another joint's where it mimics one
+    limits: Sequence[float] | None = None  # of that actuator
+    speed: float = math.inf
+    factor: float = 1.0  # times the actuator is the joint's position
 
 
 def moving_joints(path: list[Joint]) -> dict[str, Any]:
@@ -48,25 +40,29 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
     for joint in path:
         pending = pending @ joint.origin
         if joint.kind != "fixed":
-            moving.append(joint._replace(origin=pending))
+            name = joint.name or f"joint_{len(moving) + 1}"
+            moving.append(joint._replace(origin=pending, name=name))
             pending = np.eye(4)
-    if not moving:
-        raise ValueError("the path from the root to `end_link` must have a moving joint.")
-    limits = np.array([_limits(joint) for joint in moving])
+    drivers = {joint.name: joint for joint in moving}
+    factors = [joint.factor * (joint.name == name) for joint in moving for name in drivers]
+    couplings = np.reshape(factors, (len(moving), len(drivers)))
+    limits = np.array([_limits(joint) for joint in drivers.values()]).reshape(-1, 2)
     return {
-        "origins": np.stack([joint.origin for joint in moving]),
-        "axes": [joint.axis for joint in moving],
+        "origins": np.array([joint.origin for joint in moving]).reshape(-1, 4, 4),
+        "axes": np.array([joint.axis for joint in moving]).reshape(-1, 3),
         "kinds": [joint.kind for joint in moving],
-        "names": [joint.name or f"joint_{k + 1}" for k, joint in enumerate(moving)],
+        "couplings": None if np.array_equal(couplings, np.eye(len(moving))) else couplings,
+        "names": [*drivers],
         "q_min": limits[:, 0],
         "q_max": limits[:, 1],
+        "dq_max": [joint.speed for joint in drivers.values()],
         "tip": pending,
     }
 
 
 def _limits(joint: Joint) -> tuple[float, float]:
     """Return the limits of a joint: infinite without any; equal ones lock it."""
-    low, high = _UNLIMITED if joint.limits is None else map(float, joint.limits)
+    low, high = UNLIMITED if joint.limits is None else map(float, joint.limits)
     if not low <= high or math.inf in (low, -high):
         raise ValueError(
             f"joint {joint.name!r} must have a lower and an upper limit, the smaller first, got "
@@ -75,10 +71,10 @@ def _limits(joint: Joint) -> tuple[float, float]:
     return low, high
 
 
-def _source(text_or_path: str | PathLike[str]) -> str | Path:
+def source_of(text_or_path: str | PathLike[str]) -> str | Path:
     """Return XML text as it is, else the path of an existing file."""
     if isinstance(text_or_path, str) and text_or_path.lstrip().startswith("<"):
-        return text_or_path.strip()
+        return text_or_path.lstrip()
     path = Path(text_or_path)
     if not path.is_file():
         raise FileNotFoundError(
@@ -87,83 +83,12 @@ def _source(text_or_path: str | PathLike[str]) -> str | Path:
     return path
 
 
-def _one_of(name: str, known: Sequence[str], what: str) -> str:
+def one_of(name: str, known: Sequence[str], what: str) -> str:
     if name not in known:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {close[0]!r}? It has" if close else "it has"
         raise ValueError(f"{what} {name!r} is not in the robot; {hint} {list(known)}.")
     return name
-
-
-def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[Joint]:
-    """Return the joints of a URDF from one link to another."""
-    from pytorch_kinematics.urdf import URDF  # takes a second and loads pyplot
-
-    source = _source(text_or_path)
-    text = source.read_bytes() if isinstance(source, Path) else source.encode()
-    try:
-        robot: Any = URDF.from_xml_string(text)
-    except Exception as error:  # the reader has no exception of its own for all its failures
-        raise ValueError(f"`text_or_path` must be a valid URDF: {error}.") from error
-    known = [link.name for link in robot.links]
-    _check_tree(known, robot.joints)
-    by_child = {joint.child: joint for joint in robot.joints}
-    link = _one_of(end_link, known, "`end_link`")
-    root = None if root_link is None else _one_of(root_link, known, "`root_link`")
-    path: list[Joint] = []
-    while link != root and link in by_child:
-        path.insert(0, _urdf_joint(by_child[link]))
-        link = by_child[link].parent
-    if root is not None and link != root:
-        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root!r} does not.")
-    for limits, what in ((None, _MISSING), ((0.0, 0.0), _LOCKED)):
-        names = [joint.name for joint in path if joint.kind != "fixed" and joint.limits == limits]
-        if names:
-            warnings.warn(f"joints {names} {what}", stacklevel=3)
-    return path
-
-
-def _check_tree(links: list[str], joints: Sequence[Any]) -> None:
-    """Raise unless links and joints are one tree, with names that occur once."""
-    children = [joint.child for joint in joints]
-    names = {"link": links, "joint": [joint.name for joint in joints], "<child>": children}
-    for what, given in names.items():
-        doubled = sorted({name for name in given if given.count(name) > 1})
-        if doubled:
-            raise ValueError(f"every {what} of a URDF must occur once, got {doubled} more often.")
-    for joint in joints:
-        _one_of(joint.parent, links, f"<parent> of joint {joint.name!r}")
-        _one_of(joint.child, links, f"<child> of joint {joint.name!r}")
-    try:
-        TopologicalSorter({joint.child: [joint.parent] for joint in joints}).prepare()
-    except CycleError as error:
-        loop = " -> ".join(error.args[1])
-        raise ValueError(f"the links of a URDF must be a tree, got a cycle: {loop}.") from error
-    roots = [link for link in links if link not in children]
-    if len(roots) > 1:
-        raise ValueError(
-            f"a URDF must have one root, but no joint leads to any of {roots}; connect them by a "
-            "joint, or remove all but one."
-        )
-
-
-def _urdf_joint(joint: Any) -> Joint:
-    mimic, known = joint.mimic, ("revolute", "continuous", "prismatic", "fixed")
-    if joint.type not in known or mimic is not None:
-        does = f"is {joint.type}" if mimic is None else f"mimics {mimic.joint!r}"
-        raise ValueError(
-            f"joint {joint.name!r} {does}; only {known} joints that mimic no other are supported "
-            "on the way to `end_link`; choose a `root_link` after it."
-        )
-    origin = np.eye(4)
-    if joint.origin is not None:
-        turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0])
-        origin = _matrix(turn, joint.origin.xyz or [0, 0, 0])
-    axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # the URDF default
-    if joint.type == "continuous":
-        return Joint(origin, "revolute", axis, joint.name, _UNLIMITED)
-    limits = None if joint.limit is None else (joint.limit.lower, joint.limit.upper)
-    return Joint(origin, joint.type, axis, joint.name, limits)
 
 
 def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[Joint]:
@@ -174,7 +99,7 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         raise ImportError(
             "RigidChain.from_mjcf needs MuJoCo: pip install 'hybridkin[sim]'."
         ) from error
-    source = _source(text_or_path)
+    source = source_of(text_or_path)
     try:
         if isinstance(source, Path):
             model = mujoco.MjModel.from_xml_path(str(source))
@@ -184,8 +109,8 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         raise ValueError(f"`text_or_path` must be a valid MJCF: {error}.") from error
     bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
     sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
-    _one_of(end_link, [*bodies, *sites], "`end_link`")
-    root = 0 if root_link is None else bodies[_one_of(root_link, list(bodies), "`root_link`")]
+    one_of(end_link, [*bodies, *sites], "`end_link`")
+    root = 0 if root_link is None else bodies[one_of(root_link, list(bodies), "`root_link`")]
     path: list[Joint] = []
     body = bodies.get(end_link, -1)
     if body < 0:
@@ -222,19 +147,21 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
                 'it. Remove the joint to lock it, or set limited="false".'
             )
         back, slides = -zero * axis, kind == 2  # from MuJoCo's reference to q = 0
-        origin = _matrix(Rotation.from_rotvec((not slides) * back), anchor + slides * back)
+        origin = matrix_of(Rotation.from_rotvec((not slides) * back), anchor + slides * back)
         steps.append(Joint(origin, _MJCF_KINDS[kind], axis, name, limits))
-        steps.append(Joint(_matrix(Rotation.identity(), -anchor)))
+        steps.append(Joint(matrix_of(Rotation.identity(), -anchor)))
     return steps
 
 
 def _mjcf_pose(position: NDArray, quaternion: NDArray) -> NDArray:
-    return _matrix(Rotation.from_quat(np.roll(quaternion, -1)), position)  # w comes first
+    return matrix_of(Rotation.from_quat(np.roll(quaternion, -1)), position)  # w comes first
 
 
-def _matrix(turn: Rotation, position: ArrayLike) -> NDArray:
+def matrix_of(turn: Rotation | None = None, position: ArrayLike = 0.0) -> NDArray:
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), position
+    matrix[:3, 3] = position
+    if turn is not None:
+        matrix[:3, :3] = turn.as_matrix()
     return matrix
 
 

@@ -188,6 +188,21 @@ def shaped(
     return numeric(arrays.shaped(value, name, need, length), name, dtype, finite=finite)
 
 
+def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
+    """Return `q_min`, `q_max` and `dq_max`, shape (n,), infinite where they are None."""
+    limits, ends = {}, {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
+    for (name, end), value in zip(ends.items(), given, strict=True):
+        value = np.full(n, end) if value is None else value
+        limits[name] = shaped(value, name, "n", n, finite=False)
+    low, high, speed = limits.values()
+    if not ((low <= high) & (speed > 0.0)).all():
+        raise ValueError(
+            "`q_min` must not exceed `q_max`, and `dq_max` must be positive, got "
+            f"{low.tolist()}, {high.tolist()} and {speed.tolist()}."
+        )
+    return limits
+
+
 def actuator_counts(n_actuators: int | Sequence[int], n_segments: int) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
     given = np.asarray(n_actuators)

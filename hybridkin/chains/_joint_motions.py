@@ -1,4 +1,4 @@
-"""Kernels of rigid arms: tips, frames and Jacobian columns from the motions of the joints.
+"""Kinematics of rigid arms: tips, frames and Jacobian columns from the motions of the joints.
 
 Every joint moves by T(q) = B_0 + u_1(q) B_1 + u_2(q) B_2 with three constant matrices: u_1, u_2
 are sin q and cos q of a revolute joint (Rodrigues' formula), q and nothing of a prismatic one.
@@ -8,13 +8,25 @@ Batches come last in the results, vectors are (3, N); all are in the base frame.
 from __future__ import annotations
 
 import itertools
+import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import identity
+from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.units import degrees_message, millimetres_message
+from hybridkin.chains.chain import Chain
 
-def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
-    """Return B_0, B_1, B_2 of every joint, its origin included, shape (n, 3, 4, 4)."""
+FAR = 10.0  # [m]; a joint that slides further is more likely in millimetres
+
+
+def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor) -> Tensor:
+    """Return B_0, B_1, B_2 of every joint, its origin included, shape (n, 3, 4, 4).
+
+    `zeros` (n,) are the positions at which the joints have not moved from their origins.
+    """
     motions = origins.new_zeros(len(axes), 3, 4, 4)
     motions[:, 0, 3, 3] = 1.0
     eye = torch.eye(3, dtype=axes.dtype, device=axes.device)
@@ -24,7 +36,14 @@ def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
     motions[:, 1, :3, :3] = torch.where(slide, 0.0, torch.linalg.cross(eye[None], axes[:, None]))
     motions[:, 2, :3, :3] = torch.where(slide, 0.0, eye - along)
     motions[:, 1, :3, 3] = torch.where(slides[:, None], axes, 0.0)
-    return origins[:, None] @ motions
+    # T(q - zero), by the sine and cosine of a difference of angles.
+    still, by_u1, by_u2 = motions.unbind(1)
+    zero = zeros[:, None, None]
+    turn = torch.where(slide, 0.0, zero)
+    still = still - torch.where(slide, zero, 0.0) * by_u1
+    ahead, aside = turn.cos(), turn.sin()
+    parts = [still, ahead * by_u1 + aside * by_u2, ahead * by_u2 - aside * by_u1]
+    return origins[:, None] @ torch.stack(parts, 1)
 
 
 def column_carriers(motions: Tensor, origins: Tensor, axes: Tensor) -> Tensor:
@@ -55,11 +74,12 @@ def carried_tip(u1: Tensor, u2: Tensor, motions: Tensor, end: Tensor) -> Tensor:
 
 
 def frames(u1: Tensor, u2: Tensor, motions: Tensor) -> Tensor:
-    """Return every joint's moving frame, shape (N, n, 4, 4)."""
+    """Return the identity and every joint's moving frame, shape (N, n + 1, 4, 4)."""
+    first = identity(4, u1).expand(len(u1), 4, 4)
     u1, u2 = (part[..., None, None] for part in (u1, u2))
     still, by_u1, by_u2 = motions.unbind(1)
     steps = torch.addcmul(torch.addcmul(still, u1, by_u1), u2, by_u2).unbind(1)
-    return torch.stack([*itertools.accumulate(steps, torch.matmul)], dim=1)
+    return torch.stack([*itertools.accumulate(steps, torch.matmul, initial=first)], dim=1)
 
 
 def last_frame_and_joints(
@@ -73,7 +93,7 @@ def last_frame_and_joints(
     # Three coordinates of every row side by side, so that a joint costs one small product.
     u1, u2 = (part.T.repeat(1, 3) for part in (u1, u2))
     frame = torch.eye(4, dtype=u1.dtype, device=u1.device)[:, :3].repeat_interleave(n_rows, 1)
-    axes, points = [], []
+    axes, points = [frame[:0]], [frame[:0]]
     for carrier, of_u1, of_u2 in zip(carriers.unbind(), u1.unbind(), u2.unbind(), strict=True):
         still, by_u1, by_u2, axis = (carrier @ frame).split((4, 4, 4, 1))
         frame = torch.addcmul(torch.addcmul(still, of_u1, by_u1), of_u2, by_u2)
@@ -81,3 +101,216 @@ def last_frame_and_joints(
         points.append(frame[3:])
     joint_axes, joint_points = (torch.cat(part).reshape(n, 3, n_rows) for part in (axes, points))
     return frame.unflatten(1, (3, n_rows)), joint_axes, joint_points
+
+
+class JointChain(Chain):
+    """The kinematics of a rigid arm, from the buffers that its constructor checks."""
+
+    _structure = ("n_actuators", "kinds", "names")
+    kinds: tuple[str, ...]
+    names: tuple[str, ...]
+    couplings: Tensor | None
+
+    @property
+    def reach(self) -> Tensor:
+        """The natural size of the arm, shape () [m]: links, finite strokes and tool end to end."""
+        strokes = torch.maximum(self.q_min.abs(), self.q_max.abs())
+        strokes = torch.where(torch.isfinite(strokes), strokes, 0.0)
+        if self.couplings is not None:
+            strokes = self.couplings.abs() @ strokes
+        strokes = torch.where(self.slides, strokes, 0.0)
+        links = torch.linalg.vector_norm(self.origins[:, :3, 3], dim=1).sum()
+        ends = torch.linalg.vector_norm(torch.stack([self.tip[:3, 3], self.tool]), dim=1).sum()
+        reach = links + strokes.sum() + ends
+        return torch.where(reach > 0, reach, 1.0)
+
+    def geometry(self) -> dict[str, Tensor]:
+        """Return the geometry by name.
+
+        Besides entries of the constructor "links", shape (n_joints, 3) [m]: where the origin of
+        every joint lies in the frame that the joint before it moves. The last link is the `tool`.
+        """
+        return {**super().geometry(), "links": self.origins[:, :3, 3]}
+
+    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
+        buffers = dict(geometry)
+        links = buffers.pop("links", None)
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
+        if links is not None:
+            column = nn.functional.pad(links, (0, 1), value=1.0)[..., None]
+            self.origins = torch.cat([self.origins[..., :3], column], dim=-1)
+        zeros = self.joint_zeros if self.couplings is None else self.couplings @ self.joint_zeros
+        motions = joint_motions(self.origins, self.axes, self.slides, zeros)
+        self.register_buffer("motions", motions)
+        carriers = column_carriers(motions, self.origins, self.axes)
+        self.register_buffer("carriers", carriers)
+
+    @property
+    def units(self) -> list[str]:
+        """The unit of every actuator: "rad" where it turns a joint, else "m"."""
+        turns = ~self.slides
+        if self.couplings is not None:
+            turns = (self.couplings[turns] != 0.0).any(0)
+        return ["rad" if turn else "m" for turn in turns.tolist()]
+
+    def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the joint positions of rows q (N, n), and how q moves them, (n_joints, n)."""
+        if self.couplings is None:
+            return super().coordinates(q)
+        return q @ self.couplings.to(q).mT, self.couplings.to(q)
+
+    def from_coordinates(self, z: Tensor) -> Tensor:
+        """Return the tip (N, 3) at joint positions z (N, n_joints)."""
+        p = carried_tip(*self._shares(z), self.motions.to(z), self._end(z))
+        return (self.base.to(z)[:3] @ p).T
+
+    def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip (N, 3) and its derivative by the joint positions (N, 3, n_joints)."""
+        tip, linear, _, _ = self._columns(z)
+        base = self.base.to(z)
+        return (base[:3, :3] @ tip + base[:3, 3:]).T, self._in_measuring_frame(linear, z)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the tip position.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Joint positions [rad], of prismatic joints [m].
+
+        Returns
+        -------
+        Tensor of shape (..., 3)
+            Tip position in the measuring frame [m].
+        """
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        return in_blocks(lambda rows: (self.from_coordinates(self._joints(rows)),), q)[0]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip (..., 3) [m] and its Jacobian dx/dq (..., 3, n) in one pass.
+
+        In closed form, in [m/rad] for revolute joints and [-] for prismatic ones.
+        """
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        x, J = in_blocks(self._forward_and_jacobian, q)
+        return x, J
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip's pose (..., 4, 4) in the measuring frame, and `pose_jacobian(q)`."""
+        tip, linear, axes, frame = self._columns(self._joints(q))
+        slides = self.slides.to(q.device)[:, None, None]
+        angular = torch.where(slides, torch.zeros_like(axes), axes)
+        columns = [self._in_measuring_frame(part, q) for part in (linear, angular)]
+        J = self._by_actuators(torch.cat(columns, dim=-2)).reshape(
+            *q.shape[:-1], 6, self.n_actuators
+        )
+        turned = (self.tip.to(q)[:, :3].T @ frame.flatten(1)).unflatten(1, (3, -1))
+        local = torch.cat([turned, tip[None]]).permute(2, 1, 0)  # (N, 3, 4): axes and tip
+        last = identity(4, q)[3].expand(len(local), 1, 4)
+        pose = (self.base.to(q) @ torch.cat([local, last], 1)).reshape(*q.shape[:-1], 4, 4)
+        return pose, J
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Return the pose of the base and of the link that every joint moves.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Joint positions [rad], of prismatic joints [m].
+
+        Returns
+        -------
+        Tensor of shape (..., n_joints + 1, 4, 4)
+            Homogeneous transforms into the measuring frame; the last one is the tip: the end link
+            moved to its tool.
+        """
+        frames = self._frames(q)
+        end = torch.cat([self.tip.to(q)[:, :3], self._end(q)[:, None]], dim=1)
+        return torch.cat([frames[..., :-1, :, :], frames[..., -1:, :, :] @ end], dim=-3)
+
+    def pose(self, q: Tensor) -> Tensor:
+        """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
+        return self.poses(q)[..., -1, :, :]
+
+    def backbone(self, q: Tensor, n_points: int = 1) -> Tensor:
+        """Return points along the straight lines from the base through all joints to the tip.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Joint positions [rad], of prismatic joints [m].
+        n_points : int, default=1
+            Points per line; the last of each is its end.
+
+        Returns
+        -------
+        Tensor of shape (..., (n_joints + 1) * n_points + 1, 3)
+            Positions in the measuring frame [m].
+        """
+        if n_points < 1:
+            raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
+        corners = torch.cat([self._frames(q)[..., :3, 3], self(q)[..., None, :]], dim=-2)
+        start, end = corners[..., :-1, None, :], corners[..., 1:, None, :]
+        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
+        return torch.cat([corners[..., :1, :], torch.lerp(start, end, t).flatten(-3, -2)], dim=-2)
+
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return warnings where joints turn by more than two turns, or slide far."""
+        turns = torch.tensor([unit == "rad" for unit in self.units], device=q.device)
+        turned = degrees_message(name, q[:, turns].abs(), factor)
+        slid = millimetres_message(name, q[:, ~turns].abs(), factor * FAR)
+        return [message for message in (turned, slid) if message is not None]
+
+    def extra_repr(self) -> str:
+        """Return the summary shown by repr()."""
+        joints = f"{len(self.kinds)} joints" + ", coupled" * (self.couplings is not None)
+        return f"{joints}: {', '.join(self.names)}"
+
+    def _why_shape(self) -> str:
+        return f"this arm has {self.n_actuators} moving joints"
+
+    def _joints(self, q: Tensor) -> Tensor:
+        """Return the joint positions of q (..., n), as rows (N, n_joints)."""
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        return self.coordinates(q.reshape(math.prod(q.shape[:-1]), self.n_actuators))[0]
+
+    def _by_actuators(self, J: Tensor) -> Tensor:
+        """Return derivatives by q of those by the joint positions (N, m, n_joints)."""
+        return J if self.couplings is None else J @ self.couplings.to(J)
+
+    def _shares(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return u_1 and u_2 of every joint at joint positions (N, n_joints)."""
+        return shares(z, self.slides if "prismatic" in self.kinds else None)
+
+    def _frames(self, q: Tensor) -> Tensor:
+        """Return the base and every joint's moving frame, shape (..., n_joints + 1, 4, 4)."""
+        found = frames(*self._shares(self._joints(q)), self.motions.to(q))
+        return self.base.to(q) @ found.reshape(*q.shape[:-1], *found.shape[1:])
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        x, J = self.from_coordinates_and_jacobian(self._joints(q))
+        return x, self._by_actuators(J)
+
+    def _columns(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return tip (3, N), its derivatives and the joint axes (n_joints, 3, N), and a frame.
+
+        All are in the base frame, at joint positions (N, n_joints); of the last joint's moving
+        frame (4, 3, N) these are the three axes and the origin.
+        """
+        shares, carriers = self._shares(z), self.carriers.to(z)
+        frame, axes, points = last_frame_and_joints(*shares, carriers)
+        tip = (self._end(z) @ frame.flatten(1)).unflatten(0, (3, -1))
+        columns = torch.linalg.cross(axes, tip - points, dim=1)
+        if "prismatic" in self.kinds:
+            slides = self.slides.to(z.device)[:, None, None]
+            columns = torch.where(slides, axes, columns)
+        return tip, columns, axes, frame
+
+    def _in_measuring_frame(self, columns: Tensor, q: Tensor) -> Tensor:
+        """Return columns (n_joints, 3, N) of the base frame as a Jacobian (N, 3, n_joints)."""
+        return (self.base.to(q)[:3, :3] @ columns).permute(2, 1, 0)
+
+    def _end(self, q: Tensor) -> Tensor:
+        """Return the tool in the last joint's moving frame, homogeneous, shape (4,)."""
+        return self.tip.to(q) @ nn.functional.pad(self.tool.to(q), (0, 1), value=1.0)

@@ -143,13 +143,15 @@ class InverseKinematics:
         own, given = task.models[0].robot.limits, {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
         good = 0 not in np.shape(own["q_min"])
         require(good, "`model` must have an actuator, but its joints are all fixed: a constant.")
-        own = {name: own[name] for name, value in given.items() if value is None}
-        given |= own
+        bounds = {
+            name: bound(own[name] if value is None else value, name, positive=name == "dq_max")
+            for name, value in given.items()
+        }
         self.settings = StepSettings(
             task,
-            bound(given["q_min"], "q_min"),
-            bound(given["q_max"], "q_max"),
-            bound(given["dq_max"], "dq_max", positive=True),
+            bounds["q_min"],
+            bounds["q_max"],
+            bounds["dq_max"],
             bound(np.inf if ddq_max is None else ddq_max, "ddq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
             number(beta, "beta"),
@@ -158,7 +160,7 @@ class InverseKinematics:
             limits,
             number(dt, "dt"),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
-            tuple(own),
+            tuple(name for name, value in given.items() if value is None),
             None if tip_limits is None or limits == "off" else half_spaces(tip_limits, task),
         )
         for message in self.settings.unit_messages():

@@ -167,8 +167,11 @@ def _elastic_tendons(plan: Plan, stored: Stored) -> int:
 
 def _rigid(plan: Plan, stored: Stored) -> int:
     slides = [kind == "prismatic" for kind in stored.list_of(str, "kinds")]
-    before, numbers = stored.array("base"), []
-    for origin, axis in zip(stored.array("origins"), stored.array("axes"), strict=True):
+    if not slides:
+        raise NoKernel("an arm without moving joints is a constant")
+    plan.limit("actuators", len(slides))
+    before, numbers, motions = stored.array("base"), [], stored.derived["motions"]
+    for origin, axis in zip(motions[:, 0] + motions[:, 2], stored.array("axes"), strict=True):
         side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         side = side / np.linalg.norm(side)
         turn = np.eye(4)  # after which the joint's axis is z
@@ -177,7 +180,10 @@ def _rigid(plan: Plan, stored: Stored) -> int:
         numbers += [frame[:3, :3], frame[:3, 3]]
         before = turn.T
     tip = before @ stored.array("tip") @ np.append(stored.array("tool"), 1.0)
-    return plan.node(RIGID, len(slides), 3, [*numbers, tip[:3]], *slides)
+    couplings = stored.arrays.get("couplings", np.zeros((0, len(slides))))
+    n, coupled = couplings.shape[1], len(couplings) > 0
+    more = len(slides), coupled, *slides
+    return plan.node(RIGID, n, 3, [*numbers, tip[:3], couplings], *more)
 
 
 def _units(

@@ -195,9 +195,7 @@ def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
 def _units(model: object, output: str = "position") -> dict[str, str | list[str]]:
     if not isinstance(model, Chain):
         return {"q": "as in training", "x": "as in training"}
-    q = "m"
-    if isinstance(model, RigidChain):
-        q = ["m" if kind == "prismatic" else "rad" for kind in model.kinds]
+    q = model.units if isinstance(model, RigidChain) else "m"
     return {"q": q, "x": "m" if output == "position" else ["m"] * 3 + ["rad"] * 3}
 
 

@@ -641,7 +641,9 @@ def test_bad_input_says_what_is_needed(change, message):
 
 def test_an_arm_has_no_radii(rng):
     q = uniform(rng, 10, 6)
-    with pytest.raises(ValueError, match=r"different ones of \['base', 'tool'\] for this chain"):
+    with pytest.raises(
+        ValueError, match=r"different ones of \['base', 'joint_zeros', 'tool', 'links'\]"
+    ):
         calibrate(arm(), q, arm()(q), ("radii",))
 
 

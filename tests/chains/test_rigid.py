@@ -1,6 +1,7 @@
 import copy
 import math
 import pickle
+import re
 
 import joblib
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from hybridkin import HybridForwardModel, InverseKinematics, RigidChain, calibrate
@@ -440,7 +442,7 @@ def test_calibration_finds_the_base(rng):
 
 LINKS = '<robot name="r"><link name="a"/><link name="b"/>{}</robot>'
 JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>'
-MIMIC = LINKS.format(JOINT.format("revolute", '<mimic joint="k"/>'))
+MIMIC = LINKS.format(JOINT.format("revolute", '<mimic joint="j"/>'))
 CIRCLE = LINKS.format(
     JOINT.format("fixed", "")
     + '<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint>'
@@ -454,7 +456,7 @@ EYES = np.stack([np.eye(4)] * 2)
         (lambda: RigidChain(EYES, [Z]), r"`origins` must have shape \(1, 4, 4\), got \(2, 4, 4\)"),
         (lambda: RigidChain(2 * EYES, [Z, Z]), r"`origins\[0\]` must hold a rotation"),
         (lambda: RigidChain(EYES, [[0, 0]]), r"`axes` must have shape \(n, 3\)"),
-        (lambda: RigidChain(EYES, [Z, [0, 0, 0]]), "`axes` must hold at least one axis"),
+        (lambda: RigidChain(EYES, [Z, [0, 0, 0]]), "`axes` must not have zero length"),
         (lambda: RigidChain(EYES, [Z, ["a", 0, 0]]), "`axes` must be numeric"),
         (lambda: RigidChain(EYES, [Z, [math.nan, 0, 0]]), "`axes` must be finite"),
         (lambda: planar(kinds=["revolute"]), "`kinds` must hold 2 of"),
@@ -462,6 +464,9 @@ EYES = np.stack([np.eye(4)] * 2)
         (lambda: planar(names=["a"]), "`names` must hold 2 names"),
         (lambda: planar(q_min=[1, 1], q_max=[2, 0]), "`q_min` must not exceed `q_max`"),
         (lambda: planar(q_min=[0, math.nan]), "`q_min` must be finite"),
+        (lambda: planar(dq_max=[1, 0]), "`dq_max` must be positive, got"),
+        (lambda: planar(couplings=[[1.0]]), r"`couplings` must have shape \(2, m\)"),
+        (lambda: planar(joint_zeros=[1.0]), r"`joint_zeros` must have shape \(2,\)"),
         (lambda: planar(tool=[0.1]), r"`tool` must have shape \(3,\)"),
         (lambda: planar(tool=[0, 0, math.inf]), "`tool` must be finite"),
         (lambda: planar(base=np.eye(3)), r"`base` must be one pose of shape \(4, 4\)"),
@@ -479,13 +484,12 @@ EYES = np.stack([np.eye(4)] * 2)
         ),
         (lambda: arm(root_link="?"), "`root_link` '[?]' is not in the robot; it has"),
         (lambda: arm(root_link="camera"), "`root_link` must lead to 'flange', but 'camera'"),
-        (lambda: RigidChain.from_urdf(URDF, "base"), "must have a moving joint"),
         (
-            lambda: RigidChain.from_urdf(LINKS.format(JOINT.format("floating", "")), "b"),
-            "joint 'j' is floating",
+            lambda: RigidChain.from_urdf(LINKS.format(JOINT.format("ball", "")), "b"),
+            "`type` of joint 'j' must be one of .* got 'ball'",
         ),
         (lambda: RigidChain.from_urdf(CIRCLE, "b"), "must be a tree, got a cycle"),
-        (lambda: RigidChain.from_urdf(MIMIC, "b"), "joint 'j' mimics 'k'"),
+        (lambda: RigidChain.from_urdf(MIMIC, "b"), "joints must not mimic each other in a circle"),
     ],
 )
 def test_bad_input_says_what_is_needed(make, message):
@@ -498,7 +502,7 @@ def one_joint(low, high):
     return LINKS.format(JOINT.format("revolute", limit))
 
 
-@pytest.mark.parametrize("limits", [(1, -1), ("nan", 1), (0, "nan"), ("inf", "inf"), (0, "-inf")])
+@pytest.mark.parametrize("limits", [("nan", 1), (0, "nan"), ("inf", "inf"), (0, "-inf")])
 def test_wrong_urdf_limits_name_the_joint(limits):
     with pytest.raises(ValueError, match="joint 'j' must have a lower and an upper limit"):
         RigidChain.from_urdf(one_joint(*limits), "b")
@@ -593,7 +597,6 @@ def test_wrong_mjcf_limits_name_the_joint(joint, message, tmp_path, monkeypatch)
         (MJCF, "hant", None, "`end_link` 'hant' .* did you mean 'hand'"),
         (MJCF, "hand", "hend", "`root_link` 'hend' .* did you mean 'hand'"),
         (MJCF, "hand", "ball", "`root_link` must lead to 'hand', but 'ball'"),
-        (MJCF, "pedestal", None, "must have a moving joint"),
         (MJCF, "pin", None, "of body 'ball' is free or a ball"),
     ],
 )
@@ -620,3 +623,223 @@ def test_degrees_and_millimetres_are_noticed():
     with pytest.warns(UserWarning, match="millimetres"):
         RigidChain.from_urdf(URDF.replace("0.33", "330"), "flange")
     assert slider.check_actuators(torch.tensor([[-6.0, 0.1]])) == []
+
+
+def joint(name, parent, child, kind, *tags):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{"".join(tags)}</joint>'
+
+
+LIMIT = '<limit lower="-1" upper="2" effort="1" velocity="3"/>'
+
+# "k" mimics "m" beside the path, "l" mimics "k"; "n" is an actuator of its own.
+COUPLED = f"""<!-- kept --><robot xmlns:v="x" name="coupled"><v:paint rgb="1 0 0"/>
+<link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/><link name="f"/>
+<transmission name="t"><joint name="not a joint"/></transmission>
+{joint("m", "a", "b", "prismatic", LIMIT)}
+{
+    joint(
+        "k",
+        "a",
+        "c",
+        "revolute",
+        LIMIT,
+        '<axis xyz="0 0 1"/>',
+        '<mimic joint="m" multiplier="2" offset="0.3"/>',
+        '<origin xyz="0.1 0 0"/>',
+    )
+}
+{joint("plate", "c", "d", "fixed", '<origin xyz="0 0 0.1" rpy="0.1 1.5707963267948966 0.3"/>')}
+{
+    joint(
+        "l",
+        "d",
+        "e",
+        "prismatic",
+        LIMIT,
+        '<mimic joint="k" multiplier="-0.5" offset="0.1"/>',
+        '<gazebo reference="x"/>',
+        '<axis xyz="0 3 4"/>',
+    )
+}
+{joint("n", "e", "f", "continuous", '<origin xyz="0.2 0 0" rpy="0.4 0 0"></origin>')}
+</robot>"""
+
+
+def test_joints_that_mimic_others_are_one_actuator(rng):
+    """Against the joints on their own; limits are those of the actuator; Jacobians sum columns."""
+    arm = RigidChain.from_urdf(COUPLED, "f", tool=[0.1, 0.2, 0.3], base=random_pose(rng))
+    alone = RigidChain.from_urdf(
+        re.sub("<mimic.*?>", "", COUPLED), "f", tool=arm.tool, base=arm.base
+    )
+    q = random_q(rng, 7, 2)
+    k = 2 * q[:, 0] + 0.3
+    joints = torch.stack([k, 0.1 - 0.5 * k, q[:, 1]], 1)
+    assert arm.names == ("m", "n")
+    assert arm.units == ["rad", "rad"]
+    assert_close(arm.dq_max, torch.tensor([3.0, math.inf], dtype=torch.float64))
+    assert_close(arm.q_min, torch.tensor([-1.0, -math.inf], dtype=torch.float64))
+    assert_close(arm.poses(q), alone.poses(joints), rtol=0, atol=2e-15)
+    assert_close(arm.backbone(q), alone.backbone(joints), rtol=0, atol=2e-15)
+    slopes = torch.tensor([[2.0, 0], [-1.0, 0], [0, 1.0]], dtype=torch.float64)
+    T, J = arm.pose_and_jacobian(q)
+    assert_close(T, alone.pose(joints), rtol=0, atol=2e-15)
+    assert_close(J, alone.pose_jacobian(joints) @ slopes, rtol=0, atol=4e-15)
+    assert_close(arm.jacobian(q), reverse_jacobian(arm.forward, q)[1], rtol=0, atol=4e-15)
+    z, dz = arm.coordinates(q)
+    assert_close(dz, slopes)
+    assert_close(arm.from_coordinates(z), arm(q))
+    for ik in (
+        InverseKinematics(arm, q_pref=0.0),
+        InverseKinematics(arm, q_pref=0.0, limits="off"),
+    ):
+        assert ik.solve(arm(q[:1]), q0=q[:1] + 0.05).converged.all()
+
+
+def test_a_mimicked_joint_may_be_fixed_or_missing():
+    fixed = COUPLED.replace('name="m" type="prismatic"', 'name="m" type="fixed"')
+    arm = RigidChain.from_urdf(fixed, "f")
+    still = RigidChain.from_urdf(COUPLED, "f").with_geometry(base=arm.base)
+    q = torch.tensor([[0.0, 0.7]], dtype=torch.float64)
+    assert arm.names == ("n",)
+    assert_close(arm.pose(q[:, 1:]), still.pose(q), rtol=0, atol=2e-15)
+    with pytest.warns(UserWarning, match=r"\['q'\] have no <limit>"):
+        missing = RigidChain.from_urdf(COUPLED.replace('mimic joint="m"', 'mimic joint="q"'), "f")
+    assert missing.names == ("q", "n")
+    assert_close(missing.pose(q), still.pose(q), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("end", ["base", "world"])
+def test_an_arm_of_fixed_joints_is_a_constant(end, rng):
+    arm = RigidChain.from_urdf(URDF, end, tool=[0.1, 0.2, 0.3])
+    q = torch.zeros(4, 5, 0, dtype=torch.float64)
+    x, J = arm.forward_and_jacobian(q)
+    turn = Rotation.from_euler("xyz", [0.1, 0.2, -0.3]) if end == "base" else Rotation.identity()
+    expected = turn.apply([0.1, 0.2, 0.3]) + (end == "base") * np.array([0.1, -0.2, 0.3])
+    assert_close(x, torch.from_numpy(expected).expand(4, 5, 3), rtol=0, atol=1e-15)
+    assert_close(arm(q[0, 0]), x[0, 0], rtol=0, atol=0)
+    assert J.shape == (4, 5, 3, 0)
+    assert arm.pose_jacobian(q).shape == (4, 5, 6, 0)
+    assert_close(arm.poses(q)[..., -1, :, :], arm.pose(q))
+    assert arm.backbone(q).shape == (4, 5, 2, 3)
+    with pytest.raises(ValueError, match="`model` must have an actuator"):
+        InverseKinematics(arm)
+
+
+def test_floating_and_planar_joints_are_moves_and_turns():
+    both = joint("p", "b", "c", "planar") + joint(
+        "o", "a", "b", "floating", '<origin xyz="1 0 0"/>'
+    )
+    arm = RigidChain.from_urdf(LINKS.format('<link name="c"/>' + both), "c")
+    names = ("o_x", "o_y", "o_z", "o_yaw", "o_pitch", "o_roll", "p_x", "p_y", "p_yaw")
+    assert arm.names == names
+    q = torch.linspace(-0.4, 0.9, 9, dtype=torch.float64)
+    first, second = np.eye(4), np.eye(4)
+    first[:3, :3] = Rotation.from_euler("ZYX", q[3:6]).as_matrix()
+    first[:3, 3] = q[:3].numpy() + np.array([1.0, 0.0, 0.0])
+    second[:3, :3] = Rotation.from_euler("Z", float(q[8])).as_matrix()
+    second[:2, 3] = q[6:8]
+    assert_close(arm.pose(q), torch.from_numpy(first @ second), rtol=0, atol=1e-15)
+
+
+def test_swapped_limits_are_taken_in_order_and_no_speed_stands_for_none():
+    with pytest.warns(UserWarning, match="limits of joint 'j' are swapped"):
+        arm = RigidChain.from_urdf(one_joint(1, -1), "b")
+    assert (float(arm.q_min), float(arm.q_max), float(arm.dq_max)) == (-1.0, 1.0, 1.0)
+    still = one_joint(-1, 1).replace('velocity="1"', 'velocity="0"')
+    assert RigidChain.from_urdf(still, "b").dq_max == math.inf
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<!DOCTYPE robot [<!ENTITY a "aaaa">]>' + COUPLED, "it declares entities"),
+        ("<sdf/>", "the outermost tag must be <robot>, got <sdf>"),
+        (COUPLED.replace("0.2 0 0", "0.2 0"), r"`xyz` of <origin> of joint 'n' must be 3 numbers"),
+        (COUPLED.replace('multiplier="2"', 'multiplier="x"'), "`multiplier` of <mimic> of joint"),
+        (COUPLED.replace('joint="m"', 'joint="l"'), "mimic each other in a circle"),
+    ],
+)
+def test_hostile_and_broken_urdfs_are_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        RigidChain.from_urdf(text, "f")
+
+
+def moved(arm, rng):
+    """An arm with other links and zeros."""
+    old = arm.geometry()
+    new = {
+        name: old[name] + 0.1 * torch.randn(old[name].shape, generator=rng, dtype=torch.float64)
+        for name in ("links", "joint_zeros")
+    }
+    return arm.with_geometry(**new)
+
+
+def test_joint_zeros_are_where_q_starts(rng):
+    plain, q, zeros = arm(), random_q(rng), torch.linspace(-0.3, 0.4, 8, dtype=torch.float64)
+    chain = plain.with_geometry(joint_zeros=zeros)
+    assert_close(chain.pose(q + zeros), plain.pose(q), rtol=0, atol=4e-15)
+    assert_close(chain.jacobian(q + zeros), plain.jacobian(q), rtol=0, atol=4e-15)
+    assert_close(arm(joint_zeros=zeros).poses(q), chain.poses(q), rtol=0, atol=0)
+    given = {name: value.clone().requires_grad_() for name, value in plain.geometry().items()}
+
+    def tip(links, joint_zeros):
+        return plain.with_geometry(links=links, joint_zeros=joint_zeros)(q[:2])
+
+    assert torch.autograd.gradcheck(tip, (given["links"], given["joint_zeros"]))
+
+
+@pytest.mark.parametrize(("text", "end"), [(URDF, "flange"), (COUPLED, "f")])
+def test_a_calibrated_urdf_is_read_as_the_calibrated_arm(text, end, tmp_path, rng):
+    path = tmp_path / "arm.urdf"
+    path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    tool = [0.1, 0.2, 0.3]
+    chain = moved(RigidChain.from_urdf(path, end, tool=tool), rng)
+    written = chain.to_urdf(path, end)
+    again, q = RigidChain.from_urdf(written, end, tool=tool), random_q(rng, 9, chain.n_actuators)
+    assert_close(again.poses(q)[:, 1:], chain.poses(q)[:, 1:], rtol=0, atol=1e-12)
+    assert_close(again.jacobian(q), chain.jacobian(q), rtol=0, atol=1e-12)
+    assert again.to_urdf(written, end) == written
+    kept = re.compile("<origin[^>]*>")
+    assert kept.sub("", written) == kept.sub("", text.replace("\n", "\r\n"))
+    fixed = re.search('<joint name="(plate|mount)".*?</joint>', text.replace("\n", "\r\n"), re.S)
+    assert fixed[0] in written
+    plain = RigidChain.from_urdf(text, end)
+    assert plain.to_urdf(text, end) == text
+    with pytest.raises(ValueError, match="must be the URDF of this arm"):
+        plain.to_urdf(text, "e" if end == "f" else "l7")
+
+
+def test_a_pitch_of_ninety_degrees_is_written_exactly(rng):
+    """Beside it too, where roll and yaw nearly turn about the same axis."""
+    text = LINKS.format(joint("j", "a", "b", "continuous", "<origin/>"))
+    for off in (0.0, 1e-15, -1e-9, 1e-7, 1e-4):
+        turn = Rotation.from_euler("xyz", [0.7, math.pi / 2 - off, 0.4]).as_matrix()
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        chain = RigidChain(pose[None], [[1, 0, 0]], names=["j"])
+        again = RigidChain.from_urdf(chain.to_urdf(text, "b"), "b")
+        assert_close(again.origins, chain.origins, rtol=0, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_calibration_finds_links_and_joint_zeros(rng):
+    """Up to what the tips cannot identify: the tips of new postures, and a URDF that gives them."""
+    nominal = arm(tool=[0.1, 0.05, 0.2], root_link="base")
+    true, q = moved(nominal, rng), 1.5 * random_q(rng, 300)
+    x = true(q) + 1e-4 * torch.randn(300, 3, generator=rng, dtype=torch.float64)
+    result = calibrate(nominal, q, x, ("base", "joint_zeros", "links"))
+    assert result.converged
+    unseen = 1.5 * random_q(rng, 100)
+    error = (result.chain(unseen) - true(unseen)).norm(dim=1)
+    assert error.max() < 3e-4
+    assert (nominal(unseen) - true(unseen)).norm(dim=1).mean() > 0.05
+    assert result.std_errors["joint_zeros"].shape == (8,)
+    assert result.identifiable["links"].shape == (8, 3)
+    said = "\n".join(result.unidentified)
+    assert "links[0, z] +1 mm with links[1, z] -1 mm does not move the tips" in said
+    assert re.search(r"base\[rot z\] \+1 deg with .*joint_zeros\[0\] \+1 deg", said)
+    text = result.chain.to_urdf(URDF, "flange", root_link="base")
+    options = {name: getattr(result.chain, name) for name in ("base", "tool")}
+    again = RigidChain.from_urdf(text, "flange", root_link="base", **options)
+    assert_close(again(q), result.chain(q), rtol=0, atol=1e-12)

@@ -7,7 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, PlayOperator, RigidChain
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    HybridForwardModel,
+    PlayOperator,
+    RigidChain,
+)
 from hybridkin.hybrid._features import PoseFeatures, Readout
 from hybridkin.native.library import Program
 from hybridkin.native.plan import NoKernel, Plan
@@ -221,6 +227,26 @@ def test_rigid_arms(n):
     q = rng.uniform(-7, 7, (203, n))
     check(arm, q)
     check_nan_row(arm, q)
+
+
+@pytest.mark.parametrize(("joints", "n"), [(3, 1), (7, 5), (3, 6)])
+def test_coupled_joints_with_zeros(joints, n):
+    rng = np.random.default_rng(n)
+    arm = RigidChain(
+        [pose_of(rng) for _ in range(joints)],
+        rng.normal(size=(joints, 3)),
+        kinds=[("revolute", "prismatic")[k % 3 == 1] for k in range(joints)],
+        couplings=rng.normal(size=(joints, n)),
+        joint_zeros=rng.normal(size=n),
+        tool=[0.1, 0.2, 0.3],
+        base=pose_of(rng),
+    )
+    q = rng.uniform(-2, 2, (103, n))
+    check(arm, q)
+    check_nan_row(arm, q)
+    twin = HybridForwardModel(arm, "quadratic", coupling="serial")
+    x = in_torch(arm, q)[0] + 0.01 * np.sin(q[:, :1])
+    check(twin.fit(q, x).module_, q, 1e-11)
 
 
 @pytest.mark.parametrize("counts", [[3], [3, 4, 3]])

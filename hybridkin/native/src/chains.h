@@ -9,15 +9,26 @@ static inline HK(linear_arcs) HK(linear_arcs_of)(const hk_plan *p, int at) {
 }
 
 static inline int HK(n_coordinates)(const hk_plan *p, int at) {
-    return HK_CHAIN_IS(p, at, HK_RIGID) ? p->code[at + HK_N] : 3 * p->code[at + HK_MORE];
+    return (HK_CHAIN_IS(p, at, HK_RIGID) ? 1 : 3) * p->code[at + HK_MORE];
+}
+
+/* How far the n actuators of a rigid arm move its joints (joints, n), NULL where they are them. */
+static inline const real *HK(couplings)(const hk_plan *p, int at) {
+    const int32_t *more = p->code + at + HK_MORE;
+    return more[1] ? hk_numbers(p, at) + 12 * more[0] + 3 : NULL;
 }
 
 /* The inner coordinates z of q, and what `pull` needs. */
 static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, HK(inside) *in) {
     (void)in;
-    if (HK_CHAIN_IS(p, at, HK_RIGID))
-        for (int i = 0; i < p->code[at + HK_N]; i++) z[i] = q[i];
-    else if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
+    if (HK_CHAIN_IS(p, at, HK_RIGID)) {
+        const int n = p->code[at + HK_N];
+        const real *A = HK(couplings)(p, at);
+        for (int i = 0; i < HK(n_coordinates)(p, at); i++) {
+            z[i] = A ? SPLAT(0.0) : q[i];
+            for (int j = 0; A && j < n; j++) z[i] = z[i] + q[j] * A[n * i + j];
+        }
+    } else if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
         HK(elastic_t) e = HK(elastic_of)(p, at);
         if (HK_COMMON(e.S == 3 && e.same == 3)) {
             e.S = e.same = 3;
@@ -40,7 +51,7 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, H
 static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V *x, V *C) {
     const int32_t *more = p->code + at + HK_MORE;
     if (HK_CHAIN_IS(p, at, HK_RIGID))
-        HK(rigid)(p->code[at + HK_N], more, hk_numbers(p, at), z, x, C);
+        HK(rigid)(more[0], more + 2, hk_numbers(p, at), z, x, C);
     else if (HK_USES(HK_ARCS) || HK_USES(HK_ELASTIC))
         HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
 }
@@ -50,9 +61,15 @@ HK_INLINE void HK(pull_rows)(
     const hk_plan *p, int at, const HK(inside) *in, int rows, const V *C, V *J) {
     const int n = p->code[at + HK_N];
     (void)in, (void)n;
-    if (HK_CHAIN_IS(p, at, HK_RIGID))
-        for (int i = 0; i < rows * n; i++) J[i] = J[i] + C[i];
-    else if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
+    if (HK_CHAIN_IS(p, at, HK_RIGID)) {
+        const int k = HK(n_coordinates)(p, at);
+        const real *A = HK(couplings)(p, at);
+        for (int i = 0; i < rows * n; i++) {
+            if (!A) J[i] = J[i] + C[i];
+            for (int l = 0; A && l < k; l++)
+                J[i] = J[i] + C[i / n * k + l] * A[n * l + i % n];
+        }
+    } else if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
         HK(elastic_t) e = HK(elastic_of)(p, at);
         if (HK_COMMON(e.S == 3 && e.same == 3)) {
             e.S = e.same = 3;
@@ -79,7 +96,7 @@ static inline void HK(pull)(const hk_plan *p, int at, const HK(inside) *in, cons
 static inline void HK(chain)(const hk_plan *p, int at, const V *q, V *x, V *J) {
     V z[HK_MAX_Z], C[3 * HK_MAX_Z];
     HK(inside) in;
-    if (HK_CHAIN_IS(p, at, HK_RIGID)) { /* q are its coordinates */
+    if (HK_CHAIN_IS(p, at, HK_RIGID) && !HK(couplings)(p, at)) { /* q are its coordinates */
         HK(from_coordinates)(p, at, q, x, J);
         return;
     }
