@@ -129,6 +129,11 @@ class ForwardModel(PortableModule):
         return {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
 
     @property
+    def turns(self) -> Tensor | bool:
+        """Which actuators, bool () or (n,), are angles: a whole turn more changes nothing."""
+        return False
+
+    @property
     def robot(self) -> ForwardModel:
         """The model that knows the geometry: of a hybrid its mechanical model, else itself."""
         return self

@@ -147,6 +147,14 @@ class JointChain(Chain):
         self.register_buffer("carriers", carriers)
 
     @property
+    def turns(self) -> Tensor:
+        """Which actuators turn joints, shape (n,): a whole turn more changes nothing."""
+        if self.couplings is None:
+            return ~self.slides
+        still = torch.where(self.slides[:, None], 0.0, self.couplings.round())
+        return (self.couplings == still).all(0)
+
+    @property
     def units(self) -> list[str]:
         """The unit of every actuator: "rad" where it turns a joint, else "m"."""
         turns = ~self.slides

@@ -42,10 +42,11 @@ class Tick(NamedTuple):
     step: StepRows
 
 
-def core_of(settings: StepSettings) -> Core | None:
+def core_of(settings: StepSettings, search: bool = False) -> Core | None:
     """Return the core of settings, None where a part of the task has no kernel.
 
-    It is kept with the settings, and made anew where the model has changed.
+    Poses have kernels for the search alone. The core is kept with the settings, and made anew
+    where the model has changed.
     """
     kept, model = vars(settings).get("_program"), program_of(settings.task.models[0])
     if kept is None or kept[0] is not model:
@@ -54,7 +55,7 @@ def core_of(settings: StepSettings) -> Core | None:
         except (NoKernel, TypeError):
             kept = model, None
         object.__setattr__(settings, "_program", kept)
-    return kept[1]
+    return kept[1] if search or settings.task.parts == (3,) else None
 
 
 class Core:
@@ -78,7 +79,9 @@ class Core:
     def __init__(self, settings: StepSettings, model: Program) -> None:
         self._plan, self._made_of = Plan(settings.stored()), (settings, model)
         self.n, self.program = self._plan.n_inputs, model
-        self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
+        self.settings, self.rows = settings, sum(settings.task.parts)
+        if self.rows == 3:
+            self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
         self.head = self._plan.code.ctypes.data, self._plan.data.ctypes.data, self._plan.root
         self._idle: list[Follower] = []  # one for every thread that is in `step`
         n = self.n
@@ -122,18 +125,21 @@ class Core:
         """Return the search for targets."""
         return _CoreSearch(self.settings, tol, max_iter, self)
 
-    def find(self, mode: int, q: Tensor, target: Tensor, tol: float, max_iter: int) -> Found:
+    def find(self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int) -> Found:
         """Return what `hk_ik_find` makes of starts q (N, n)."""
         best, rows = _plain(q).copy(), len(q)
-        J, e = np.empty((rows, 3, self.n)), np.empty((rows, 3))
+        J, e = np.empty((rows, self.rows, self.n)), np.empty((rows, self.rows))
         found, n_iter = np.empty((2, rows), dtype=np.int32)
-        numbers = [ctypes.c_int32(mode), ctypes.c_int32(max_iter), ctypes.c_double(tol)]
+        way, turn = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
+        turn = ctypes.c_double(turn * self.settings.task.units[-1])
+        numbers = [ctypes.c_int32(mode), ctypes.c_int32(max_iter), ctypes.c_double(way), turn]
         self._run("hk_ik_find", rows, numbers, [_plain(target), best, J, e, found, n_iter])
         at, J, e, found, n_iter = (torch.from_numpy(a) for a in (best, J, e, found, n_iter))
         reached, at_rest, held = (found & bit > 0 for bit in (_REACHED, _AT_REST, _HELD))
         n_iter = n_iter.long()
         ends = n_iter, torch.ones_like(n_iter)
-        return Found(at, target - e, J, e, target, reached, at_rest, held, *ends)
+        x = target - e if self.rows == 3 else torch.full_like(target, math.nan)  # not asked for
+        return Found(at, x, J, e, target, reached, at_rest, held, *ends)
 
     def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
         """Call a function of the library for the rows of arrays."""
@@ -298,8 +304,7 @@ class _CoreSearch(Search):
         found.n_iter[rows] += slid.n_iter
 
     def _find(self, mode: int, q: Tensor, target: Tensor) -> Found:
-        tol = self.tol[0] if isinstance(self.tol, tuple) else self.tol
-        return self.core.find(mode, q, target, tol, self.max_iter)
+        return self.core.find(mode, q, target, self.tol, self.max_iter)
 
 
 def _function(name: str) -> Any:

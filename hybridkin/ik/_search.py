@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
 from hybridkin.ik._settings import StepSettings
-from hybridkin.ik._starts import nearest_starts
+from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
 
@@ -24,9 +24,11 @@ _NULL_SLIP = 0.3  # error per tip-sized motion that a null-space step may leave 
 _NULL_GAIN = 1e-8  # of the square of what is left to go; the descent ends where it gains less
 _INSIDE = 0.98  # domain distance to go to from outside the domain
 _OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
-_FIRST = 4  # further starts before all the others
 _RETURNS = 30  # of rows that ended outside the limits of the tip, towards these
+_PARTS = [4, 8, 16]  # further starts in all, before there are more
 _ROWS = 256  # that start elsewhere at once
+_FINE = 0.01  # of tol, for configurations that are compared
+_SAME = 0.01  # of the ranges: nearer configurations are one
 
 RowsT = TypeVar("RowsT", bound="Point")
 
@@ -111,7 +113,7 @@ class Search:
         for some in rows.split(_ROWS) if restarts * len(rows) > 0 else ():
             size = _per_tip(found.J, found.error)[some]
             starts = nearest_starts(settings, q[some], size, found.target[some], restarts)
-            for part in starts.tensor_split([_FIRST], dim=1):  # a few, then the others
+            for part in starts.tensor_split(_PARTS, dim=1):
                 open_rows = self._cost(found)[some] > _DONE
                 self._try_again(found, some[open_rows], part[open_rows])
         for _ in range(_RETURNS if settings.tip_limits is not None else 0):
@@ -122,6 +124,39 @@ class Search:
             found.put(rows, self._attempt(found.q[rows], (found.x + 1.5 * way)[rows]))
         if settings.has_posture:
             self._to_posture(found)
+        return found
+
+    def several(self, best: Found, start: Tensor, restarts: int, count: int) -> Found:
+        """Return `count` different points for each row of `best`, the nearest to `start` first.
+
+        Rows that are left when no further point was found have NaN as q.
+        """
+        settings, s, tol = self.settings, restarts + 1, self.tol
+        tol = tuple(_FINE * t for t in tol) if isinstance(tol, tuple) else _FINE * tol
+        fine, spans = replace(self, tol=tol), settings.spans.to(start)
+        found = best.take(torch.arange(len(start), device=start.device).repeat_interleave(count))
+        further = torch.arange(len(found.q), device=start.device) % count > 0
+        found.q[further] = torch.nan
+        for some in (self._cost(best) == _DONE).nonzero()[:, 0].split(_ROWS):
+            size, near = torch.zeros_like(best.error[some]), start[some].repeat_interleave(s, 0)
+            starts = even_starts(settings, start[some], size, restarts).expand(len(some), -1, -1)
+            starts = torch.cat([best.q[some, None], starts], dim=1).flatten(0, 1)
+            more = fine._attempt(settings.inside(starts), best.target[some].repeat_interleave(s, 0))
+            if settings.has_posture:
+                fine._to_posture(more)
+            turned = more.q + settings.whole_turns(near - more.q)
+            more.q = torch.where(settings.inside(turned) == turned, turned, more.q)
+            far = ((more.q - near) / spans).norm(dim=-1)
+            far = torch.where(fine._cost(more) == _DONE, far, torch.inf).view(-1, s)
+            first, q = s * torch.arange(len(some), device=some.device), more.q.unflatten(0, (-1, s))
+            more.n_starts = best.n_starts[some].repeat_interleave(s) + s
+            for place in range(count):
+                distance, pick = far.min(1)
+                there, picked = torch.isfinite(distance), more.take(first + pick)
+                found.put(count * some[there] + place, picked.take(there))
+                apart = q - picked.q[:, None]
+                apart = ((apart - settings.whole_turns(apart)) / spans).abs().amax(-1)
+                far = torch.where(apart <= _SAME, torch.inf, far)
         return found
 
     def _to_posture(self, found: Found) -> None:
@@ -173,7 +208,8 @@ class Search:
         one = torch.ones_like(found.error)
         own = {"start": found.error, "nu": _FIRST_DAMPING * one, "growth": 2.0 * one}
         live = _Descent(**vars(found), **own, slow=0.0 * one)
-        rows = torch.arange(len(q), device=q.device)
+        rows, half = torch.arange(len(q), device=q.device), 0.5 * self.settings.periods.to(q)
+        turning = torch.isfinite(half)
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
             live.stationary = self._blocked(live)
@@ -190,8 +226,10 @@ class Search:
             # Damping in proportion to the error, so that the last iterations are Gauss-Newton's.
             trust = live.nu * (error / live.start)
             bounds = self.settings.step_bounds(live.q)
+            # What turns on beyond a limit comes back at the other one.
+            bounds = (a.where(~turning, b) for a, b in zip(bounds, (-half, half), strict=True))
             step = limited_step(self.settings, live.J, live.e, None, *bounds, trust, quick=True)
-            new = self._point(live.q + step.dq, live.target)
+            new = self._point(self.settings.inside(live.q + step.dq), live.target)
             error_new = new.error
             predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
             # The damping follows the share of the predicted gain that came true.
@@ -266,7 +304,7 @@ class Search:
             if rows.numel() == 0:
                 break
         _, ended = self._try_step(found.take(all_rows), None, hold=True)
-        better = ended.error < found.error[all_rows]
+        better = (ended.error < found.error[all_rows]) & self._within(ended.e)
         found.put(all_rows[better], ended.take(better))
 
     def _slide(self, at: Point, wanted: Callable[[Tensor], Tensor], share: Tensor) -> _Slide:
@@ -293,6 +331,7 @@ class Search:
         q, (lower, upper) = at.q, self.settings.box(at.q)
         pull = apply_columns(at.J, at.e)
         out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
+        out &= torch.isinf(self.settings.periods.to(q.device))
         left = torch.where(out, 0.0, pull).norm(dim=-1)
         return left <= _STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
 

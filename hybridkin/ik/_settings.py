@@ -22,7 +22,7 @@ from hybridkin._core.arrays import (
 from hybridkin._core.model import Portable
 from hybridkin._core.stored import Stored
 from hybridkin.ik._box import HalfSpaces
-from hybridkin.ik.tasks import PositionTask, Task, Tolerance
+from hybridkin.ik.tasks import PoseTask, PositionTask, Task, Tolerance
 
 Array: TypeAlias = Numbers | Transform  # what comes in
 Posture: TypeAlias = Callable[[Tensor], Tensor]
@@ -72,6 +72,8 @@ def stopping(way: Tensor, change: Tensor) -> Tensor:
 
 
 _FAST = 5.0  # times the largest plausible q in a second is too fast
+_TURN = 2.0 * math.pi
+_FULL = 0.999  # share of a turn between limits that counts as all of it
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,8 @@ class StepSettings(Portable):
 
     Limits, weights and a fixed posture are float64 tensors of shape () or (n,). `posture` is
     `q_pref`, and the middle of the limits where none is given; `of_model` names the limits that are
-    those of the model.
+    those of the model; `periods`, shape () or (n,), is what q counts modulo: a turn of an angle
+    whose limits leave a whole one, else inf.
     """
 
     task: Task
@@ -98,6 +101,7 @@ class StepSettings(Portable):
     of_model: tuple[str, ...]
     tip_limits: HalfSpaces | None
     posture: Tensor | Posture | None = field(init=False)
+    periods: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         """Check the settings, and take the middle of the limits where no posture is given."""
@@ -116,6 +120,11 @@ class StepSettings(Portable):
         share = 0.0 if self.damping == "adaptive" else self.damping
         good, text = not isinstance(share, str) and 0.0 <= share < math.inf, '"adaptive" or'
         require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
+        models = self.task.models
+        turns = torch.stack([torch.as_tensor(model.turns, device="cpu") for model in models])
+        full = (self.q_max - self.q_min >= _FULL * _TURN) & (self.limits != "off")
+        periods = torch.where(turns.all(0) & full, self.q_max.new_tensor(_TURN), math.inf)
+        object.__setattr__(self, "periods", periods)
 
     def unit_messages(self) -> list[str]:
         """Return warnings where limits or a posture look like another unit than the model's."""
@@ -157,6 +166,16 @@ class StepSettings(Portable):
         return self.limits != "off" and bool(torch.isfinite(self.ddq_max).any())
 
     @property
+    def spans(self) -> Tensor:
+        """The ranges of q, shape () or (n,), at most its periods."""
+        return torch.minimum(self.q_max - self.q_min, self.periods)
+
+    def whole_turns(self, dq: Tensor) -> Tensor:
+        """Return the whole turns nearest to dq (..., n)."""
+        periods = self.periods.to(dq)
+        return torch.where(torch.isfinite(periods), periods * (dq / periods).round(), 0.0)
+
+    @property
     def has_posture(self) -> bool:
         """Whether there is a preferred configuration to go to."""
         return self.posture is not None and self.beta > 0.0
@@ -167,13 +186,13 @@ class StepSettings(Portable):
         Raises
         ------
         TypeError
-            Where they could only be stored as code: other tasks than a `PositionTask`, or a posture
-            that is a function; and with limits of the tip.
+            Where they could only be stored as code: other tasks than a `PositionTask` or a
+            `PoseTask`, or a posture that is a function; and with limits of the tip.
         """
         model, n = self.task.models[0], self.n_actuators
         of_code = callable(self.posture) or self.tip_limits is not None
-        if type(self.task) is not PositionTask or of_code or n is None:
-            raise TypeError("only a PositionTask with a fixed posture can be described as data")
+        if type(self.task) not in (PositionTask, PoseTask) or of_code or n is None:
+            raise TypeError("only a position or a pose, with a fixed posture, can be data")
         arrays = {
             "q_min": self.q_min,
             "q_max": self.q_max,
@@ -181,10 +200,12 @@ class StepSettings(Portable):
             "ddq_max": self.ddq_max,
             "posture": 0.0 if self.posture is None else self.posture,
             "weights": 1.0 if self.weights is None else self.weights,
+            "periods": self.periods,
         }
         arrays = {name: np.broadcast_to(as_array(a), n) for name, a in arrays.items()}
         names = ("beta", "gain", "damping", "limits", "dt", "has_posture", "accelerates")
         settings = {name: getattr(self, name) for name in names}
+        settings["radian"] = self.task.units[1] if len(self.task.parts) > 1 else 0.0
         return Stored.of("inverse_kinematics", arrays, {"model": model.stored()}, **settings)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -234,8 +255,10 @@ class StepSettings(Portable):
         return self.q_min.to(q), self.q_max.to(q)
 
     def inside(self, q: Tensor) -> Tensor:
-        """Return q moved into the limits."""
-        return torch.clamp(q, *self.box(q))
+        """Return q moved into the limits: by whole turns where they leave one, else clipped."""
+        low, high = self.box(q)
+        turned = q - self.whole_turns(q - 0.5 * (low + high))
+        return torch.clamp(torch.where((q < low) | (q > high), turned, q), low, high)
 
     def allowed(self, x: Tensor) -> Tensor:
         """Return the points nearest to x where the tip may be."""
@@ -320,6 +343,17 @@ class StepSettings(Portable):
         require(increasing, "`t` must be finite and increasing [s]; sort it, drop repeated times.")
         self.rates(max(periods, default=dt))
         return times, [*periods, dt]
+
+    def places(self, n_solutions: int | None, differentiable: bool) -> int:
+        """Return how many configurations a target has room for."""
+        if n_solutions is None:
+            return 1
+        require(not differentiable, "`n_solutions` must be None for differentiable=True.")
+        need = "at least 1, or None for one without an axis of its own"
+        require(n_solutions >= 1, f"`n_solutions` must be {need}, got {n_solutions}.")
+        good, way = torch.isfinite(self.spans).all(), "give finite `q_min` and `q_max`"
+        require(good, f"`n_solutions` compares configurations by the range of q; {way}.")
+        return n_solutions
 
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
         """Return one tolerance [m], or one for every part of the task."""

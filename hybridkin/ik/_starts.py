@@ -39,21 +39,29 @@ def nearest_starts(
         Starts, the nearest one first.
     """
     task, n = settings.task, q.shape[-1]
-    low, high = (a.to(q).expand(1, n) for a in (settings.q_min, settings.q_max))
-    if not torch.isfinite(high - low).all():
-        size = size[:, None]
-        lower = torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size)
-        high = torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size)
-        low = lower
-    k = max(count, _SHARED if len(low) == 1 else _OWN)
-    low, high = low[:, None], high[:, None]
-    sample = torch.lerp(low, high, _even_shares(n, k, q.device).to(q)).clamp(low, high)
+    k = max(count, _SHARED if torch.isfinite(settings.q_max - settings.q_min).all() else _OWN)
+    sample = even_starts(settings, q, size, k)
     x, _ = settings.evaluate(sample.flatten(0, 1))
-    x = x.unflatten(0, (-1, k)).expand(len(q), k, *task.shape).flatten(0, 1)
-    away = task.difference(x, target.repeat_interleave(k, 0)).norm(dim=-1).view(-1, k)
+    away = task.distances(x.unflatten(0, (-1, k)), target)
     away = away * torch.where(task.in_domain(sample.flatten(0, 1)), 1.0, _OUTSIDE).view(-1, k)
     near = away.nan_to_num(torch.inf).topk(count, largest=False).indices
     return sample.expand(len(q), k, n).gather(1, near[..., None].expand(-1, -1, n))
+
+
+def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> Tensor:
+    """Return `count` configurations (1, count, n) that fill the limits, their faces and corners.
+
+    Where an actuator has no limits they fill a range around q (N, n): (N, count, n).
+    """
+    low, high = (a.to(q).expand(1, q.shape[-1]) for a in (settings.q_min, settings.q_max))
+    if not torch.isfinite(high - low).all():
+        size = torch.minimum(size[:, None], 0.5 * settings.periods.to(q))
+        lower = torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size)
+        high = torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size)
+        low = lower
+    low, high = low[:, None], high[:, None]
+    shares = _even_shares(q.shape[-1], count, q.device).to(q)
+    return torch.lerp(low, high, shares).clamp(low, high)
 
 
 def _even_shares(n: int, count: int, device: torch.device) -> Tensor:

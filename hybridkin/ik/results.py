@@ -39,6 +39,8 @@ class IKStatus(IntEnum):
     """Converged, but outside the domain of the model (its `in_domain` is False)."""
     INVALID_INPUT = 6
     """The target, the start, the model's answer or the measured tip is not finite."""
+    NO_FURTHER = 7
+    """Of several configurations that were asked for (`n_solutions`), no further one was found."""
 
 
 def statuses(
@@ -110,6 +112,8 @@ class Step(Generic[ArrayT]):
 @dataclass(frozen=True, repr=False)
 class IKSolution(Generic[ArrayT]):
     """Configurations found for a batch of targets, in the kind that was given.
+
+    With `n_solutions` every target has an axis of that length: q is of shape (..., n_solutions, n).
 
     Attributes
     ----------

@@ -264,16 +264,15 @@ class InverseKinematics:
         tol: float | Sequence[float] = 1e-4,
         max_iter: int = 50,
         restarts: int = 32,
+        n_solutions: int | None = None,
         differentiable: bool = False,
     ) -> IKSolution:
         """Return configurations that reach the targets, or come as near as the limits allow.
 
-        Levenberg-Marquardt on the tip error with the box-limited step; a step is taken only
-        where it lowers the error. One start can end in a local minimum. Targets that it missed
-        are searched again from up to `restarts` further starts, first from four, then from the
-        others, before a status is given. Rows that have converged leave the work, and then slide
-        along their null space towards `q_pref`. `dq_max` plays no part here: this is where to go,
-        not how fast.
+        Levenberg-Marquardt on the error with the box-limited step; a joint that can turn all the
+        way round turns on beyond its limit. Targets that one start missed are searched again from
+        up to `restarts` further ones, a few at first. Rows that have converged leave the work, and
+        then slide along their null space towards `q_pref`. `dq_max` plays no part here.
 
         Parameters
         ----------
@@ -291,6 +290,10 @@ class InverseKinematics:
             model's domain: of an even sample of the limits, the same in every call, those whose
             tips lie nearest to the target. Without limits the sample lies around the start. 0:
             none.
+        n_solutions : int, optional
+            Return up to this many configurations per target, in an axis of this length, nearest to
+            `q0`, or else to `q_pref`, first. They differ by more than 1 % of the range of an
+            actuator, whole turns left out. Places that are left have NaN as q and NO_FURTHER.
         differentiable : bool, default=False
             Keep the graph from q to `x_target`, and to parameters of the model that require
             gradients, by the implicit function theorem at the solution.
@@ -313,6 +316,7 @@ class InverseKinematics:
         good, given = max_iter >= 1 and restarts >= 0, (max_iter, restarts)
         require(good, f"`max_iter` must be at least 1 and `restarts` at least 0, got {given}.")
         as_numpy, axes = is_numpy(x_target), len(task.shape)
+        places = settings.places(n_solutions, differentiable)
         good = isinstance(x_target, Tensor) or not differentiable
         require(good, "`x_target` must be a torch tensor for differentiable=True.")
         target = settings.points(x_target, "x_target")
@@ -322,12 +326,15 @@ class InverseKinematics:
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q, target = rows_of(q, lead), rows_of(target, lead, axes)
-        core = core_of(settings) if as_numpy and q.dtype == torch.float64 else None
+        core = core_of(settings, search=True) if as_numpy and q.dtype == torch.float64 else None
         search = Search(settings, tolerance, max_iter)
         if core is not None:
             search, settings = core.search(tolerance, max_iter), core.settings
             task = settings.task
         found = search.solve(q, target, q0 is None, restarts)
+        if n_solutions is not None:
+            found, lead = search.several(found, q, restarts, places), (*lead, places)
+            target = target.repeat_interleave(places, 0)
         q, moved = found.q, (found.target != target).flatten(1).any(-1)  # by limits of the tip
         if differentiable:
             with torch.enable_grad():
@@ -341,6 +348,8 @@ class InverseKinematics:
         status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
         ended = found.stationary | (found.reached & moved)
         status[ended & ~reached & torch.isfinite(error)] = IKStatus.UNREACHABLE
+        further = torch.arange(len(q), device=q.device) % places > 0
+        status[further & q.isnan().all(-1)] = IKStatus.NO_FURTHER
         margin = settings.margin(q.detach())
         results = (q, x, error, status, found.n_iter, found.n_starts, gram.sigma_min, margin)
         with torch.set_grad_enabled(differentiable):

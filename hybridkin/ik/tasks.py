@@ -57,6 +57,12 @@ class Task:
         """
         raise NotImplementedError
 
+    def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return how far x ``(1 or N, k, *shape)`` are from targets ``(N, *shape)``, (N, k)."""
+        n, k = len(x_target), x.shape[1]
+        x = x.expand(n, k, *self.shape).flatten(0, 1)
+        return self.difference(x, x_target.repeat_interleave(k, 0)).norm(dim=-1).view(n, k)
+
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise where targets ``(..., *shape)`` are not valid, as of rotations."""
 
@@ -210,6 +216,17 @@ class PoseTask(Task):
         """Return the way [m] and the rotation vector [rad] times `radian`, (N, 6)."""
         turn = rotation_vector(x_target[..., :3, :3] @ x[..., :3, :3].mT)
         return torch.cat([x_target[..., :3, 3] - x[..., :3, 3], self.units[1] * turn], dim=-1)
+
+    def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return how far x is from targets, with the chords of rotations for their angles."""
+        share = self.units[1] / math.sqrt(2.0)
+        x, x_target = (
+            torch.cat([T[..., :3, 3], share * T[..., :3, :3].flatten(-2)], dim=-1)
+            for T in (x, x_target)
+        )
+        if len(x) == 1:  # much faster
+            return torch.cdist(x_target, x[0])
+        return torch.cdist(x_target[:, None], x)[:, 0]
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise where a finite target does not hold a rotation."""

@@ -179,11 +179,12 @@ def _rigid(plan: Plan, stored: Stored) -> int:
         frame = before @ origin @ turn
         numbers += [frame[:3, :3], frame[:3, 3]]
         before = turn.T
-    tip = before @ stored.array("tip") @ np.append(stored.array("tool"), 1.0)
+    before = before @ stored.array("tip")
+    tip = before @ np.append(stored.array("tool"), 1.0)
     couplings = stored.arrays.get("couplings", np.zeros((0, len(slides))))
     n, coupled = couplings.shape[1], len(couplings) > 0
     more = len(slides), coupled, *slides
-    return plan.node(RIGID, n, 3, [*numbers, tip[:3], couplings], *more)
+    return plan.node(RIGID, n, 3, [*numbers, tip[:3], before[:3, :3], couplings], *more)
 
 
 def _units(
@@ -370,6 +371,9 @@ def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     n, m = plan._code[model + 1 : model + 3]
     if m != 3:
         raise NoKernel(f"a step is computed for tips of 3 coordinates, got {m}")
+    radian = stored.settings["radian"]
+    if radian and plan.entry(model, 0) != RIGID:
+        raise NoKernel("poses are computed for rigid arms only")
     names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
     vectors = [stored.array(name, [n], finite=False) for name in names]
     gain, beta, dt, damping = (stored.settings[name] for name in ("gain", "beta", "dt", "damping"))
@@ -377,7 +381,9 @@ def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     weights = stored.array("weights", [n])
     flags = (stored.settings["limits"] == "saturate") + 2 * stored.settings["has_posture"]
     flags += 4 * bool((weights != 1.0).any()) + 8 * stored.settings["accelerates"]
-    return plan.node(IK, n, 3, [*vectors, weights**-0.5, np.array(rates)], model, flags)
+    periods = stored.array("periods", [n], finite=False)
+    numbers = [*vectors, weights**-0.5, np.array([*rates, radian]), periods]
+    return plan.node(IK, n, 6 if radian else 3, numbers, model, flags)
 
 
 WRITERS: dict[str, Callable[[Plan, Stored], int]] = {

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from compiled import random_settings
+from scipy.spatial.transform import Rotation
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -13,12 +14,14 @@ from hybridkin import (
     ELMRegressor,
     HybridForwardModel,
     InverseKinematics,
+    RigidChain,
     datasets,
     robots,
 )
+from hybridkin.ik._compiled import core_of
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import PoseTask
-from hybridkin.native.plan import Plan
+from hybridkin.native.plan import NoKernel, Plan
 
 pytestmark = pytest.mark.needs_core
 
@@ -176,7 +179,7 @@ def test_what_has_no_kernel_runs_in_torch():
     ]
     for ik in others:
         assert ik.tracker(q).backend == "torch"
-        with pytest.raises(TypeError):
+        with pytest.raises((TypeError, NoKernel)):
             Plan(ik.stored())
     assert InverseKinematics(BHA, **limits).tracker(q.astype(np.float32)).backend == "torch"
 
@@ -238,3 +241,77 @@ def test_a_search_slides_into_the_domain_as_in_torch(guard):
     np.testing.assert_array_equal(ours.n_starts, theirs.n_starts.numpy())
     outside = ~model.in_domain(torch.from_numpy(q)).numpy()
     assert (ours.status[outside] == IKStatus.CONVERGED).sum() > 5
+
+
+def arm_of(draw, kinds):
+    origins = np.tile(np.eye(4), (len(kinds), 1, 1))
+    origins[:, :3, :3] = Rotation.random(len(kinds), rng=draw).as_matrix()
+    origins[:, :3, 3] = draw.uniform(-0.3, 0.3, (len(kinds), 3))
+    tip = np.eye(4)
+    tip[:3, :3], tip[:3, 3] = Rotation.random(rng=draw).as_matrix(), [0.05, -0.1, 0.2]
+    axes = draw.standard_normal((len(kinds), 3))
+    more = {"tip": tip, "tool": [0.1, 0.0, 0.05], "base": origins[0]}
+    if kinds[:2] == COUPLED[:2]:
+        couplings = np.vstack([np.eye(6), [[0, -1, 0, 0, 0, 0], [0, 0.5, 0, 0, 2, 0]]])
+        more |= {"couplings": couplings, "joint_zeros": draw.uniform(-1.0, 1.0, 6)}
+    return RigidChain(origins, axes, kinds=kinds, **more)
+
+
+COUPLED = ["prismatic", "revolute", *["revolute"] * 6]
+KINDS = {
+    "eight by six actuators": COUPLED,
+    "six": ["revolute"] * 6,
+    "seven, one slides": ["revolute"] * 3 + ["prismatic"] + ["revolute"] * 3,
+    "eight": ["revolute"] * 8,
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_errors_and_jacobians_of_poses_are_those_of_torch(name):
+    draw = np.random.default_rng(7)
+    arm = arm_of(draw, KINDS[name])
+    task = PoseTask(arm, radian=0.3)
+    ik = InverseKinematics(task, q_min=-2.0, q_max=2.0)
+    q = torch.from_numpy(draw.uniform(-2.0, 2.0, (60, arm.n_actuators)))
+    target = arm.pose(q.flip(0))
+    half = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    target[:3, :3, :3] = half @ arm.pose(q[:3])[:, :3, :3]  # half a turn away
+    target[3] = arm.pose(q[3])
+    target[4, :3, :3] = arm.pose(q[4])[:3, :3] @ half[[1, 2, 0]][:, [1, 2, 0]]
+    found = core_of(ik.settings, search=True).find(0, q, target, 1e-4, 1)
+    x, J = task.evaluate(q)
+    e = task.difference(x, target)
+    torch.testing.assert_close(found.J, J, rtol=0.0, atol=1e-13)
+    torch.testing.assert_close(found.e[3:], e[3:], rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(found.e[:3].norm(dim=1), e[:3].norm(dim=1), rtol=0.0, atol=1e-12)
+    assert found.e[:3, 3:].norm(dim=1).min() > 0.3 * 3.14159
+    assert core_of(ik.settings) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_poses_are_solved_as_in_torch(name):
+    draw = np.random.default_rng(8)
+    arm = arm_of(draw, KINDS[name])
+    n = arm.n_actuators
+    high = np.where(np.arange(n) % 2, 2.5, 3.2)  # of some a whole turn
+    q = draw.uniform(-high, high, (40, n))
+    x = arm.pose(torch.from_numpy(q)).numpy()
+    x[::10, :3, 3] *= 5.0
+    x[7, 0, 0] = np.nan
+    for settings in ({"weights": 1.0 + np.arange(n) / n}, {"beta": 0.0, "damping": 0.01}):
+        ik = InverseKinematics(PoseTask(arm), q_min=-high, q_max=high, **settings)
+        options = {"tol": (1e-3, 1e-2), "restarts": 4}
+        ours, theirs = ik.solve(x, **options), ik.solve(torch.from_numpy(x), **options)
+        assert (ours.status == theirs.status.numpy()).mean() > 0.95
+        assert ours.status[7] == theirs.status[7] == IKStatus.INVALID_INPUT
+        reached = ours.converged
+        assert reached.mean() > (0.5 if KINDS[name] is COUPLED else 0.8)  # it slides by metres
+        both = reached & theirs.converged.numpy()
+        assert both.sum() >= 0.95 * reached.sum()
+        known = np.arange(40) != 7
+        assert ((ours.q[known] >= -high) & (ours.q[known] <= high)).all()
+        at = arm.pose(torch.from_numpy(ours.q[reached])).numpy()
+        turn = Rotation.from_matrix(at[:, :3, :3] @ x[reached][:, :3, :3].swapaxes(1, 2))
+        assert np.linalg.norm(at[:, :3, 3] - x[reached][:, :3, 3], axis=1).max() <= 1e-3
+        assert turn.magnitude().max() <= 1e-2 + 1e-9

@@ -15,7 +15,7 @@ static inline int HK(n_coordinates)(const hk_plan *p, int at) {
 /* How far the n actuators of a rigid arm move its joints (joints, n), NULL where they are them. */
 static inline const real *HK(couplings)(const hk_plan *p, int at) {
     const int32_t *more = p->code + at + HK_MORE;
-    return more[1] ? hk_numbers(p, at) + 12 * more[0] + 3 : NULL;
+    return more[1] ? hk_numbers(p, at) + 12 * more[0] + 12 : NULL;
 }
 
 /* The inner coordinates z of q, and what `pull` needs. */
@@ -51,7 +51,7 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, H
 static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V *x, V *C) {
     const int32_t *more = p->code + at + HK_MORE;
     if (HK_CHAIN_IS(p, at, HK_RIGID))
-        HK(rigid)(more[0], more + 2, hk_numbers(p, at), z, x, C);
+        HK(rigid)(more[0], more + 2, hk_numbers(p, at), z, x, C, NULL);
     else if (HK_USES(HK_ARCS) || HK_USES(HK_ELASTIC))
         HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
 }

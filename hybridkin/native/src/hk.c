@@ -131,8 +131,8 @@ HK_API void hk_ik_steps(const int32_t *code, const real *data, int32_t at, int64
 
 /* The search, see ik_search.h. */
 HK_API void hk_ik_find(const int32_t *code, const real *data, int32_t at, int64_t rows, int32_t mode,
-                    int32_t max_iter, real tol, const real *target, real *q, real *J, real *e,
+                    int32_t max_iter, real tol, real turn_tol, const real *target, real *q, real *J, real *e,
                     int32_t *found, int32_t *n_iter) {
-    const ik_search_t search = {ik_settings_of(code, data, at), mode, max_iter, tol};
+    const ik_search_t search = {ik_settings_of(code, data, at), mode, max_iter, tol, turn_tol};
     ik_search(&search, rows, target, q, J, e, found, n_iter);
 }

@@ -1,4 +1,4 @@
-/* The search for configurations that reach positions, one row per target, HK_LANES rows at a time.
+/* The search for configurations that reach positions, or poses of rigid arms, one row per target, HK_LANES rows at a time.
 
    A row is a small machine: it asks for the model at a configuration, and takes what comes. */
 
@@ -15,14 +15,14 @@ enum { IK_REACHED = 1, IK_AT_REST = 2, IK_HELD = 4 };
 enum { IK_FIRST, IK_LOWER, IK_SLIDE, IK_POLISH, IK_DONE };
 
 typedef struct {
-    real q[HK_MAX_N], J[3 * HK_MAX_N], e[3], error, distance;
+    real q[HK_MAX_N], J[IK_ROWS * HK_MAX_N], e[IK_ROWS], error, distance;
 } ik_point;
 
 typedef struct {
     int64_t row;
     int phase, iteration, n_iter, found, inside;
     real start, nu, growth, predicted, share; /* of the descent, and of the slide */
-    real target[3], ask[HK_MAX_N], wish[HK_MAX_N], free[HK_MAX_N];
+    real target[16], ask[HK_MAX_N], wish[HK_MAX_N], free[HK_MAX_N];
     int slow;
     ik_point live, best;
     ik_step_t step;
@@ -31,12 +31,59 @@ typedef struct {
 typedef struct {
     ik_settings ik;
     int mode, max_iter;
-    real tol;
+    real tol, turn_tol; /* of the whole error; of position and rotation apart where turn_tol > 0 */
 } ik_search_t;
 
-static inline void ik_ask(ik_row *r, int n, int phase, int stays) {
+static inline void ik_keep(const ik_settings *ik, ik_point *to, const ik_point *from) {
+    for (int j = 0; j < ik->n; j++) to->q[j] = from->q[j];
+    for (int j = 0; j < ik->m * ik->n; j++) to->J[j] = from->J[j];
+    for (int i = 0; i < ik->m; i++) to->e[i] = from->e[i];
+    to->error = from->error, to->distance = from->distance;
+}
+
+/* Ask for the point after a step. What turns on beyond a limit comes back at the other one. */
+static inline void ik_ask(const ik_settings *ik, ik_row *r, int phase) {
     r->phase = phase;
-    for (int j = 0; j < n; j++) r->ask[j] = r->live.q[j] + (stays ? R(0.0) : r->step.dq[j]);
+    for (int j = 0; j < ik->n; j++) {
+        real q = r->live.q[j] + r->step.dq[j];
+        if (ik->period[j] < R(INFINITY) && phase == IK_LOWER) {
+            if (q > ik->high[j]) q -= ik->period[j];
+            if (q < ik->low[j]) q += ik->period[j];
+            q = ik_clip(q, ik->low[j], ik->high[j]);
+        }
+        r->ask[j] = q;
+    }
+}
+
+static inline int ik_reached(const ik_search_t *s, const ik_point *at) {
+    if (!(s->turn_tol > R(0.0))) return at->error <= s->tol;
+    return ik_norm(3, at->e) <= s->tol && ik_norm(3, at->e + 3) <= s->turn_tol;
+}
+
+/* e (3) = the rotation vector of A B^T, for rotations A in a pose (4, 4) and B (3, 3), by the unit
+   quaternion with the largest component first, which no rotation makes small. */
+static void ik_turn(const real *A, const real *B, real *e) {
+    real E[9], w, size;
+    int largest = 3;
+    for (int i = 0; i < 9; i++) {
+        const real *a = A + i / 3 * 4, *b = B + i % 3 * 3;
+        E[i] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    }
+    const real trace = E[0] + E[4] + E[8];
+    const real skew[3] = {E[7] - E[5], E[2] - E[6], E[3] - E[1]};
+    const real squares[4] = {R(1.0) + R(2.0) * E[0] - trace, R(1.0) + R(2.0) * E[4] - trace,
+                             R(1.0) + R(2.0) * E[8] - trace, R(1.0) + trace};
+    for (int i = 0; i < 3; i++)
+        if (squares[i] > squares[largest]) largest = i;
+    for (int i = 0; i < 3; i++) {
+        e[i] = largest == 3 ? skew[i] : E[3 * i + largest] + E[3 * largest + i];
+        if (i == largest) e[i] = squares[i];
+    }
+    w = largest == 3 ? squares[3] : skew[largest];
+    if (w < R(0.0)) w = -w, e[0] = -e[0], e[1] = -e[1], e[2] = -e[2];
+    size = ik_norm(3, e);
+    const real ratio = size > R(1e-9) * w ? R(2.0) * HK_MATH(atan2)(size, w) / size : R(2.0) / w;
+    for (int i = 0; i < 3; i++) e[i] *= ratio;
 }
 
 /* Whether no motion within the limits lowers the error to first order. */
@@ -44,20 +91,21 @@ static inline int ik_blocked(const ik_settings *ik, const ik_point *at) {
     const int n = ik->n, limited = ik->flags & IK_LIMITED;
     real left = R(0.0), pull[HK_MAX_N];
     for (int j = 0; j < n; j++) pull[j] = R(0.0);
-    ik_columns_of(n, at->J, at->e, pull, pull);
+    IK_OF(ik->m, ik_columns_of, n, at->J, at->e, pull, pull);
     for (int j = 0; j < n; j++) {
-        const int out = limited && ((at->q[j] >= ik->high[j] && pull[j] > R(0.0)) ||
-                                    (at->q[j] <= ik->low[j] && pull[j] < R(0.0)));
+        const int held = limited && !(ik->period[j] < R(INFINITY));
+        const int out = held && ((at->q[j] >= ik->high[j] && pull[j] > R(0.0)) ||
+                                 (at->q[j] <= ik->low[j] && pull[j] < R(0.0)));
         left += out ? R(0.0) : pull[j] * pull[j];
     }
-    return HK_MATH(sqrt)(left) <= IK_STATIONARY * ik_norm(3 * n, at->J) * at->error;
+    return HK_MATH(sqrt)(left) <= IK_STATIONARY * ik_norm(ik->m * n, at->J) * at->error;
 }
 
 /* The wanted step of a slide from a point, and its part that does not move the tip. */
 static void ik_wish(const ik_search_t *s, const ik_point *at, real *wish, real *free) {
     const ik_settings *ik = &s->ik;
     const int n = ik->n;
-    real J[3 * HK_MAX_N], g[6];
+    real J[IK_ROWS * HK_MAX_N], g[IK_PAIRS];
     if (s->mode & IK_TO_DOMAIN) { /* Newton's step of the domain distance */
         real distance, square = R(0.0);
         hk_domain(&ik->plan, ik->model, at->q, &distance, wish);
@@ -68,11 +116,11 @@ static void ik_wish(const ik_search_t *s, const ik_point *at, real *wish, real *
     } else
         for (int j = 0; j < n; j++) wish[j] = ik->posture[j] - at->q[j];
     for (int j = 0; j < n; j++) {
-        for (int i = 0; i < 3; i++) J[n * i + j] = at->J[n * i + j] * ik->unit[j];
+        for (int i = 0; i < ik->m; i++) J[n * i + j] = at->J[n * i + j] * ik->unit[j];
         free[j] = wish[j] / ik->unit[j];
     }
-    ik_products(n, J, NULL, g);
-    ik_null_projection(n, J, g, free);
+    IK_OF(ik->m, ik_products, n, J, NULL, g);
+    IK_OF(ik->m, ik_null_projection, n, J, g, free);
     for (int j = 0; j < n; j++) free[j] *= ik->unit[j];
 }
 
@@ -80,7 +128,7 @@ static void ik_wish(const ik_search_t *s, const ik_point *at, real *wish, real *
    held, and only the error counts. */
 static void ik_slide_on(const ik_search_t *s, ik_row *r, int phase) {
     const int n = s->ik.n, slides = phase == IK_SLIDE && r->iteration < IK_NULL_STEPS - 1;
-    if (phase == IK_POLISH) r->live = r->best;
+    if (phase == IK_POLISH) ik_keep(&s->ik, &r->live, &r->best);
     ik_step_bounds(&s->ik, r->live.q, R(0.0), NULL, &r->step);
     for (int j = 0; j < n; j++) {
         real *lower = r->step.lower + j, *upper = r->step.upper + j;
@@ -88,13 +136,13 @@ static void ik_slide_on(const ik_search_t *s, ik_row *r, int phase) {
         if (phase == IK_POLISH && (*lower >= R(0.0) || *upper <= R(0.0))) *lower = *upper = R(0.0);
     }
     ik_limited_step(&s->ik, r->live.J, r->live.e, slides, NULL, &r->step);
-    ik_ask(r, n, phase, 0);
+    ik_ask(&s->ik, r, phase);
 }
 
 /* From here a row slides, or is done. */
 static void ik_settle(const ik_search_t *s, ik_row *r) {
     const int outside = r->live.distance > R(1.0);
-    r->best = r->live;
+    ik_keep(&s->ik, &r->best, &r->live);
     r->phase = IK_DONE;
     if (!(r->found & IK_REACHED)) return;
     if (!(s->mode & IK_TO_POSTURE) && !((s->mode & IK_TO_DOMAIN) && outside)) return;
@@ -105,7 +153,7 @@ static void ik_settle(const ik_search_t *s, ik_row *r) {
 
 /* Levenberg and Marquardt: ask for the next point, or settle. */
 static void ik_lower_on(const ik_search_t *s, ik_row *r) {
-    const int n = s->ik.n, reached = r->live.error <= s->tol;
+    const int n = s->ik.n, m = s->ik.m, reached = ik_reached(s, &r->live);
     const int rests = ik_blocked(&s->ik, &r->live) || r->nu > IK_LAST_DAMPING ||
                       r->slow >= IK_SLOW_STEPS;
     r->n_iter = r->iteration;
@@ -116,15 +164,20 @@ static void ik_lower_on(const ik_search_t *s, ik_row *r) {
     }
     /* Damping in proportion to the error, so that the last iterations are Gauss-Newton's. */
     const real trust = r->nu * (r->live.error / r->start);
-    real moved[3];
+    real moved[IK_ROWS];
     ik_step_bounds(&s->ik, r->live.q, R(0.0), NULL, &r->step);
+    for (int j = 0; j < n; j++)
+        if (s->ik.period[j] < R(INFINITY)) {
+            r->step.upper[j] = R(0.5) * s->ik.period[j];
+            r->step.lower[j] = -r->step.upper[j];
+        }
     ik_limited_step(&s->ik, r->live.J, r->live.e, 0, &trust, &r->step);
-    ik_rows_of(n, r->live.J, r->step.dq, moved);
-    for (int i = 0; i < 3; i++) moved[i] = r->live.e[i] - moved[i];
-    r->predicted = ik_norm(3, moved);
+    IK_OF(m, ik_rows_of, n, r->live.J, r->step.dq, moved);
+    for (int i = 0; i < m; i++) moved[i] = r->live.e[i] - moved[i];
+    r->predicted = ik_norm(m, moved);
     r->found &= ~IK_HELD;
     for (int j = 0; j < n; j++) r->found |= r->step.held[j] ? IK_HELD : 0;
-    ik_ask(r, n, IK_LOWER, 0);
+    ik_ask(&s->ik, r, IK_LOWER);
 }
 
 static void ik_lowered(const ik_search_t *s, ik_row *r, const ik_point *now) {
@@ -137,7 +190,7 @@ static void ik_lowered(const ik_search_t *s, ik_row *r, const ik_point *now) {
     r->nu *= better ? ik_clip(R(1.0) - u * u * u, R(1.0) / R(3.0), R(2.0)) : r->growth;
     r->growth = better ? R(2.0) : R(2.0) * r->growth;
     r->slow = better && error - now->error < R(0.01) * s->tol ? r->slow + 1 : 0;
-    if (better) r->live = *now;
+    if (better) ik_keep(&s->ik, &r->live, now);
     r->iteration++;
     ik_lower_on(s, r);
 }
@@ -156,8 +209,8 @@ static void ik_slid(const ik_search_t *s, ik_row *r, const ik_point *now) {
         square += way * way;
         left += want * want;
     }
-    const real slip = IK_NULL_SLIP * ik_norm(3 * n, r->live.J) * ik_norm(n, r->step.dq);
-    const int reached = r->live.error <= s->tol, reached_now = now->error <= s->tol;
+    const real slip = IK_NULL_SLIP * ik_norm(s->ik.m * n, r->live.J) * ik_norm(n, r->step.dq);
+    const int reached = ik_reached(s, &r->live), reached_now = ik_reached(s, now);
     int ok = ((now->error <= slip || reached_now) && gain > R(0.0)) || last;
     ok |= !reached && now->error < R(0.5) * r->live.error;
     ok &= now->distance <= R(1.0) || !r->inside;
@@ -168,9 +221,9 @@ static void ik_slid(const ik_search_t *s, ik_row *r, const ik_point *now) {
         const real curvature = bend / square;
         r->share = ik_clip(curvature > R(0.0) ? R(1.0) / curvature : R(2.0) * r->share, R(0.1),
                            R(4.0));
-        r->live = *now;
+        ik_keep(&s->ik, &r->live, now);
         for (int j = 0; j < n; j++) r->wish[j] = wish[j], r->free[j] = free[j];
-        if (reached_now) r->best = *now;
+        if (reached_now) ik_keep(&s->ik, &r->best, now);
     } else
         r->share *= R(0.25);
     ik_slide_on(s, r, going && !last ? IK_SLIDE : IK_POLISH);
@@ -180,28 +233,32 @@ static void ik_slid(const ik_search_t *s, ik_row *r, const ik_point *now) {
 static void ik_take(const ik_search_t *s, ik_row *r, const ik_point *now) {
     switch (r->phase) {
     case IK_FIRST:
-        r->live = *now;
+        ik_keep(&s->ik, &r->live, now);
         r->start = now->error;
         r->nu = R(1.0), r->growth = R(2.0), r->slow = 0, r->iteration = 0, r->n_iter = 0;
-        r->found = now->error <= s->tol ? IK_REACHED : 0;
+        r->found = ik_reached(s, now) ? IK_REACHED : 0;
         s->mode & IK_LOWERS ? ik_lower_on(s, r) : ik_settle(s, r);
         break;
     case IK_LOWER: ik_lowered(s, r, now); break;
     case IK_SLIDE: ik_slid(s, r, now); break;
     default:
-        if (now->error < r->best.error) r->best = *now;
+        if (now->error < r->best.error && ik_reached(s, now)) ik_keep(&s->ik, &r->best, now);
         r->phase = IK_DONE;
     }
 }
 
-/* Search `rows` rows from q (rows, n), which becomes the best configurations; J (rows, 3, n) there,
-   errors e (rows, 3), what was found (rows), and the iterations (rows). */
+/* Search `rows` rows from q (rows, n), which becomes the best configurations; J (rows, m, n) there,
+   errors e (rows, m), what was found (rows), and the iterations (rows). */
 static void ik_search(const ik_search_t *s, int64_t rows, const real *target, real *q, real *J,
                       real *e, int32_t *found, int32_t *n_iter) {
-    const int n = s->ik.n;
+    const int n = s->ik.n, m = s->ik.m, pose = m == 6, width = pose ? 16 : 3;
+    const hk_plan *plan = &s->ik.plan;
+    const int32_t *more = plan->code + s->ik.model + HK_MORE;
     ik_row lane[HK_LANES];
     ik_point now;
-    V vq[HK_MAX_N], vx[3], vJ[3 * HK_MAX_N], distance;
+    V vq[HK_MAX_N], vx[3], vJ[IK_ROWS * HK_MAX_N], frame[9], distance = SPLAT(0.0);
+    V z[HK_MAX_Z], C[IK_ROWS * HK_MAX_Z];
+    hkv_inside inside;
     int64_t next = 0;
     int busy = 0;
     for (int j = 0; j < n; j++) vq[j] = SPLAT(0.0);
@@ -211,28 +268,43 @@ static void ik_search(const ik_search_t *s, int64_t rows, const real *target, re
             ik_row *r = lane + i;
             if (r->phase == IK_DONE && next < rows) {
                 for (int j = 0; j < n; j++) r->live.q[j] = q[next * n + j];
-                for (int j = 0; j < 3; j++) r->target[j] = target[next * 3 + j];
+                for (int j = 0; j < width; j++) r->target[j] = target[next * width + j];
+                for (int j = 0; j < n; j++) r->step.dq[j] = R(0.0);
                 r->row = next++, busy++;
-                ik_ask(r, n, IK_FIRST, 1);
+                ik_ask(&s->ik, r, IK_FIRST);
             }
             if (r->phase != IK_DONE)
                 for (int j = 0; j < n; j++) vq[j][i] = r->ask[j];
         }
         if (!busy) return;
-        hkv_model(&s->ik.plan, s->ik.model, vq, vx, vJ, &distance);
+        if (pose) {
+            hkv_coordinates(plan, s->ik.model, vq, z, &inside);
+            hkv_rigid(more[0], more + 2, hk_numbers(plan, s->ik.model), z, vx, C, frame);
+            for (int j = 0; j < 6 * n; j++) vJ[j] = SPLAT(0.0);
+            hkv_pull_rows(plan, s->ik.model, &inside, 6, C, vJ);
+        } else
+            hkv_model(plan, s->ik.model, vq, vx, vJ, &distance);
         EACH(i) {
             ik_row *r = lane + i;
             if (r->phase == IK_DONE) continue;
             for (int j = 0; j < n; j++) now.q[j] = r->ask[j];
             for (int j = 0; j < 3 * n; j++) now.J[j] = vJ[j][i];
-            for (int j = 0; j < 3; j++) now.e[j] = r->target[j] - vx[j][i];
-            now.error = ik_norm(3, now.e), now.distance = distance[i];
+            for (int j = 0; j < 3; j++)
+                now.e[j] = r->target[pose ? 4 * j + 3 : j] - vx[j][i];
+            if (pose) {
+                real turn[9];
+                for (int j = 0; j < 9; j++) turn[j] = frame[j][i];
+                ik_turn(r->target, turn, now.e + 3);
+                for (int j = 3; j < 6; j++) now.e[j] *= s->ik.radian;
+                for (int j = 3 * n; j < 6 * n; j++) now.J[j] = s->ik.radian * vJ[j][i];
+            }
+            now.error = ik_norm(m, now.e), now.distance = distance[i];
             ik_take(s, r, &now);
             if (r->phase != IK_DONE) continue;
             busy--;
             for (int j = 0; j < n; j++) q[r->row * n + j] = r->best.q[j];
-            for (int j = 0; j < 3 * n; j++) J[r->row * 3 * n + j] = r->best.J[j];
-            for (int j = 0; j < 3; j++) e[r->row * 3 + j] = r->best.e[j];
+            for (int j = 0; j < m * n; j++) J[r->row * m * n + j] = r->best.J[j];
+            for (int j = 0; j < m; j++) e[r->row * m + j] = r->best.e[j];
             found[r->row] = r->found;
             n_iter[r->row] = r->n_iter;
         }

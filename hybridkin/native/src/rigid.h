@@ -2,10 +2,11 @@
 
 /* The tip x (3) and its derivative J (3, n) where not NULL. The numbers are the pose of every
    joint's frame in the frame before it, turned so that its axis is z (rotation (3, 3), position
-   (3)); of the first one in the measuring frame; then the tip in the last one. `slides` (n) tells
-   which joints are prismatic. */
+   (3)); of the first one in the measuring frame; then position and rotation of the tip in the last
+   one. `slides` (n) tells which joints are prismatic. Where `frame` is not NULL it becomes the
+   rotation (3, 3) of the tip, and J (6, n) has the rows of its angular velocity. */
 static inline void HK(rigid)(
-    int n, const int32_t *slides, const real *numbers, const V *q, V *x, V *J) {
+    int n, const int32_t *slides, const real *numbers, const V *q, V *x, V *J, V *frame) {
     V turn[9], at[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)}, axes[HK_MAX_N][3], points[HK_MAX_N][3];
     for (int i = 0; i < 9; i++) turn[i] = SPLAT(i % 4 == 0 ? 1.0 : 0.0);
     for (int k = 0; k < n; k++, numbers += 12) {
@@ -27,6 +28,13 @@ static inline void HK(rigid)(
     for (int i = 0; i < 3; i++)
         x[i] = at[i] + turn[3 * i] * numbers[0] + turn[3 * i + 1] * numbers[1] +
                turn[3 * i + 2] * numbers[2];
+    for (int i = 0; frame && i < 9; i++) {
+        const V *row = turn + i / 3 * 3;
+        const real *column = numbers + 3 + i % 3;
+        frame[i] = row[0] * column[0] + row[1] * column[3] + row[2] * column[6];
+    }
+    for (int i = 0; frame && i < 3 * n; i++)
+        J[3 * n + i] = slides[i % n] ? SPLAT(0.0) : axes[i % n][i / n];
     for (int k = 0; J && k < n; k++)
         for (int i = 0; i < 3; i++) {
             const int j = (i + 1) % 3, l = (i + 2) % 3;
