@@ -138,6 +138,11 @@ class ForwardModel(PortableModule):
         """The model that knows the geometry: of a hybrid its mechanical model, else itself."""
         return self
 
+    @property
+    def tip_model(self) -> ForwardModel:
+        """The model of the tip alone: of several markers that of the last, else itself."""
+        return self
+
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings where q (N, n) holds values too large to be metres or radians.
 

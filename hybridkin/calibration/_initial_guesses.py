@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin.calibration._least_squares import Rows
+from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.native.library import evaluate
 
 _Chain = TypeVar("_Chain", bound=Chain)
 
@@ -58,10 +58,11 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
 
 def aligned(chain: _Chain, rows: Rows) -> _Chain:
     """Return the chain at the base pose that matches the two clouds of tips (Kabsch)."""
-    tips = torch.from_numpy(evaluate(chain, rows.q.numpy())[0]).to(rows.x)
-    weight = rows.weight[:, None] / rows.weight.sum()
-    here, there = (weight * tips).sum(0), (weight * rows.x).sum(0)
-    u, _, vh = torch.linalg.svd((weight * (tips - here)).mT @ (rows.x - there))
+    x = torch.from_numpy(points(rows.x.numpy())[rows.seen])
+    tips = x + torch.from_numpy(rows.residual(chain)).to(x)
+    weight = torch.from_numpy(rows.weights).to(x)[:, None] / rows.weights.sum()
+    here, there = (weight * tips).sum(0), (weight * x).sum(0)
+    u, _, vh = torch.linalg.svd((weight * (tips - here)).mT @ (x - there))
     sign = torch.ones_like(here)
     sign[2] = torch.sign(torch.linalg.det(u @ vh))
     rotation = vh.mT @ (sign[:, None] * u.mT)

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from hybridkin.calibration._parameters import Problem
+from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
 from hybridkin.native.library import evaluate
 
@@ -36,30 +37,44 @@ def _huber(s: NDArray, far: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 class Rows(NamedTuple):
-    """Actuator vectors (N, n), measured tips (N, 3) and how many times each row counts (N,)."""
+    """Actuator vectors (N, n), measured tips and how many times each row counts (N,).
+
+    Of K markers the tips are (N, 3 K), NaN where a marker is missing. What is computed of them has
+    one entry for each of the M markers that were measured.
+    """
 
     q: Tensor
     x: Tensor
     weight: Tensor
 
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which markers were measured, (N, K)."""
+        return ~np.isnan(points(self.x.numpy())[..., 0])
+
+    @property
+    def weights(self) -> NDArray:
+        """How many times each measured marker counts, (M,)."""
+        return np.repeat(self.weight.numpy(), self.seen.sum(1))
+
     def residual(self, chain: Chain) -> NDArray:
-        """Return the coordinate errors (N, 3)."""
-        return evaluate(chain, self.q.numpy())[0] - self.x.numpy()
+        """Return the coordinate errors (M, 3)."""
+        return points(evaluate(chain, self.q.numpy())[0] - self.x.numpy())[self.seen]
 
     def jacobian(self, problem: Problem, theta: NDArray, chain: Chain) -> NDArray:
-        """Return the derivative of the residual, times the roots of the weights, (3 N, P)."""
+        """Return the derivative of the residual, times the roots of the weights, (3 M, P)."""
         with torch.no_grad():
             tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
-            J = chain.geometry_jacobian(self.q, tangents)
-            return (self.weight.sqrt()[:, None, None] * J).numpy().reshape(-1, theta.size)
+            J = chain.geometry_jacobian(self.q, tangents).unflatten(1, (-1, 3)).numpy()[self.seen]
+            return (np.sqrt(self.weights)[:, None, None] * J).reshape(-1, theta.size)
 
     def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
-        return float(np.sqrt(np.average(_squares(self.residual(chain)), weights=self.weight)))
+        return float(np.sqrt(np.average(_squares(self.residual(chain)), weights=self.weights)))
 
     def noise(self, residual: NDArray, robust: bool) -> float:
         """Return the standard deviation of one coordinate, from the median where robust."""
-        squares, weight = _squares(residual), self.weight.numpy()
+        squares, weight = _squares(residual), self.weights
         if not robust:
             return float(np.sqrt(np.average(squares, weights=weight) / 3.0))
         order = np.argsort(squares)
@@ -108,7 +123,7 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
 
     With `roughly` the search stops as soon as good and bad initial guesses differ.
     """
-    weight = rows.weight.numpy()
+    weight = rows.weights
     root = np.sqrt(weight)[:, None]
 
     @lru_cache(1)

@@ -22,7 +22,7 @@ from hybridkin.calibration._least_squares import LOSSES, Fit, Rows, solve
 from hybridkin.calibration._parameters import ALIASES, parameter_names
 from hybridkin.calibration._search import Start, search
 from hybridkin.calibration._unidentified import sentences
-from hybridkin.calibration.measured import check_finite, folds
+from hybridkin.calibration.measured import folds, points, with_missing_markers
 from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
@@ -67,7 +67,7 @@ class CalibrationResult(Portable):
         Parameters, as "lengths", of which a value ran into a bound or left what is physical. They
         compensate for what the model does not describe, however well the data identify them.
     rmse : float
-        Root mean square tip distance on the given data [m].
+        Root mean square tip distance on the given data, of all markers [m].
     cv_rmse : float or None
         The same on held-out groups (at most 5 folds), when `groups` was given [m].
     converged : bool
@@ -133,8 +133,9 @@ def calibrate(
         Start of the search; it is not changed.
     q : array or Tensor of shape (N, n_actuators)
         Actuator vectors [m, or unit of q of a chain with gains], of revolute joints [rad].
-    x : array or Tensor of shape (N, 3)
-        Measured tip positions [m].
+    x : array or Tensor of shape (N, 3) or (N, 3 K)
+        Measured tip positions [m]; of a chain with K markers all of these, NaN where one was not
+        measured. All count alike.
     parameters : sequence of str, default=("radii", "base")
         Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
         chains), "offsets", "rest_bends", "actuator_zeros", "gains", "base" (pose), of elastic
@@ -272,9 +273,9 @@ def _few(fit: Fit, rows: Rows) -> str | None:
 
 def _unexplained(fit: Fit, rows: Rows) -> str | None:
     """Return a warning where half of the rows are not explained well: not by outliers alone."""
-    with torch.no_grad():
-        left = (fit.chain()(rows.q) - rows.x).norm(dim=1).median()
-    spread = (rows.x - rows.x.median(dim=0).values).norm(dim=1).median()
+    left = np.median(np.linalg.norm(rows.residual(fit.chain()), axis=1))
+    around = points((rows.x - rows.x.nanmedian(dim=0).values).numpy())[rows.seen]
+    spread = np.median(np.linalg.norm(around, axis=1))
     if len(rows.x) < _FEW or not 0 < _LEFT * spread < left:
         return None
     return (
@@ -344,7 +345,7 @@ def _result(
         narrowing=prior_std / safe,
         identifiable=identifiable,
         singular_values=narrowed,
-        unidentified=sentences(fit, unidentified, covariance, float(rows.weight.sum())),
+        unidentified=sentences(fit, unidentified, covariance, float(rows.weights.sum())),
         unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
@@ -357,8 +358,8 @@ def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     for train, test in folds(groups, groups):
         fit = solve(best.problem, Rows(*(part[train] for part in rows)), best.theta, loss)
         held_out = Rows(*(part[test] for part in rows))
-        squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weight.sum())
-    return float(np.sqrt(squares / float(rows.weight.sum())))
+        squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weights.sum())
+    return float(np.sqrt(squares / float(rows.weights.sum())))
 
 
 def _check_parameters(
@@ -394,12 +395,13 @@ def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, li
     dtype = chain.geometry()["base"].dtype
     q, x = as_tensor(q, "q").to("cpu", dtype), as_tensor(x, "x").to("cpu", dtype)
     check_shape(q, "q", ("N", "n_actuators"))
-    check_shape(x, "x", (len(q), 3), "one tip position per row of `q`")
+    check_shape(x, "x", (len(q), chain.n_outputs), "one tip position per row of `q`")
     if len(q) == 0:
         raise ValueError("`q` must hold at least one row, got none.")
     messages = chain.check_actuators(q)
-    check_finite(x=x)
-    return q, x, [*messages, motion_message("x", x, chain(q), float(chain.reach.detach()))]
+    x, found = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x")), chain(q)
+    known = torch.where(x.isnan(), found, x)
+    return q, x, [*messages, motion_message("x", known, found, float(chain.reach.detach()))]
 
 
 def _check_weights(sample_weight: Numbers | None, q: Tensor) -> Tensor:

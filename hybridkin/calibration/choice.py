@@ -129,8 +129,8 @@ def choose_geometry(
         The nominal chain; it is not changed.
     q : array or Tensor of shape (N, n_actuators)
         Actuator vectors [m or rad].
-    x : array or Tensor of shape (N, 3)
-        Measured tip positions [m].
+    x : array or Tensor of shape (N, 3) or (N, 3 K)
+        Measured tip positions [m], as in `calibrate`.
     groups : array-like of shape (N,), optional
         Motion of every row. Of one motion stretches are held out, without groups rows.
     weights : array-like of shape (N,), optional
@@ -298,7 +298,7 @@ def _errors(
         chain, known, new = rung.chain, *(Rows(*(part[i] for part in rows)) for i in (train, test))
         if start is not None:
             chain = solve(start.problem, known, start.theta, loss, roughly=True).chain()
-        residual, weight = new.residual(chain), new.weight.numpy()
+        residual, weight = new.residual(chain), new.weights
         totals[kind] += weight @ np.linalg.norm(residual, axis=1), weight.sum()
     with np.errstate(invalid="ignore"):
         io, cv = (totals[:, 0] / totals[:, 1]).tolist()

@@ -26,6 +26,32 @@ def check_finite(**arrays: ArrayLike) -> None:
         )
 
 
+def points(x: NDArray) -> NDArray:
+    """Return rows x (N, 3 K) of K points as (N, K, 3); rows of other lengths m as (N, 1, m)."""
+    return x.reshape(len(x), -1, 3 if x.shape[1] % 3 == 0 else x.shape[1])
+
+
+def distances(a: NDArray, b: NDArray) -> NDArray:
+    """Return the distances (N, K) of the points of two sets of rows (N, m) or (N,)."""
+    return np.linalg.norm(points((a - b).reshape(len(a), -1)), axis=2)
+
+
+def distance(a: NDArray, b: NDArray) -> NDArray:
+    """Return their distance row by row, (N,), of several points the mean of those measured."""
+    return np.nanmean(distances(a, b), axis=1)
+
+
+def with_missing_markers(x: NDArray, name: str) -> NDArray:
+    """Return rows x (N, 3 K) in which a marker that lacks a coordinate is NaN as a whole.
+
+    Raise where a row has no marker at all, and where numbers are infinite.
+    """
+    missing = np.any(np.isnan(points(x)), axis=2)
+    allowed = missing & ~np.all(missing, axis=1, keepdims=True)
+    check_finite(**{name: np.where(allowed[..., None], 0.0, points(x)).reshape(x.shape)})
+    return np.where(missing[..., None], np.nan, points(x)).reshape(x.shape)
+
+
 def check_unscaled(name: str, values: NDArray, meant: str) -> None:
     """Raise where a scaler has turned all columns (N, k) into numbers without a unit."""
     if len(values) < 3:

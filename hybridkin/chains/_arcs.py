@@ -66,15 +66,19 @@ def _turned(v: Sequence[Tensor], b: Bending, arc: Stumpff) -> Vector:
     return fma(v[0], b[0], m), fma(v[1], b[1], m), fms(c * v[2], f, along)
 
 
-def tip(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
-    """Return the tip (3, N) in the base frame, carried from the last segment to the first."""
-    return torch.stack(_all_carried(length, bending, offsets)[0][0].point)
+def tip(length: Tensor, bending: Tensor, offsets: Tensor, beside: Sequence[float]) -> Tensor:
+    """Return the tip (3, N) in the base frame, carried from the last segment to the first.
+
+    `beside` is where it is in the frame after the last rigid offset [m].
+    """
+    return torch.stack(_all_carried(length, bending, offsets, beside)[0][0].point)
 
 
 def tip_and_columns(
     length: Tensor,
     bending: Tensor,
     offsets: Tensor,
+    beside: Sequence[float] = (0.0, 0.0, 0.0),
     *,
     angular: bool = False,
     rigid: bool = False,
@@ -84,7 +88,7 @@ def tip_and_columns(
     Columns are the lengths of all segments, then the x-, then the y-bendings. With `angular`,
     3 S columns of angular velocity follow, with `rigid`, S columns for the offsets.
     """
-    carried, segments, (x, y), arc = _all_carried(length, bending, offsets)
+    carried, segments, (x, y), arc = _all_carried(length, bending, offsets, beside)
     tx, ty, tz = (torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
     rest = torch.stack([at.rest for at in carried])
     across = torch.stack([at.across for at in carried])
@@ -104,7 +108,7 @@ def tip_and_columns(
 
 
 def _all_carried(
-    length: Tensor, bending: Tensor, offsets: Tensor
+    length: Tensor, bending: Tensor, offsets: Tensor, beside: Sequence[float]
 ) -> tuple[list[_Carried], list[tuple[Bending, Stumpff]], Bending, Stumpff]:
     """Return the tip in the start frame of every segment, and the segments' bendings and arcs.
 
@@ -116,7 +120,7 @@ def _all_carried(
     arcs = [Stumpff(*each) for each in zip(*(part.unbind() for part in arc), strict=True)]
     segments = [*zip(bends, arcs, strict=True)]
     zero = torch.zeros_like(length[0])
-    point, carried = (zero, zero, zero), []
+    point, carried = (zero + beside[0], zero + beside[1], zero + beside[2]), []
     parts = [*zip(length.unbind(), segments, offsets.unbind(), strict=True)]
     for of_length, (b, of_arc), offset in reversed(parts):
         carried.append(_carried(point, of_length, b, of_arc, offset))

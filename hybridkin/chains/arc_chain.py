@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import identity, number
+from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains._arcs import levers, reading_matrix, rolled, tip, tip_and_columns, transforms
 from hybridkin.chains._checks import arc_geometry, path_starts, stored_arguments
-from hybridkin.chains.chain import Chain
+from hybridkin.chains.markers import MarkedChain
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -28,7 +27,7 @@ ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 """Names of `calibrate` that move a part of an entry of the geometry, and that entry."""
 
 Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
-STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "routing": str}
+STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "markers": list, "routing": str}
 
 
 class Frames(NamedTuple):
@@ -41,21 +40,19 @@ class Frames(NamedTuple):
     slope: Tensor  # of the arcs by q, (3 S, n) or (3 S, n, N)
 
 
-class ArcChain(Chain):
+class ArcChain(MarkedChain):
     """A chain of circular arcs; its kinds differ in how the actuators shape them.
 
     A kind gives `_arcs_and_slope` and `_arcs_and_change`.
     """
 
-    _structure = (*STRUCTURE, "n_segments", "n_actuators", "extensible", "starts")
+    _structure = (*STRUCTURE, "n_segments", "n_actuators", "n_outputs", "extensible", "starts")
 
-    n_segments: int
     actuators_per_segment: tuple[int, ...]
     routing: str
     extensible: tuple[bool, ...]  # whether each segment is; the others have lengths
     starts: tuple[int, ...]  # the first segment that the actuators of each run through
     stage: str | None = None  # "rotation" where the first segment is one
-    tip_at: float  # the point that is steered, in segments from the base
     radii: Tensor  # (S,)
     angles: Tensor  # (n,)
     offsets: Tensor  # (S,)
@@ -96,7 +93,8 @@ class ArcChain(Chain):
         self.actuators_per_segment = counts
         self.starts = path_starts(routing, counts, self.extensible)
         self.n_segments, self.n_actuators = len(geometry["radii"]), len(geometry["angles"])
-        self.routing, self.tip_at = routing, float(self.n_segments)
+        self.routing = routing
+        self._set_markers([(self.n_segments, 0.0, 0.0, 0.0)])
         return geometry
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
@@ -130,8 +128,7 @@ class ArcChain(Chain):
         The angular rows give the angular velocity in the measuring frame.
         """
         arcs, slope = self._arcs_and_slope(self._rows(q))
-        length, bending = self._split(self._to_tip(arcs))
-        _, columns = tip_and_columns(length, bending, self._tip_offsets().to(q), angular=True)
+        _, columns = tip_and_columns(*self._to_point(self.up_to_tip(arcs)), angular=True)
         parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
         J = torch.cat(parts, dim=-2)
         if self.stage is not None:  # which turns the tip's frame with all that follows
@@ -163,19 +160,23 @@ class ArcChain(Chain):
         tensor([0., 0., 1.], dtype=torch.float64)
         """
         arcs, change = self._arcs_and_change(self._rows(q))
-        length, bending = self._split(self._to_tip(arcs))
-        offsets = self._tip_offsets().to(q)
-        tail, columns = tip_and_columns(length, bending, offsets, rigid=True)
         tangents = {name: value.to(q) for name, value in tangents.items()}
-        columns, S = self._turned(columns).permute(2, 0, 1).contiguous(), len(length)
+        J = torch.cat([one._along(arcs, change, tangents) for one in self.tips()], dim=1)
+        return J.reshape(*q.shape[:-1], *J.shape[1:])
+
+    def _along(self, arcs: Tensor, change: Change, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return how the tip (N, 3, P) moves along changes of the geometry, of arcs (3 S, N)."""
+        place = self._to_point(self.up_to_tip(arcs))
+        tail, columns = tip_and_columns(*place, rigid=True)
+        columns, S = self._turned(columns).permute(2, 0, 1).contiguous(), len(place[0])
         by_arcs, by_offsets = columns.split([3 * S, S], dim=2)
-        J = change(by_arcs @ self._to_tip(identity(3 * self.n_segments, q)), tangents)
+        J = change(by_arcs @ self.up_to_tip(identity(3 * self.n_segments, arcs)), tangents)
         if "offsets" in tangents:
             J = J + by_offsets @ self._tip_offsets(tangents["offsets"]).T
         if "base" in tangents:
             turned = tail.T @ tangents["base"][:, :3, :3].permute(2, 1, 0).flatten(1)
             J = J + turned.unflatten(1, J.shape[1:]) + tangents["base"][:, :3, 3].T
-        return J.reshape(*q.shape[:-1], *J.shape[1:])
+        return J
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arc of every segment.
@@ -212,8 +213,10 @@ class ArcChain(Chain):
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
-        arcs = self._leading(self._to_tip(self._arcs(q)), q)
-        return self._poses(*arcs, self._tip_offsets(), q)[..., -1, :, :]
+        arcs = self._leading(self.up_to_tip(self._arcs(q)), q)
+        beside = identity(4, q)
+        beside[:3, 3] = q.new_tensor(self.markers[-1][1:])
+        return self._poses(*arcs, self._tip_offsets(self.offsets), q)[..., -1, :, :] @ beside
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)`."""
@@ -262,40 +265,11 @@ class ArcChain(Chain):
         points = torch.cat([points[..., :-1, :], end], dim=-2)
         return torch.cat([poses[..., 0, None, :3, 3], points.flatten(-3, -2)], dim=-2)
 
-    def with_tip(self, at: float) -> Self:
-        """Return a chain that steers another point of the same robot.
-
-        Parameters
-        ----------
-        at : float
-            Where on the backbone, in segments from the base: 1.5 is the middle of the second
-            segment's arc, 2.0 its end with its rigid offset, S (the default) the robot's end.
-
-        Returns
-        -------
-        ArcChain
-            Its tip, Jacobians and tip transform are those of that point; actuators, arcs, poses and
-            backbone stay those of the whole robot.
-
-        Examples
-        --------
-        >>> import torch
-        >>> from hybridkin import ConstantCurvatureChain
-        >>> chain = ConstantCurvatureChain([0.01, 0.01], lengths=[0.1, 0.1]).with_tip(1.5)
-        >>> chain(torch.zeros(6, dtype=torch.float64))
-        tensor([0.0000, 0.0000, 0.1500], dtype=torch.float64)
-        """
-        if not 0.0 < number(at, "at") <= self.n_segments:
-            raise ValueError(
-                f"`at` must lie in (0, {self.n_segments}], in segments from the base, got {at}."
-            )
-        chain = copy.deepcopy(self)
-        chain.tip_at = float(at)
-        return chain
-
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
         where = "" if self.tip_at == self.n_segments else f", tip at {self.tip_at:g}"
+        if len(self.markers) > 1:
+            where = f", markers at {', '.join(f'{at:g}' for at, *_ in self.markers)}"
         size = f"{self.n_segments} segments, {self.n_actuators} actuators"
         return f"{size}{where}, routing {self.routing!r}"
 
@@ -341,20 +315,33 @@ class ArcChain(Chain):
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, 3 m) up to the tip and their derivative, (3 m, n) or (N, 3 m, n).
 
-        Lengths [m], then x-, then y-bendings [rad] of the m segments up to the tip.
+        Lengths [m], then x-, then y-bendings [rad] of the m segments up to the tip; of several
+        markers the arcs of all segments.
         """
-        arcs, slope = (self._to_tip(part) for part in self._arcs_and_slope(q))
+        arcs, slope = self._arcs_and_slope(q)
+        if len(self.markers) == 1:
+            arcs, slope = self.up_to_tip(arcs), self.up_to_tip(slope)
         return arcs.mT, slope if slope.ndim == 2 else slope.permute(2, 0, 1)
 
     def from_coordinates(self, z: Tensor) -> Tensor:
-        """Return the tip (N, 3) of arcs (N, 3 m) up to it."""
-        return self._tip_of(z.mT, z)
+        """Return the tip (N, 3), or all markers (N, 3 K), of their `coordinates` (N, C)."""
+        if len(self.markers) == 1:
+            return self._tip_of(z.mT, z)
+        tips = [one.from_coordinates(one.up_to_tip(z.mT).mT) for one in self.tips()]
+        return torch.cat(tips, dim=-1)
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the tip (N, 3) of arcs (N, 3 m) up to it, and its derivative (N, 3, 3 m)."""
-        arcs = z.mT
-        tail, columns = tip_and_columns(*self._split(arcs), self._tip_offsets().to(arcs))
-        return self._in_measuring_frame(tail, z), self._turned(columns).permute(2, 0, 1)
+        """Return `from_coordinates` (N, 3 K) and its derivative (N, 3 K, C)."""
+        if len(self.markers) == 1:
+            tail, columns = tip_and_columns(*self._to_point(z.mT))
+            return self._in_measuring_frame(tail, z), self._turned(columns).permute(2, 0, 1)
+        pairs = []
+        for one in self.tips():
+            to_tip = one.up_to_tip(identity(3 * self.n_segments, z))
+            x, J = one.from_coordinates_and_jacobian(z @ to_tip.mT)
+            pairs.append((x, J @ to_tip))
+        x, J = (torch.cat(part, dim=1) for part in zip(*pairs, strict=True))
+        return x, J
 
     def _rows(self, q: Tensor) -> Tensor:
         check_vectors(q, self.n_actuators, "q", self._why_shape())
@@ -367,23 +354,10 @@ class ArcChain(Chain):
     def _arcs(self, q: Tensor) -> Tensor:
         return self._arcs_and_slope(self._rows(q))[0]
 
-    def _to_tip(self, arcs: Tensor) -> Tensor:
-        """Return the rows (3 m, ...) of arcs (3 S, ...), or of their slope, up to the tip."""
-        if self.tip_at == self.n_segments:
-            return arcs
-        m = math.ceil(self.tip_at)
-        parts = arcs.unflatten(0, (3, self.n_segments))[:, :m]
-        last = parts[:, -1:] * (self.tip_at - m + 1)
-        return torch.cat([parts[:, :-1], last], dim=1).flatten(0, 1)
-
-    def _tip_offsets(self, offsets: Tensor | None = None) -> Tensor:
-        """Return the rigid offsets (..., m) up to the tip, by default of the chain itself."""
-        offsets = self.offsets if offsets is None else offsets
-        if self.tip_at == self.n_segments:
-            return offsets
-        m = math.ceil(self.tip_at)
-        last = offsets[..., m - 1 : m] * float(self.tip_at == m)
-        return torch.cat([offsets[..., : m - 1], last], dim=-1)
+    def _to_point(self, arcs: Tensor) -> tuple[Tensor, Tensor, Tensor, Sequence[float]]:
+        """Return lengths, bendings and rigid offsets up to the tip, and its own offset."""
+        offsets = self._tip_offsets(self.offsets).to(arcs)
+        return *self._split(arcs), offsets, self.markers[-1][1:]
 
     @staticmethod
     def _split(arcs: Tensor) -> tuple[Tensor, Tensor]:
@@ -409,18 +383,25 @@ class ArcChain(Chain):
         return poses if turned is None else rolled(poses, self.metres(turned)[..., :1])
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
-        return (self._tip_of(self._to_tip(self._arcs(q)), q),)
+        arcs = self._arcs(q)
+        tips = [one._tip_of(one.up_to_tip(arcs), q) for one in self.tips()]
+        return (tips[0] if len(tips) == 1 else torch.cat(tips, dim=-1),)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         arcs, slope = self._arcs_and_slope(self._rows(q))
-        arcs = self._split(self._to_tip(arcs))
-        tail, columns = tip_and_columns(*arcs, self._tip_offsets().to(q))
-        return self._in_measuring_frame(tail, q), self._by_actuators(columns, slope, q)
+        pairs = []
+        for one in self.tips():
+            tail, columns = tip_and_columns(*one._to_point(one.up_to_tip(arcs)))
+            tip = one._in_measuring_frame(tail, q)
+            pairs.append((tip, one._by_actuators(columns, slope, q)))
+        if len(pairs) == 1:
+            return pairs[0]
+        x, J = zip(*pairs, strict=True)
+        return torch.cat(x, dim=-1), torch.cat(J, dim=-2)
 
     def _tip_of(self, arcs: Tensor, q: Tensor) -> Tensor:
         """Return the tips (..., 3) of arcs (3 m, N) up to them, in the batch shape of q."""
-        tail = tip(*self._split(arcs), self._tip_offsets().to(arcs))
-        return self._in_measuring_frame(tail, q)
+        return self._in_measuring_frame(tip(*self._to_point(arcs)), q)
 
     def _turned(self, columns: Tensor) -> Tensor:
         """Return columns (3, k, N) of the base frame in the measuring frame."""
@@ -433,7 +414,7 @@ class ArcChain(Chain):
 
     def _by_actuators(self, columns: Tensor, slope: Tensor, q: Tensor) -> Tensor:
         """Fold the slope of the arcs and the base into columns (3, 3 m, N)."""
-        columns, slope = self._turned(columns), self._to_tip(slope)
+        columns, slope = self._turned(columns), self.up_to_tip(slope)
         if slope.ndim == 3:
             J = torch.matmul(columns.permute(2, 0, 1), slope.permute(2, 0, 1))
             return J.reshape(*q.shape[:-1], 3, self.n_actuators)
@@ -445,5 +426,9 @@ class ArcChain(Chain):
         """Return the chain of a description."""
         given = stored_arguments(stored, cls._entries)
         chain = cls(**given, dtype=torch.from_numpy(given["base"]).dtype)
-        angles = torch.from_numpy(stored.array("angles"))
-        return chain.with_geometry(angles=angles).with_tip(stored.value("tip_at", float))
+        chain = chain.with_geometry(angles=torch.from_numpy(stored.array("angles")))
+        at = stored.value("tip_at", float)
+        markers = stored.settings.get("markers", [[at, 0.0, 0.0, 0.0]])  # earlier files have none
+        markers = [*markers[:-1], [at, *markers[-1][1:]]]
+        found = [(math.ceil(place) - 1, place, beside) for place, *beside in markers]
+        return chain.with_markers([(k, place - k, beside) for k, place, beside in found])

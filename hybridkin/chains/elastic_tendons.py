@@ -175,7 +175,7 @@ class ElasticTendonChain(ArcChain):
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
         given = {"n_actuators": counts, "routing": chain.routing, "dtype": chain.radii.dtype}
-        return cls(**{**geometry, "angles": angles, **given, **options}).with_tip(chain.tip_at)
+        return cls(**{**geometry, "angles": angles, **given, **options})._marked(chain.markers)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:

@@ -69,7 +69,8 @@ class LogFormat:
     Attributes
     ----------
     q, x : tuple of str
-        Columns of the actuator vector and of the tip position, in the chain's order.
+        Columns of the actuator vector and of the tip position, in the chain's order; of several
+        markers three each, in the order of ``chain.markers``.
     q_unit, x_unit : {"m", "cm", "mm", "um", "in"}
         Units of these columns. Of a chain with `gains` that of q is any name but these; of a robot
         without segments it may be "rad", "deg" or "1" as well.
@@ -267,7 +268,10 @@ def read_description(path: str | Path) -> RobotDescription:
 
             [log]                           # how its logs are written, optional
             q = ["servo_1", "servo_2", "servo_3"]
-            x = ["tip_x", "tip_y", "tip_z"]
+            x = ["tip_x", "tip_y", "tip_z"] # of several markers three columns each, the tip last;
+                                            # then where they are: segment, counted from 0, fraction
+                                            # of its arc, and offset in the frame there [m]:
+                                            # markers = [[0, 1.0, 0, 0, 0], [1, 1.0, 0, 0, 0.01]]
             q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; with a gain any other
             x_unit = "mm"
             q_sign = -1                     # -1: a pulled tendon counts as positive; or one each
@@ -317,6 +321,13 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
             "data alone give [log], and none of `model`, `routing`, `calibrate` and `base`."
         )
     log = _log_format(tables["log"], chain) if "log" in tables else None
+    markers = tables.get("log", {}).get("markers")
+    if log is not None and len(log.x) != 3 * len((chain and markers) or [0]):
+        raise ValueError(
+            f"`x` in [log] must hold 3 names of columns, or 3 for each of `markers`, got {log.x}."
+        )
+    if markers and chain is not None:
+        chain = chain.with_markers([(k, at, beside) for k, at, *beside in markers])
     names = () if chain is None else tables.get("calibrate", "auto")
     known = () if chain is None else (*chain.geometry(), *ALIASES)
     if names == "default" and chain is not None:
@@ -343,6 +354,7 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     if doubled := sorted({name for name in columns if columns.count(name) > 1}):
         raise ValueError(f"[log] must name every column once, got {doubled} more often.")
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+    given.pop("markers", None)
     gained = chain is not None and not chain.in_metres
     unit = given.setdefault("q_unit", "1" if gained else "m")
     known = [*UNITS] if chain is None else [*METRES]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +38,8 @@ def check_log(
     few motions to hold some out. With a chain it also looks for wrong units, columns of q in
     another order or of another sign, actuators numbered the other way round, axes of the tip that
     are turned or left-handed, radii that are far off, and an offset or a drift of one actuator.
-    Rows must be in order of time.
+    Rows must be in order of time. Of several markers the last one, the tip, is checked, where it
+    was measured.
 
     Parameters
     ----------
@@ -75,9 +77,14 @@ def check_log(
         raise ValueError(
             f"`log` must have {chain.n_actuators} actuators, as `chain` has, got {n_actuators}."
         )
+    several = log.x.shape[1] > 3
+    if several:
+        log = replace(log, x=log.x[:, -3:], x_names=log.x_names[-3:])
+        chain = None if chain is None else chain.tip_model
     columns = np.column_stack([log.q, log.x]).astype(float)
     valid = np.asarray(np.isfinite(columns).all(axis=1))
-    findings = [*_invalid(log, valid, drop_invalid)]
+    complete = valid | (several & np.isfinite(log.q).all(axis=1))
+    findings = [*_invalid(log, complete, drop_invalid)]
     if valid.any():
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))
         for check in (_frozen, _constant, _same, _duplicates, _jumps, _times, _motions):

@@ -32,8 +32,9 @@ class Log:
     ----------
     q : ndarray of shape (N, n)
         Actuator vectors [m], or in the unit that `units` says.
-    x : ndarray of shape (N, 3)
-        Tip positions [m].
+    x : ndarray of shape (N, 3) or (N, 3 K)
+        Tip positions [m], or those of K markers, the last of which is the tip; NaN where a marker
+        was not measured.
     groups : ndarray of shape (N,) or None
         Motion, run or day of each row.
     time : ndarray of shape (N,) or None
@@ -69,10 +70,11 @@ class Log:
         for name in ("q", "x", "time"):
             if vars(self)[name] is not None:
                 vars(self)[name] = real_array(vars(self)[name], name)
-        if np.ndim(self.q) != 2 or np.shape(self.x) != (len(self.q), 3) or len(self.q) == 0:
+        q, x = np.shape(self.q), np.shape(self.x)
+        if len(q) != 2 or len(x) != 2 or x[0] != q[0] or x[1] % 3 or 0 in (*q[:1], x[1]):
             raise ValueError(
-                f"A log needs q of shape (N, n) and x of shape (N, 3), got {np.shape(self.q)} and "
-                f"{np.shape(self.x)}."
+                f"A log needs q of shape (N, n) and x of shape (N, 3), or (N, 3 K) of K markers, "
+                f"got {q} and {x}."
             )
 
     def rows(self, kept: NDArray | slice) -> Self:
@@ -110,8 +112,9 @@ def load_log(
     q : sequence of str
         Columns of the actuator vector, in the order of the robot model. In an npz file an array
         (N,) is a column; ``"name[2]"`` is column 2 of an array (N, k), ``"name"`` all of them.
-    x : sequence of 3 str
-        Columns of the tip position.
+    x : sequence of 3 str, or of 3 K
+        Columns of the tip position, or of the positions of K markers, the last of which is the tip.
+        A row that lacks some markers is kept, with NaN for these.
     groups : str or None, default=None
         Column that names the motion, run or day of a row, for splitting by groups.
     time : str or None, default=None
@@ -170,12 +173,18 @@ def load_log(
     suffix = path.suffix.lower()
     table = read[suffix](path) if suffix in read else _read_text(path, delimiter)
     q, x = table.names("q", q), table.names("x", x)
-    if len(x) != 3:
-        raise ValueError(f"`x` must name 3 columns, got {len(x)}: {x}.")
+    if len(x) % 3:
+        raise ValueError(
+            f"`x` must name 3 columns, got {len(x)}: {x}; of several markers 3 for each."
+        )
     factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
     values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
     places = np.arange(len(values)) if table.lines is None else table.lines
-    valid = np.isfinite(values).all(axis=1)
+    n, K = len(q), len(x) // 3
+    known = np.isfinite(values)
+    seen = known[:, n : n + 3 * K].reshape(-1, K, 3).all(axis=2)
+    values[:, n : n + 3 * K][~seen.repeat(3, axis=1)] = np.nan
+    valid = known[:, :n].all(axis=1) & known[:, n + 3 * K :].all(axis=1) & np.any(seen, axis=1)
     if not valid.any() or not (drop_invalid or valid.all()):
         where = named_rows(places[~valid], "row" if table.lines is None else "line")
         raise ValueError(
@@ -183,10 +192,11 @@ def load_log(
             f"infinite value ({where}); correct them, or leave them out by drop_invalid=True where "
             "others are left."
         )
-    values, n = values[valid], len(q)
-    columns = values[:, :n], values[:, n : n + 3]
+    values = values[valid]
+    columns = values[:, :n], values[:, n : n + 3 * K]
     for name, unit, column in zip("qx", (q_unit, x_unit), columns, strict=True):
-        span, middle = np.ptp(column, axis=0).max(), np.median(np.abs(column))
+        span = np.nanmax(np.nanmax(column, axis=0) - np.nanmin(column, axis=0))
+        middle = np.nanmedian(np.abs(column))
         if unit == "m" and (middle > 10 or span > 5):
             warnings.warn(
                 f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "

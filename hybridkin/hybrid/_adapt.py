@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.rotations import cross_matrix, rotation, rotation_vector
+from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import MISFITS, SWITCH
@@ -116,7 +117,9 @@ def held_out_noise(error: Any, cv_results: dict[str, Any] | None) -> float:
     if cv_results is not None:
         return float(np.min(cv_results["mean_distance"])) / _MEAN_LENGTH
     if isinstance(error, ReadoutFit):
-        return error.rmse / error.residual.shape[1] ** 0.5
+        return error.rmse / points(error.residual).shape[2] ** 0.5
+    if type(error) is tuple:  # one for each marker
+        return float(np.sqrt(np.mean([held_out_noise(one, None) ** 2 for one in error])))
     known = isinstance(error, ELMRegressorCV)
     return float(np.sqrt(np.nanmean(np.square(error.left_out_errors_)))) if known else np.nan
 
@@ -134,9 +137,10 @@ def training_noise(fitted: FittedHybrid, rows: Rows, output: str) -> float:
         if isinstance(error, ELMRegressor):
             own = rows.counts * error.module_.leverage(rows.q).numpy()
             after /= np.maximum(1.0 - own, 1e-3)[:, None]
-    mean_squares = [np.average(after**2, axis=0, weights=rows.counts).mean()]
+    squares = np.ma.masked_invalid(after**2)  # without those of missing markers
+    mean_squares = [np.ma.average(squares, axis=0, weights=rows.counts).mean()]
     if error is not None and not isinstance(error, ELMRegressor):
-        mean_squares.append(_LEAST**2 * before.var(axis=0).mean())
+        mean_squares.append(_LEAST**2 * np.nanvar(before, axis=0).mean())
     return float(max(mean_squares) ** 0.5)
 
 
@@ -165,7 +169,8 @@ class _Problem:
         Arun, Huang & Blostein (1987); the turn stays small about axes of which the rows say little.
         """
         x = torch.from_numpy(evaluate(self.fitted, self.q.numpy())[0])
-        y, theta = self.y[:, :3], self.q.new_zeros(6 + len(self.scale))
+        y, theta = self.y[:, : x.shape[1]].reshape(-1, 3), self.q.new_zeros(6 + len(self.scale))
+        x = x.reshape(-1, 3)
         moments = (y - y.mean(0)).mT @ (x - x.mean(0)) + noise**2 * identity(3, x)
         left, _, right = torch.linalg.svd(moments)
         left[:, 2] *= torch.linalg.det(left @ right).sign()
@@ -184,14 +189,15 @@ class _Problem:
         residual, J = self.y - x, J * self.scale
         A = torch.cat([J.new_zeros(*x.shape, 6), J], dim=-1)
         spin = rotation(torch.from_numpy(theta[:3]))[1]
-        if x.shape[1] in (3, 6):
-            arm = x[:, :3] - self.pivot - self.reach * torch.from_numpy(theta[3:6])
-            A[:, :3, :3] = -cross_matrix(arm) @ spin
-            A[:, :3, 3:6] = self.reach * identity(3, x)
-        if x.shape[1] == 6:
+        pose, K = isinstance(self.fitted, PoseHybridModule), x.shape[1] // 3
+        if x.shape[1] % 3 == 0:
+            arm = x.unflatten(1, (K, 3)) - self.pivot - self.reach * torch.from_numpy(theta[3:6])
+            A[..., :3] = (-cross_matrix(arm) @ spin).flatten(1, 2)
+            A[..., 3:6] = self.reach * identity(3, x).repeat(K, 1)
+        if pose:
             turn = rotation(self.y[:, 3:])[0] @ rotation(x[:, 3:])[0].mT
             residual[:, 3:] = self.reach * rotation_vector(turn)
-            A[:, 3:, :3] = spin
+            A[:, 3:, :3], A[:, 3:, 3:6] = spin, 0.0
             A[:, 3:] *= self.reach
         return residual.numpy(), A.numpy()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor
 from typing_extensions import Self
@@ -58,6 +60,11 @@ class AdaptedModel(ForwardModel):
         """The mechanical part after the change, or the module itself without one."""
         return self.mechanical or self
 
+    @property
+    def tip_model(self) -> ForwardModel:
+        """The model of the tip alone after the change."""
+        return self.of(cast(HybridModule, self.fitted.tip_model))
+
     def of(self, fitted: HybridModule) -> Self:
         """Return another hybrid after the same change."""
         return type(self)(fitted, self.shift, self.motion)
@@ -110,7 +117,9 @@ class AdaptedModel(ForwardModel):
 
     def _moved(self, x: Tensor, motion: Tensor) -> Tensor:
         """Return outputs (..., m) moved by a motion."""
-        return self._turned(x, motion) + motion[:3, 3].to(x) if x.shape[-1] == 3 else x
+        if x.shape[-1] % 3:
+            return x
+        return self._turned(x, motion) + motion[:3, 3].to(x).repeat(x.shape[-1] // 3)
 
 
 class AdaptedPoseModel(AdaptedModel, PoseModel):

@@ -277,6 +277,10 @@ class Readout(ForwardModel):
         self.register_buffer("weights", weights)
         self.n_actuators, self.n_outputs = len(features.center), len(weights)
 
+    def up_to(self, chain: ArcChain) -> Readout:
+        """Return the readout of the arcs up to the tip of a chain, from that of all arcs."""
+        return Readout(self.features, chain.up_to_tip(self.weights))
+
     def forward(self, q: Tensor) -> Tensor:
         """Return W phi(q), shape (..., C)."""
         return self.features(q) @ self.weights.to(q).mT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, NamedTuple, cast
@@ -18,12 +19,14 @@ from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._features import Features, HiddenFeatures, PoseFeatures, QuadraticFeatures
 from hybridkin.hybrid._guards import GroupDistance, fit_guard
 from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._linearised import Pair
+from hybridkin.hybrid._marked import MarkedHybridModule
 from hybridkin.hybrid._module import Correction, HybridModule, InnerCorrection, TipCorrection
 from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
 from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
@@ -59,6 +62,14 @@ class Rows(NamedTuple):
         """Return some of the rows."""
         return Rows(*(None if part is None else part[rows] for part in self))  # pyright: ignore
 
+    def marker(self, k: int) -> Rows:
+        """Return the rows in which marker k was measured, with its tips alone."""
+        tips = self.tips[:, 3 * k : 3 * k + 3]
+        measured = np.flatnonzero(~np.isnan(tips[:, 0]))
+        if len(measured) < 2:
+            raise ValueError(f"`y` must hold marker {k} in at least 2 rows; leave that marker out.")
+        return self._replace(y=tips).take(measured)
+
     def distinct(self, runs: bool = False) -> tuple[Rows, NDArray]:
         """Return the different rows, and the place of every row, see `distinct_rows`."""
         first, weights, place = distinct_rows(self.X, self.y, self.weights, self.groups, runs)
@@ -78,7 +89,9 @@ class Part(NamedTuple):
 
     weight: float
     coupling: str  # "parallel" or "serial"
-    error_model: NamedFeatures | BaseEstimator | str  # "drop" and "kernel" are names
+    # "drop" and "kernel" are names. A fitted readout is used as it is; of several markers outside
+    # the robot there may be one error model for each.
+    error_model: NamedFeatures | BaseEstimator | str | ReadoutFit | tuple[Any, ...]
 
 
 class Blend(NamedTuple):
@@ -127,6 +140,11 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     spec = calibrated(spec, rows, rows.groups)
     distinct, place = rows.distinct()
     error = residuals(spec.mechanical, distinct.q, distinct.y, spec.output)
+    tips = spec.mechanical.tips() if isinstance(spec.mechanical, ArcChain) else []
+    if spec.mechanical is None and np.isnan(error).any():
+        tips = [None] * points(error).shape[1]
+    if len(tips) > 1:
+        return _fit_markers(spec, tips, rows)
     errors = distinct._replace(y=error)
     fits = [_fit_part(part, spec, rows, errors, place) for part in spec.parts]
     weights = tuple(part.weight for part in spec.parts)
@@ -139,6 +157,36 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
         tested = GroupDistance.fit(errors.q, errors.groups)
     module = kind(spec.mechanical, corrections, rows.q.new_tensor(shares), None, tested)
     return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
+
+
+def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], rows: Rows) -> FittedHybrid:
+    """Return the hybrid of several markers, each on the rows in which it was measured.
+
+    What acts inside the robot is learned once, from all of them; what acts outside it one by one.
+    """
+    joint: list[Part] = []
+    for part in spec.parts:
+        if spec.mechanical is not None and part.coupling == "serial" and part.error_model != "drop":
+            own = part._replace(error_model=_of_marker(part.error_model, 0))
+            q = rows.distinct()[0].q
+            found = _fit_features(own, spec.mechanical, rows, q, spec.left_out)
+            part = part._replace(error_model=found)
+        joint.append(part)
+    fits = []
+    for k, tip in enumerate(tips):
+        parts = tuple(p._replace(error_model=_of_marker(p.error_model, k, tip)) for p in joint)
+        fits.append(fit_hybrid(replace(spec, mechanical=tip, parts=parts), rows.marker(k)))
+    errors = tuple(one.error_model for one in fits)
+    module = MarkedHybridModule(spec.mechanical, [one.module for one in fits])
+    error_model = None if errors[0] is None else errors
+    return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
+
+
+def _of_marker(error_model: Any, k: int, tip: ArcChain | None = None) -> Any:
+    """Return the error model of marker k; of one inside the robot what its chain sees of it."""
+    if isinstance(error_model, ReadoutFit) and tip is not None:
+        return error_model._replace(readout=error_model.readout.up_to(tip))
+    return error_model[k] if type(error_model) is tuple else error_model
 
 
 def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
@@ -245,7 +293,8 @@ def _fit_part(
         return None, None
     serial = part.coupling == "serial"
     if mechanical is not None and (serial or isinstance(model, NamedFeatures)):
-        fitted = _fit_features(part, mechanical, rows, q, spec.left_out)
+        known = model if isinstance(model, ReadoutFit) else None  # of several markers
+        fitted = known or _fit_features(part, mechanical, rows, q, spec.left_out)
         readout = fitted.readout
         correction = InnerCorrection(mechanical, readout) if serial else TipCorrection(readout)
     else:
@@ -325,13 +374,19 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
     return HiddenFeatures.of_range(q, *inner), alphas
 
 
+def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:
+    """Return measured tips (N, m), where one is missing the chain's, and the chain's [m]."""
+    found = chain(rows.q).detach()
+    tips = torch.from_numpy(rows.tips[:, : chain.n_outputs])
+    return torch.where(tips.isnan(), found, tips), found
+
+
 def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
     """Return the warnings of a fit: of its calibration, or of the rows of an uncalibrated chain."""
     chain = fitted.mechanical
     if fitted.calibration is not None or not isinstance(chain, Chain):
         return fitted.messages
-    tips = torch.from_numpy(rows.tips[:, :3])
-    motion = motion_message("y", tips, chain(rows.q), float(chain.reach))
+    motion = motion_message("y", *known_tips(chain, rows), float(chain.reach))
     found = [*fitted.messages, *chain.check_actuators(rows.q, "X")]
     more = chain.contradiction(rows.q, "X"), motion
     return (*found, *(message for message in more if message is not None))

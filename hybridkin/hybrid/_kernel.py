@@ -12,7 +12,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.metrics.pairwise import euclidean_distances
 
-from hybridkin.calibration.measured import folds
+from hybridkin.calibration.measured import distance, folds
 
 _FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
@@ -22,11 +22,6 @@ _GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # over the mean variance of the in
 def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
     """Return training and held-out rows of 5 folds of groups, or of rows; 10 of a small log."""
     return folds(X, groups, _FOLDS if len(X) >= _FEW else _FOLDS_OF_FEW, shuffle=True)
-
-
-def distance(a: NDArray, b: NDArray) -> NDArray:
-    """Return the distance of two sets of tips (N, m) or (N,), row by row, shape (N,)."""
-    return np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)
 
 
 def tuned_kernel(

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.model import ForwardModel, as_forward_model
@@ -18,7 +19,7 @@ from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapted import AdaptedModel
-from hybridkin.hybrid._fit import Rows
+from hybridkin.hybrid._fit import Rows, known_tips
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._radius import Radius
 from hybridkin.learning.hidden_layer import check_inputs
@@ -78,6 +79,14 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
         return self._evaluated(_method("error_part"), X, groups, warn=False)[0]
 
+    def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
+        """Return R^2 of `predict`, the mean over the columns of y, each without missing markers."""
+        x, n = self.predict(X), len(np.asarray(y))
+        weights = np.ones(n) if sample_weight is None else np.asarray(sample_weight)
+        both = (np.asarray(values, dtype=float).reshape(n, -1).T for values in (y, x))
+        found = [(a, b, ~np.isnan(a)) for a, b in zip(*both, strict=True)]
+        return float(np.mean([r2_score(a[k], b[k], sample_weight=weights[k]) for a, b, k in found]))
+
     def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
@@ -121,9 +130,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Warn where measured tips span so much more than the robot that they are not in metres."""
         if not isinstance(chain := self.mechanical_model_, Chain):
             return
-        tips = chain(rows.q).detach()
-        both = torch.cat([tips, torch.from_numpy(rows.tips[:, :3])])
-        message = motion_message("y", both, tips, float(chain.reach))
+        known, tips = known_tips(chain, rows)
+        message = motion_message("y", torch.cat([tips, known]), tips, float(chain.reach))
         if message is not None:
             warnings.warn(message, stacklevel=3)
 

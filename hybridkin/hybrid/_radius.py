@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin.calibration.measured import folds
+from hybridkin.calibration.measured import distances, folds
 from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid, with_geometry_chosen
-from hybridkin.hybrid._kernel import distance
 from hybridkin.hybrid._selection import select
 
 _ROUNDING = 1e-9  # of shares
@@ -41,7 +40,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
 
     Whole groups are held out, in five folds, and everything is fitted anew without them,
     calibration included. Without groups every row is one. The errors inside the domain of these
-    fits give the radius.
+    fits give the radius; of several markers the largest of a row counts.
 
     References
     ----------
@@ -60,7 +59,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():
             inside[test] = module.in_domain(q).numpy()
-            errors[test] = distance(module(q).numpy(), y[test])
+            errors[test] = np.nanmax(distances(module(q).numpy(), y[test]), axis=1)
     names, of = np.unique(groups[inside], return_inverse=True)
     radius = _quantile(errors[inside], of, rows.counts[inside], coverage)
     found, n = Radius(radius, inf, coverage, len(y)), len(names)

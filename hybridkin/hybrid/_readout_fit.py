@@ -17,6 +17,7 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Restore, Stored
+from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
@@ -81,7 +82,8 @@ def _tips(model: ForwardModel) -> _Tips:
     offsets[-1] *= model.tip_at == m
     arrays = {"base": model.base.numpy(force=True), "offsets": offsets, "radii": np.ones(m)}
     derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}  # of q that are arcs
-    plan = Plan(Stored("constant_curvature", {"tip_at": float(m)}, arrays, derived=derived))
+    place = {"tip_at": float(m), "markers": [[float(m), *model.markers[-1][1:]]]}
+    plan = Plan(Stored("constant_curvature", place, arrays, derived=derived))
     program = Program(plan)
 
     def tips(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -128,7 +130,7 @@ def fit_readout(
     q : Tensor of shape (N, n)
         Actuator vectors.
     x : Tensor of shape (N, m)
-        Measured tips [m].
+        Measured tips [m], NaN where a marker is missing; its residual is zero.
     coupling : {"serial", "parallel"}, default="serial"
         Whether W phi(q) is added to the inner coordinates, or to the tip.
     sample_weight : Tensor of shape (N,), optional
@@ -219,8 +221,8 @@ class _Problem:
         self.noise_ratio, self.whitening, self._last = inf, None, None
         self._tips = _tips(mechanical) if serial else _at_tip
         self.z = mechanical.coordinates(q)[0] if serial else mechanical(q)
-        tips, J = self._tips(self.z)
-        self.rest = x - tips
+        self.seen = ~x.isnan()
+        self.rest, J = self._rest(self.z)
         J = self.root[:, None] * J
         moved = (J.square().sum((0, 1)) / weight.sum()).sqrt()
         moves = moved > 1e-9 * moved.max()
@@ -251,7 +253,7 @@ class _Problem:
         """Return the ratio that makes residuals (N, m) [m] likeliest as normal noise."""
         spread, axes = self._principal_noise
         squares = (axes.mT @ residual[..., None])[..., 0].square()
-        weights = self.root.square().expand_as(squares)
+        weights = self.root.square() * self.seen.all(1, keepdim=True) * torch.ones_like(squares)
         total, mean = weights.sum(), (weights * spread).sum() / weights.sum()
 
         def unlikely(ratio: float) -> float:
@@ -264,7 +266,7 @@ class _Problem:
     @cached_property
     def _principal_noise(self) -> tuple[Tensor, Tensor]:
         """Return variances (N, m) and axes (N, m, m) of what noise of the actuators does to x."""
-        J = self.mechanical.forward_and_jacobian(self.q)[1]
+        J = self.mechanical.forward_and_jacobian(self.q)[1] * self.seen[..., None]
         spread, axes = torch.linalg.eigh(J @ J.mT)
         return spread.clamp(min=0.0), axes
 
@@ -275,9 +277,10 @@ class _Problem:
         return residual / self.root
 
     def mean_distance(self, residual: NDArray, power: int = 1) -> float:
-        """Return the weighed mean length of residuals (N, m) [m], or of its `power`."""
-        weights = self.root[:, 0].square().numpy(force=True)
-        return float(np.average(np.linalg.norm(residual, axis=1) ** power, weights=weights))
+        """Return the weighed mean length of residuals (N, m) of markers [m], or of its `power`."""
+        weights = self.root.square().numpy() * points(self.seen.numpy())[..., 0]
+        far = np.linalg.norm(points(residual), axis=2)
+        return float((weights * far**power).sum() / weights.sum())
 
     def penalty(self, alphas: Pair) -> Tensor:
         """Return the penalty of every feature (K,)."""
@@ -340,9 +343,13 @@ class _Problem:
 
     def _about(self, readout: Tensor) -> tuple[Tensor, Tensor]:
         """Return residuals (N, m) [m] and Jacobians (N, m, C) by the coordinates."""
-        z = self.z + self.units * (self.phi @ readout.mT)
+        return self._rest(self.z + self.units * (self.phi @ readout.mT))
+
+    def _rest(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return residuals (N, m) [m] and Jacobians (N, m, C) at coordinates, of no marker zero."""
         tip, J = self._tips(z)
-        return self.x - tip, J
+        seen = self.seen
+        return torch.where(seen, self.x - tip, 0.0), torch.where(seen[..., None], J, 0.0)
 
     def _whitened(self, values: Tensor) -> Tensor:
         """Return values (N, m) or (N, m, C) in units of the noise, times the roots of weights."""

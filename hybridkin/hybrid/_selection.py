@@ -12,10 +12,10 @@ from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
 
 from hybridkin.calibration.choice import Errors
-from hybridkin.calibration.measured import inner_and_outer
+from hybridkin.calibration.measured import distance, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid._fit import NamedFeatures, Part, Rows, Spec, calibrated, fit_hybrid
-from hybridkin.hybrid._kernel import distance, folds_of
+from hybridkin.hybrid._kernel import folds_of
 from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
@@ -183,6 +183,8 @@ def _candidates(spec: Spec) -> dict[str, tuple[str, Any]]:
 
 def _settled(error_model: Any, fitted: Any) -> Any:
     """Return the error model with the choices that its fit to all rows made."""
+    if type(fitted) is tuple:  # one for each marker
+        return tuple(_settled(error_model, one) for one in fitted)
     if isinstance(fitted, ReadoutFit):
         return error_model._replace(alphas=fitted.alphas, noise_ratio=fitted.noise_ratio)
     if isinstance(error_model, ELMRegressorCV):

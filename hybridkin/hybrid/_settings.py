@@ -7,11 +7,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from torch import nn
 
 from hybridkin._core.model import PoseModel
+from hybridkin.calibration.measured import with_missing_markers
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.markers import MarkedChain
 from hybridkin.hybrid._fit import NamedFeatures
 from hybridkin.hybrid._guards import GUARDS
 from hybridkin.learning.elm import ELMRegressor
@@ -29,6 +32,15 @@ def resolved_error_model(error_model: Any, seed: int | np.random.RandomState | N
     if error_model is None or error_model == "elm":
         return ELMRegressor(random_state=seed)
     return NamedFeatures(error_model) if error_model in FEATURES else error_model
+
+
+def missing_markers(estimator: BaseEstimator, y: Any) -> NDArray[np.bool_]:
+    """Return which entries of y (N, 3 K) belong to markers that are missing; rows keep one."""
+    model = SimpleNamespace(**estimator.get_params(deep=False))
+    allowed = model.mechanical_model is None or isinstance(model.mechanical_model, MarkedChain)
+    if not allowed or model.output == "pose" or np.ndim(y) != 2 or y.shape[1] % 3:
+        return np.zeros(np.shape(y), dtype=bool)
+    return np.isnan(with_missing_markers(y, "y"))
 
 
 def check_settings(estimator: BaseEstimator) -> None:

@@ -22,6 +22,7 @@ from hybridkin.hybrid._adapt import held_out_noise
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Blend
+from hybridkin.hybrid._marked import MarkedHybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._readout_fit import ReadoutFit
@@ -43,7 +44,8 @@ _MODULES: dict[str, type[PortableModule]] = {
         *(_guards.BoxGuard, _guards.LeverageGuard, _guards.QuadraticLeverage),
         _guards.GroupDistance,
         *(_module.TipCorrection, _module.InnerCorrection),
-        *(_module.HybridModule, PoseHybridModule, AdaptedModel, AdaptedPoseModel),
+        *(_module.HybridModule, PoseHybridModule, MarkedHybridModule),
+        *(AdaptedModel, AdaptedPoseModel),
     )
 }
 # Fitted error models that describe themselves, and others that a hybrid may be given.
@@ -202,6 +204,8 @@ def _stored_error(error: Any) -> Stored | None:
     """Return how a fitted error model describes itself; None where there is none."""
     if error is None or isinstance(error, (ReadoutFit, ELMRegressor, ELMRegressorCV)):
         return None if error is None else error.stored()
+    if type(error) is tuple:  # one for each marker
+        return Stored.of("list", parts={str(k): _stored_error(one) for k, one in enumerate(error)})
     if isinstance(error, Blend):
         models = {str(k): _stored_error(one) for k, one in enumerate(error.error_models)}
         return Stored.of("blend", parts=models, weights=error.weights)
@@ -214,6 +218,8 @@ def _restored_error(stored: Stored | None, restore: Restore, n: int) -> Any:
     """Return the fitted error model of a description, for n actuators."""
     if stored is None:
         return None
+    if stored.kind == "list":
+        return tuple(_restored_error(part, restore, n) for part in stored.parts.values())
     if stored.kind == "blend":
         weights = tuple(stored.list_of(float, "weights"))
         parts = [stored.parts.get(str(k)) for k in range(len(weights))]

@@ -42,7 +42,7 @@ from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._selection import select
-from hybridkin.hybrid._settings import check_settings, resolved_error_model
+from hybridkin.hybrid._settings import check_settings, missing_markers, resolved_error_model
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 
@@ -136,8 +136,7 @@ class HybridForwardModel(HybridPredictor):
         The play; None where there is none, and where "auto" found no significant gain.
     radius_ : Radius or None
         Where a coverage was asked for: the radius ``inside`` the domain [m], infinite where the
-        groups are too few, and ``outside`` it, always infinite. `partial_fit` and `adapt` do not
-        update it.
+        groups are too few, and ``outside`` it, always infinite; that of the fit, whatever follows.
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)
@@ -203,11 +202,10 @@ class HybridForwardModel(HybridPredictor):
         X : array-like of shape (N, n)
             Actuator vectors q [m], of revolute joints [rad].
         y : array-like of shape (N, m) or (N,)
-            Measured tip positions x [m]; of poses (N, 6), see `output`.
+            Measured tip positions x [m]; of poses (N, 6); of K markers (N, 3 K), NaN: missing.
         sample_weight : array-like of shape (N,), optional
             How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
-            Equal rows are held out together. With `play` a row of weight 0 still moves the
-            actuators.
+            Equal rows are held out together. With `play` weight 0 still moves actuators.
         groups : array-like of shape (N,), optional
             Motion of every row, which is held out as a whole: by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
@@ -405,7 +403,7 @@ class HybridForwardModel(HybridPredictor):
                 "does not hold; fit the model again and save it."
             )
         rows = self._checked_rows(X, y, None, groups, reset=False)
-        check_parameters(parameters, self.output == "pose" or rows.tips.shape[1] == 3)
+        check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         rows = rows._replace(X=self._effective(rows.X, rows.groups))
         self._warn_of_units(rows)
         self.module_, message = adapted(fitted, rows, self._noise, self._drift.scale, parameters)
@@ -420,8 +418,11 @@ class HybridForwardModel(HybridPredictor):
     ) -> Rows:
         """Return the measured rows, checked."""
         X, y = table(X, "X"), table(y, "y")
+        missing = missing_markers(self, y) if reset else np.zeros(np.shape(y), dtype=bool)
+        y = y if y is None else np.where(missing, 0.0, y)
         check_finite(X=X, y=y)
         X, y, weights = check_rows(self, X, y, weights, reset)
+        y = np.where(missing, np.nan, y)
         X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
         groups = None if groups is None else labels(groups, len(X))
         return Rows(X, y, cast("NDArray | None", weights), groups)

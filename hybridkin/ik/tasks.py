@@ -104,7 +104,8 @@ class PositionTask(Task):
         ``(..., size, n)``; row by row, torch to torch, see `as_forward_model`. NumPy functions:
         `from_numpy`.
     size : int, default=3
-        Number of coordinates.
+        Number of coordinates. With 3 a model of several markers brings its last one, the tip, to
+        the target; with three times their number all of them.
 
     Examples
     --------
@@ -127,7 +128,8 @@ class PositionTask(Task):
     """
 
     def __init__(self, model: object, size: int = 3) -> None:
-        self.models = (as_forward_model(model),)
+        found = as_forward_model(model)
+        self.models = (found.tip_model if size == 3 else found,)
         self.shape, self.parts, self.units = (int(size),), (int(size),), (1.0,)
 
     @classmethod

@@ -112,17 +112,22 @@ def _frame(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
     The frame is the rotation of the base, its position, the reach, and the rigid offsets.
     """
     base, at = stored.array("base"), stored.value("tip_at", float)
+    (_, x, y, z), *others = stored.settings.get("markers", [[at, 0.0, 0.0, 0.0]])
+    if others or x or y:
+        raise NoKernel("several markers, and one beside the backbone, have no kernel")
     offsets = stored.array("offsets")
     plan.limit("segments", len(offsets))
     m = math.ceil(at)
     share = np.append(np.ones(m - 1), at - m + 1)
     frame = [base[:3, :3].ravel(), base[:3, 3], [reach], offsets[:m] * (share == 1)]
+    frame[3][-1] += z
     return np.concatenate(frame), share
 
 
 def whole_chain(plan: Plan, stored: Stored) -> int:
     """Write the node of a chain of arcs up to the robot's end, wherever it is steered."""
-    end = {"tip_at": float(len(stored.array("offsets")))}
+    at = float(len(stored.array("offsets")))
+    end = {"tip_at": at, "markers": [[at, 0.0, 0.0, 0.0]]}
     return plan.node_of(replace(stored, settings={**stored.settings, **end}))
 
 

@@ -9,9 +9,10 @@ import torch
 from sklearn.utils import Bunch
 
 from hybridkin.calibration.calibrate import calibrate
+from hybridkin.calibration.measured import distance
 from hybridkin.chains import robots
 from hybridkin.datasets import paper_split
-from hybridkin.workflow.report import IDENTIFIED, Report, distance, geometry_entries
+from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries
 
 ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
 """The geometry that `identifiability` asks for at once."""

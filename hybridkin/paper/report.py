@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from sklearn.utils import Bunch
 
+from hybridkin.calibration.measured import distance
 from hybridkin.chains import robots
 from hybridkin.datasets import load_trunk, paper_split
 from hybridkin.hybrid.estimator import HybridForwardModel
@@ -15,7 +16,7 @@ from hybridkin.paper import tables, tracks
 from hybridkin.paper.identifiability import identifiability, write_identifiability
 from hybridkin.plots import ErrorHistogramDisplay, WorkspaceDisplay, new_figure
 from hybridkin.simulation import TrunkPlant
-from hybridkin.workflow.report import Progress, Report, check_out, distance, quiet
+from hybridkin.workflow.report import Progress, Report, check_out, quiet
 
 
 def run_paper(

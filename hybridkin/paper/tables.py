@@ -11,13 +11,14 @@ from sklearn.utils import Bunch
 from threadpoolctl import threadpool_limits
 
 from hybridkin.calibration.calibrate import calibrate
+from hybridkin.calibration.measured import distance
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.plots import new_figure
-from hybridkin.workflow.report import Progress, Report, distance, linear, quadratic, quiet
+from hybridkin.workflow.report import Progress, Report, linear, quadratic, quiet
 
 PAPER_TABLE_1 = {
     ("mechanical, nominal", "-"): ("", "2.5 (9.3)"),

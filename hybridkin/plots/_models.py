@@ -56,7 +56,8 @@ def body_of(model: Model, q: ArrayLike, n_points: int) -> dict[str, Any]:
         return full
 
     with torch.no_grad():
-        body: dict[str, Any] = {"frames": spread(chain.poses(rows)), "tips": spread(chain(rows))}
+        body: dict[str, Any] = {"frames": spread(chain.poses(rows))}
+        body["tips"] = spread(chain.tip_model(rows))
         if isinstance(chain, ArcChain):
             points = chain.backbone(rows, n_points)
             actuators, disks = _around_arcs(chain, rows, points.numpy())
@@ -66,7 +67,8 @@ def body_of(model: Model, q: ArrayLike, n_points: int) -> dict[str, Any]:
             points, body["rigid"] = chain.backbone(rows), True
     body["points"] = spread(points)
     if isinstance(model, Predictor):
-        learned = predicted(model, q[known])[:, :3] if known.any() else np.empty((0, 3))
+        tip = slice(3) if chain.n_outputs == 3 else slice(-3, None)  # of poses, or of markers
+        learned = plain(model.predict(q[known]), "x")[:, tip] if known.any() else np.empty((0, 3))
         body["predicted"] = spread(learned)
     return body
 

@@ -12,7 +12,7 @@ from scipy.linalg import eigvalsh, null_space
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from hybridkin.simulation._mjcf import REST_LENGTH, TIME_STEP, trunk_mjcf
+from hybridkin.simulation._mjcf import LINKS, REST_LENGTH, TIME_STEP, trunk_mjcf
 
 # What "settled" means, and the hold over which it is checked with the length servos on.
 MAX_LENGTH_ERROR = 1e-5  # [m]
@@ -86,6 +86,9 @@ class TrunkPlant:
     ----------
     admissible : tuple of two floats
         Smallest and largest chamber length that may be commanded [m].
+    segment_ends : ndarray of shape (3, 3)
+        After `settle`: where the segments end, base to tip, in the motion-capture frame without
+        noise [m]. The last one is the tip.
 
     Raises
     ------
@@ -155,6 +158,8 @@ class TrunkPlant:
         self._model = mujoco.MjModel.from_xml_string(trunk_mjcf(down, mass, tip_mass, stiffness))
         self._data = mujoco.MjData(self._model)
         self._tip = self._model.site("tip").id
+        rings = [[f"s{s}_{i}_{LINKS}" for i in range(3)] for s in range(3)]
+        self._rings = [[self._model.site(name).id for name in ring] for ring in rings]
         # A state is the joint positions and the forces of the nine chambers.
         self._n_dof = self._model.nv
         straight, lengths = np.zeros(self._n_dof + 9), np.full(9, REST_LENGTH)
@@ -215,6 +220,8 @@ class TrunkPlant:
         state, held = self._equilibrium(self._rest, target, iter(range(self._max_iter)))
         self._check_stable(state, held)
         lengths, T_base_tip = self._hold(state, target, held)
+        ends = self._data.site_xpos[self._rings].mean(1) @ self._T_mocap_base[:3, :3].T
+        self.segment_ends = ends + self._T_mocap_base[:3, 3]
         rng = self._rng if random_state is None else np.random.default_rng(random_state)
         q = lengths + self._noise[0] * rng.standard_normal(9)
         pose = self._T_mocap_base @ T_base_tip

@@ -82,6 +82,18 @@ def write_comparison(
     )
 
 
+def write_markers(report: Report, errors: NDArray, what: str) -> None:
+    """Add the errors (N, K) of several markers, one by one, NaN where one was not measured."""
+    if errors.shape[1] == 1:
+        return
+    measured = [column[~np.isnan(column)] for column in errors.T]
+    entries = [{"rows": len(column), **statistics(column)} for column in measured]
+    report.record["markers"] = entries
+    report.text(f"Errors of the markers, base to tip ({what}); elsewhere the mean of them counts:")
+    columns = ("rows", "mean", "p95", "max")
+    report.errors({f"marker {k}": entry for k, entry in enumerate(entries)}, columns)
+
+
 def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, str]) -> None:
     figure, ax = new_figure(7.0, 3.9)
     ErrorBoxDisplay(errors).plot(ax, unit="mm")

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin.calibration.measured import distance, distances
 from hybridkin.datasets import Log
 from hybridkin.plots import BackboneDisplay, ErrorHistogramDisplay, WorkspaceDisplay, new_figure
-from hybridkin.workflow._fit_report import radius_entry, write_check
+from hybridkin.workflow._fit_report import radius_entry, write_check, write_markers
 from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.model import LoadedModel
-from hybridkin.workflow.report import Report, check_out, distance, statistics
+from hybridkin.workflow.report import Report, check_out, statistics
 
 _PARTS = {"new rows": "new", "fitted rows": "fitted", "held out in the fit": "held_out"}
 _SHARES = ("share_in_domain", "share_in_radius")
@@ -68,14 +69,16 @@ def evaluate_log(
         measured.check_order("A model with play")
     motion = measured.motions if measured.named else np.zeros(len(log.q))  # else it is one
     predicted = loaded.predict(log.q, motion)
-    errors = distance(predicted, log.x)
-    columns = {"error": errors}
+    markers = distances(predicted, log.x)
+    columns = {"error": np.nanmean(markers, axis=1)}
     report = Report(f"{loaded.name}: errors on {Path(log.source).name}")
     if loaded.hybrid is not None:
         columns["share_in_domain"] = loaded.hybrid.in_domain(log.q, groups=motion)
         if loaded.hybrid.radius_ is not None:
             _, radius = loaded.hybrid.predict(log.q, return_radius=True, groups=motion)
-            columns["share_in_radius"] = np.where(np.isinf(radius), np.nan, errors <= radius)
+            columns["share_in_radius"] = np.where(
+                np.isinf(radius), np.nan, np.nanmax(markers, axis=1) <= radius
+            )
             report.record["radius"] = radius_entry(loaded.hybrid)
     motions = {name: measured.motions == name for name in dict.fromkeys(measured.motions)}
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
@@ -93,6 +96,7 @@ def evaluate_log(
     )
     write_check(report, measured)
     _write_errors(report)
+    write_markers(report, markers, "all rows")
     if out is None:
         return report, []
     _add_figures(report, loaded, measured, predicted, motion)
@@ -138,5 +142,5 @@ def _add_figures(
     if loaded.chain is not None:
         q = loaded.effective(log.q, motion)[row]
         body = BackboneDisplay.from_estimator(loaded.chain, q).points[0]
-    WorkspaceDisplay(log.x, predicted, body, row).plot(ax, unit="mm")
+    WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row).plot(ax, unit="mm")
     report.figure("workspace", figure, "Measured tips, coloured by the model's error.")

@@ -46,7 +46,7 @@ def export_model(
     paths : list of Path
         The files.
     """
-    report, model = Report("C code"), loaded.model
+    report, model = Report("C code"), loaded.module
     report.record.update(n_actuators=loaded.n_actuators, dtype=dtype, dt=dt)
     report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}, SI units.")
     if dt is not None:

@@ -21,6 +21,7 @@ from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+from hybridkin.calibration.measured import distances
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -38,6 +39,7 @@ from hybridkin.workflow._fit_report import (
     write_check,
     write_choice,
     write_comparison,
+    write_markers,
     write_model,
 )
 from hybridkin.workflow.log import MeasuredLog, checked
@@ -45,7 +47,6 @@ from hybridkin.workflow.report import (
     Progress,
     Report,
     check_out,
-    distance,
     linear,
     quadratic,
     quiet,
@@ -108,7 +109,9 @@ class Comparison(NamedTuple):
     Attributes
     ----------
     errors : dict of str to ndarray of shape (N,)
-        Tip distance of each row when its motion was held out [m].
+        Tip distance of each row when its motion was held out [m]; of several markers their mean.
+    markers : dict of str to ndarray of shape (N, K)
+        The distance of every marker [m], NaN where it was not measured.
     fold : ndarray of shape (N,)
         Fold in which a row was held out.
     choices : list of dict
@@ -116,6 +119,7 @@ class Comparison(NamedTuple):
     """
 
     errors: dict[str, NDArray]
+    markers: dict[str, NDArray]
     fold: NDArray
     choices: list[dict[str, str]]
 
@@ -216,7 +220,7 @@ def compare_by_group(
     folds = list(GroupKFold(n_folds).split(log.q, groups=log.motions))
     rows = _Rows(log.q, log.x, log.motions, robot, settings)
     jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in folds)
-    found = Comparison({}, np.empty(len(log.q), dtype=int), [])
+    found = Comparison({}, {}, np.empty(len(log.q), dtype=int), [])
     most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
     most = min(effective_n_jobs(n_jobs or 1), len(folds), most)
     # Else torch and BLAS start threads in every process, and these wait for each other.
@@ -224,10 +228,12 @@ def compare_by_group(
     results: Any = workers(jobs)
     for i, ((_, test), (errors, chosen)) in enumerate(zip(folds, results, strict=True)):
         for name, values in errors.items():
-            found.errors.setdefault(name, np.empty(len(log.q)))[test] = values
+            empty = np.empty((len(log.q), values.shape[1]))
+            found.markers.setdefault(name, empty)[test] = values
         found.fold[test] = i
         found.choices.append(chosen)
         progress("cross-validation by motion", i + 1, len(folds))
+    found.errors.update((name, np.nanmean(values, 1)) for name, values in found.markers.items())
     return found
 
 
@@ -314,6 +320,7 @@ def fit_log(
     )
     write_check(report, whole)
     write_comparison(report, compared.errors, compared.fold, data)
+    write_markers(report, compared.markers[saved], f"{saved}, on held-out motions")
     write_model(report, model)
     if rows.geometry is not None:
         write_choice(report, rows.geometry)
@@ -420,10 +427,10 @@ def _chosen(model: HybridForwardModel) -> str:
 
 
 def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
-    """Return the errors (N,) on test rows of a model, fitted to training rows; it does not warn."""
+    """Return the errors (N, K) of the markers of test rows; the fit does not warn."""
     model.fit_with_messages(train.q, train.x, groups=train.groups, geometry=train.geometry)
     q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
-    return distance(evaluate(model.module_, np.array(q, dtype=float))[0], test.x)
+    return distances(evaluate(model.module_, np.array(q, dtype=float))[0], test.x)
 
 
 def _choose(rows: _Rows, *, hybrid: bool) -> tuple[float | None, str | None]:
@@ -439,5 +446,5 @@ def _choose(rows: _Rows, *, hybrid: bool) -> tuple[float | None, str | None]:
     for train, test in folds.split(rows.q, groups=rows.groups):
         known, new = rows.of(train), rows.of(test)
         base = known.mechanical() if hybrid else None
-        errors += [_held_out(_elm(base, *choice), known, new).sum() for choice in candidates]
+        errors += [np.nansum(_held_out(_elm(base, *c), known, new)) for c in candidates]
     return candidates[int(errors.argmin())]

@@ -64,8 +64,8 @@ class LoadedModel:
 
     @property
     def module(self) -> ForwardModel:
-        """The torch module q -> x."""
-        return as_forward_model(self.model)
+        """The torch module q -> tip."""
+        return as_forward_model(self.model).tip_model
 
     @property
     def n_actuators(self) -> int:
@@ -102,10 +102,10 @@ class LoadedModel:
         return self.play.apply_by_group(q, np.zeros(len(q)) if groups is None else groups)
 
     def predict(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
-        """Return tips (N, 3) [m]; with play by `groups`, the motion of every row."""
+        """Return tips (N, 3) [m], or all markers; with play by `groups`, the motion of a row."""
         if self.hybrid is not None:
             return self.hybrid.predict(q, groups=groups)
-        return self.tips(q)
+        return evaluate(as_forward_model(self.model), np.array(q, dtype=float))[0]
 
     def tips(self, q: NDArray) -> NDArray:
         """Return tips (N, 3) [m] where the actuators do q (N, n), whatever the play."""

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from hybridkin._core.units import METRES
+from hybridkin.calibration.measured import distance
 from hybridkin.hybrid.choose_rows import choose_rows
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow._domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.model import LoadedModel
-from hybridkin.workflow.report import Progress, Report, check_out, distance, quiet
+from hybridkin.workflow.report import Progress, Report, check_out, quiet
 from hybridkin.workflow.track import best_track
 
 _POOL = 2000  # configurations to choose from

@@ -63,11 +63,6 @@ def quadratic() -> Any:
     return make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression())
 
 
-def distance(a: NDArray, b: NDArray) -> NDArray:
-    """Return the distances (N,) between points (N, 3)."""
-    return np.linalg.norm(a - b, axis=-1)
-
-
 def statistics(errors: NDArray, motions: NDArray | None = None) -> dict[str, Any]:
     """Return mean, standard deviation, median, 95 % quantile and maximum of errors (N,).
 

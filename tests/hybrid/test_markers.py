@@ -1,0 +1,227 @@
+"""Hybrids of several markers: one fit inside the robot, missing markers, steering, files."""
+
+import numpy as np
+import pytest
+import torch
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import LinearRegression
+from sklearn.metrics import r2_score
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    HybridForwardModel,
+    InverseKinematics,
+    load_model,
+    save_model,
+    tasks,
+)
+from hybridkin.native.library import program_of
+
+MARKERS = [(0, 1.0), (1, 1.0, (0.02, 0.0, 0.0)), (2, 1.0)]
+CHAIN = ConstantCurvatureChain([0.1, 0.09, 0.08]).with_markers(MARKERS)
+NOISE = 3e-4
+
+
+def plant(q):
+    """Return markers of a robot whose lengths are bent functions of q."""
+    lengths = q + 0.1 * (q - 0.25) ** 2 + 0.03 * (q[:, [1]] - 0.25)
+    with torch.no_grad():
+        return CHAIN(torch.from_numpy(lengths)).numpy()
+
+
+def log(n=120, seed=0):
+    rng = np.random.default_rng(seed)
+    q = 0.25 + 0.03 * rng.uniform(-1.0, 1.0, (n, 9))
+    return q, plant(q) + NOISE * rng.standard_normal((n, 9))
+
+
+def without(x, share=0.3, seed=1):
+    missing = np.random.default_rng(seed).random((len(x), 3)) < share
+    missing[:, 2] &= ~missing.all(axis=1)
+    return np.where(missing.repeat(3, axis=1), np.nan, x)
+
+
+def mean_errors(model, n=200):
+    q = log(n, 7)[0]
+    return np.linalg.norm((model.predict(q) - plant(q)).reshape(n, 3, 3), axis=2).mean(axis=0)
+
+
+MODELS = {
+    "drop": {"error_model": "drop", "calibrate": ("radii", "base")},
+    "ELM": {"random_state": 0},
+    "box": {"random_state": 0, "guard": "box"},
+    "kernel": {"error_model": "kernel"},
+    "linear": {"error_model": "linear"},
+    "regressor": {"error_model": LinearRegression(), "guard": None},
+    "serial linear": {"error_model": "linear", "coupling": "serial"},
+    "serial pose": {"error_model": "pose", "coupling": "serial"},
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_kind_of_hybrid_has_several_markers(name, tmp_path):
+    q, x = log(50)
+    model = HybridForwardModel(CHAIN, **MODELS[name]).fit(q, without(x))
+    new = log(5, 3)[0]
+    found, J = model.predict_and_jacobian(new)
+    assert found.shape == (5, 9)
+    assert np.isfinite(found).all()
+    steps = 1e-6 * np.eye(9)
+    expected = [(model.predict(new + h) - model.predict(new - h)) / 2e-6 for h in steps]
+    np.testing.assert_allclose(J, np.stack(expected, axis=2), atol=1e-6)
+    parts = model.predict_mechanical(new) + model.predict_error(new)
+    np.testing.assert_allclose(parts, found, atol=1e-12)
+    assert model.in_domain(q).mean() > 0.7  # all but rows that one marker has not seen
+    assert model.error_weight(new).shape == (5,)
+    tip = model.module_.tip_model
+    np.testing.assert_allclose(tip(torch.from_numpy(new)).numpy(), found[:, 6:], atol=1e-13)
+    assert (program_of(tip) is not None) == (program_of(CHAIN.tip_model) is not None)
+    save_model(model, tmp_path / "model.safetensors")
+    again = load_model(tmp_path / "model.safetensors").predict(new)
+    np.testing.assert_allclose(again, found, atol=1e-15)
+
+
+def test_outside_the_robot_every_marker_is_learned_alone():
+    q, x = log(60)
+    missing = without(x)
+    model = HybridForwardModel(CHAIN, KernelRidge(kernel="rbf"), guard=None).fit(q, missing)
+    for k, tip in enumerate(CHAIN.tips()):
+        y = missing[:, 3 * k : 3 * k + 3]
+        rows = ~np.isnan(y[:, 0])
+        alone = HybridForwardModel(tip, KernelRidge(kernel="rbf"), guard=None).fit(q[rows], y[rows])
+        found = model.predict(q)[:, 3 * k : 3 * k + 3]
+        np.testing.assert_allclose(found, alone.predict(q), atol=1e-12)
+
+
+def test_inside_the_robot_all_markers_are_learned_together():
+    """25 rows of the tip cannot tell 90 coefficients of the arcs apart, those of three ends can."""
+    q, _ = log(325)
+    zeros = torch.full((9,), 0.02, dtype=torch.float64)
+    wrong = CHAIN.with_geometry(radii=1.1 * CHAIN.radii, actuator_zeros=zeros)
+    x = wrong(torch.from_numpy(q)).numpy()
+    three = HybridForwardModel(CHAIN, "linear", coupling="serial").fit(q[:25], x[:25])
+    one = HybridForwardModel(CHAIN.tip_model, "linear", coupling="serial").fit(q[:25], x[:25, 6:])
+    far = [np.abs(model.predict(q)[25:, -3:] - x[25:, 6:]).max() for model in (one, three)]
+    assert far[1] < 0.1 * far[0]
+
+
+def test_a_missing_marker_drops_that_marker_alone():
+    """A row without a marker is as good as a row of a robot without it."""
+    q, x = log(80)
+    gone = x.copy()
+    gone[:, 3:6] = np.nan
+    gone[::40, 3:6] = x[::40, 3:6]  # two rows keep it: then it says next to nothing
+    model = HybridForwardModel(CHAIN, "linear", coupling="serial", guard=None).fit(q, gone)
+    two = CHAIN.with_markers([MARKERS[0], MARKERS[2]])
+    kept = HybridForwardModel(two, "linear", coupling="serial", guard=None)
+    kept.fit(q, np.delete(x, np.s_[3:6], axis=1))
+    new = log(20, 3)[0]
+    found = np.delete(model.predict(new), np.s_[3:6], axis=1)
+    far = np.abs(found - kept.predict(new)).max()
+    assert far < 0.2 * np.abs(found - np.delete(plant(new), np.s_[3:6], axis=1)).max()
+
+
+def test_score_counts_the_markers_that_were_measured():
+    q, x = log(60)
+    model = HybridForwardModel(CHAIN, "linear").fit(q, x)
+    assert model.score(q, x) == pytest.approx(r2_score(x, model.predict(q)))
+    missing = without(x)
+    weights = np.arange(60) % 3
+    columns = [~np.isnan(column) for column in missing.T]
+    expected = [
+        r2_score(x[k, i], model.predict(q)[k, i], sample_weight=weights[k])
+        for i, k in enumerate(columns)
+    ]
+    assert model.score(q, missing, weights) == pytest.approx(np.mean(expected))
+
+
+@pytest.mark.slow
+def test_the_radius_holds_for_every_marker():
+    q, x = log(200)
+    model = HybridForwardModel(CHAIN, "linear", coverage=0.9).fit(q, without(x))
+    new, measured = log(400, 5)
+    found, radius = model.predict(new, return_radius=True)
+    far = np.linalg.norm((found - measured).reshape(-1, 3, 3), axis=2)
+    known = np.isfinite(radius)
+    assert known.mean() > 0.9
+    assert 0.85 < (far.max(axis=1) <= radius)[known].mean() < 0.98
+
+
+def test_inverse_kinematics_steers_the_tip_or_all_markers():
+    q, x = log(60)
+    model = HybridForwardModel(CHAIN, "linear", coupling="serial").fit(q, x)
+    target = model.predict(q[:3])
+    ik = InverseKinematics(model, q_min=0.2, q_max=0.3)
+    found = ik.solve(target[:, 6:], q0=q[3:6])
+    assert found.converged.all()
+    np.testing.assert_allclose(model.predict(found.q)[:, 6:], target[:, 6:], atol=1e-4)
+    tracker = ik.tracker(q[0])
+    assert tracker.backend == ("compiled" if program_of(CHAIN.tip_model) else "torch")
+    every = InverseKinematics(tasks.PositionTask(model, size=9), q_min=0.2, q_max=0.3)
+    found = every.solve(target, q0=q[:3] + 0.003)
+    assert found.converged.all()
+    np.testing.assert_allclose(model.predict(found.q), target, atol=1e-4)
+
+
+@pytest.mark.parametrize("names", [["base", "actuator_zeros"], ["actuator_zeros"]])
+@pytest.mark.parametrize("K", [2, 3])
+def test_adapt_and_partial_fit_take_all_markers(names, K):
+    columns = np.s_[:, 9 - 3 * K :]
+    q, x = log(60)
+    chain = CHAIN.with_markers(MARKERS[3 - K :])
+    model = HybridForwardModel(chain, "linear", coupling="serial").fit(q, x[columns])
+    new, seen = log(8, 3)
+    moved = seen[columns].copy()
+    if "base" in names:
+        moved = moved + np.tile([0.05, 0.0, -0.02], K)
+        model.adapt(new, moved, parameters=names)
+    else:
+        model.adapt(new - 0.004, moved, parameters=names)
+        new = new - 0.004
+    assert np.abs(model.predict(new) - moved).max() < 5e-3
+    tip = model.module_.tip_model(torch.from_numpy(new)).detach().numpy()
+    np.testing.assert_allclose(tip, model.predict(new)[:, -3:], atol=1e-12)
+    followed = model.partial_fit(new, moved + 0.01, alpha=1e-3)
+    assert np.abs(followed.predict(new) - moved - 0.01).max() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda x: x[:, :6], "`y` must have 9 columns"),
+        (lambda x: np.where(np.arange(60)[:, None] == 4, np.nan, x), "first: row 4"),
+        (lambda x: np.where(np.arange(9) < 3, np.nan, x), "marker 0 in at least 2 rows"),
+    ],
+)
+def test_wrong_rows_raise(change, match):
+    q, x = log(60)
+    with pytest.raises(ValueError, match=match):
+        HybridForwardModel(CHAIN, "linear").fit(q, change(x))
+
+
+def test_data_alone_may_miss_markers():
+    q, x = log(60)
+    missing = without(x)
+    model = HybridForwardModel(None, LinearRegression()).fit(q, missing)
+    for k in range(3):
+        rows = ~np.isnan(missing[:, 3 * k])
+        alone = LinearRegression().fit(q[rows], missing[rows, 3 * k : 3 * k + 3])
+        np.testing.assert_allclose(model.predict(q)[:, 3 * k : 3 * k + 3], alone.predict(q))
+
+
+@pytest.mark.slow
+def test_auto_blends_models_of_several_markers():
+    chain = ConstantCurvatureChain([0.1]).with_markers([(0, 0.5), (0, 1.0)])
+    rng = np.random.default_rng(0)
+    q = 0.25 + 0.03 * rng.uniform(-1.0, 1.0, (200, 3))
+    x = chain(torch.from_numpy(q + (q - 0.25) ** 2)).numpy() + NOISE * rng.standard_normal((200, 6))
+    known = x[:40].copy()
+    known[::3, :3] = np.nan
+    model = HybridForwardModel(chain, "auto", calibrate=(), random_state=0).fit(q[:40], known)
+    scores = dict(
+        zip(model.cv_results_["candidate"], model.cv_results_["mean_distance"], strict=True)
+    )
+    assert scores["blend"] < 0.85 * scores["mechanical"]
+    far = np.linalg.norm((model.predict(q[40:]) - x[40:]).reshape(-1, 2, 3), axis=2).mean(axis=0)
+    assert far.max() < 1.3 * 3**0.5 * NOISE
+    assert isinstance(model.error_model_, tuple)
