@@ -129,7 +129,7 @@ def test_the_unit_of_q_changes_no_calibration(elastic):
 
 def test_natural_size_of_zeros():
     problem = Problem.of(tendon_robot(2e-5), ("actuator_zeros",), {}, {"actuator_zeros": 1.0})
-    assert_close(problem.parameters[0].units, np.full(6, 0.007 / 2e-5))
+    np.testing.assert_allclose(problem.parameters[0].units, np.full(6, 0.007 / 2e-5))
 
 
 @pytest.mark.slow
