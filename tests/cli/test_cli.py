@@ -333,7 +333,7 @@ def test_spoilt_rows_can_be_left_out(robot, tmp_path, capsys, spoil, option, lef
         ({"text": HEADER + "\n0,1,2,3,4,5,6,7,8,9,1\n1,2,1,3,4,5,6,7,7,9,1\n"}, "at least 2 mot"),
         ({"toml": ROBOT.replace("length = 0.1\n", "")}, "positive lengths"),
         ({"toml": "[[segment]]\nradius = 0.1\n"}, r"\[log\]"),
-        ({"toml": "[[segment]]\nradius = 0.1\nactuators = 2\n"}, "at least 3"),
+        ({"toml": "[[segment]]\nradius = 0.1\nactuators = 0\n"}, "from 1 to 64"),
         ({"out": "robot.toml"}, "must be a folder"),
     ],
 )

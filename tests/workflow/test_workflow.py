@@ -311,7 +311,8 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions():
     robot = robots.RobotDescription("playful", chain, ("radii",), None)
     settings = workflow.FitSettings(n_folds=2, n_seeds=1, play=4e-4)
     log = datasets.Log(q, x, groups)
-    errors, _, choices = workflow.compare_by_group(log, robot, settings, n_jobs=1)
+    compared = workflow.compare_by_group(log, robot, settings, n_jobs=1)
+    errors, choices = compared.errors, compared.choices
     assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
     assert all(choice["hybrid, auto"].endswith("play 0.4 mm") for choice in choices)
 
