@@ -80,7 +80,7 @@ class InverseKinematics:
 
     tip_limits : tuple of array-like of shape (k, 3) and (k,), optional
         Half-spaces (A, b) in which the tip must stay, ``A x <= b`` [m], in the frame of x; of a
-        `PositionTask` only. A box ``low <= x <= high`` is
+        position task only. A box ``low <= x <= high`` is
         ``(np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]))``.
 
     Attributes
