@@ -86,6 +86,23 @@ def folds(
     return [*splitter.split(X, groups=groups)]
 
 
+def moved_directions(X: NDArray) -> tuple[NDArray, NDArray | None]:
+    """Return the mean of rows X (N, n), and the map M (n, n) of changes dq @ M to those they make.
+
+    M is None where the rows move q every way. Tendons that are commanded in balance never move
+    together; what the rows say of such a direction is rounding. Directions are compared in units of
+    the ranges.
+    """
+    X = X.astype(np.float64)
+    mean, scale = X.mean(axis=0), 0.5 * np.ptp(X, axis=0)
+    scale[scale == 0.0] = 1.0
+    _, spread, axes = np.linalg.svd((X - mean) / scale, full_matrices=False)
+    moved = axes[spread > _EXCITED * spread.max(initial=0.0)]
+    if len(X) <= X.shape[1] or len(moved) == X.shape[1]:
+        return mean, None
+    return mean, (moved.T @ moved) * scale / scale[:, None]
+
+
 def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:
     """Return the inner 40 % and the outer 35 % of rows by Mahalanobis distance from the mean.
 

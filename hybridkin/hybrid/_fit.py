@@ -19,7 +19,7 @@ from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
-from hybridkin.calibration.measured import points
+from hybridkin.calibration.measured import moved_directions, points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._features import Features, HiddenFeatures, PoseFeatures, QuadraticFeatures
@@ -32,6 +32,7 @@ from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
 from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
 from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.learning.network import ELM, seen_through
 from hybridkin.learning.regressor_modules import error_module
 
 
@@ -298,8 +299,15 @@ def _fit_part(
         readout = fitted.readout
         correction = InnerCorrection(mechanical, readout) if serial else TipCorrection(readout)
     else:
-        fitted = _fit_regressor(model, rows, errors, place)
-        correction = TipCorrection(error_module(fitted, q))
+        mean, M = moved_directions(errors.X)
+        if not isinstance(model, (ELMRegressor, ELMRegressorCV)) or M is None:
+            fitted = _fit_regressor(model, rows, errors, place)
+            module = error_module(fitted, q)
+        else:  # or random weights would give it a slope where the rows say nothing
+            seen = (mean + (errors.X - mean) @ M).astype(errors.X.dtype)
+            fitted = _fit_regressor(model, rows, errors._replace(X=seen), place)
+            module = cast(ELM, fitted.module_).seen_through(*map(torch.from_numpy, (mean, M)))
+        correction = TipCorrection(module)
     if mechanical is None:
         return fitted, correction  # without a mechanical model there is nothing to fall back on
     alone = HybridModule(mechanical, [correction], q.new_ones(1))
@@ -370,8 +378,11 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
     else:
         alphas = float(model.alpha), float(model.alpha)
     layer = draw_layer(params, q.numpy(), None)
-    inner = layer.input_weights, layer.input_bias, layer.activation
-    return HiddenFeatures.of_range(q, *inner), alphas
+    W, b, (mean, M) = layer.input_weights, layer.input_bias, moved_directions(q.numpy())
+    if M is not None:
+        scaling, seen = (layer.input_center, layer.input_scale), map(torch.from_numpy, (mean, M))
+        W, b = seen_through(W, b, *scaling, *seen)
+    return HiddenFeatures.of_range(q, W, b, layer.activation), alphas
 
 
 def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:

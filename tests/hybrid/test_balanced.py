@@ -1,0 +1,39 @@
+"""Directions that a log never moves: balanced tendons."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel
+
+
+@pytest.mark.parametrize("coupling", ["parallel", "serial"])
+@pytest.mark.parametrize("direct_link", [False, True])
+def test_a_network_has_no_slope_where_the_log_never_moved(coupling, direct_link):
+    """Balanced pairs: on the rows it is the same network, together they move nothing."""
+    rng = np.random.default_rng(0)
+    chain = ConstantCurvatureChain([0.006, 0.005], lengths=[0.08, 0.07], n_actuators=2)
+    pulls = rng.uniform(-0.004, 0.004, (80, 2))
+    q = np.stack([pulls[:, 0], -pulls[:, 0], pulls[:, 1], -pulls[:, 1]], axis=1)
+    x = chain(torch.from_numpy(q)).numpy() + 0.3 * (q[:, :1] ** 2 * [1.0, 2.0, 3.0]) / 0.004
+    elm = ELMRegressor(40, 1e-6, direct_link=direct_link, random_state=0)
+    model = HybridForwardModel(chain, elm, coupling=coupling, guard=None).fit(q, x)
+    assert np.linalg.norm(model.predict(q) - x, axis=1).max() < 2e-4
+    together = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]]).T
+    J = model.jacobian(q)
+    assert np.abs(J @ together).max() < 1e-9 * np.abs(J).max()
+    moved = torch.from_numpy(q + 0.001 * together.sum(axis=1))
+    assert_close(model.module_(moved), torch.from_numpy(model.predict(q)), rtol=0.0, atol=1e-12)
+    if coupling == "parallel":
+        learned = model.predict_mechanical(q) + model.error_model_.predict(q)
+        np.testing.assert_allclose(model.predict(q), learned, atol=1e-12)
+
+
+def test_a_network_whose_log_moves_every_way_is_as_it_was_fitted():
+    rng = np.random.default_rng(1)
+    q, x = rng.uniform(-1.0, 1.0, (80, 3)), rng.normal(size=(80, 3))
+    model = HybridForwardModel(None, ELMRegressor(20, random_state=0)).fit(q, x)
+    np.testing.assert_array_equal(model.predict(3.0 * q), model.error_model_.predict(3.0 * q))
+    few = HybridForwardModel(None, ELMRegressor(20, random_state=0)).fit(q[:, [0, 0, 1]], x)
+    assert np.abs(few.jacobian(q) @ [1.0, -1.0, 0.0]).max() < 1e-12
