@@ -13,7 +13,7 @@ from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.stored import Layout
 from hybridkin.chains.arc_chain import ArcChain, Frames
-from hybridkin.learning.network import ACTIVATIONS
+from hybridkin.learning.network import ACTIVATIONS, seen_through
 
 _POSE_BLOCK = 2048  # rows of pose features, whose temporaries stay in the cache
 _BLOCK = 2**18  # numbers in the features of a block of rows, which stay in the cache
@@ -144,6 +144,12 @@ class HiddenFeatures(Features):
         self.activation = activation
         self.register_buffer("input_weights", input_weights)
         self.register_buffer("input_bias", input_bias)
+
+    def seen_through(self, mean: Tensor, M: Tensor) -> HiddenFeatures:
+        """Return the features whose hidden layer sees ``mean + (q - mean) @ M`` in place of q."""
+        layer = self.input_weights, self.input_bias, self.center, self.scale
+        W, b = seen_through(*layer, mean, M)
+        return HiddenFeatures(self.center, self.scale, W, b, self.activation)
 
     def _bent(self, u: Tensor) -> tuple[Tensor, ...]:
         return (self._hidden(u)[1],)

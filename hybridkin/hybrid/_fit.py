@@ -32,7 +32,7 @@ from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
 from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
 from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.learning.network import ELM, seen_through
+from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import error_module
 
 
@@ -378,11 +378,11 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
     else:
         alphas = float(model.alpha), float(model.alpha)
     layer = draw_layer(params, q.numpy(), None)
-    W, b, (mean, M) = layer.input_weights, layer.input_bias, moved_directions(q.numpy())
+    inner = layer.input_weights, layer.input_bias, layer.activation
+    features, (mean, M) = HiddenFeatures.of_range(q, *inner), moved_directions(q.numpy())
     if M is not None:
-        scaling, seen = (layer.input_center, layer.input_scale), map(torch.from_numpy, (mean, M))
-        W, b = seen_through(W, b, *scaling, *seen)
-    return HiddenFeatures.of_range(q, W, b, layer.activation), alphas
+        features = features.seen_through(torch.from_numpy(mean), torch.from_numpy(M))
+    return features, alphas
 
 
 def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:

@@ -55,7 +55,7 @@ class HalfSpaces(NamedTuple):
         """Return how many they are."""
         return f"{len(self.offsets)} half-spaces"
 
-    def room(self, x: Tensor) -> Tensor:
+    def margin(self, x: Tensor) -> Tensor:
         """Return the distances (N, k) of points (N, m) to the planes, negative outside."""
         return self.offsets.to(x) - self.along(x)
 
@@ -63,17 +63,17 @@ class HalfSpaces(NamedTuple):
         """Return the parts (N, k) of ways (N, m) along the normals."""
         return way @ self.normals.to(way).T
 
-    def way_in(self, room: Tensor) -> Tensor:
-        """Return the shortest ways (N, m) with along(way) <= room.
+    def way_in(self, margin: Tensor) -> Tensor:
+        """Return the shortest ways (N, m) with along(way) <= margin.
 
-        The way is -normals^T nu, and nu >= 0 minimises |normals^T nu|^2 / 2 + nu . room. A change
+        The way is -normals^T nu, and nu >= 0 minimises |normals^T nu|^2 / 2 + nu . margin. A change
         of nu is a box-limited step, whose damping proximal rounds take out.
         """
-        J = self.normals.to(room).T.expand(len(room), -1, -1)
-        way, nu = room.new_zeros(len(room), J.shape[1]), torch.zeros_like(room)
-        small = room.new_full((len(room),), max(1e-6, math.sqrt(torch.finfo(room.dtype).eps)))
+        J = self.normals.to(margin).T.expand(len(margin), -1, -1)
+        way, nu = margin.new_zeros(len(margin), J.shape[1]), torch.zeros_like(margin)
+        small = margin.new_full((len(margin),), max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps)))
         for _ in range(1 + _PROXIMAL_ROUNDS):
-            z = (self.along(way) - room) / small[:, None]
+            z = (self.along(way) - margin) / small[:, None]
             problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
             change = box_limited_step(problem, small)[0]
             nu, way = nu + change, way - apply_rows(J, change)

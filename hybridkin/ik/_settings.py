@@ -54,7 +54,7 @@ def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
     shapes = f"of shapes (k, {m}) and (k,), finite, with a direction in every row of A"
     require(good, f"{need} {shapes}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
     found = HalfSpaces(A / size[:, None], b / size)
-    inside = found.room(found.way_in(found.offsets[None])) >= -1e-9
+    inside = found.margin(found.way_in(found.offsets[None])) >= -1e-9
     require(inside.all(), "`tip_limits` must leave a point; these half-spaces have none in common.")
     return found
 
@@ -263,7 +263,7 @@ class StepSettings(Portable):
     def allowed(self, x: Tensor) -> Tensor:
         """Return the points nearest to x where the tip may be."""
         limits = self.tip_limits
-        return x if limits is None else x + limits.way_in(limits.room(x))
+        return x if limits is None else x + limits.way_in(limits.margin(x))
 
     def change(self, q: Tensor, period: float) -> Tensor:
         """Return by how much a step may differ from the one before."""
@@ -345,7 +345,7 @@ class StepSettings(Portable):
         return times, [*periods, dt]
 
     def places(self, n_solutions: int | None, differentiable: bool) -> int:
-        """Return how many configurations a target has room for."""
+        """Return how many configurations a target takes."""
         if n_solutions is None:
             return 1
         require(not differentiable, "`n_solutions` must be None for differentiable=True.")

@@ -92,12 +92,12 @@ def control_step(
     if tip is None or settings.tip_limits is None:
         step = limited_step(settings, J, v, posture, *bounds)
     else:
-        room = settings.tip_limits.room(torch.where(fine, tip, 0.0))
+        margin = settings.tip_limits.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
             normals = settings.tip_limits.normals.to(J)
             brakes = [_braking(settings, J, a.expand(len(J), -1), change) for a in normals]
-            room = stopping(room, torch.stack(brakes, dim=-1))
-        step = _step_inside(settings, room, J, v, posture, *bounds)
+            margin = stopping(margin, torch.stack(brakes, dim=-1))
+        step = _step_inside(settings, margin, J, v, posture, *bounds)
     return step._replace(
         dq=torch.where(torch.isnan(step.dq), 0.0, step.dq),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
@@ -111,7 +111,7 @@ def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> 
 
 
 def _step_inside(
-    settings: StepSettings, room: Tensor, J: Tensor, v: Tensor, z: Tensor | None, *bounds: Tensor
+    settings: StepSettings, margin: Tensor, J: Tensor, v: Tensor, z: Tensor | None, *bounds: Tensor
 ) -> StepRows:
     """Return a step within the bounds after which, to first order, the tip is within its limits.
 
@@ -125,9 +125,9 @@ def _step_inside(
 
     def taken(way: Tensor, z: Tensor | None = z) -> tuple[StepRows, Tensor]:
         step = limited_step(settings, J, way, z, *bounds)
-        return step, limits.along(apply_rows(J, step.dq)) - room
+        return step, limits.along(apply_rows(J, step.dq)) - margin
 
-    wanted = v + limits.way_in(room - limits.along(v))
+    wanted = v + limits.way_in(margin - limits.along(v))
     step, over = taken(wanted)
     for _ in range(_PROJECTIONS):
         out = (over > close).any(-1, keepdim=True)
@@ -137,7 +137,7 @@ def _step_inside(
         wanted = torch.where(out, back, wanted)
         step, over = taken(wanted)
     else:
-        stay, least = taken(limits.way_in(room), None)
+        stay, least = taken(limits.way_in(margin), None)
         share = ((close - least) / (over - least)).clamp(0.0, 1.0)
         share = torch.where(over > close, share, 1.0).amin(-1, keepdim=True)
         dq = torch.clamp(stay.dq + share * (step.dq - stay.dq), *bounds)

@@ -77,7 +77,6 @@ class InverseKinematics:
     weights : float or array-like of shape (n,), optional
         What a unit of every actuator's motion costs: steps minimise ``sum_i weights_i dq_i^2``,
         and the preferred configuration is the nearest one in that measure. Default: all alike.
-
     tip_limits : tuple of array-like of shape (k, 3) and (k,), optional
         Half-spaces (A, b) in which the tip must stay, ``A x <= b`` [m], in the frame of x; of a
         position task only. A box ``low <= x <= high`` is
@@ -185,8 +184,7 @@ class InverseKinematics:
         Raises
         ------
         TypeError
-            Where it could only be stored as code: other tasks than the position of a tip, or a
-            posture that is a function.
+            Where it could only be stored as code, see `StepSettings`: a posture that is a function.
         """
         return self.settings.stored()
 

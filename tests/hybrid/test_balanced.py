@@ -6,6 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel
+from hybridkin.hybrid._features import HiddenFeatures
 
 
 @pytest.mark.parametrize("coupling", ["parallel", "serial"])
@@ -35,5 +36,32 @@ def test_a_network_whose_log_moves_every_way_is_as_it_was_fitted():
     q, x = rng.uniform(-1.0, 1.0, (80, 3)), rng.normal(size=(80, 3))
     model = HybridForwardModel(None, ELMRegressor(20, random_state=0)).fit(q, x)
     np.testing.assert_array_equal(model.predict(3.0 * q), model.error_model_.predict(3.0 * q))
-    few = HybridForwardModel(None, ELMRegressor(20, random_state=0)).fit(q[:, [0, 0, 1]], x)
-    assert np.abs(few.jacobian(q) @ [1.0, -1.0, 0.0]).max() < 1e-12
+
+
+@pytest.mark.parametrize("input_scaling", ["minmax", "standard", None])
+def test_columns_of_unlike_ranges_that_move_together(input_scaling):
+    """Two drums of 1 and 3 on one motor: nothing is learned of one by itself."""
+    rng = np.random.default_rng(2)
+    pulls = rng.uniform(-0.5, 1.0, (80, 2))
+    q = np.stack([pulls[:, 0], 3.0 * pulls[:, 0], pulls[:, 1], 1.0 - pulls.sum(axis=1)], axis=1)
+    x = np.sin(pulls @ [[1, 2, 0], [0, 1, 1]])
+    elm = ELMRegressor(30, 1e-8, input_scaling=input_scaling, random_state=0)
+    model = HybridForwardModel(None, elm).fit(q, x)
+    assert np.linalg.norm(model.predict(q) - x, axis=1).max() < 0.05
+    np.testing.assert_allclose(model.predict(q), model.error_model_.predict(q), atol=1e-8)
+    _, spread, axes = np.linalg.svd((q - q.mean(0)) / np.ptp(q, axis=0), full_matrices=False)
+    still = axes[spread < 0.01 * spread[0]] * np.ptp(q, axis=0)
+    assert len(still) == 2
+    J = model.jacobian(q)
+    assert np.abs(J @ still.T).max() < 1e-9 * np.abs(J).max()
+
+
+def test_hidden_features_that_see_a_part_of_q():
+    rng = np.random.default_rng(3)
+    q = torch.from_numpy(rng.uniform(-1.0, 1.0, (20, 3)) * [1.0, 5.0, 0.2] + 2.0)
+    layer = (torch.from_numpy(rng.normal(size=size)) for size in ((7, 3), 7))
+    features = HiddenFeatures.of_range(q, *layer)
+    mean, M = torch.from_numpy(rng.normal(size=3)), torch.from_numpy(rng.normal(size=(3, 3)))
+    found, seen = features.seen_through(mean, M)(q), features(mean + (q - mean) @ M)
+    assert_close(found[:, :4], features(q)[:, :4])
+    assert_close(found[:, 4:], seen[:, 4:], rtol=0.0, atol=1e-12)
