@@ -7,7 +7,7 @@ TESTS := -q -n auto --maxprocesses 4 --dist worksteal
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test quick bench check docs clean dist oldest native
+.PHONY: paper test quick bench examine coverage check docs clean dist oldest native
 
 paper: $(VENV)/.native
 	$(BIN)/python -m hybridkin paper --out $(OUT)
@@ -20,6 +20,13 @@ quick: $(VENV)/.native
 
 bench: $(VENV)/.bench $(VENV)/.native
 	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet
+
+# A shortened examination; docs/reliability.md has the figures of the full one.
+examine: $(VENV)/.examine $(VENV)/.native
+	$(BIN)/python tests/examination --out $(OUT)/examination
+
+coverage: $(VENV)/.examine $(VENV)/.native
+	$(BIN)/python -m pytest $(TESTS) --cov hybridkin --cov-branch --cov-report html:$(OUT)/coverage
 
 check: $(VENV)/.installed
 	$(BIN)/ruff check .
@@ -56,6 +63,10 @@ $(VENV)/.wheels: $(VENV)/.installed
 
 $(VENV)/.bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable ".[bench]"
+	touch $@
+
+$(VENV)/.examine: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --group examine
 	touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

@@ -8,6 +8,7 @@ from hybridkin import ForwardModel
 from hybridkin.native import available, backend
 
 torch.set_num_threads(1)
+collect_ignore = ["examination"]  # `make examine` runs it
 
 
 def pytest_collection_modifyitems(items):
