@@ -3,11 +3,24 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from hybridkin import ForwardModel
 from hybridkin.native import available, backend
 
 torch.set_num_threads(1)
+# The suite takes the same few examples each time; the examination as many as it says, by its seed.
+_SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
+settings.register_profile("suite", max_examples=10, derandomize=True, database=None, deadline=None)
+settings.register_profile(
+    "examination",
+    max_examples=int(os.environ.get("EXAMPLES", "2000")),
+    database=None,
+    deadline=None,
+    print_blob=True,
+    suppress_health_check=_SLOW,
+)
+settings.load_profile("suite")
 collect_ignore = ["examination"]  # `make examine` runs it
 
 
