@@ -62,7 +62,8 @@ def tensors(shape, low=-1.0, high=1.0, special=SPECIAL, dtypes=(torch.float64, t
 
 
 def _state(inputs):
-    arrays = [a.detach().numpy() if isinstance(a, torch.Tensor) else a for a in inputs]
+    plain = [isinstance(a, torch.Tensor) and a.device.type == "cpu" for a in inputs]
+    arrays = [a.detach().numpy() if ok else a for a, ok in zip(inputs, plain, strict=True)]
     return {
         "inputs": [a.tobytes() if isinstance(a, np.ndarray) else repr(a) for a in arrays],
         "seeds": (
