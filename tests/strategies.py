@@ -98,16 +98,21 @@ def untouched(*inputs):
 def answer(function, *args, **kwargs):
     """Return what a call gives and None, or None and its error, which must be one of ours.
 
-    That is one of `ERRORS` whose message names something in backticks. A warning must do so too.
-    Arguments and settings stay untouched.
+    That is one of `ERRORS`, or another one that begins so, whose message names something in
+    backticks, or a file given. A warning must do so too. Arguments and settings stay untouched.
     """
+    files = [str(a) for a in (*args, *kwargs.values()) if isinstance(a, (str, os.PathLike)) and a]
+
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with untouched(*args, *kwargs.values()):
             try:
                 value, error = function(*args, **kwargs), None
-            except ERRORS as raised:
+            except Exception as raised:
+                if not (isinstance(raised, ERRORS) or str(raised).startswith("`")):
+                    raise
                 value, error = None, raised
-    for said in [error, *(warning.message for warning in caught)]:
-        assert said is None or "`" in str(said), f"{type(said).__name__}: {said}"
+    for said in [warning.message for warning in caught] + ([] if error is None else [error]):
+        named = "`" in str(said) or any(file in str(said) for file in files)
+        assert named, f"{type(said).__name__}: {said}"
     return value, error

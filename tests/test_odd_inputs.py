@@ -282,7 +282,6 @@ NEVER = {
     ("zeros", "ragged"),  # one list per segment
     ("ik.solve pose", "bfloat16"),  # no rotation
     *(("origins", kind) for kind in ("matrix of pandas", "nullable", "read-only pandas", "sparse")),
-    *((entry, "without data") for entry in TENSORS),  # torch computes shapes on "meta"
 }
 # What takes its time: of these a few kinds every time, all of them where time does not count.
 LONG = ("calibrate", "play.q", "play.x", "hybrid.fit", "elm_cv", "ik.q_", "ik.dq_max", "ik.weights")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from numbers import Real
+import os
+from collections.abc import Collection, Iterable, Sequence
+from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -24,6 +26,9 @@ class Transform(Protocol):
 
 
 Numbers = ArrayLike | Tensor  # what a caller may hand over as an array
+_OVERFLOWS = np.float64(
+    1e100
+)  # squares, and fourth powers nearly; no sensor and no robot comes near
 
 
 def as_tensor(
@@ -71,6 +76,33 @@ def number(value: Any, name: str) -> float:
     return float(found)
 
 
+def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
+    """Return a caller's whole number within these limits."""
+    if not isinstance(value, Integral) or not least <= value <= most:
+        need = f"at least {least}" if most == math.inf else f"{least} to {most}"
+        raise ValueError(f"`{name}` must be {need}, a whole number, got {value!r:.80}.")
+    return int(value)
+
+
+def one_of(value: Any, name: str, known: Collection[str], hint: str = "") -> str:
+    """Return a caller's choice among known names."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"`{name}` must be one of {[*known]}, got {value!r:.80}{hint}.")
+    return value
+
+
+def as_path(value: Any, name: str = "path") -> Path:
+    """Return a caller's path."""
+    if not isinstance(value, (str, os.PathLike)) or "\0" in str(value):
+        raise TypeError(f"`{name}` must be a path, got {value!r:.80}.")
+    return Path(value)
+
+
+def countable(value: Any) -> Any:
+    """Return where numbers are neither NaN nor so large that their squares overflow."""
+    return abs(value) < _OVERFLOWS
+
+
 def check_shape(
     value: NDArray | Tensor, name: str, need: Sequence[int | str], why: str = ""
 ) -> None:
@@ -116,6 +148,8 @@ def labels(groups: Any, n_rows: int) -> NDArray:
     """Return the motion of every row, shape (N,)."""
     found = groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
     check_shape(found, "groups", [n_rows], "one entry for each row of the log")
+    if found.dtype.kind == "f" and np.isnan(found).any():
+        raise ValueError("`groups` must name the motion of every row, got NaN; drop these rows.")
     return found.astype(str) if found.dtype == object else found
 
 

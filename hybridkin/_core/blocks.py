@@ -36,10 +36,12 @@ def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:
             f"`{name}` must be a torch tensor of shape (..., {size}), got "
             f"{type(value).__name__}; wrap it in torch.as_tensor(...)."
         )
-    if value.dtype not in (torch.float64, torch.float32) or value.layout != torch.strided:
+    known = value.dtype in (torch.float64, torch.float32)
+    if not known or value.layout != torch.strided or value.is_meta:
         raise TypeError(
             f"`{name}` must be a dense floating tensor, float64 or float32, got {value.dtype} "
-            f"with layout {value.layout}; convert it with `.double()`, or `.to_dense()`."
+            f"with layout {value.layout} on {value.device}; convert it with `.double()`, or "
+            "`.to_dense()`."
         )
 
 

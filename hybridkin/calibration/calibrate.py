@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor, check_shape, labels
+from hybridkin._core.arrays import Numbers, as_tensor, check_shape, labels, one_of
 from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
@@ -225,8 +225,7 @@ def fit_geometry(
             f"another Chain, got {type(chain).__name__}."
         )
     names = _check_parameters(chain, parameters, bounds, prior)
-    if loss not in LOSSES:
-        raise ValueError(f"`loss` must be one of {[*LOSSES]}, got {loss!r}.")
+    one_of(loss, "loss", LOSSES)
     torch_given, device = isinstance(q, Tensor), chain.geometry()["base"].device
     chain = copy.deepcopy(chain).cpu()  # where the solver works, without a graph
     q, x, messages = check_data(chain, q, x)

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor
+from hybridkin._core.arrays import Numbers, as_tensor, labels
 from hybridkin.calibration._least_squares import Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration._unidentified import few_terms
@@ -151,6 +151,8 @@ def choose_geometry(
     q, x, _ = check_data(chain, q, x)
     kept = np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
     kept = np.sort(kept[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)])
+    if groups is not None:
+        groups = labels(groups, len(q))
     counts = q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
     rows = Rows(q[kept], x[kept], counts[kept])
     with torch.no_grad():

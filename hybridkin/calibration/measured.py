@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold, KFold
 
+from hybridkin._core.arrays import countable
+
 _INNER, _BEYOND = 0.4, 0.65  # of rows by distance: the inner ones, where the outer ones begin
 _EXCITED = 0.01  # of the largest spread
 
@@ -16,9 +18,9 @@ def check_finite(**arrays: ArrayLike) -> None:
     """Raise where rows of numbers hold NaN or infinity."""
     for name, values in arrays.items():
         rows = np.asarray(values)
-        if rows.ndim not in (1, 2) or rows.dtype.kind != "f" or np.isfinite(rows).all():
+        if rows.ndim not in (1, 2) or rows.dtype.kind != "f" or countable(rows).all():
             continue
-        bad = ~np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+        bad = ~countable(rows.reshape(len(rows), -1)).all(axis=1)
         raise ValueError(
             f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(rows)} rows "
             f"(first: row {bad.argmax()}); leave these rows out (np.isfinite finds them), or "

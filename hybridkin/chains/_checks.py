@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core import arrays
-from hybridkin._core.arrays import Numbers, Transform, real_array
+from hybridkin._core.arrays import Numbers, Transform, one_of, real_array
 from hybridkin._core.stored import Stored
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arcs import bend_readings
@@ -101,8 +101,7 @@ def path_starts(routing: str, counts: Sequence[int], extensible: Sequence[bool])
 
     What a rigid stage carries starts behind it.
     """
-    if routing not in _ROUTINGS:
-        raise ValueError(f"`routing` must be one of {_ROUTINGS}, got {routing!r}.")
+    one_of(routing, "routing", _ROUTINGS)
     S = len(counts)
     if routing == "segment":
         return (*range(S),)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import identity
+from hybridkin._core.arrays import identity, whole
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
@@ -85,6 +85,7 @@ class ArcChain(MarkedChain):
 
     def metres(self, q: Tensor) -> Tensor:
         """Return what q (..., n) means in metres: lengths, or changes of length."""
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
         return self.gains.to(q) * (q - self.rest.to(q))
 
     def _checked(self, routing: str, *given: Any) -> dict[str, Tensor]:
@@ -159,6 +160,7 @@ class ArcChain(MarkedChain):
         >>> chain.geometry_jacobian(torch.zeros(3, dtype=torch.float64), longer).flatten()
         tensor([0., 0., 1.], dtype=torch.float64)
         """
+        self._check_tangents(tangents)
         arcs, change = self._arcs_and_change(self._rows(q))
         tangents = {name: value.to(q) for name, value in tangents.items()}
         J = torch.cat([one._along(arcs, change, tangents) for one in self.tips()], dim=1)
@@ -252,8 +254,7 @@ class ArcChain(MarkedChain):
         Tensor of shape (..., S * n_points + 1, 3)
             Positions in the measuring frame [m].
         """
-        if n_points < 1:
-            raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
+        n_points = whole(n_points, "n_points", most=10**6)
         length, bending = self.arcs(q)
         poses = self._poses(length, bending, self.offsets)
         t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import check_shape
+from hybridkin._core.arrays import check_shape, countable
 from hybridkin._core.blocks import check_tensor, check_vectors
 from hybridkin._core.model import PoseModel
 from hybridkin._core.units import span_message
@@ -96,13 +96,29 @@ class Chain(PoseModel):
         tangents : dict of str to Tensor of shape (P, ...)
             P changes of entries of `geometry()`, stacked; other entries stay as they are.
         """
+        self._check_tangents(tangents)
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
         current = self.geometry()
 
         def tip(t: Tensor) -> Tensor:
-            moved = {name: current[name] + torch.tensordot(t, v, 1) for name, v in tangents.items()}
+            moved = {
+                name: current[name] + torch.tensordot(t.to(current[name]), v.to(current[name]), 1)
+                for name, v in tangents.items()
+            }
             return self.with_geometry(**moved)(q)
 
         return torch.func.jacfwd(tip)(q.new_zeros(len(next(iter(tangents.values())))))
+
+    def _check_tangents(self, tangents: Mapping[str, Tensor]) -> None:
+        shapes = {name: value.shape for name, value in self.geometry().items()}
+        given = tangents if isinstance(tangents, Mapping) else {}
+        if not given or not {*given} <= {*shapes}:
+            need = f"must map entries of the geometry, {sorted(shapes)}, to changes"
+            raise ValueError(f"`tangents` {need}, got {tangents!r:.80}.")
+        first = next(iter(given.values()))
+        for name, value in given.items():
+            check_tensor(value, f"tangents[{name!r}]")
+            check_shape(value, f"tangents[{name!r}]", (len(first), *shapes[name]))
 
     def poses(self, q: Tensor) -> Tensor:
         """Return the poses (..., K, 4, 4) of the base and of the frames along the robot."""
@@ -135,11 +151,12 @@ class Chain(PoseModel):
         """
         check_vectors(q, self.n_actuators, name, self._why_shape())
         rows = q.detach().reshape(-1, self.n_actuators)
-        bad = ~torch.isfinite(rows).all(dim=1)
+        bad = ~countable(rows).all(dim=1)
         if bad.any():
             raise ValueError(
                 f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of {len(rows)} "
-                f"rows (first: row {int(bad.nonzero()[0])}); drop those rows."
+                f"rows (first: row {int(bad.nonzero()[0])}; more than 1e100 counts as infinite); "
+                "drop those rows."
             )
         self._check_rows(rows, name)
         return self.unit_messages(rows, name)

@@ -217,7 +217,7 @@ class ConstantCurvatureChain(ArcChain):
             are none; extensible segments do not count.
         """
         with torch.no_grad():
-            rows = q.reshape(-1, self.n_actuators)
+            rows = self._rows(q)
             wrong = self.contradictory(rows) & ~torch.tensor(self.extensible, device=q.device)
             if not wrong.any():
                 return None

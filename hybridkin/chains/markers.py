@@ -95,7 +95,11 @@ class MarkedChain(Chain):
         tensor([0.0200, 0.0000, 0.0500, 0.0000, 0.0000, 0.2000], dtype=torch.float64)
         """
         found = []
-        for segment, fraction, *offset in markers:
+        for marker in markers:
+            if not isinstance(marker, (list, tuple)) or len(marker) not in (2, 3):
+                need = "tuples (segment, fraction) or (segment, fraction, offset)"
+                raise ValueError(f"`markers` must be {need}, got {marker!r:.80}.")
+            segment, fraction, *offset = marker
             beside = filled(offset[0] if offset else 0.0, "markers", torch.float64, (3,))
             if segment not in range(self.n_segments) or not 0.0 < number(fraction, "markers") <= 1:
                 raise ValueError(

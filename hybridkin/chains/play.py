@@ -176,12 +176,12 @@ class PlayOperator:
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
             raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
-        start = (rows[0], rows[0]) if state is None else state
-        shapes = [tuple(np.shape(part)) for part in start]
-        if shapes != [tuple(rows.shape[1:])] * 2:
-            raise ValueError(
-                f"`state` must hold vectors of shape ({rows.shape[1]},), got {shapes}."
-            )
+        start = [rows[0]] * 2 if state is None else [real_array(part, "state") for part in state]
+        shapes = [tuple(part.shape) for part in start]
+        finite = state is None or all(np.isfinite(part).all() for part in start)
+        if shapes != [tuple(rows.shape[1:])] * 2 or not finite:
+            need = f"must hold vectors of shape ({rows.shape[1]},), finite"
+            raise ValueError(f"`state` {need}, got {state!r:.200}.")
         if isinstance(rows, np.ndarray):
             if len(rows) and rows.dtype == np.float64 and available():
                 found, *last = play(rows, start, self.width / 2, wanted == 0)

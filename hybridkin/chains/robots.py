@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridkin._core.arrays import as_path
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains._robot_files import chain_of, each, read_tables
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
@@ -303,7 +304,7 @@ def read_description(path: str | Path) -> RobotDescription:
         If the file is not TOML, lacks a key, or has one that is not known or whose value is not
         of its kind; the message names it.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` must name a robot description, got {path}: no such file.")
     try:

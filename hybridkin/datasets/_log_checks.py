@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin._core.arrays import countable
 from hybridkin.datasets._log_geometry import geometry_findings, in_metres
 from hybridkin.datasets._log_report import MISREAD, SEVERITIES, LogFinding, LogReport, named_rows
 from hybridkin.datasets._log_residual import residual_findings
@@ -82,8 +83,8 @@ def check_log(
         log = replace(log, x=log.x[:, -3:], x_names=log.x_names[-3:])
         chain = None if chain is None else chain.tip_model
     columns = np.column_stack([log.q, log.x]).astype(float)
-    valid = np.asarray(np.isfinite(columns).all(axis=1))
-    complete = valid | (several & np.isfinite(log.q).all(axis=1))
+    valid = np.asarray(countable(columns).all(axis=1))
+    complete = valid | (several & countable(log.q).all(axis=1))
     findings = [*_invalid(log, complete, drop_invalid)]
     if valid.any():
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import real_array
+from hybridkin._core.arrays import as_path, check_shape, countable, labels, one_of, real_array
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._log_report import named_rows
 
@@ -73,9 +73,14 @@ class Log:
         q, x = np.shape(self.q), np.shape(self.x)
         if len(q) != 2 or len(x) != 2 or x[0] != q[0] or x[1] % 3 or 0 in (*q[:1], x[1]):
             raise ValueError(
-                f"A log needs q of shape (N, n) and x of shape (N, 3), or (N, 3 K) of K markers, "
+                f"`Log` needs q of shape (N, n) and x of shape (N, 3), or (N, 3 K) of K markers, "
                 f"got {q} and {x}."
             )
+        if self.groups is not None:
+            vars(self)["groups"] = labels(self.groups, q[0])
+        for name in ("time", "line"):
+            if vars(self)[name] is not None:
+                check_shape(np.asarray(vars(self)[name]), name, [q[0]], "one for each row")
 
     def rows(self, kept: NDArray | slice) -> Self:
         """Return a log of some of the rows."""
@@ -166,7 +171,7 @@ def load_log(
     >>> log.x, log.q_names
     (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
     read = {".npz": _read_npz, ".parquet": _read_parquet, ".pq": _read_parquet}
@@ -181,7 +186,7 @@ def load_log(
     values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
     places = np.arange(len(values)) if table.lines is None else table.lines
     n, K = len(q), len(x) // 3
-    known = np.isfinite(values)
+    known = countable(values)
     seen = known[:, n : n + 3 * K].reshape(-1, K, 3).all(axis=2)
     values[:, n : n + 3 * K][~seen.repeat(3, axis=1)] = np.nan
     valid = known[:, :n].all(axis=1) & known[:, n + 3 * K :].all(axis=1) & np.any(seen, axis=1)
@@ -244,6 +249,8 @@ class _Table(NamedTuple):
 
     def column(self, name: str) -> NDArray | Sequence[str]:
         """Return the column of that name."""
+        if not isinstance(name, str):
+            raise TypeError(f"`groups` and `time` must be names of columns, got {name!r:.80}.")
         count, path = self.header.count(name), str(self.path)
         if count > 1:
             raise ValueError(f"Column {name!r} occurs {count} times in {path!r}; rename it.")
@@ -291,18 +298,18 @@ class _Table(NamedTuple):
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
     """Return the factor of the n columns of q, once units and sign are known to be such."""
-    if q_unit not in UNITS:
-        other = "of other units give '1' and the chain `gains` [m per unit]"
-        raise ValueError(f"`q_unit` must be one of {list(UNITS)}, got {q_unit!r}; {other}.")
-    if x_unit not in METRES:
-        raise ValueError(f"`x_unit` must be one of {list(METRES)}, got {x_unit!r}.")
-    sign = np.asarray(q_sign, dtype=float)
+    other = "; of other units give '1' and the chain `gains` [m per unit]"
+    one_of(q_unit, "q_unit", UNITS, other)
+    one_of(x_unit, "x_unit", METRES)
+    sign = real_array(q_sign, "q_sign")
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
         raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
     return sign * UNITS[q_unit]
 
 
 def _read_text(path: Path, delimiter: str | None) -> _Table:
+    if delimiter is not None and not (isinstance(delimiter, str) and len(delimiter) == 1):
+        raise ValueError(f"`delimiter` must be one character or None, got {delimiter!r:.80}.")
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
             delimiter = delimiter or max(_DELIMITERS, key=file.readline().count)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import NoneType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.arrays import shaped, whole
+
+MOST = 10**9  # rows; 72 GB
 RANGE = {"low": 0.19, "high": 0.31, "hold": 0.20, "jitter": 0.005}
 """Working range, held length and half the spread about it [m]."""
 
@@ -51,11 +55,16 @@ def paper_protocol(
     ((2000, 9), 500)
     """
     for name, value in (("n_segment", n_segment), ("n_random", n_random)):
-        if not (isinstance(value, (int, np.integer)) and value >= 0):
-            raise ValueError(f"`{name}` must be an integer >= 0, got {value!r}.")
-    rng = np.random.default_rng(random_state)
+        whole(value, name, 0, MOST)
+    rng = _generator(random_state)
     part = np.repeat(np.arange(4, dtype=np.int8), [n_segment] * 3 + [n_random])
     return draw(rng, part), part
+
+
+def _generator(random_state: int | np.random.Generator | None) -> np.random.Generator:
+    if not isinstance(random_state, (np.random.Generator, NoneType)):
+        random_state = whole(random_state, "random_state", 0)
+    return np.random.default_rng(random_state)
 
 
 def draw(rng: np.random.Generator, part: NDArray[np.int8]) -> NDArray[np.float64]:
@@ -104,13 +113,9 @@ def paper_split(
     part = getattr(data, "part", data)
     if part is None:
         raise ValueError("`data` has no parts: it was not drawn by the paper's protocol.")
-    part = np.asarray(part)
+    part = shaped(part, "data", ["n_samples"])
     random_rows = np.flatnonzero(part == 3)
-    if not 0 < n_test <= len(random_rows):
-        raise ValueError(
-            f"`n_test` must be 1 to {len(random_rows)}, the fully random rows of `data`, "
-            f"got {n_test}."
-        )
-    rng = np.random.default_rng(random_state)
+    n_test = whole(n_test, "n_test", 1, len(random_rows))
+    rng = _generator(random_state)
     test_idx = np.sort(rng.permutation(random_rows)[:n_test])
     return np.setdiff1d(np.arange(len(part)), test_idx), test_idx

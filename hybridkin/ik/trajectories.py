@@ -12,11 +12,12 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridkin._core.arrays import real_array, shaped
+from hybridkin._core.arrays import as_path, one_of, real_array, shaped
 from hybridkin._core.units import METRES
 
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
 
+_MOST = 1e8  # points of a path; 3 GB
 _FAR = 20.0  # no tip is that far from where it is measured [m]
 _ABOVE_ZERO = np.finfo(float).tiny
 _POINT = "3 finite numbers [m]"
@@ -54,8 +55,8 @@ class Trajectory:
         largest = float(np.abs(x).max())
         if largest > _FAR:
             warnings.warn(
-                f"the path reaches {largest:.4g} m, which looks like millimetres; hybridkin works "
-                "in metres: divide by 1000, or read a file with unit='mm'.",
+                f"`x` reaches {largest:.4g} m, which looks like millimetres; hybridkin works in "
+                "metres: divide by 1000, or read a file with unit='mm'.",
                 stacklevel=4,
             )
         vars(self).update(t=t, x=x)
@@ -268,8 +269,10 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     Trajectory
         In metres and seconds, as timed in the file.
     """
-    if unit not in METRES:
-        raise ValueError(f"`unit` must be one of {tuple(METRES)}, got {unit!r}.")
+    one_of(unit, "unit", METRES)
+    path = as_path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {path}.")
     with open(path, encoding="utf-8-sig") as file:
         rows = [text.split(",") for text in map(str.strip, file) if text and text[0] != "#"]
     columns, need = (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
@@ -285,22 +288,29 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     return Trajectory(t, METRES[unit] * table[:, -3:])
 
 
+def periods(duration: float, dt: float) -> float:
+    """Return how many times `dt` goes into a duration [s]; raise for more points than fit."""
+    n = duration / _period(dt, "dt")
+    if n > _MOST:
+        raise ValueError(f"`duration` must be at most {_MOST:g} times `dt`, got {n:g} times.")
+    return n
+
+
 def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.ndarray]:
     """Return times [s] and the share of the way at each."""
-    n = max(1, round(_period(duration, "duration") / _period(dt, "dt")))
-    if timing not in ("min_jerk", "uniform"):
-        raise ValueError(f'`timing` must be one of "min_jerk" and "uniform", got {timing!r}.')
+    n = max(1, round(periods(_period(duration, "duration"), dt)))
+    one_of(timing, "timing", ("min_jerk", "uniform"))
     s = np.arange(n + 1) / n
-    return dt * np.arange(n + 1), s if timing == "uniform" else min_jerk(s)
+    return float(dt) * np.arange(n + 1), s if timing == "uniform" else min_jerk(s)
 
 
 def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a right-handed frame (across, up, normal)."""
     normal = _checked(normal, "normal", _POINT, (3,))
-    norm = np.linalg.norm(normal)
-    if norm == 0.0:
+    if not normal.any():
         raise ValueError("`normal` must not be zero; it is the normal of the plane.")
-    normal = normal / norm
+    normal = normal / np.abs(normal).max()  # squares neither overflow nor vanish
+    normal /= np.linalg.norm(normal)
     axis = np.eye(3)[0 if abs(normal[0]) < 1.0 - 1e-9 else 1]
     across = axis - (axis @ normal) * normal
     across /= np.linalg.norm(across)

@@ -84,7 +84,7 @@ def device_named(name):
     try:
         device = torch.device("cpu" if name is None else name)
         torch.zeros(1, dtype=torch.float64, device=device).item()
-    except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
+    except (RuntimeError, AssertionError, TypeError, ValueError, NotImplementedError) as error:
         raise RuntimeError(
             f"`device` must name a device on which torch computes in float64 here, got "
             f"{str(name)!r}; use device=None for the CPU."

@@ -46,4 +46,4 @@ def positions(x: ArrayLike) -> NDArray:
 
 def distance(a: NDArray, b: NDArray) -> NDArray:
     """Return the distances of rows, NaN where either is not known."""
-    return np.linalg.norm(a - b, axis=-1)
+    return np.hypot.reduce(a - b, axis=-1)  # whose squares do not overflow

@@ -14,6 +14,8 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
+from hybridkin._core.arrays import one_of
+
 LENGTHS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 # Okabe & Ito: colour-blind readers can distinguish them.
 COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
@@ -90,9 +92,7 @@ def steps_of(t: NDArray | None, n_rows: int) -> tuple[NDArray, str]:
 
 def scale_of(unit: str, known: Mapping[str, float] = LENGTHS) -> float:
     """Return how many of a unit one metre has, or one radian."""
-    if unit not in known:
-        raise ValueError(f"`unit` must be one of {[*known]}, got {unit!r}.")
-    return known[unit]
+    return known[one_of(unit, "unit", known)]
 
 
 def decimals(values: ArrayLike) -> int:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import shaped
+from hybridkin._core.arrays import shaped, whole
 from hybridkin.plots._arrays import distance, plain, times
 from hybridkin.plots._canvas import COLORS, Display, decimals, scale_of, space_or_new, steps_of
 from hybridkin.plots._models import Model, predicted
@@ -89,14 +89,14 @@ class TrackAnimation(Display):
         self.target = None if target is None else shaped(target, "target", "T3", T)
         self.error = None if self.target is None else distance(self.x, self.target)
         self.t = times(t, T)
-        self.rows = np.arange(T) if rows is None else np.array(rows, dtype=int)
+        self.rows = np.arange(T) if rows is None else shaped(rows, "rows", "K").astype(int)
         K = len(self.rows)
         inside = K > 0 and self.rows[0] >= 0 and self.rows[-1] < T
         if not (inside and (np.diff(self.rows) > 0).all()):
             raise ValueError(f"`rows` must increase within the {T} rows of `x`, got {self.rows}.")
         if body is not None and len(body.points) != K:
             raise ValueError(f"`body` must hold {K} configurations, got {len(body.points)}.")
-        self.body, self.name = body, name
+        self.body, self.name = body, str(name)
 
     @classmethod
     def from_estimator(
@@ -131,8 +131,7 @@ class TrackAnimation(Display):
         TrackAnimation
             Nothing is drawn yet.
         """
-        if n_frames < 1:
-            raise ValueError(f"`n_frames` must be at least 1, got {n_frames}.")
+        n_frames = whole(n_frames, "n_frames")
         q = plain(q, "q")
         if q.ndim != 2 or len(q) == 0:
             raise ValueError(f"`q` must have shape (T, n) with T >= 1, got {q.shape}.")
@@ -169,8 +168,8 @@ class TrackAnimation(Display):
         TrackAnimation
             Itself, drawn.
         """
-        space = space_or_new(ax)
-        Stage(self._scene(unit), space).show(range(len(self.rows))[frame])
+        space, K = space_or_new(ax), len(self.rows)
+        Stage(self._scene(unit), space).show(whole(frame, "frame", -K, K - 1) % K)
         return self._drawn(space)
 
     def save(

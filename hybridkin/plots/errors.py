@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
+from hybridkin._core.arrays import whole
 from hybridkin.plots._arrays import distance, named, plain, positions
 from hybridkin.plots._canvas import COLORS, Display, axes_or_new, look_of, scale_of
 
@@ -105,7 +106,7 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         ErrorHistogramDisplay
             Itself, drawn.
         """
-        known, ax = self._known(unit), axes_or_new(ax)
+        known, ax, bins = self._known(unit), axes_or_new(ax), whole(bins, "bins")
         top = max(float(values.max()) for values in known.values()) or 1e-3
         edges = np.linspace(0.0, top, bins + 1).tolist()
         for i, (name, values) in enumerate(known.items()):

@@ -11,7 +11,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import shaped
+from hybridkin._core.arrays import shaped, whole
 from hybridkin.plots._arrays import distance, plain
 from hybridkin.plots._canvas import COLORS, Display, label_space, scale_of, space_or_new
 from hybridkin.plots._models import Model, body_of
@@ -70,8 +70,8 @@ class WorkspaceDisplay(Display):
         self.predicted = shaped(predicted, "predicted", "N3", len(self.x))
         self.backbone = None if backbone is None else shaped(backbone, "backbone", "P3")
         self.row = row
-        if row is not None and not -len(self.x) <= row < len(self.x):
-            raise ValueError(f"`row` must be one of the {len(self.x)} rows of `x`, got {row}.")
+        if row is not None:
+            whole(row, "row", -len(self.x), len(self.x) - 1)
 
     def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw into a 3-D axes and return self; the colours end where 1 % of the errors is larger.

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import shaped
+from hybridkin._core.arrays import one_of, shaped, whole
 from hybridkin.plots._arrays import distance, named, plain, times
 from hybridkin.plots._canvas import (
     COLORS,
@@ -116,8 +116,7 @@ class TrackingDisplay(Display):
         TrackingDisplay
             Itself, drawn.
         """
-        if plane not in _PLANES:
-            raise ValueError(f"`plane` must be one of {_PLANES}, got {plane!r}.")
+        one_of(plane, "plane", _PLANES)
         scale, ax = scale_of(unit), axes_or_new(ax)
         i, j = ("xyz".index(letter) for letter in plane)
         for k, (name, x) in enumerate(self.tracks.items()):
@@ -198,18 +197,21 @@ class ActuatorDisplay:
         names: Sequence[str] | None = None,
         limits: ArrayLike | None = None,
     ) -> None:
-        self.actuators_per_segment = tuple(actuators_per_segment)
+        given = actuators_per_segment
+        self.actuators_per_segment = tuple(whole(k, "actuators_per_segment") for k in given)
         n = sum(self.actuators_per_segment)
         self.paths = {name: plain(q, "paths") for name, q in named(paths, "paths").items()}
-        rows = len(next(iter(self.paths.values())))
+        rows = next(iter(self.paths.values())).shape[:1]
         for name, q in self.paths.items():
-            if q.shape != (rows, n):
+            if q.shape != (*rows, n):
                 raise ValueError(
                     f"`paths` must hold arrays of one shape (T, {n}), as `actuators_per_segment` "
                     f"says, got {q.shape} for {name!r}; the first has {rows} rows."
                 )
-        self.t, self.names = times(t, rows), names
-        self.limits = None if limits is None else plain(limits, "limits")
+        self.t, self.names = times(t, *rows), None if names is None else [*map(str, names)]
+        if names is not None and len(self.names) != n:
+            raise ValueError(f"`names` must hold {n} names, one per actuator, got {names!r:.80}.")
+        self.limits = None if limits is None else shaped(limits, "limits", ("2", n))
 
     @classmethod
     def from_tracks(cls, tracks: Mapping[str, Any], actuators_per_segment: Sequence[int]) -> Self:
@@ -256,7 +258,13 @@ class ActuatorDisplay:
         """
         shares, names = self.actuators_per_segment, self.names or ()
         n = len(shares)
-        scale = scale_of(unit, _ACTUATOR_UNITS) if per_unit is None else 1.0 / np.asarray(per_unit)
+        if per_unit is None:
+            scale = scale_of(unit, _ACTUATOR_UNITS)
+        else:
+            size = plain(per_unit, "per_unit")
+            if size.shape not in ((), (sum(shares),)) or not size.all():
+                raise ValueError(f"`per_unit` must be one or (n,) numbers, not 0, got {per_unit}.")
+            scale = 1.0 / size
         if axes is None:
             size = (6.0, 1.0 + 1.6 * n)
             axes = plt.subplots(n, 1, figsize=size, sharex=True, layout="constrained")[1]

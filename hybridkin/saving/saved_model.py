@@ -9,13 +9,14 @@ import time
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
 import sklearn
 import torch
 
-from hybridkin._core.arrays import as_array
+from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import plain
 from hybridkin._core.version import __version__
@@ -97,7 +98,7 @@ def save_model(
         known = {"rows": stored.settings["n_samples_seen"]}
     entries, arrays = packed(stored)
     header["training"] = {**known, **_checked(training)}
-    write(Path(path), {**header, **entries}, arrays)
+    write(as_path(path), {**header, **entries}, arrays)
 
 
 def load_model(path: str | Path, *, device: str | torch.device | None = None) -> Any:
@@ -126,7 +127,7 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
     RuntimeError
         If there is no such device here.
     """
-    path = Path(path)
+    path = as_path(path)
     at = device_named(device)
     header, arrays = read(path)
     try:
@@ -178,10 +179,12 @@ def model_header(path: str | Path) -> dict[str, Any]:
     >>> model_header(path)["units"]
     {'q': 'm', 'x': 'm'}
     """
-    return read(Path(path))[0]
+    return read(as_path(path))[0]
 
 
 def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
+    if not isinstance(training, (Mapping, NoneType)):
+        raise TypeError(f"`training` must be a mapping of names to numbers, got {training!r:.80}.")
     given = plain(dict(training or {}))
     try:
         json.dumps(given)

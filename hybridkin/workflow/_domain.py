@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import as_array
+from hybridkin._core.arrays import as_array, real_array
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -80,7 +80,7 @@ def path_limits(
     open_end = described.q_min is None or described.q_max is None
     trained = (loaded.trained_range if within_fit or open_end else None) or robots.Limits()
     given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max, "ddq_max": ddq_max}
-    asked = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
+    asked = {k: real_array(v, k).astype(float) for k, v in given.items() if v is not None}
     overrides = vars(robots.Limits(**asked).narrowed(half_play))
     found = described.narrowed(half_play).intersect(trained)
     found = replace(found, **{name: overrides[name] for name in asked})

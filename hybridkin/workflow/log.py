@@ -134,6 +134,8 @@ def read_log(
     ValueError
         If columns or motions are not there.
     """
+    if not isinstance(exclude, Sequence) or not all(isinstance(p, str) for p in exclude):
+        raise TypeError(f"`exclude` must be a list of patterns of names, got {exclude!r:.80}.")
     suffix = log_format.group_suffix
     log = load_log(path, **log_format.reading, delimiter=delimiter, drop_invalid=True)
     if log.groups is None and exclude:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.arrays import as_array
+from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
@@ -175,7 +175,7 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     ValueError
         If it is no model, or not one of that robot.
     """
-    path = Path(path)
+    path = as_path(path)
     if path.suffix.lower() == ".toml":
         description = robots.read_description(path)
         if description.chain is None:

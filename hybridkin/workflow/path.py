@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hybridkin._core.arrays import as_path, number, one_of
 from hybridkin.ik import trajectories
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow._domain import Domain, PathLimits
 from hybridkin.workflow.model import LoadedModel
+
+_SHAPES = ("figure-eight", "spiral", "line")
 
 
 def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> Trajectory:
@@ -39,7 +43,7 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     ValueError
         If it has no times and `dt` is not given, or is not a table of numbers.
     """
-    file = Path(path)
+    file = as_path(path)
     if not file.is_file():
         raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {file}.")
     try:
@@ -54,7 +58,7 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     timed = trajectories.from_csv(file, unit=unit)
     if dt is None:
         return timed
-    t = timed.t[0] + dt * np.arange(int(timed.duration / dt + 1e-9) + 1)
+    t = timed.t[0] + dt * np.arange(int(trajectories.periods(timed.duration, dt) + 1e-9) + 1)
     return Trajectory(t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1))
 
 
@@ -73,6 +77,8 @@ def scaled_path(path: Trajectory, scale: float) -> Trajectory:
     Trajectory
         The centre, that of the box around the points, stays where it is.
     """
+    if not math.isfinite(number(scale, "scale")):
+        raise ValueError(f"`scale` must be finite, got {scale!r}.")
     center = 0.5 * (path.x.min(axis=0) + path.x.max(axis=0))
     return Trajectory(path.t, center + scale * (path.x - center))
 
@@ -124,9 +130,10 @@ def shape_path(
     ValueError
         For another number of sizes than the shape has.
     """
-    n_sizes = 3 if shape == "line" else 2
-    if len(size) != n_sizes:
-        raise ValueError(f"--size must be {n_sizes} numbers for a {shape}, got {len(size)}.")
+    n_sizes = 3 if one_of(shape, "shape", _SHAPES) == "line" else 2
+    if np.shape(size) != (n_sizes,):
+        need = f"--size must be {n_sizes} numbers for a {shape}"
+        raise ValueError(f"`size` does not fit: {need}, got {size!r:.80}.")
     if center is None:
         # The tip nearest to the mean of all tips in the domain: some robots reach only a surface.
         tips = Domain(loaded, limits).sample[1]

@@ -895,7 +895,7 @@ def test_groups_of_the_description_can_be_left_out(log, robot, capsys):
         ),
         (
             ["track", "model", *SHAPE, "--size", "5,5", "--duration", "1e9", "--out", "t"],
-            "allocate",
+            "at most 1e+08 times `dt`",
         ),
     ],
 )

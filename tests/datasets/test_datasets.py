@@ -67,7 +67,7 @@ def test_protocol_is_seeded():
 
 
 def test_protocol_needs_whole_numbers():
-    with pytest.raises(ValueError, match="`n_segment` must be an integer"):
+    with pytest.raises(ValueError, match=r"`n_segment` must be 0 to .*, a whole number"):
         paper_protocol(n_segment=1.5)
 
 

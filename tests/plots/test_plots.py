@@ -642,7 +642,10 @@ def test_page_in_a_browser(film, track, tmp_path):
         (lambda: plots.LearningCurveDisplay([50, 25], {"a": [1, 2]}), "`sizes` must .* increase"),
         (lambda: plots.LearningCurveDisplay([25, 50], {"a": [1, 2, 3]}), r"\(2,\) or"),
         (lambda: plots.WorkspaceDisplay(np.zeros((4, 2)), np.zeros((4, 2))), r"\(N, 3\)"),
-        (lambda: plots.WorkspaceDisplay(np.zeros((4, 3)), np.zeros((4, 3)), row=4), "4 rows"),
+        (
+            lambda: plots.WorkspaceDisplay(np.zeros((4, 3)), np.zeros((4, 3)), row=4),
+            "`row` must be -4 to 3",
+        ),
         (lambda: plots.BackboneDisplay(np.zeros((4, 2))), r"\(K, P, 3\)"),
         (lambda: plots.BackboneDisplay(np.zeros((4, 3)), tips=np.zeros((2, 3))), r"\(1, 3\)"),
         (lambda: plots.TrackingDisplay(np.zeros((4, 3)), {"a": np.zeros((5, 3))}), r"\(4, 3\)"),
