@@ -36,5 +36,7 @@ ROW_BY_ROW = {
         RigidChain: "",
     }.items()
 }
-# The first derivative by torch.func loads SymPy, which sets a warning filter: not of this package.
-torch.func.jacfwd(torch.func.vmap(torch.sin))(torch.zeros(2))
+# Its first derivative by torch.func loads SymPy, which sets a warning filter: not of this package.
+_tangent = {"base": torch.ones(1, 4, 4, dtype=torch.float64)}
+CHAINS["pair"][0].geometry_jacobian(torch.tensor(CHAINS["pair"][1]), _tangent)
+CHAINS["arm"][0].geometry_jacobian(torch.tensor(CHAINS["arm"][1]), _tangent)

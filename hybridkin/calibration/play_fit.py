@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import Numbers, labels, real_array
+from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
 from hybridkin.calibration.measured import folds
 from hybridkin.chains.arc_chain import ArcChain
@@ -126,7 +126,8 @@ def fit_play(
     tried = np.unique(np.concatenate([[0.0], given])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q, x = real_array(q, "q"), real_array(x, "x")
-    groups = labels(groups, len(q))
+    check_shape(x, "x", ("N", chain.n_outputs))
+    groups = labels(groups, len(x))
     splits = folds(groups, groups)
     sizes = [len(test) for _, test in splits]
     effective, mean_squares = {}, {}  # by width

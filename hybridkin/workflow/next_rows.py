@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridkin._core.arrays import whole
 from hybridkin._core.units import METRES
 from hybridkin.calibration.measured import distance
 from hybridkin.hybrid.choose_rows import choose_rows
@@ -72,6 +73,7 @@ def next_rows(
         within it.
     """
     check_out(out)
+    n = whole(n, "n")
     limits = path_limits(loaded, within_fit=False) if limits is None else limits
     domain, log = Domain(loaded, limits), loaded.log_format()
     candidates, target, where = domain.postures(_POOL), None, "within the limits"

@@ -21,6 +21,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
+from hybridkin._core.arrays import as_path
 from hybridkin._core.stored import plain
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.arc_chain import ArcChain
@@ -239,7 +240,7 @@ def _wrapped(text: str) -> str:
 
 def check_out(out: str | Path) -> None:
     """Raise, before any work is done, where `out` cannot become a folder of results."""
-    path = Path(out)
+    path = as_path(out, "out")
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"`out` must be a folder, got the file {path}; name another one.")
     home = next(parent for parent in [path, *path.absolute().parents] if parent.exists())

@@ -1,0 +1,97 @@
+"""Hostile values in any argument of what takes its time: fits, tracks, simulation, reports."""
+
+import numpy as np
+import pytest
+from entry_points import (
+    DESCRIPTION,
+    FOLDER,
+    GROUPS,
+    LIMITS,
+    LOADED,
+    LOG,
+    PATH,
+    Q,
+    X,
+    fuzz,
+)
+
+from hybridkin import ConstantCurvatureChain, datasets, fit_play, simulation, workflow
+
+SETTINGS = {"n_folds": 2, "n_seeds": 1, "auto": False, "loss": "linear", "coverage": None}
+SETTINGS |= {"play": None, "max_rows": None}
+OUT = FOLDER / "out"
+PLANT = {"tilt": 0.6, "gravity": 9.8, "max_force": 150.0}
+PLANT |= {"base_error": np.zeros(6), "cable_noise": 1e-3, "mocap_noise": 1e-3, "max_iter": 50}
+TENDONS = ConstantCurvatureChain([0.005], lengths=[0.1])
+
+
+def with_settings(function):
+    """Return a function that takes the fields of its settings one by one."""
+
+    def call(n_jobs=1, **given):
+        own = {name: given.pop(name) for name in SETTINGS}
+        return function(**given, settings=workflow.FitSettings(**own), n_jobs=n_jobs)
+
+    return call
+
+
+def settled(q, **given):
+    return simulation.TrunkPlant(**given).settle(q)
+
+
+ENTRIES = {
+    "LoadedModel.effective": (LOADED.effective, {"q": Q, "groups": GROUPS}),
+    "fit_play": (
+        fit_play,
+        {
+            "chain": TENDONS,
+            "q": 1e-3 * X,
+            "x": X,
+            "groups": GROUPS,
+            "widths": [1e-4],
+            "parameters": ["radii"],
+        },
+    ),
+    "make_trunk": (
+        datasets.make_trunk,
+        {
+            **{"q_target": np.full((1, 9), 0.25), "n_segment": 0, "n_random": 1, "random_state": 0},
+            **{"cable_noise": 1e-3, "mocap_noise": 1e-3, "return_X_y": False},
+        },
+    ),
+    "TrunkPlant.settle": (settled, {"q": np.full(9, 0.25), **PLANT}),
+    "evaluate_log": (
+        workflow.evaluate_log,
+        {"loaded": LOADED, "log": LOG, "out": None, "force": True},
+    ),
+    "next_rows": (
+        workflow.next_rows,
+        {"loaded": LOADED, "out": OUT, "n": 2, "limits": LIMITS, "path": PATH},
+    ),
+    "track_path": (
+        workflow.track_path,
+        {
+            **{"loaded": LOADED, "path": PATH, "out": OUT, "limits": LIMITS, "start": "rest"},
+            **{"tol": 1e-3, "force": True},
+        },
+    ),
+    "compare_by_group": (
+        with_settings(workflow.compare_by_group),
+        {"log": LOG, "robot": DESCRIPTION, **SETTINGS},
+    ),
+    "fit_log": (
+        with_settings(workflow.fit_log),
+        {"log": LOG, "robot": DESCRIPTION, "out": OUT, "force": True, **SETTINGS},
+    ),
+}
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(monkeypatch):
+    monkeypatch.chdir(FOLDER)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_any_argument_gives_an_answer_or_an_error_of_ours(entry):
+    fuzz(*ENTRIES[entry], share=2 if entry.startswith("LoadedModel") else 40)
