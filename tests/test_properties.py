@@ -235,30 +235,22 @@ ENTRIES = {
         {"x": X, "predictions": {"a": X + 0.01}},
     ),
     "plots.LearningCurveDisplay": (
-        lambda unit, styles, **k: drawn(plots.LearningCurveDisplay(**k), unit=unit, styles=styles),
-        {
-            "sizes": np.array([5.0, 10.0]),
-            "errors": {"a": np.array([[0.2, 0.3], [0.1, 0.2]])},
-            "unit": "cm",
-            "styles": None,
-        },
+        plots.LearningCurveDisplay,  # matplotlib warns of zero errors on its logarithmic axis
+        {"sizes": np.array([5.0, 10.0]), "errors": {"a": np.array([[0.2, 0.3], [0.1, 0.2]])}},
     ),
     "plots.TrackingDisplay": (
-        lambda unit, plane, method, **k: drawn(
-            plots.TrackingDisplay(**k),
-            unit=unit,
-            method=method,
-            **({"plane": plane} if method == "plot" else {}),
-        ),
-        {
-            "target": X,
-            "tracks": {"a": X + 0.01},
-            "t": np.arange(24.0),
-            "unit": "cm",
-            "plane": "xz",
-            "method": "plot_error",
-        },
+        lambda unit, plane, **k: drawn(plots.TrackingDisplay(**k), unit=unit, plane=plane),
+        {"target": X, "tracks": {"a": X + 0.01}, "t": np.arange(24.0), "unit": "cm", "plane": "xz"},
     ),
+    **{
+        f"plots.TrackingDisplay.{method}": (
+            lambda unit, method=method, **k: drawn(
+                plots.TrackingDisplay(**k), unit=unit, method=method
+            ),
+            {"target": X, "tracks": {"a": X + 0.01}, "t": np.arange(24.0), "unit": "cm"},
+        )
+        for method in ("plot_error", "plot_time")
+    },
     "plots.TrackingDisplay.from_tracks": (
         plots.TrackingDisplay.from_tracks,
         {"tracks": {"a": TRACK}},

@@ -149,10 +149,10 @@ def choose_geometry(
     """
     given, chain = chain, copy.deepcopy(chain).cpu()
     q, x, _ = check_data(chain, q, x)
-    kept = np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
-    kept = np.sort(kept[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)])
     if groups is not None:
         groups = labels(groups, len(q))
+    kept = np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
+    kept = np.sort(kept[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)])
     counts = q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
     rows = Rows(q[kept], x[kept], counts[kept])
     with torch.no_grad():
@@ -161,7 +161,7 @@ def choose_geometry(
     starts = _starts(rungs, rows, loss)
     best, errors = 0, {}
     if len(rungs) > 1:
-        motions = None if groups is None else np.asarray(groups)[kept]
+        motions = None if groups is None else groups[kept]
         splits = [(1, *split) for split in _splits(rows, motions)]
         if outside and len(kept) >= _FEW:
             splits.append((0, *inner_and_outer(rows.q.numpy())))

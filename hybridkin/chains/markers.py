@@ -95,7 +95,7 @@ class MarkedChain(Chain):
         tensor([0.0200, 0.0000, 0.0500, 0.0000, 0.0000, 0.2000], dtype=torch.float64)
         """
         found = []
-        for marker in markers:
+        for marker in markers if isinstance(markers, (list, tuple)) else [markers]:
             if not isinstance(marker, (list, tuple)) or len(marker) not in (2, 3):
                 need = "tuples (segment, fraction) or (segment, fraction, offset)"
                 raise ValueError(f"`markers` must be {need}, got {marker!r:.80}.")

@@ -58,7 +58,7 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     timed = trajectories.from_csv(file, unit=unit)
     if dt is None:
         return timed
-    t = timed.t[0] + dt * np.arange(int(trajectories.periods(timed.duration, dt) + 1e-9) + 1)
+    t = timed.t[0] + float(dt) * np.arange(int(trajectories.periods(timed.duration, dt) + 1e-9) + 1)
     return Trajectory(t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1))
 
 
