@@ -67,8 +67,8 @@ def require(good: bool | Tensor, message: str) -> None:
 
 def stopping(way: Tensor, change: Tensor) -> Tensor:
     """Return the largest first step from which steps that shrink by `change` stop within `way`."""
-    stops = 2.0 * way / (1.0 + (1.0 + 2.0 * way.clamp_min(0.0) / change).sqrt())
-    return torch.where(torch.isfinite(way), stops, way)
+    stops = way / (0.5 + 0.5 * (1.0 + 2.0 * (way.clamp_min(0.0) / change)).sqrt())
+    return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
 
 
 _FAST = 5.0  # times the largest plausible q in a second is too fast

@@ -45,7 +45,8 @@ def control_step(
 ) -> StepRows:
     """Return eq. (1) for one period, v = dx dt + gain dt e; rows that are not finite hold still.
 
-    With a limit of acceleration these brake until they stand.
+    So do rows whose numbers overflow. With a limit of acceleration they brake until they stand;
+    from outside the limits the actuators that are known walk back.
 
     Parameters
     ----------
@@ -72,7 +73,9 @@ def control_step(
         With sigma_min NaN where a row held still.
     """
     gain, beta, seconds = settings.rates(period)
-    given = [a for a in (q, J.flatten(1), e, feed_forward, last) if a is not None]
+    v = gain * e if feed_forward is None else feed_forward + gain * e
+    sizes = [a.norm(dim=-1, keepdim=True) for a in (e, v)]
+    given = [a for a in (q, J.flatten(1), *sizes, last) if a is not None]
     before = 0.0 if last is None else torch.where(torch.isfinite(last).all(-1)[:, None], last, 0.0)
     fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
     at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
@@ -98,9 +101,14 @@ def control_step(
             brakes = [_braking(settings, J, a.expand(len(J), -1), change) for a in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
         step = _step_inside(settings, margin, J, v, posture, *bounds)
+    fine = fine & torch.isfinite(step.dq).all(-1, keepdim=True)
+    still = torch.where(torch.isfinite(q), torch.clamp(torch.zeros_like(q), *bounds), 0.0)
+    held = (still <= bounds[0]) | (still >= bounds[1])
     return step._replace(
-        dq=torch.where(torch.isnan(step.dq), 0.0, step.dq),
+        dq=torch.where(fine, step.dq, still),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
+        damping=torch.where(fine[:, 0], step.damping, 0.0),
+        saturated=torch.where(fine, step.saturated, held),
     )
 
 

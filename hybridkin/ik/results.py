@@ -79,10 +79,11 @@ class Step(Generic[ArrayT]):
     x : array of shape (..., 3)
         Tip of the model at q, before the step [m].
     error : array of shape (...,)
-        Distance from the tip to the target before the step [m]; NaN where an input was not
-        finite (such a row holds still).
+        Distance from the tip to the target before the step [m]; NaN or infinite where q, the target
+        or the tip was not finite (such a row holds still).
     sigma_min : array of shape (...,)
-        Smallest singular value of the Jacobian at q.
+        Smallest singular value of the Jacobian at q; NaN where the row holds still because an input
+        was not finite.
     damping : array of shape (...,)
         lambda used, in the unit of `sigma_min`; 0 where the step is the pseudo-inverse's.
     saturated : bool array of shape (..., n)

@@ -215,8 +215,9 @@ class InverseKinematics:
         Returns
         -------
         Step
-            `dq` and what came with it. A row with a NaN or infinite input holds still, with
-            `ddq_max` after it has braked.
+            `dq` and what came with it. A row with a NaN or infinite input, or one whose square
+            overflows, holds still, with `ddq_max` after it has braked; its `sigma_min` is NaN. From
+            outside the limits its actuators walk back, but one that is NaN or infinite never moves.
         """
         core = core_of(self.settings)
         found = None if core is None or dq is not None else core.step(q, x_target, dx, x_measured)
@@ -299,7 +300,8 @@ class InverseKinematics:
         Returns
         -------
         IKSolution
-            Never raises for an unreachable target; a NaN target marks only its own row.
+            Never raises for an unreachable target; a NaN target or start marks only its own row,
+            which stays at the start, with NaN in place of what is infinite there.
 
         Notes
         -----
@@ -324,6 +326,7 @@ class InverseKinematics:
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q, target = rows_of(q, lead), rows_of(target, lead, axes)
+        q = torch.where(torch.isfinite(q), q, torch.nan)  # or the limits would make it finite
         core = core_of(settings, search=True) if as_numpy and q.dtype == torch.float64 else None
         search = Search(settings, tolerance, max_iter)
         if core is not None:

@@ -97,9 +97,8 @@ static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, co
 
 /* The largest first step from which steps that shrink by `change` stop within `way`. */
 static inline real ik_stopping(real way, real change) {
-    const real ahead = way > R(0.0) ? way : R(0.0);
-    if (!(ahead < R(INFINITY))) return way;
-    return R(2.0) * way / (R(1.0) + HK_MATH(sqrt)(R(1.0) + R(2.0) * ahead / change));
+    if (!(way > R(0.0) && way < R(INFINITY))) return way;
+    return way / (R(0.5) + R(0.5) * HK_MATH(sqrt)(R(1.0) + R(2.0) * (way / change)));
 }
 
 /* The bounds of a step: position, and for `seconds` > 0 speed and acceleration from the step
@@ -150,7 +149,8 @@ static inline real ik_brake(const ik_settings *ik, const real *q, const real *J,
 }
 
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
-   taken back. What is not finite holds still, with a limit of acceleration after it has braked. */
+   taken back. What is not finite, or overflows, holds still, with a limit of acceleration after it
+   has braked; from outside the limits the actuators that are known walk back. */
 static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *J,
                                    const real *e, const real *feed, real seconds,
                                    const real *last, ik_step_t *s) {
@@ -159,8 +159,9 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
     gain = gain > R(1.0) ? R(1.0) : gain;
     beta = beta > R(1.0) ? R(1.0) : beta;
     for (int i = 0; i < 3; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));
+    const real sizes[2] = {ik_norm(3, e), ik_norm(3, v)};
     const int known = !last || ik_finite(n, last);
-    if (known && ik_finite(n, q) && ik_finite(3 * n, J) && ik_finite(3, v)) {
+    if (known && ik_finite(n, q) && ik_finite(3 * n, J) && ik_finite(2, sizes)) {
         for (int j = 0; j < n; j++) s->posture[j] = beta * (ik->posture[j] - q[j]);
         if (ik->flags & IK_ACCELERATES) {
             const real share = ik_brake(ik, q, J, e, seconds, s);
@@ -169,13 +170,14 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
         }
         ik_step_bounds(ik, q, seconds, last, s);
         ik_limited_step(ik, J, v, ik->flags & IK_POSTURE, NULL, s);
-        return;
+        if (ik_finite(n, s->dq)) return;
     }
-    const real still[3 * HK_MAX_N] = {R(0.0)};
     ik_step_bounds(ik, q, seconds, known ? last : NULL, s);
-    ik_limited_step(ik, still, still, 0, NULL, s);
-    for (int j = 0; j < n; j++) s->dq[j] = q[j] == q[j] ? s->dq[j] : R(0.0);
-    s->sigma_min = R(NAN);
+    for (int j = 0; j < n; j++) {
+        s->dq[j] = ik_finite(1, q + j) ? ik_clip(R(0.0), s->lower[j], s->upper[j]) : R(0.0);
+        s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
+    }
+    s->sigma_min = R(NAN), s->damping = R(0.0);
 }
 
 /* The model at one configuration. Every step and tick calls this one, and gets the same bits; who
