@@ -41,7 +41,7 @@ def as_tensor(
     if isinstance(value, Transform):
         value = value.get_matrix()
     if not isinstance(value, Tensor):
-        return torch.tensor(real_array(value, name), device=device or "cpu")
+        return copied(real_array(value, name), device or "cpu")
     if value.is_complex() or value.layout != torch.strided or value.is_meta:
         got = f"{value.dtype} with layout {value.layout} on {value.device}"
         raise ValueError(f"`{name}` must be a dense tensor that holds real numbers, got {got}.")
@@ -66,6 +66,11 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
         raise kind(f"`{name}` must be numeric, got {value!r:.200} ({error}).") from error
     hint = " Complex data not supported." if array.dtype.kind == "c" else ""
     raise ValueError(f"`{name}` must be numeric, got {value!r:.200}.{hint}")
+
+
+def copied(a: NDArray, device: torch.device | str, dtype: type | None = None) -> Tensor:
+    """Return a copy as a tensor; torch takes no negative stride, not even of a single row."""
+    return torch.from_numpy(np.array(a, dtype, order="C")).to(device)
 
 
 def number(value: Any, name: str) -> float:
@@ -174,7 +179,7 @@ def leading(pairs: Sequence[tuple[Tensor, int]]) -> tuple[int, ...]:
     try:
         return np.broadcast_shapes(*shapes)  # torch's loads half a second of modules first
     except ValueError as error:
-        need = "configurations and targets must agree in their batch shapes"
+        need = "configurations (`q`) and targets (`x_target`) must agree in their batch shapes"
         raise ValueError(f"{need}, got {shapes}.") from error
 
 

@@ -139,7 +139,7 @@ class Core:
         n_iter = n_iter.long()
         ends = n_iter, torch.ones_like(n_iter)
         x = target - e if self.rows == 3 else torch.full_like(target, math.nan)  # not asked for
-        return Found(at, x, J, e, target, reached, at_rest, held, *ends)
+        return Found(at, x, J, e, target.clone(), reached, at_rest, held, *ends)
 
     def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
         """Call a function of the library for the rows of arrays."""

@@ -18,6 +18,7 @@ from hybridkin._core.arrays import (
     as_tensor,
     check_shape,
     real_array,
+    whole,
 )
 from hybridkin._core.model import Portable
 from hybridkin._core.stored import Stored
@@ -349,8 +350,7 @@ class StepSettings(Portable):
         if n_solutions is None:
             return 1
         require(not differentiable, "`n_solutions` must be None for differentiable=True.")
-        need = "at least 1, or None for one without an axis of its own"
-        require(n_solutions >= 1, f"`n_solutions` must be {need}, got {n_solutions}.")
+        n_solutions = whole(n_solutions, "n_solutions", 1)
         good, way = torch.isfinite(self.spans).all(), "give finite `q_min` and `q_max`"
         require(good, f"`n_solutions` compares configurations by the range of q; {way}.")
         return n_solutions

@@ -17,6 +17,7 @@ from hybridkin._core.arrays import (
     leading,
     number,
     rows_of,
+    whole,
 )
 from hybridkin._core.stored import Stored
 from hybridkin.ik._compiled import Core, core_of
@@ -242,6 +243,7 @@ class InverseKinematics:
         lead = leading(given)
         rows, target, *others = (rows_of(a, lead, trailing) for a, trailing in given)
         before = None if last is None else others.pop()
+        before = before if settings.accelerates else None  # nothing else counts from it
         feed_forward = None if dx is None else settings.dt * others.pop()
         measured = others.pop() if others else None
         if core is not None and as_numpy and rows.dtype == torch.float64:
@@ -313,8 +315,7 @@ class InverseKinematics:
         """
         settings, task = self.settings, self.settings.task
         tolerance = settings.tolerance(tol)
-        good, given = max_iter >= 1 and restarts >= 0, (max_iter, restarts)
-        require(good, f"`max_iter` must be at least 1 and `restarts` at least 0, got {given}.")
+        max_iter, restarts = whole(max_iter, "max_iter", 1), whole(restarts, "restarts", 0)
         as_numpy, axes = is_numpy(x_target), len(task.shape)
         places = settings.places(n_solutions, differentiable)
         good = isinstance(x_target, Tensor) or not differentiable

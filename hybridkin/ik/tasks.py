@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import as_tensor, identity, number
+from hybridkin._core.arrays import as_tensor, identity, number, whole
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
@@ -128,9 +128,9 @@ class PositionTask(Task):
     """
 
     def __init__(self, model: object, size: int = 3) -> None:
-        found = as_forward_model(model)
-        self.models = (found.tip_model if size == 3 else found,)
-        self.shape, self.parts, self.units = (int(size),), (int(size),), (1.0,)
+        found, count = as_forward_model(model), whole(size, "size", 1)
+        self.models = (found.tip_model if count == 3 else found,)
+        self.shape, self.parts, self.units = (count,), (count,), (1.0,)
 
     @classmethod
     def from_numpy(
@@ -283,7 +283,7 @@ class PointsTask(Task):
                 f"`chain` must have with_tip(at), as chains of arcs, got {type(chain).__name__}."
             )
         self.models, n = tuple(chain.with_tip(number(a, "at")) for a in at), len(at)
-        self.units = (1.0,) * n if weights is None else tuple(float(w) for w in weights)
+        self.units = (1.0,) * n if weights is None else tuple(number(w, "weights") for w in weights)
         if n == 0 or len(self.units) != n or not all(0.0 < w < math.inf for w in self.units):
             need = "positive, one for every point of `at`"
             raise ValueError(f"`weights` must be {need}, got {self.units} for {n} points.")

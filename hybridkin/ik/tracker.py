@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import as_array, as_tensor, is_numpy
+from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
 from hybridkin.ik._compiled import Follower, Tick, core_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._settings import Array, StepSettings, require
@@ -67,6 +67,7 @@ class Tracker:
     def __init__(
         self, settings: StepSettings, q0: Array, tol: Tolerance, memory: float | None
     ) -> None:
+        memory = None if memory is None else number(memory, "memory")
         good = memory is None or 0.0 < memory < math.inf
         require(good, f"`memory` must be a positive time [s], got {memory!r}.")
         self._settings, self._tol, self._memory = settings, tol, memory

@@ -9,6 +9,7 @@ from scipy.linalg.blas import dsyrk  # pyright: ignore
 from scipy.linalg.lapack import dpocon, dpotrf, dtrtri  # pyright: ignore
 from sklearn.utils import gen_batches
 
+from hybridkin._core.arrays import copied
 from hybridkin.learning.network import READOUT
 
 BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
@@ -38,12 +39,12 @@ def gather(stats, elm, X, y, sample_weight, block_size):
     scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is kept up
     buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
     for rows in gen_batches(len(X), block_size):
-        q = torch.tensor(X[rows], dtype=torch.float64, device=device)
+        q = copied(X[rows], device, np.float64)
         z = buffer[: len(q) + 1]
         block = z[:-1]
         elm._write_features(q, block[:, :n_features])
-        block[:, n_features:] = torch.tensor(y[rows], device=device)
-        w = None if sample_weight is None else torch.tensor(sample_weight[rows], device=device)
+        block[:, n_features:] = copied(y[rows], device)
+        w = None if sample_weight is None else copied(sample_weight[rows], device)
         n_block = float(len(block)) if w is None else w.sum().item()
         mean_block = block.mean(0) if w is None else w @ block / n_block
         block -= mean_block
@@ -59,14 +60,10 @@ def gather(stats, elm, X, y, sample_weight, block_size):
         else:
             scatter.addmm_(z.T, z)
     lower = np.tril(scatter.cpu().numpy())
-    if not np.isfinite(lower[:, :n_features]).all():
-        raise ValueError(
-            "`X` and `y` must give finite sums of products of features and targets in float64, "
-            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
-        )
     return Statistics(n, mean.cpu().numpy(), lower + np.tril(lower, -1).T)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def merge(a, b):
     """Return the statistics of the rows of both (parallel variance formula)."""
     n, step = a.n + b.n, b.mean - a.mean
@@ -100,6 +97,7 @@ def ridge(G, C, alpha):
     return W, R, np.sum(eigenvalues[kept] / shifted[kept]), "eigh"
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def moments(stats, n_features, fit_intercept):
     """Return the means, the features' Gram matrix, their products with the targets, and y'y.
 
@@ -110,10 +108,16 @@ def moments(stats, n_features, fit_intercept):
         # Both terms are positive: going back from the mean to the origin cancels nothing.
         scatter = scatter + n * np.outer(mean, mean)
         mean = np.zeros_like(mean)
+    if not np.isfinite(scatter).all():
+        raise ValueError(
+            "`X` and `y` must give finite sums of products of features and targets in float64, "
+            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
+        )
     G, C = scatter[:n_features, :n_features], scatter[:n_features, n_features:]
     return mean, G, C, scatter.diagonal()[n_features:]
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def fit_readout(stats, n_features, alpha, fit_intercept):
     """Return the arrays of the readout (eq. 3), the noise variance (m,) and the solver.
 
@@ -129,7 +133,7 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
     # This form of the residual is stationary in W: rounding in W enters squared.
     rss = yy - np.sum(W * (2 * C - G @ W), axis=0)
     dof_left = n - dof - fit_intercept
-    resolved = dof_left > np.sqrt(np.finfo(np.float64).eps) * n
+    resolved = (dof_left > np.sqrt(np.finfo(np.float64).eps) * n) & np.isfinite(dof_left)
     noise = np.maximum(rss, 0.0) / np.where(resolved, dof_left, np.nan)
     mu, offset = mean[:n_features], np.float64(1 / n if fit_intercept else 0)
     arrays = (W, mean[n_features:] - mu @ W, mu, R, offset)

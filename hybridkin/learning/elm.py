@@ -11,7 +11,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_c
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted
 
-from hybridkin._core.arrays import real_array
+from hybridkin._core.arrays import copied, real_array
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
 from hybridkin.learning._ridge import BLOCK_ELEMENTS, Statistics, fit_readout, gather, merge
@@ -115,7 +115,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         elm = self.module_
         size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
-            q = torch.tensor(X, dtype=torch.float64, device=elm.input_center.device)
+            q = copied(X, elm.input_center.device, np.float64)
             parts = in_blocks(partial(function, elm), q, int(self.block_size or max(1, size)))
         return self._shaped(X, [part.cpu().numpy() for part in parts])
 
@@ -339,8 +339,9 @@ class ELMRegressor(FittedNetwork):
             stats, y_ndim = Statistics(decay * n, mean, decay * scatter), self._y_ndim
         elm = elm.to(device_named(self.device))
         stats = gather(stats, elm, X, y, sample_weight, self.block_size)
+        self._solve(stats, elm)
         self._y_ndim = y_ndim
-        return self._solve(stats, elm)
+        return self
 
     def _solve(self, stats, elm):
         """Fit the readout to statistics of the features of `elm`."""

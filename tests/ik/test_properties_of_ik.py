@@ -1,0 +1,340 @@
+"""Inverse kinematics of hostile numbers: an answer within the limits, or an error that names why.
+
+Rows whose numbers are not finite hold still, say so, and change no other row: by no bit in the
+compiled core, by 1e-12 in torch, where sums of a batch are taken in another order.
+"""
+
+import warnings
+
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from saved_models import arm, tendon_chain, trunk, trunk_log
+from strategies import ERRORS, answer, arrays
+
+from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics
+from hybridkin.ik.results import IKStatus
+from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
+
+Q, X, GROUPS = trunk_log()
+LEARNED = HybridForwardModel(trunk(), ELMRegressor(4, random_state=0)).fit(Q, X)
+
+
+def line(q):
+    """One actuator that moves the tip along a line, in torch alone."""
+    return torch.cat([0.2 * q, 0.0 * q, 0.3 * q], dim=-1)
+
+
+# model, and the middle and the half width of its limits
+MODELS = {
+    "trunk": (trunk(), 0.25, 0.15),
+    "hybrid": (LEARNED, 0.25, 0.1),
+    "tendons": (tendon_chain(), 0.0, 0.004),
+    "arm": (arm(), 0.2, 3.3),  # two joints may turn all the way round
+    "line": (line, 0.0, 1.0),
+    "pose": (PoseTask(arm()), 0.2, 3.3),
+    "points": (PointsTask(tendon_chain(), [1.0, 2.0]), 0.0, 0.004),
+}
+COMPILED = ("trunk", "hybrid", "tendons", "arm")
+# Positive numbers that a user may mean, and some that nobody does.
+ODD = (np.inf, 5e-324, 1e-300, 1e300, 1e-9)
+
+
+def dofs(name):
+    task = InverseKinematics(MODELS[name][0]).settings.task
+    return task.n_actuators or 1, task.shape, sum(task.parts)
+
+
+@st.composite
+def solvers(draw, names=tuple(MODELS), odd=ODD):
+    """A name of `MODELS` and a solver with any of its options."""
+    name = draw(st.sampled_from(names))
+    model, middle, half = MODELS[name]
+    n, shape, _ = dofs(name)
+    spread = np.random.default_rng(draw(st.integers(0, 9))).uniform(0.5, 1.0, n)
+    low, high = middle - half * spread, middle + half * spread
+    if draw(st.booleans()):
+        high[0] = low[0]  # locked
+    options = {
+        "q_min": low,
+        "q_max": high,
+        "dq_max": draw(st.sampled_from([10.0 * half, *odd])),
+        "ddq_max": draw(st.sampled_from([np.inf, 100.0 * half, *odd])),
+        "weights": draw(st.sampled_from([None, 1.0 + np.arange(n), 1e-300, 1e300, 1e9**spread])),
+        "beta": draw(st.sampled_from([0.0, 1.0, 100.0])),
+        "gain": draw(st.sampled_from([None, 1.0, 1e-300])),
+        "damping": draw(st.sampled_from(["adaptive", 0.0, 0.1, 1e300])),
+        "limits": draw(st.sampled_from(["saturate", "saturate", "off"])),
+    }
+    if shape == (3,) and draw(st.booleans()):
+        options["tip_limits"] = (np.eye(3)[:2], [0.02, 0.03])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`.*` reaches")  # of units
+        return name, InverseKinematics(model, **options)
+
+
+def targets(draw, name, rows):
+    """Targets (rows, ...) for a model, hostile but for poses, which are checked."""
+    _, shape, _ = dofs(name)
+    if shape == (4, 4):
+        target = np.tile(np.eye(4), (rows, 1, 1))
+        target[:, :3, 3] = draw(arrays((rows, 3), -0.6, 0.6))
+        return target
+    return draw(arrays((rows, *shape), -0.3, 0.5))
+
+
+@st.composite
+def motions(draw, rows, names=tuple(MODELS)):
+    """Arguments of a step: a solver, configurations, targets, and what else may be given."""
+    name, ik = draw(solvers(names))
+    n, _, m = dofs(name)
+    _, middle, half = MODELS[name]
+    q = draw(arrays((rows, n), middle - 1.1 * half, middle + 1.1 * half))
+    more = {
+        "dx": draw(st.none() | arrays((rows, m))),
+        "x_measured": targets(draw, name, rows) if draw(st.booleans()) else None,
+        "dq": draw(st.none() | arrays((rows, n), -0.02 * half, 0.02 * half)),
+    }
+    return name, ik, q, targets(draw, name, rows), more
+
+
+@np.errstate(over="ignore", under="ignore")
+def finite(rows, dtype, *given):
+    """Return which rows hold finite numbers only, in a precision."""
+    flat = [np.reshape(a, (rows, -1)).astype(dtype) for a in given if a is not None]
+    return np.logical_and.reduce([np.isfinite(a).all(1) for a in flat])
+
+
+def of_rows(more, rows):
+    return {name: None if a is None else a[rows] for name, a in more.items()}
+
+
+def bounds(ik, dtype=float):
+    n = ik.settings.n_actuators or 1
+    ends = ik.settings.box(torch.zeros((), dtype=torch.from_numpy(np.empty(0, dtype)).dtype))
+    return [np.broadcast_to(end.numpy(), n) for end in ends]
+
+
+@np.errstate(all="ignore")
+def check_limits(ik, q, dq, last):
+    """Limits of q, speed and acceleration hold to the last bit, in the dtype of q."""
+    settings, (low, high) = ik.settings, bounds(ik, q.dtype)
+    if settings.limits == "off":
+        return
+    inside, new = (q >= low) & (q <= high), q + dq
+    # A speed that cannot be stopped in time leads out: there the step brakes.
+    stops = inside & (last == 0.0) if settings.accelerates else inside
+    assert ((new >= low) & (new <= high))[stops].all()
+    # From outside no actuator goes farther out, but by rounding of q.
+    out = np.isfinite(q) & ~inside & (last == 0.0)
+    before, after = (np.abs(a - np.clip(a, low, high)) for a in (q, new))
+    assert (after <= before + np.spacing(np.abs(q)))[out].all()
+    most = settings.dq_max.to(torch.from_numpy(np.array(q))) * settings.dt
+    slow = np.abs(last) <= np.broadcast_to(most.numpy(), q.shape)
+    assert (np.abs(dq) <= most.numpy())[slow].all()
+    if settings.accelerates:
+        change = (settings.ddq_max.to(torch.from_numpy(np.array(q))) * settings.dt**2).numpy()
+        change = np.broadcast_to(change, q.shape)
+        kept = np.isfinite(q) & np.isfinite(last).all(-1, keepdims=True)
+        ends = last - change, last + change
+        assert ((dq >= ends[0]) & (dq <= ends[1]))[kept].all()
+
+
+@given(motions(rows=4))
+def test_a_step_is_finite_within_the_limits_and_its_own(case):
+    name, ik, q, target, more = case
+    step, error = answer(ik.step, q, target, **more)
+    assert error is None
+    n, shape, _ = dofs(name)
+    assert step.dq.dtype == step.x.dtype == q.dtype
+    assert (step.dq.shape, step.x.shape, step.error.shape) == ((4, n), (4, *shape), (4,))
+    assert np.isfinite(step.dq).all()
+    assert (step.dq[~np.isfinite(q)] == 0.0).all()
+    with np.errstate(over="ignore", under="ignore"):
+        last = np.zeros_like(q) if more["dq"] is None else np.asarray(more["dq"], q.dtype)
+    check_limits(ik, np.asarray(q), step.dq, last)
+    counted = more if ik.settings.accelerates else {**more, "dq": None}
+    good = finite(4, q.dtype, q, target, *counted.values())
+    assert np.isnan(step.sigma_min[~good]).all()
+    # The others are what they are alone, and in any order.
+    backwards = answer(ik.step, q[::-1], target[::-1], **of_rows(more, np.s_[::-1]))[0]
+    compiled = name in COMPILED and q.dtype == float and ik.settings.tip_limits is None
+    for i in range(4):
+        alone = answer(ik.step, q[i], target[i], **of_rows(more, i))[0]
+        for field in ("dq", "x", "error", "sigma_min", "damping", "saturated"):
+            parts = [getattr(one, field) for one in (step, backwards, alone)]
+            parts = parts[0][i], parts[1][3 - i], parts[2]
+            for part in parts[1:]:
+                if compiled:
+                    assert_array_equal(part, parts[0], err_msg=field)
+                elif field != "saturated":
+                    tol = 1e-12 if q.dtype == float else 1e-4
+                    with np.errstate(over="ignore"):
+                        assert_allclose(part, parts[0], rtol=tol, atol=tol, err_msg=field)
+
+
+@given(motions(rows=5), st.sampled_from([None, 0.05]), st.booleans())
+def test_a_tracker_stays_within_the_limits_whatever_comes(case, memory, in_torch):
+    _, ik, q, target, more = case
+    settings, (low, high) = ik.settings, bounds(ik)
+    start = np.clip(np.nan_to_num(np.asarray(q[0], float)), -1e3, 1e3)
+    start = np.clip(start, low, high)
+    convert = torch.tensor if in_torch else np.array
+    tracker, error = answer(ik.tracker, convert(start), memory=memory)
+    assert error is None
+    before = start
+    for i in range(5):
+        given = of_rows(more, i)
+        given.pop("dq")
+        parts = {k: a if a is None else convert(a.copy()) for k, a in given.items()}
+        command, error = answer(tracker.step, convert(target[i].copy()), **parts)
+        assert error is None
+        command = np.asarray(command)
+        assert np.isfinite(command).all()
+        if settings.limits != "off":
+            assert ((command >= low) & (command <= high)).all()
+            most = np.broadcast_to((settings.dq_max * settings.dt).numpy(), command.shape)
+            assert (np.abs(command - before) <= most + np.spacing(np.abs(before))).all()
+        status, error = answer(lambda: (tracker.status, repr(tracker)))
+        assert error is None
+        if not finite(1, float, target[i], given["dx"]):
+            assert status[0] is IKStatus.INVALID_INPUT
+            if not settings.accelerates:
+                assert_array_equal(command, before)
+        before = command
+
+
+@given(st.data(), solvers(), st.sampled_from([0, 3]), st.sampled_from([None, None, 2]))
+def test_a_solution_stays_within_the_limits_whatever_is_asked(data, case, restarts, places):
+    name, ik = case
+    (n, shape, _), (low, high) = dofs(name), bounds(ik)
+    _, middle, half = MODELS[name]
+    target = targets(data.draw, name, 4)
+    q0 = data.draw(st.none() | arrays((4, n), middle - 2.0 * half, middle + 2.0 * half))
+    options = {"max_iter": 6, "restarts": restarts, "n_solutions": places}
+    if ik.settings.n_actuators is None:
+        q0 = np.zeros((4, n)) if q0 is None else q0
+    solution, error = answer(ik.solve, target, q0, **options)
+    assert error is None
+    dtype = target.dtype if q0 is None else np.promote_types(target.dtype, q0.dtype)
+    lead = (4,) if places is None else (4, places)
+    assert (solution.q.shape, solution.status.shape) == ((*lead, n), lead)
+    assert solution.q.dtype == dtype
+    low, high = bounds(ik, dtype)
+    known = ~np.isnan(solution.q)
+    assert (((solution.q >= low) & (solution.q <= high)) | ~known).all()
+    good = finite(4, dtype, target, q0)
+    first = np.s_[:] if places is None else np.s_[:, 0]
+    assert (solution.status[first][~good] == IKStatus.INVALID_INPUT).all()
+    missing = (solution.status == IKStatus.NO_FURTHER) | (solution.status == IKStatus.INVALID_INPUT)
+    assert known[~missing].all()
+    assert np.isfinite(solution.error[~missing]).all()
+    # What is not finite changes no other row.
+    plain = np.where(good.reshape(4, *(1,) * len(shape)), target, target[good][:1].sum(0))
+    if good.any():
+        start = None if q0 is None else np.where(good[:, None], q0, q0[good][0])
+        alone = answer(ik.solve, plain.astype(target.dtype), start, **options)[0]
+        assert_array_equal(alone.status[good], solution.status[good])
+        assert_allclose(alone.q[good], solution.q[good], rtol=0.0, atol=1e-3 * half)
+
+
+@given(st.data(), solvers(), st.sampled_from(["model", "measured", None]), st.integers(0, 4))
+def test_a_track_stays_within_the_limits_whatever_comes(data, case, feedback, rows):
+    name, ik = case
+    n, (low, high) = dofs(name)[0], bounds(ik)
+    path = targets(data.draw, name, rows)
+    t = data.draw(st.none() | arrays((rows,), 0.0, 0.01).map(np.sort))
+    readings = iter(targets(data.draw, name, rows))
+    _, middle, half = MODELS[name]
+    q0 = data.draw(st.none() | arrays((n,), middle - half, middle + half, special=()))
+    if q0 is not None or not ik.settings.n_actuators:
+        q0 = np.clip(np.zeros(n) if q0 is None else q0, low, high)
+    plant = (lambda q: next(readings)) if data.draw(st.booleans()) else None
+    track, error = answer(ik.track, path, t, q0=q0, plant=plant, feedback=feedback)
+    if error is not None:
+        return
+    assert np.isfinite(track.q).all()
+    low, high = bounds(ik, track.q.dtype)
+    assert ((track.q >= low) & (track.q <= high)).all()
+    assert (track.status[~finite(rows, track.q.dtype, path)] == IKStatus.INVALID_INPUT).all()
+    assert answer(repr, track)[1] is None
+
+
+@given(st.data())
+def test_settings_make_a_solver_or_are_refused_by_name(data):
+    name = data.draw(st.sampled_from(["trunk", "arm", "line", "pose"]))
+    n = dofs(name)[0]
+    sizes = st.sampled_from([(), (n,), (1,), (0,), (n, 1), (n + 1,)])
+    numbers = arrays(sizes, -1.0, 1.0)
+    words = st.sampled_from(["adaptive", "off", "saturate", "", None, True])
+    values = numbers | words | st.floats(width=64) | st.just([]) | st.just({})
+    pair = st.tuples(arrays(st.sampled_from([(2, 3), (1, 3), (0, 3), (3,)])), arrays((2,)))
+    options = data.draw(
+        st.dictionaries(
+            st.sampled_from(["q_min", "q_max", "dq_max", "ddq_max", "q_pref", "weights"]), values
+        )
+    )
+    for option in ("beta", "gain", "damping", "limits", "dt"):
+        if data.draw(st.integers(0, 3)) == 0:
+            options[option] = data.draw(values)
+    if data.draw(st.integers(0, 3)) == 0:
+        options["tip_limits"] = data.draw(pair | values)
+    ik, error = answer(InverseKinematics, MODELS[name][0], **options)
+    if error is not None:
+        return
+    assert answer(repr, ik)[1] is None
+    middle = MODELS[name][1]
+    q, target = np.full((2, n), middle), targets(data.draw, name, 2)
+    step, error = answer(ik.step, q, target)
+    assert error is None
+    assert np.isfinite(step.dq).all()
+    if ik.settings.limits != "off":
+        check_limits(ik, q, step.dq, np.zeros_like(q))
+
+
+@given(st.data())
+def test_tasks_are_made_or_refused_by_name(data):
+    number = st.floats(width=64) | st.integers(-3, 9) | st.sampled_from([None, "a", [], np.ones(2)])
+    size, radian = data.draw(number), data.draw(number)
+    at = data.draw(st.lists(number, max_size=3))
+    weights = data.draw(st.none() | st.lists(number, max_size=3))
+    for make in (
+        lambda: PositionTask(trunk(), size),
+        lambda: PoseTask(trunk(), radian=radian),
+        lambda: PointsTask(trunk(), at, weights),
+    ):
+        task, error = answer(make)
+        assert isinstance(error, (type(None), *ERRORS))
+        if error is None:
+            assert len(task.units) == len(task.parts)
+
+
+@given(st.data())
+def test_shapes_that_do_not_fit_are_refused_by_name(data):
+    shapes = st.sampled_from([(), (0,), (1,), (3,), (2, 3), (3, 2), (0, 3), (2, 0), (4, 2, 3)])
+    q, target, dx, tip, dq = (data.draw(arrays(shapes, 0.1, 0.4)) for _ in range(5))
+    ik = InverseKinematics(trunk(), q_min=0.1, q_max=0.4)
+    answer(ik.step, q, target, dx, x_measured=tip, dq=dq)
+    answer(ik.solve, target, q, max_iter=2, restarts=0)
+    answer(ik.track, target, q0=q)
+    tracker, error = answer(ik.tracker, q)
+    if error is None:
+        answer(tracker.step, target, dx, x_measured=tip)
+        assert np.isfinite(tracker.q).all()
+
+
+@given(st.data())
+def test_counts_and_tolerances_are_refused_by_name(data):
+    number = (
+        st.floats(width=64) | st.integers(-3, 5) | st.sampled_from([None, "a", [], (1e-3, 1.0)])
+    )
+    ik = InverseKinematics(trunk(), q_min=0.1, q_max=0.4)
+    options = data.draw(
+        st.dictionaries(st.sampled_from(["tol", "max_iter", "restarts", "n_solutions"]), number)
+    )
+    solution, error = answer(ik.solve, X[:2], Q[:2], **options)
+    assert error is not None or np.isfinite(solution.q).any()
+    answer(ik.tracker, Q[0], tol=data.draw(number), memory=data.draw(number))
+    answer(ik.track, X[:2], q0=Q[0], tol=data.draw(number), memory=data.draw(number))
