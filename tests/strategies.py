@@ -2,6 +2,7 @@
 
 import os
 import random
+import re
 import warnings
 from contextlib import contextmanager
 
@@ -116,3 +117,20 @@ def answer(function, *args, **kwargs):
         named = "`" in str(said) or any(file in str(said) for file in files)
         assert named, f"{type(said).__name__}: {said}"
     return value, error
+
+
+_NAMED = re.compile(r"\b([Xy]|[Ss]amples?|sample_weight|n_splits|array|parameter|weights)\b")
+
+
+def named(function):
+    """Return a function whose messages that name X, y or the weights have a backtick."""
+
+    def call(*args, **given):
+        try:
+            return function(*args, **given)
+        except ValueError as error:
+            if _NAMED.search(str(error)):
+                raise ValueError(f"`{error}`") from error
+            raise
+
+    return call

@@ -15,7 +15,7 @@ from hybridkin._core.rotations import cross_matrix, rotation, rotation_vector
 from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
-from hybridkin.hybrid._drift import MISFITS, SWITCH
+from hybridkin.hybrid._drift import MISFITS, SWITCH, too_far
 from hybridkin.hybrid._fit import FittedHybrid, Rows, residuals
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
@@ -67,12 +67,27 @@ def adapted(
     MacKay, Bayesian interpolation, Neural Computation 4 (1992), for the evidence.
     """
     problem = _Problem(fitted, rows, scale)
-    theta = std = np.zeros(6 + len(scale))
+    try:
+        with np.errstate(over="raise", invalid="raise"):
+            theta, residual = _likeliest_change(problem, rows.groups, noise, parameters)
+            rms = float(np.sqrt(np.mean(residual**2)))
+    except (ArithmeticError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+        raise too_far() from error
+    if not np.isfinite(theta).all():
+        raise too_far()
+    return (problem.model(theta) if theta.any() else fitted), _misfit(rms, noise)
+
+
+def _likeliest_change(
+    problem: _Problem, groups: NDArray | None, noise: float, parameters: Sequence[str]
+) -> tuple[NDArray, NDArray]:
+    """Return the most probable change theta, and the residual that it leaves, relative to noise."""
+    theta = std = np.zeros(6 + len(problem.scale))
     misfit, residual = 1.0, np.zeros(0)
     if "base" in parameters:
         theta = problem.registered(noise)
     for k in range(_ROUNDS):
-        residual, A = (_whitened(a, rows.groups) / noise for a in problem.linearised(theta))
+        residual, A = (_whitened(a, groups) / noise for a in problem.linearised(theta))
         A = A.reshape(-1, len(theta))
         target = residual.ravel() + A @ theta
         if k < _CHOOSING:
@@ -81,8 +96,7 @@ def adapted(
         previous, theta = theta, std * np.linalg.solve(system, std * (A.T @ target))
         if np.abs(theta - previous).max() <= _SETTLED:
             break
-    rms = float(np.sqrt(np.mean(residual**2)))
-    return (problem.model(theta) if theta.any() else fitted), _misfit(rms, noise)
+    return theta, residual
 
 
 def _misfit(rms: float, noise: float) -> str | None:

@@ -19,6 +19,12 @@ _ALPHAS = np.append(inf, 10.0 ** np.arange(3.0, -6.1, -0.5))  # penalties to cho
 SWITCH, MISFITS = 2.0, 2.0 ** np.arange(5)
 
 
+def too_far() -> ValueError:
+    """Return the error for rows about which the model of the fit says nothing finite."""
+    way = "leave these rows out, or check their unit"
+    return ValueError(f"`X` or `y` is too far from the rows of the fit to be computed with; {way}.")
+
+
 class Drift(NamedTuple):
     """Statistics of the residuals of a fitted model; earlier ones fade.
 
@@ -58,6 +64,8 @@ class Drift(NamedTuple):
 
         Each row multiplies the weight of all before it by `decay`, once for each repetition.
         """
+        if not np.isfinite(residual).all():
+            raise too_far()
         phi = np.column_stack([np.ones(len(q)), (q - self.center) / self.scale])
         later = weights[::-1].cumsum()[::-1] - weights
         own = weights if decay == 1.0 else (1.0 - decay**weights) / (1.0 - decay)
@@ -97,7 +105,8 @@ class Drift(NamedTuple):
         """Return the correction as a torch module q (..., n) -> (..., m)."""
         readout = 0.0 * self.moment
         if alpha < inf:
-            system = self.gram + alpha * np.eye(len(self.gram))
+            least = np.finfo(float).eps * self.gram.trace() + np.finfo(float).tiny
+            system = self.gram + max(alpha, least) * np.eye(len(self.gram))
             readout = np.linalg.solve(system, self.moment)
         coef = readout[1:].T / self.scale
         return AffineModule(coef, readout[0] - coef @ self.center)

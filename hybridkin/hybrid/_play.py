@@ -45,6 +45,8 @@ def play_of(
             "log gives no upper limit. Record larger motions, or give the width as `play`."
         ]
     operator = PlayOperator(play)
+    if operator.width.size not in (1, len(ranges)):
+        raise ValueError(f"`play` must be a width or {len(ranges)} widths, got {play!r:.200}.")
     if not np.any(operator.width >= ranges):
         return operator, []
     return operator, [

@@ -158,7 +158,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 if message is not None:
                     warnings.warn(message, stacklevel=3)
         arrays = function(self.module_.rows(), q)
-        arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
+        with np.errstate(over="ignore"):  # beyond float32
+            arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from torch import nn
 
+from hybridkin._core.arrays import number
 from hybridkin._core.model import PoseModel
 from hybridkin.calibration.measured import with_missing_markers
 from hybridkin.chains.chain import Chain
@@ -52,7 +53,7 @@ def check_settings(estimator: BaseEstimator) -> None:
     for name, value, allowed in (*chosen, ("output", model.output, _OUTPUTS)):
         if value not in allowed:
             raise ValueError(f"`{name}` must be one of {allowed}, got {value!r}.")
-    if model.coverage is not None and not 0.0 < model.coverage < 1.0:
+    if model.coverage is not None and not 0.0 < number(model.coverage, "coverage") < 1.0:
         raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}.")
     wanted = model.calibrate
     by_word = wanted is None or (isinstance(wanted, str) and wanted in ("auto", "default"))

@@ -350,7 +350,7 @@ class StepSettings(Portable):
         if n_solutions is None:
             return 1
         require(not differentiable, "`n_solutions` must be None for differentiable=True.")
-        n_solutions = whole(n_solutions, "n_solutions", 1)
+        n_solutions = whole(n_solutions, "n_solutions", 1, 10_000)
         good, way = torch.isfinite(self.spans).all(), "give finite `q_min` and `q_max`"
         require(good, f"`n_solutions` compares configurations by the range of q; {way}.")
         return n_solutions

@@ -315,7 +315,8 @@ class InverseKinematics:
         """
         settings, task = self.settings, self.settings.task
         tolerance = settings.tolerance(tol)
-        max_iter, restarts = whole(max_iter, "max_iter", 1), whole(restarts, "restarts", 0)
+        max_iter = whole(max_iter, "max_iter", 1, 1_000_000)
+        restarts = whole(restarts, "restarts", 0, 1_000_000)
         as_numpy, axes = is_numpy(x_target), len(task.shape)
         places = settings.places(n_solutions, differentiable)
         good = isinstance(x_target, Tensor) or not differentiable

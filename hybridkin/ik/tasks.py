@@ -128,7 +128,7 @@ class PositionTask(Task):
     """
 
     def __init__(self, model: object, size: int = 3) -> None:
-        found, count = as_forward_model(model), whole(size, "size", 1)
+        found, count = as_forward_model(model), whole(size, "size")
         self.models = (found.tip_model if count == 3 else found,)
         self.shape, self.parts, self.units = (count,), (count,), (1.0,)
 

@@ -121,7 +121,8 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _shaped(self, X, arrays):
         """Return arrays in the dtype of X, of a one-dimensional y without its column."""
-        outputs = (array.astype(X.dtype, copy=False) for array in arrays)
+        with np.errstate(over="ignore"):  # beyond float32
+            outputs = [array.astype(X.dtype, copy=False) for array in arrays]
         return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
 
 

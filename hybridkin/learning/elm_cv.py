@@ -250,6 +250,7 @@ class _Candidate(NamedTuple):
     left_out: LeftOut
 
 
+@np.errstate(all="ignore")  # errors that overflow lose
 def _candidate(params, relevance, task):
     X, targets, sample_weight, weights, splits, alphas = task
     asked = ELMRegressor(**params)

@@ -44,7 +44,8 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
     """Return the rows, `y` in float64, and their weights."""
     checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
     X, y, sample_weight = map(table, (X, y, sample_weight), ("X", "y", "sample_weight"))
-    X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
+    with np.errstate(invalid="ignore"):  # both infinities in a sum
+        X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
     if sample_weight is not None:
         sample_weight = _check_sample_weight(
             sample_weight, X, dtype=np.float64, ensure_non_negative=True
@@ -64,7 +65,8 @@ def check_inputs(estimator, X):
         if good:
             return np.ascontiguousarray(X)
     X = table(X, "X")
-    return np.asarray(validate_data(estimator, X, reset=False, dtype=DTYPES, order="C"))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(validate_data(estimator, X, reset=False, dtype=DTYPES, order="C"))
 
 
 def draw_layer(params, X, sample_weight):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from saved_models import arm, trunk, trunk_log
 from sklearn.linear_model import LinearRegression
-from strategies import answer, arrays
+from strategies import answer, arrays, named
 
 from hybridkin import ELMRegressor, HybridForwardModel, choose_rows
 
@@ -75,7 +75,7 @@ def test_a_fit_is_finite_or_its_rows_are_refused(data, log):
         coverage=data.draw(st.sampled_from([None, None, 0.5])),
         calibrate=data.draw(st.sampled_from([None, None, ["radii"], ["base"]])),
     )
-    fitted, error = answer(model.fit, *log)
+    fitted, error = answer(named(model.fit), *log)
     if error is not None:
         return
     q = log[0]
@@ -90,7 +90,7 @@ def test_a_fit_is_finite_or_its_rows_are_refused(data, log):
 @given(st.sampled_from(sorted(FITTED)), arrays((4, 3), 0.1, 0.4), st.sampled_from(METHODS))
 def test_rows_are_answered_each_alone_or_refused(name, q, method):
     model = FITTED[name]
-    value, error = answer(getattr(model, method), q)
+    value, error = answer(named(getattr(model, method)), q)
     if error is not None:
         assert not np.isfinite(q).all()
         return
@@ -116,14 +116,14 @@ def test_a_stream_follows_or_is_refused(data, log):
     odd = st.sampled_from([0.98, 1.0, 0.0, 5e-324, 1e-300, np.nan, -1.0, 1e300, "a", None])
     q, x, weights, groups = log
     given = {"decay": data.draw(odd), "alpha": data.draw(st.none() | odd)}
-    _, error = answer(model.partial_fit, q, x, weights, **given)
+    _, error = answer(named(model.partial_fit), q, x, weights, **given)
     after = model.predict(Q)
     assert np.isfinite(after).all()
     if error is not None:
         assert_array_equal(after, before)
     names = data.draw(st.sampled_from([("base",), ("actuator_zeros",), ("base", "actuator_zeros")]))
     before = after
-    _, error = answer(model.adapt, q, x, parameters=names, groups=groups)
+    _, error = answer(named(model.adapt), q, x, parameters=names, groups=groups)
     after = model.predict(Q)
     assert np.isfinite(after).all()
     if error is not None:

@@ -727,7 +727,7 @@ def test_bad_settings_say_what_was_needed(settings, message):
         (lambda ik: ik.step(["a"] * 9, np.zeros(3)), "`q` must be numeric"),
         (lambda ik: ik.solve(np.zeros(3), tol=0.0), "`tol` must be positive"),
         (lambda ik: ik.solve(np.zeros(3), tol=(1e-3, 1e-2)), "`tol` must be one number"),
-        (lambda ik: ik.solve(np.zeros(3), max_iter=0), "`max_iter` must be at least 1"),
+        (lambda ik: ik.solve(np.zeros(3), max_iter=0), "`max_iter` must be 1 to"),
         (lambda ik: ik.track(np.zeros(3)), r"`path` must have shape \(T, 3\)"),
         (lambda ik: ik.track(np.zeros((3, 3)), [0.0, 1.0]), r"`t` must have shape \(3,\)"),
         (lambda ik: ik.track(np.zeros((2, 3)), [1.0, 1.0]), "increasing"),

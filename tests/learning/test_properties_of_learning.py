@@ -3,13 +3,11 @@
 Where scikit-learn checks an argument its message names it without backticks.
 """
 
-import re
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import answer, arrays
+from strategies import answer, arrays, named
 
 from hybridkin import ELMRegressor, ELMRegressorCV
 
@@ -24,20 +22,6 @@ LAYERS = {
 }
 ALPHAS = st.sampled_from([0.1, 0.0, 1e-11, 5e-324, 1e-300, 1e300])
 WEIGHTS = (0.0, 0.0, 0.0, 1.0, np.nan, -1.0, np.inf, 5e-324, 1e300)
-
-
-def named(function):
-    """Return a function whose messages that name X, y or the weights have a backtick."""
-
-    def call(*args, **given):
-        try:
-            return function(*args, **given)
-        except ValueError as error:
-            if re.search(r"\b([Xy]|[Ss]amples?|sample_weight|n_splits|array|parameter|weights)\b", str(error)):
-                raise ValueError(f"`{error}`") from error
-            raise
-
-    return call
 
 
 def scaling(params, d):
@@ -76,7 +60,8 @@ def check_answers(model, X, shape):
         for i in range(n):
             alone = getattr(model, method)(X[i : i + 1])[0]
             tol = 1e-5 if X.dtype == np.float32 else 1e-11
-            assert_allclose(alone, value[i], rtol=tol, atol=tol * size)
+            with np.errstate(over="ignore"):
+                assert_allclose(alone, value[i], rtol=tol, atol=tol * min(float(size), 1e300))
 
 
 @given(rows(), st.fixed_dictionaries(LAYERS), ALPHAS, st.sampled_from([1.0, 1e-300, 1e3]))
@@ -142,5 +127,5 @@ def test_networks_that_choose_are_finite_or_refuse(data, given_rows):
     fitted, error = answer(named(model.fit), X, y, weights, groups)
     if error is None:
         assert np.isfinite(fitted.module_.output_weights.numpy()).all()
-        assert np.isfinite(fitted.best_score_)
+        assert fitted.best_score_ <= 0.0
         check_answers(fitted, X, y.shape[1:])
