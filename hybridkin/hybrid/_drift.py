@@ -20,9 +20,9 @@ SWITCH, MISFITS = 2.0, 2.0 ** np.arange(5)
 
 
 def too_far() -> ValueError:
-    """Return the error for rows about which the model of the fit says nothing finite."""
+    """Return the error for rows of which the models say nothing finite."""
     way = "leave these rows out, or check their unit"
-    return ValueError(f"`X` or `y` is too far from the rows of the fit to be computed with; {way}.")
+    return ValueError(f"`X` or `y` holds numbers too large for the model; {way}.")
 
 
 class Drift(NamedTuple):

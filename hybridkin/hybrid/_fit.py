@@ -14,6 +14,7 @@ from sklearn.base import BaseEstimator, clone
 from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 
+from hybridkin._core.arrays import countable
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.units import motion_message
@@ -22,6 +23,7 @@ from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.calibration.measured import moved_directions, points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
+from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._features import Features, HiddenFeatures, PoseFeatures, QuadraticFeatures
 from hybridkin.hybrid._guards import GroupDistance, fit_guard
 from hybridkin.hybrid._kernel import tuned_kernel
@@ -34,6 +36,8 @@ from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import error_module
+
+_COUNTS = 1e12  # weights farther apart count in no sum of float64
 
 
 class Rows(NamedTuple):
@@ -203,6 +207,12 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
             f"`X` must hold at least {least} different rows of positive weight, got "
             f"n_samples={n_rows}; record at least {10 * (n + 1)}."
         )
+    low, high = rows.counts.min(), rows.counts.max()
+    if not (low > high / _COUNTS and 1.0 / _COUNTS < high < _COUNTS):
+        raise ValueError(
+            f"`sample_weight` must lie within a factor of {_COUNTS:g} of each other and of 1 where "
+            f"rows count at all, got {low:g} to {high:g}; 0 leaves a row out."
+        )
     if not learned or n_rows >= max(20, 2 * (n + 1)):
         return []
     return [
@@ -277,6 +287,8 @@ def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: st
         return pose_errors(cast(PoseModel, mechanical), q, y)
     with torch.no_grad():
         tips = mechanical(q).numpy()
+    if not countable(tips).all():
+        raise too_far()
     if tips.shape != (y.shape if y.ndim == 2 else (len(y), 1)):
         raise ValueError(
             f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
@@ -351,7 +363,10 @@ def _fit_features(
     x = torch.from_numpy(rows.tips)
     weight = None if rows.weights is None else torch.from_numpy(rows.weights)
     given = rows.q, x, part.coupling, weight, rows.groups
-    return fit_readout(mechanical, features, *given, alphas, noise_ratio, left_out)
+    try:
+        return fit_readout(mechanical, features, *given, alphas, noise_ratio, left_out)
+    except torch.linalg.LinAlgError as error:
+        raise too_far() from error
 
 
 def _named(kind: str, mechanical: ForwardModel, q: Tensor) -> Features:

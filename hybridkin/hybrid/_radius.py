@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin.calibration.measured import distances, folds
+from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid, with_geometry_chosen
 from hybridkin.hybrid._selection import select
 
@@ -59,7 +60,10 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():
             inside[test] = module.in_domain(q).numpy()
-            errors[test] = np.nanmax(distances(module(q).numpy(), y[test]), axis=1)
+            x = module(q).numpy()
+        if not np.isfinite(x).all():
+            raise too_far()
+        errors[test] = np.nanmax(distances(x, y[test]), axis=1)
     names, of = np.unique(groups[inside], return_inverse=True)
     radius = _quantile(errors[inside], of, rows.counts[inside], coverage)
     found, n = Radius(radius, inf, coverage, len(y)), len(names)
