@@ -417,3 +417,33 @@ def test_inputs_are_not_changed():
 def test_numbers_that_are_none_are_refused_by_name(name, call, value):
     with pytest.raises((TypeError, ValueError), match=f"`{name}`"):
         call(value)
+
+
+def test_one_row_read_backwards():
+    q, x = Q[:1][::-1], X[:1][::-1]
+    model = ELMRegressor(4, random_state=0).fit(q, x)
+    assert_allclose(model.output_weights_, copy.deepcopy(model).fit(Q[:1], X[:1]).output_weights_)
+    assert_allclose(NETWORK.leverage(q), NETWORK.leverage(Q[:1]))
+    assert_allclose(IK.step(q, x).dq, IK.step(Q[:1], X[:1]).dq)
+    assert_allclose(IK.solve(x, q).q, IK.solve(X[:1], Q[:1]).q)
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("size", lambda value: tasks.PositionTask(trunk(), value)),
+        ("weights", lambda value: tasks.PointsTask(trunk(), [1.0], [value])),
+        ("max_iter", lambda value: IK.solve(X[:1], max_iter=value)),
+        ("restarts", lambda value: IK.solve(X[:1], restarts=value)),
+        ("n_solutions", lambda value: IK.solve(X[:1], n_solutions=value)),
+        ("memory", lambda value: IK.tracker(Q[0], memory=value)),
+        ("coverage", lambda value: HybridForwardModel(trunk(), coverage=value).fit(Q, X)),
+        ("play", lambda value: HybridForwardModel(trunk(), play=[0.0, value]).fit(Q, X)),
+    ],
+)
+@pytest.mark.parametrize("value", ["a", 1e300, -1.0, np.nan, []])
+def test_counts_and_sizes_are_refused_by_name(name, call, value):
+    if (name, value) in (("weights", 1e300), ("memory", 1e300)):
+        return
+    with pytest.raises((TypeError, ValueError), match=f"`({name}|width)`"):
+        call(value)

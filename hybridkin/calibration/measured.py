@@ -58,7 +58,8 @@ def check_unscaled(name: str, values: NDArray, meant: str) -> None:
     """Raise where a scaler has turned all columns (N, k) into numbers without a unit."""
     if len(values) < 3:
         return
-    low, high, mean, std = (f(values, axis=0) for f in (np.min, np.max, np.mean, np.std))
+    rows = values.astype(np.float64, copy=False)
+    low, high, mean, std = (f(rows, axis=0) for f in (np.min, np.max, np.mean, np.std))
     standard = np.abs([mean, std - 1.0]).max() < 1e-3
     if standard or (np.isin(low, (0.0, -1.0)).all() and np.abs(high - 1.0).max() < 1e-6):
         scaler = "StandardScaler" if standard else "MinMaxScaler"

@@ -11,6 +11,7 @@ from sklearn.exceptions import NotFittedError
 from torch.testing import assert_close
 
 from hybridkin import (
+    ConstantCurvatureChain,
     ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
@@ -290,3 +291,21 @@ def test_the_tracker_runs_an_adapted_model_in_the_compiled_core(trunk):
     found = ik.solve(target, q0=np.full(9, 0.25))
     assert_allclose(model.predict(found.q[None])[0], target, rtol=0, atol=1e-4)
     assert ik.tracker(found.q).backend.startswith("compiled") == native.available()
+
+
+def test_rows_too_large_for_the_model_are_refused():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (30, 3))
+    x = ConstantCurvatureChain([0.06])(torch.from_numpy(q)).numpy()
+    model = HybridForwardModel(ConstantCurvatureChain([0.05]), "linear").fit(q, x)
+    before, far = model.predict(q), q[:3].copy()
+    far[0, 1] = 9e99
+    for call in (model.adapt, model.partial_fit):
+        with pytest.raises(ValueError, match="`X` or `y` holds numbers too large"):
+            call(far, x[:3])
+        np.testing.assert_array_equal(model.predict(q), before)
+    with pytest.raises(ValueError, match="`X` or `y` holds numbers too large"):
+        copy.deepcopy(model).fit(np.vstack([far, q]), np.vstack([x[:3], x]))
+    weights = np.where(np.arange(30) == 3, 1e300, 1.0)
+    with pytest.raises(ValueError, match="`sample_weight` must lie within a factor"):
+        copy.deepcopy(model).fit(q, x, weights)
+    assert np.isfinite(model.partial_fit(q[:1], x[:1] + 0.01, alpha=5e-324).predict(q)).all()

@@ -641,3 +641,20 @@ def test_clear_errors():
         with pytest.raises(ValueError, match=name):
             fitted.merge(other)
     assert_same_model(fitted, elm(input_scaling=BOUNDS).fit(X, Y))
+
+
+def test_sums_that_overflow_are_refused_and_leave_the_model():
+    X, y = np.linspace(0.0, 1.0, 12).reshape(6, 2), np.linspace(0.0, 1.0, 6)
+    model = ELMRegressor(3, random_state=0).fit(X, y)
+    before = model.predict(X)
+    for bad in (np.full((6, 2), 1e300), np.full(6, 1e300)):
+        with pytest.raises(ValueError, match="`X` and `y` must give finite sums"):
+            model.partial_fit(X, bad.reshape(6, -1)[:, 0])
+        with pytest.raises(ValueError, match="`X` and `y` must give finite sums"):
+            model.fit(X, bad)
+        np.testing.assert_array_equal(model.predict(X), before)
+    both = np.array([[np.inf, 0.0], [-np.inf, 0.0]])
+    with pytest.raises(ValueError, match="infinity"):
+        model.predict(both)
+    wide = ELMRegressor(3, direct_link=True, random_state=0).fit(X, 1e30 * y)
+    assert np.isinf(wide.predict(np.full((1, 2), 1e30, dtype=np.float32))).all()

@@ -315,3 +315,36 @@ def test_poses_are_solved_as_in_torch(name):
         turn = Rotation.from_matrix(at[:, :3, :3] @ x[reached][:, :3, :3].swapaxes(1, 2))
         assert np.linalg.norm(at[:, :3, 3] - x[reached][:, :3, 3], axis=1).max() <= 1e-3
         assert turn.magnitude().max() <= 1e-2 + 1e-9
+
+
+@pytest.mark.parametrize("limits", [{}, {"dq_max": 0.05}, {"ddq_max": 1.0}, {"weights": 2.0}])
+def test_what_is_infinite_or_overflows_holds_still(limits):
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, **limits)
+    q, x = np.tile(np.full(9, 0.25), (6, 1)), np.tile([0.05, 0.05, 0.75], (6, 1))
+    q[0, 0], q[1, 1], x[2, 0], x[3, 0], x[4] = np.inf, -np.inf, np.inf, 1e300, 1e308
+    for step in (ik.step(q, x), ik.step(*in_torch(q, x))):
+        dq, sigma_min = np.asarray(step.dq), np.asarray(step.sigma_min)
+        np.testing.assert_array_equal(dq[:5], 0.0)
+        assert np.isfinite(dq[5]).all()
+        assert dq[5].any()
+        assert np.isnan(sigma_min).tolist() == [True] * 5 + [False]
+    for i in range(5):
+        np.testing.assert_array_equal(ik.step(q[i], x[i]).dq, 0.0)
+    for tracker in (ik.tracker(q[5]), ik.tracker(torch.from_numpy(q[5]))):
+        for target in x[2:5]:
+            np.testing.assert_array_equal(tracker.step(target), q[5])
+            assert tracker.status is IKStatus.INVALID_INPUT
+    # A row that is not known in part leads the others back into the limits.
+    q[0, 3] = 0.5
+    dq = ik.step(q[0], x[0]).dq
+    assert dq[3] < 0.0
+    np.testing.assert_array_equal(np.delete(dq, 3), 0.0)
+
+
+def test_one_target_for_several_starts():
+    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4)
+    q0 = np.array([np.full(9, 0.2), np.linspace(0.15, 0.35, 9), np.full(9, np.inf)])
+    for target in (np.array([0.05, 0.05, 0.75]), torch.tensor([0.05, 0.05, 0.75])):
+        solution = ik.solve(target, q0, restarts=2)
+        status = [IKStatus.CONVERGED, IKStatus.CONVERGED, IKStatus.INVALID_INPUT]
+        assert np.asarray(solution.status).tolist() == status
