@@ -293,6 +293,7 @@ def test_the_tracker_runs_an_adapted_model_in_the_compiled_core(trunk):
     assert ik.tracker(found.q).backend.startswith("compiled") == native.available()
 
 
+@pytest.mark.filterwarnings("ignore:`")  # a row of 1e99 is no usual one
 def test_rows_too_large_for_the_model_are_refused():
     q = np.random.default_rng(0).uniform(0.2, 0.3, (30, 3))
     x = ConstantCurvatureChain([0.06])(torch.from_numpy(q)).numpy()
