@@ -216,9 +216,8 @@ class InverseKinematics:
         Returns
         -------
         Step
-            `dq` and what came with it. A row with a NaN or infinite input, or one whose square
-            overflows, holds still, with `ddq_max` after it has braked; its `sigma_min` is NaN. From
-            outside the limits its actuators walk back, but one that is NaN or infinite never moves.
+            `dq` and what came with it. A row with a NaN, infinite or overflowing input holds still,
+            with `ddq_max` after it has braked; outside the limits its known actuators walk back.
         """
         core = core_of(self.settings)
         found = None if core is None or dq is not None else core.step(q, x_target, dx, x_measured)
@@ -243,7 +242,7 @@ class InverseKinematics:
         lead = leading(given)
         rows, target, *others = (rows_of(a, lead, trailing) for a, trailing in given)
         before = None if last is None else others.pop()
-        before = before if settings.accelerates else None  # nothing else counts from it
+        before = before if settings.accelerates else None
         feed_forward = None if dx is None else settings.dt * others.pop()
         measured = others.pop() if others else None
         if core is not None and as_numpy and rows.dtype == torch.float64:
@@ -302,8 +301,7 @@ class InverseKinematics:
         Returns
         -------
         IKSolution
-            Never raises for an unreachable target; a NaN target or start marks only its own row,
-            which stays at the start, with NaN in place of what is infinite there.
+            Never raises for an unreachable target; a NaN target or start marks only its own row.
 
         Notes
         -----

@@ -17,6 +17,7 @@ from strategies import ERRORS, answer, arrays
 from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
+from hybridkin.native import available
 
 Q, X, GROUPS = trunk_log()
 LEARNED = HybridForwardModel(trunk(), ELMRegressor(4, random_state=0)).fit(Q, X)
@@ -37,7 +38,7 @@ MODELS = {
     "pose": (PoseTask(arm()), 0.2, 3.3),
     "points": (PointsTask(tendon_chain(), [1.0, 2.0]), 0.0, 0.004),
 }
-COMPILED = ("trunk", "hybrid", "tendons", "arm")
+COMPILED = ("trunk", "hybrid", "tendons", "arm") if available() else ()
 # Positive numbers that a user may mean, and some that nobody does.
 ODD = (np.inf, 5e-324, 1e-300, 1e300, 1e-9)
 
