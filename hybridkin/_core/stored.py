@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, check_shape
 
+_LARGEST = 1e75  # of a number: the squares of larger ones, and their products, overflow
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
 
@@ -144,8 +145,8 @@ class Stored:
             raise ValueError(f"{name!r} must be float32 or float64, got {array.dtype}")
         if shape is not None:
             check_shape(array, name, shape)
-        if finite and not np.isfinite(array).all():
-            raise ValueError(f"{name!r} must be finite")
+        if finite and not (np.abs(array) < _LARGEST).all():
+            raise ValueError(f"{name!r} must be finite, and less than {_LARGEST:g}")
         return array
 
     def tensors(self, **shapes: str) -> dict[str, Tensor]:
@@ -162,6 +163,8 @@ class Stored:
             array = self.array(name, [lengths.get(letter, letter) for letter in letters])
             lengths |= dict(zip(letters, array.shape, strict=True))
             found[name] = torch.tensor(array, device="cpu")
+        if len({tensor.dtype for tensor in found.values()}) > 1:
+            raise ValueError(f"the arrays of {self.kind!r} must be of one type")
         return found
 
     def part(self, name: str) -> Stored:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain
 
 UNLIMITED = (-math.inf, math.inf)
+_BYTES = 4_000_000  # of a robot description
+_MOST = 1000  # moving joints
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 
 
@@ -43,6 +45,8 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
             name = joint.name or f"joint_{len(moving) + 1}"
             moving.append(joint._replace(origin=pending, name=name))
             pending = np.eye(4)
+    if len(moving) > _MOST:
+        raise ValueError(f"an arm must have at most {_MOST} moving joints, got {len(moving)}.")
     drivers = {joint.name: joint for joint in moving}
     factors = [joint.factor * (joint.name == name) for joint in moving for name in drivers]
     couplings = np.reshape(factors, (len(moving), len(drivers)))
@@ -78,16 +82,19 @@ def source_of(text_or_path: str | PathLike[str]) -> str | Path:
     path = Path(text_or_path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"`text_or_path` must be XML text, starting with '<', or an existing file, got {path}."
+            f"`text_or_path` must be XML text, starting with '<', or an existing file, got "
+            f"{str(path)!r:.200}."
         )
+    if path.stat().st_size > _BYTES:
+        raise ValueError(f"`text_or_path` must be at most {_BYTES} bytes long, {path} is longer.")
     return path
 
 
-def one_of(name: str, known: Sequence[str], what: str) -> str:
+def one_of(name: str, known: Collection[str], what: str) -> str:
     if name not in known:
-        close = difflib.get_close_matches(name, known, n=1)
+        close = difflib.get_close_matches(name, list(known)[:_MOST], n=1)
         hint = f"did you mean {close[0]!r}? It has" if close else "it has"
-        raise ValueError(f"{what} {name!r} is not in the robot; {hint} {list(known)}.")
+        raise ValueError(f"{what} {name!r} is not in the robot; {hint} {[*known]!s:.1000}.")
     return name
 
 

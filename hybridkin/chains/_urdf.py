@@ -28,6 +28,7 @@ _LOCKED = (
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 _FREE = {"floating": ("x", "y", "z", "yaw", "pitch", "roll"), "planar": ("x", "y", "yaw")}
 _AXES = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
+_MOST = 64  # joints that mimic each other in a row
 _SAME = 1e-12  # [m] or [-]: of origins that need not be written
 _TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 
@@ -138,9 +139,10 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
         doubled = sorted(name for name, times in Counter(given).items() if times > 1)
         if doubled:
             raise ValueError(f"every {what} of a URDF must occur once, got {doubled} more often.")
+    known = dict.fromkeys(links)
     for name, parent, child in zip(named, parents, children, strict=True):
-        one_of(parent, links, f"<parent> of joint {name!r}")
-        one_of(child, links, f"<child> of joint {name!r}")
+        one_of(parent, known, f"<parent> of joint {name!r}")
+        one_of(child, known, f"<child> of joint {name!r}")
     try:
         tree = zip(children, parents, strict=True)
         TopologicalSorter({child: [parent] for child, parent in tree}).prepare()
@@ -181,6 +183,8 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
         if name in followed:
             raise ValueError(f"joints must not mimic each other in a circle, got {followed}.")
         followed.append(name)
+        if len(followed) > _MOST:
+            raise ValueError(f"joint {followed[0]!r} must mimic through at most {_MOST} others.")
         driver = by_name.get(name) or defaultdict(_Tag, joint=_Tag(type=kind))  # not in the file
     driven_by = driver["joint"].get("type", "")
     if not {kind, driven_by} <= {*_ONE_AXIS, "fixed"}:

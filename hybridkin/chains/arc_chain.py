@@ -427,7 +427,8 @@ class ArcChain(MarkedChain):
         """Return the chain of a description."""
         given = stored_arguments(stored, cls._entries)
         chain = cls(**given, dtype=torch.from_numpy(given["base"]).dtype)
-        chain = chain.with_geometry(angles=torch.from_numpy(stored.array("angles")))
+        angles = stored.array("angles").astype(given["base"].dtype, copy=False)
+        chain = chain.with_geometry(angles=torch.from_numpy(angles))
         at = stored.value("tip_at", float)
         markers = stored.settings.get("markers", [[at, 0.0, 0.0, 0.0]])  # earlier files have none
         markers = [*markers[:-1], [at, *markers[-1][1:]]]

@@ -20,7 +20,8 @@ from hybridkin._core.units import METRES, UNITS
 EXIT_CODES = """\
 exit codes: 0 success; 1 the result is not as asked for (points not reached, errors above
 --fail-above, a log that does not pass its check in `describe`); 2 an error of input, among them a
-log that does not pass its check before a fit, and a path out of reach; 130 interrupted."""
+log that does not pass its check before a fit, and a path out of reach; 130 interrupted, 143
+terminated."""
 
 
 def parser() -> argparse.ArgumentParser:

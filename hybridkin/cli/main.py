@@ -6,10 +6,12 @@ import argparse
 import contextlib
 import os
 import re
+import signal
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -42,13 +44,16 @@ class _Outcome(NamedTuple):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, see `hybridkin --help`."""
     arguments = parser().parse_args(argv)
+    before = _stamps(arguments)
     try:
-        with contextlib.closing(_Bars()) as bars, warnings.catch_warnings():
+        with contextlib.closing(_Bars()) as bars, warnings.catch_warnings(), _terminable():
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = bars.warn
             outcome = _RUN[arguments.command](arguments, bars)
-    except KeyboardInterrupt:
-        return failed("interrupted; nothing was written", 130, arguments.json)
+    except KeyboardInterrupt as stop:
+        fate = "nothing was written" if _stamps(arguments) == before else "all was written"
+        code = 143 if isinstance(stop, _Terminated) else 130
+        return failed(f"interrupted; {fate}", code, arguments.json)
     except (*_OF_INPUT, hybridkin.simulation.NotSettledError) as error:
         return failed(f"error: {error}", 2, arguments.json)
     written = "\n  ".join(["\n\nWrote", *map(str, outcome.paths)]) if outcome.paths else ""
@@ -61,6 +66,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, `head` for example, has what it wants
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
     return outcome.code
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end."""
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM interrupt as SIGINT does, unless the caller handles it."""
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise _Terminated
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:
+    """Return the files of --out, each with its number and time on the disk."""
+    out = vars(arguments).get("out") or Path(os.devnull)
+    files = [file for file in (out.glob("[!.]*") if out.is_dir() else [out]) if file.is_file()]
+    return {file: (file.stat().st_ino, file.stat().st_mtime_ns) for file in files}
 
 
 class _Bars:

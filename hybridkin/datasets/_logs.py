@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +19,10 @@ from typing_extensions import Self
 from hybridkin._core.arrays import as_path, check_shape, countable, labels, one_of, real_array
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._log_report import named_rows
+from hybridkin.datasets._npz import arrays_of, check_expansion
 
 _DELIMITERS = (",", ";", "\t")
+_MOST_COLUMNS, _LONGEST = 10_000, 256  # of a file; characters of the name of a motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,12 +225,22 @@ def load_log(
     )
 
 
+@dataclass(frozen=True)
+class _Cells:
+    """The columns of a text, with empty cells where rows are short; made when they are read."""
+
+    by_row: list[list[str]]
+
+    def __getitem__(self, i: int) -> list[str]:
+        return [row[i] if i < len(row) else "" for row in self.by_row]
+
+
 class _Table(NamedTuple):
     """The columns of a file as they stand in it; of text also the line of every row."""
 
     path: Path
     header: list[str]
-    columns: Sequence[NDArray | Sequence[str]]
+    columns: Sequence[NDArray | Sequence[str]] | _Cells
     lines: NDArray | None = None
 
     def names(self, argument: str, asked: Sequence[str]) -> list[str]:
@@ -262,7 +273,8 @@ class _Table(NamedTuple):
         if len(self.header) == 1:
             hint = "it has one column only, check `delimiter`."
         raise ValueError(
-            f"There is no column {name!r} in {path!r}; {hint} Its columns: {self.header}."
+            f"There is no column {name!r} in {path!r}; {hint:.400} Its columns: "
+            f"{self.header!s:.1000}."
         )
 
     def numbers(self, name: str) -> NDArray:
@@ -271,10 +283,12 @@ class _Table(NamedTuple):
         if self.lines is not None:
             cells = zip(column, self.lines, strict=True)
             return np.array([_number(str(cell), name, line, self.path) for cell, line in cells])
+        kind = np.asarray(column).dtype
         try:
+            if kind.kind in "cV":  # their real part would be taken
+                raise TypeError(kind)
             return np.asarray(column).astype(float)
-        except (TypeError, ValueError) as error:
-            kind = np.asarray(column).dtype
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(
                 f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
             ) from error
@@ -284,7 +298,13 @@ class _Table(NamedTuple):
         found, labels = {name: self.numbers(name) for name in names}, None
         sizes = {name: len(column) for name, column in found.items()}
         if groups is not None:
-            labels = np.array([str(value).strip() for value in self.column(groups)])
+            named = [str(value).strip() for value in self.column(groups)]
+            if (longest := max(map(len, named), default=0)) > _LONGEST:
+                raise ValueError(
+                    f"`groups` must name motions in at most {_LONGEST} characters, but column "
+                    f"{groups!r} of {str(self.path)!r} has {longest} in a cell; check the file."
+                )
+            labels = np.array(named)
             sizes[groups] = len(labels)
         if len({*sizes.values()}) > 1:
             raise ValueError(
@@ -325,25 +345,28 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
     if not header:
         raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
     n = len(header)
+    if n > _MOST_COLUMNS:
+        raise ValueError(f"{str(path)!r} must have at most {_MOST_COLUMNS} columns, got {n}.")
     for line, row in rows:
         if len(row) > n:
             raise ValueError(
                 f"Line {line} of {str(path)!r} has {len(row)} cells, the header {n}; check "
                 f"`delimiter` (now {delimiter!r})."
             )
-    cells = [*zip(*(row + [""] * (n - len(row)) for _, row in rows), strict=True)] or [()] * n
+    cells = _Cells([row for _, row in rows])
     return _Table(path, header, cells, np.array([line for line, _ in rows], dtype=int))
 
 
 def _read_npz(path: Path) -> _Table:
     """Return the arrays (N,) of a file, columns of arrays (N, k) as ``name[i]``."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, BadZipFile, AttributeError) as error:
-        raise ValueError(f"{str(path)!r} is not an npz file of plain arrays: {error}.") from error
+    arrays = arrays_of(path)
     columns = {name: array for name, array in arrays.items() if array.ndim == 1}
     for name, array in arrays.items():
+        if array.ndim == 2 and array.shape[1] > _MOST_COLUMNS:
+            raise ValueError(
+                f"{name!r} of {str(path)!r} must have at most {_MOST_COLUMNS} columns, got "
+                f"{array.shape[1]}; transpose it where rows and columns are swapped."
+            )
         columns |= {f"{name}[{i}]": c for i, c in enumerate(array.T) if array.ndim == 2}
     return _Table(path, [*columns], [*columns.values()])
 
@@ -352,15 +375,26 @@ def _read_parquet(path: Path) -> _Table:
     try:
         import pandas as pd
 
+        _check_rows(path)
         frame = pd.read_parquet(path)
     except ImportError as error:
         raise ImportError(
             f"{str(path)!r} needs pandas and pyarrow to be read (pip install pandas pyarrow); or "
             "save the log as CSV or npz."
         ) from error
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{str(path)!r} is not a parquet file: {error}.") from error
+    except Exception as error:  # of its metadata, pyarrow and pandas have many
+        raise ValueError(f"{str(path)!r} is not a parquet file: {error!s:.200}.") from error
     return _Table(path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns])
+
+
+def _check_rows(path: Path) -> None:
+    """Raise where a parquet file has more rows than fit its size, as of one value repeated."""
+    try:
+        from pyarrow.parquet import read_metadata
+    except ImportError:  # read by fastparquet
+        return
+    found = read_metadata(path)
+    check_expansion(path, 8 * found.num_rows * found.num_columns)
 
 
 def _number(cell: str, name: str, line: int, path: Path) -> float:
@@ -371,7 +405,7 @@ def _number(cell: str, name: str, line: int, path: Path) -> float:
         return float(text)
     except ValueError:
         raise ValueError(
-            f"Line {line} of {str(path)!r}, column {name!r}: a number is needed, got {text!r}; "
+            f"Line {line} of {str(path)!r}, column {name!r}: a number is needed, got {text!r:.60}; "
             "correct the cell (an empty one counts as missing, see `drop_invalid`; decimals take "
             "a point)."
         ) from None

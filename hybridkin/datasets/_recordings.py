@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import inspect
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
 from hybridkin.datasets._logs import load_log
+from hybridkin.datasets._npz import arrays_of
 
 DATA_HOME = "HYBRIDKIN_DATA"
 
@@ -110,10 +113,10 @@ def load_armlab(data_home: str | os.PathLike[str] | None = None) -> Bunch:
         If the file is not there; the message names its source.
     """
     path, origin = _locate(data_home, "armlab_3cable", "armlab_3cable.npz")
-    with np.load(path) as file:
-        # Commands are multiples of 0.1 mm, stored in single precision.
-        tenths = np.rint(file["cable_shortening_mm"].astype(float) * 10).astype(int)
-        x, row = file["tip_mm"] * 1e-3, file["row"]
+    file = _arrays(path, {"cable_shortening_mm": (3,), "tip_mm": (3,), "row": ()})
+    # Commands are multiples of 0.1 mm, stored in single precision.
+    tenths = np.rint(file["cable_shortening_mm"].astype(float) * 10).astype(int)
+    x, row = file["tip_mm"] * 1e-3, file["row"]
     groups = np.where(tenths[:, 0] == 0, tenths[:, 1], 100 + tenths[:, 0])
     return Bunch(
         q=tenths * -1e-4 + 0.0,
@@ -150,19 +153,35 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
         If the file is not there; the message names its source.
     """
     path, origin = _locate(data_home, "asl_trunk_static", "asl_trunk_static.npz")
-    with np.load(path) as file:
-        disks = file["disk_pos_m"]
-        return Bunch(
-            q=file["u"].astype(float),
-            x=disks[:, -1].copy(),
-            disks=disks,
-            groups=file["run_id"].astype(int),
-            run_names=file["run_names"],
-            kind=file["kind"],
-            units={"q": "1", "x": "m"},
-            DESCR=inspect.getdoc(load_asl_trunk),
-            **origin,
-        )
+    shapes = {"u": (6,), "disk_pos_m": (3, 3), "run_id": (), "kind": ()}
+    file = _arrays(path, shapes, "run_names")
+    disks = file["disk_pos_m"]
+    return Bunch(
+        q=file["u"].astype(float),
+        x=disks[:, -1].copy(),
+        disks=disks,
+        groups=file["run_id"].astype(int),
+        run_names=file["run_names"],
+        kind=file["kind"],
+        units={"q": "1", "x": "m"},
+        DESCR=inspect.getdoc(load_asl_trunk),
+        **origin,
+    )
+
+
+def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str) -> dict[str, NDArray]:
+    """Return the arrays of a recording once they are as published; the shapes are those of a row."""
+    file = arrays_of(path)
+    n = {len(array) for name, array in file.items() if name in shapes and array.ndim}
+    for name in (*shapes, *names):
+        array = file.get(name, np.array(None))
+        right = array.ndim == 1 if name in names else array.shape[1:] == shapes[name]
+        kind = "U" if name in names else "biuf"
+        right &= array.ndim > 0 and len(n) == 1 and array.dtype.kind in kind
+        if not right or (kind != "U" and not np.isfinite(array).all()):
+            got = f"of shape {array.shape} and type {array.dtype!s:.40}"
+            raise ValueError(f"{path} is damaged: {name!r} is {got}; copy the file again.")
+    return file
 
 
 def _locate(

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import json
 import os
 import warnings
+from functools import partial
 from importlib.metadata import version
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import Memory, Parallel, delayed
+from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
 
 from hybridkin._core.arrays import shaped
+from hybridkin._core.files import write_file
+from hybridkin.datasets._npz import arrays_of
 from hybridkin.datasets._protocol import RANGE, draw, paper_protocol
 from hybridkin.simulation import NotSettledError, TrunkPlant
 
@@ -74,8 +79,8 @@ def make_trunk(
     n_jobs : int or None, default=None
         Processes, as in joblib.
     checkpoint : path-like or None, default=None
-        Folder that keeps rows as they are made (a `joblib.Memory`). Rows that it has from the same
-        seed and parameters are not made again, after an interruption for example.
+        Folder that keeps rows as they are made, in npz files. Rows that it has from the same seed
+        and parameters are not made again, after an interruption for example.
     return_X_y : bool, default=False
         If True, return ``(q, x)`` only.
     **plant_parameters
@@ -119,9 +124,8 @@ def make_trunk(
     plant = _plant_parameters({**plant_parameters, **noise})
     made = {"random_state": int(random_state), "plant": plant, "mujoco": version("mujoco")}
     targets, part, drawn = _targets(q_target, made["random_state"], n_segment, n_random)
-    measure = Memory(checkpoint, verbose=0).cache(_measure)
     chunks = np.array_split(np.arange(len(targets)), max(1, -(-len(targets) // CHUNK)))
-    jobs = (delayed(measure)(rows, targets[rows], part[rows], made) for rows in chunks)
+    jobs = (delayed(_kept)(checkpoint, rows, targets[rows], part[rows], made) for rows in chunks)
     q, x, targets, failed = zip(*Parallel(n_jobs=n_jobs)(jobs), strict=True)  # type: ignore
     q, x, targets = map(np.concatenate, (q, x, targets))
     failed = [one for chunk in failed for one in chunk]
@@ -185,6 +189,28 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
         columns = {name: file[name] for name in ("q", "x", "q_target", "part")}
         parameters = json.loads(str(file["parameters"]))
     return _bunch({**columns, "row": np.arange(len(columns["q"]))}, parameters, [], return_X_y)
+
+
+def _kept(checkpoint, rows, targets, part, made):
+    """Return what `_measure` does, from a file of the checkpoint where it has a whole one."""
+    if checkpoint is None:
+        return _measure(rows, targets, part, made)
+    text = json.dumps([rows.tolist(), targets.tolist(), part.tolist(), made], sort_keys=True)
+    file = Path(checkpoint) / f"rows-{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
+    names = ("q", "x", "targets", "failed", "failed_targets", "key")
+    try:
+        q, x, reached, failed, tried, key = map(arrays_of(file).__getitem__, names)
+        if str(key) == text and np.hstack([q, x, reached]).shape == (len(rows), 21):
+            found = zip(json.loads(str(failed)), tried, strict=True)
+            return q, x, reached, [(row, target, why) for (row, why), target in found]
+    except (ValueError, LookupError, TypeError):  # absent or damaged: made again
+        pass
+    q, x, reached, failed = _measure(rows, targets, part, made)
+    said = json.dumps([[row, why] for row, _, why in failed])
+    values = (q, x, reached, said, np.reshape([at for _, at, _ in failed], (-1, 9)), text)
+    Path(checkpoint).mkdir(parents=True, exist_ok=True)
+    write_file(file, partial(np.savez, **dict(zip(names, values, strict=True))))
+    return q, x, reached, failed
 
 
 def _measure(rows, targets, part, made):

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -273,15 +274,18 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {path}.")
-    with open(path, encoding="utf-8-sig") as file:
-        rows = [text.split(",") for text in map(str.strip, file) if text and text[0] != "#"]
+    try:
+        with open(path, encoding="utf-8-sig") as file:
+            rows = [text.split(",") for text in map(str.strip, file) if text and text[0] != "#"]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"`path` must be a CSV file of points, {path} is no text.") from error
     columns, need = (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
     named = bool(rows) and not re.match(r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE)
     try:
         table = np.array(rows[named:], dtype=float)
     except ValueError as error:
         need = f"numbers in {columns} columns ({need}) after one line of names"
-        raise ValueError(f"{path} must hold {need}: {error}.") from error
+        raise ValueError(f"{path} must hold {need}: {error!s:.200}.") from error
     if table.ndim != 2 or table.shape[1] != columns:
         raise ValueError(f"{path} must have rows of {columns} columns ({need}), got {table.shape}.")
     t = table[:, 0] if dt is None else _period(dt, "dt") * np.arange(len(table))

@@ -76,6 +76,10 @@ class ELM(LeverageModule):
     def __init__(self, activation="logistic", **arrays):
         super().__init__()
         self.activation = activation
+        if activation not in ACTIVATIONS:
+            raise ValueError(
+                f"`activation` must be one of {[*ACTIVATIONS]}, got {activation!r:.60}"
+            )
         for name in LAYER + READOUT:
             array = np.asarray(arrays[name], order="C")
             self.register_buffer(name, torch.tensor(array, device="cpu"))

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.files import write_files
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.stored import Stored
 from hybridkin._core.version import __version__
@@ -112,11 +114,13 @@ def export_c(
     parts = dict(STEP_H="step.h", STEP_C="step.c", TICKS="ticks.c", STEP_README="step.md")
     for key, template in parts.items():
         entries[key] = "" if controller is None else _filled(template, entries)
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    for path, template in zip(paths, files.values(), strict=True):
+
+    def write(path: Path, template: str) -> None:
         if template == "README.md":
-            entries["MEASURED"] = _measured(paths[1])
+            entries["MEASURED"] = _measured(path.with_name(f"{name}.c"))
         path.write_text(_filled(template, entries))
+
+    write_files(folder, {file: partial(write, template=files[file]) for file in files})
     return paths
 
 

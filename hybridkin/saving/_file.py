@@ -16,11 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import secrets
-import sys
-from contextlib import suppress
-from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +24,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from hybridkin._core.files import write_file
 from hybridkin._core.stored import Stored
-
-if sys.platform != "win32":
-    import fcntl
 
 FORMAT = "hybridkin-model"
 VERSION = 3
@@ -86,16 +79,7 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
 
 
 def write(path: Path, header: Header, arrays: Arrays) -> None:
-    """Write header and arrays to a file, which is replaced only once all is on the disk.
-
-    Equal content gives equal bytes. Of a symbolic link the target is replaced. A file that is
-    replaced keeps its permissions.
-    """
-    path = Path(os.path.realpath(path))
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"`path` must lie in a folder that exists, got {path}.")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"`path` must name a file, got {path}, which is none; add a file name.")
+    """Write header and arrays to a file, as `write_file` does; equal content gives equal bytes."""
     text = json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False)
     whole = {name: np.array(array, order="C", ndmin=0) for name, array in arrays.items()}
     content = save(whole, metadata={_HEADER: text, _CHECKSUM: _checksum(text, whole)})
@@ -103,45 +87,18 @@ def write(path: Path, header: Header, arrays: Arrays) -> None:
     end = 8 + int.from_bytes(content[:8], "little")
     head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 8)
-    staging = path.with_name(f".{path.name}-{secrets.token_hex(8)}.part")
-    folder = _folder_of_saves(path)
-    try:
+
+    def write_parts(staging: Path) -> None:
         with open(staging, "xb") as file:
             file.writelines([len(head).to_bytes(8, "little"), head, content[end:]])
-            file.flush()
-            os.fsync(file.fileno())
-        if path.exists():
-            os.chmod(staging, path.stat().st_mode)
-        os.replace(staging, path)
-        with suppress(OSError):  # some file systems cannot
-            os.fsync(folder)
-    finally:
-        staging.unlink(missing_ok=True)
-        os.close(folder)
 
-
-def _folder_of_saves(path: Path) -> int:
-    """Return the folder of a file, open and locked, and remove what killed saves have left there.
-
-    Every save holds a shared lock on the folder, which ends with its process: whoever gets the
-    folder alone finds no other save at work.
-    """
-    if sys.platform == "win32":  # it opens no folders
-        return os.open(os.devnull, os.O_RDONLY)
-    folder = os.open(path.parent, os.O_RDONLY)
-    with suppress(OSError):  # others are at work, or the file system has no locks
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        for left in path.parent.glob(f".{escape(path.name)}-{16 * '[0-9a-f]'}.part"):
-            left.unlink()
-    with suppress(OSError):
-        fcntl.flock(folder, fcntl.LOCK_SH)
-    return folder
+    write_file(path, write_parts)
 
 
 def read(path: Path) -> tuple[Header, Arrays]:
     """Return header and arrays of a file that is whole and of the version read here."""
     if path.is_dir():
-        found = sorted(file.name for file in path.glob("*.safetensors"))
+        found = sorted(file.name for file in path.glob("[!.]*.safetensors"))
         hint = f"; it contains {found[0]}." if found else " without a saved model."
         raise FileNotFoundError(f"`path` must name a saved model, got the folder {path}{hint}")
     if not path.is_file():

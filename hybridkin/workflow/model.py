@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.digests import row_digests
+from hybridkin._core.files import newest
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
@@ -187,15 +188,16 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     if path.suffix.lower() in LOG_SUFFIXES:
         raise ValueError(f"`model` must be a model or a robot description, got the log {path}.")
     if path.is_dir():
-        if not (path / _MODEL).is_file():
+        if not newest(path / _MODEL).is_file():
             raise FileNotFoundError(f"`model` {path} is a folder without {_MODEL}; name the file.")
         path = path / _MODEL
-    model = load_model(path)
-    if robot is None and path.name == _MODEL and path.with_name(_ROBOT).is_file():
-        robot = path.with_name(_ROBOT)
+    file, beside = newest(path), newest(path.with_name(_ROBOT))
+    model = load_model(file)
+    if robot is None and path.name == _MODEL and beside.is_file():
+        robot = beside
     description = None if robot is None else robots.read_description(robot)
     name = path.stem if description is None else description.name
-    loaded = LoadedModel(name, path, model, description, model_header(path))
+    loaded = LoadedModel(name, path, model, description, model_header(file))
     if description is not None and description.n_actuators not in (0, loaded.n_actuators):
         raise ValueError(
             f"`robot` {description.name!r} has {description.n_actuators} actuators, the "

@@ -6,10 +6,10 @@ import json
 import math
 import os
 import platform
-import tempfile
 import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin._core.arrays import as_path
+from hybridkin._core.files import write_files
 from hybridkin._core.stored import plain
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.arc_chain import ArcChain
@@ -210,22 +211,17 @@ class Report:
     def write(self, out: str | Path) -> list[Path]:
         """Write everything into the folder `out` and return the paths.
 
-        All files are made beside `out` first, so that a failure leaves `out` as it was.
+        A failure, an interrupt or a killed process leaves `out` as it was, see `write_files`.
         """
         out = Path(out)
-        out.parent.mkdir(parents=True, exist_ok=True)
         texts = {"report.json": json_text(self.record) + "\n", "report.md": self.markdown()}
-        names = [*self._files, *texts]
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
-            staging = Path(folder)
-            for name, write in self._files.items():
-                write(staging / name)
-            for name, text in texts.items():
-                (staging / name).write_text(text, encoding="utf-8")
-            out.mkdir(exist_ok=True)
-            for name in names:
-                os.replace(staging / name, out / name)
-        return [out / name for name in names]
+        written = {name: partial(_write_text, text=text) for name, text in texts.items()}
+        write_files(out, {**self._files, **written})
+        return [out / name for name in [*self._files, *texts]]
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
 def _wrapped(text: str) -> str:

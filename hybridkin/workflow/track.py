@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections import Counter
 from dataclasses import replace
 from functools import partial
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin._core.files import newest, write_file
 from hybridkin._core.units import METRES
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
@@ -275,7 +275,7 @@ def animate_track(
         )
     file = Path(path)
     if file.is_dir():
-        file = file / "track.csv"
+        file = newest(file / "track.csv")
     log = _read_track(file, loaded.log_format())
     out = Path(out)
     if not out.absolute().parent.is_dir():
@@ -285,14 +285,11 @@ def animate_track(
         loaded.chain, q, target=target, t=log.time, x=loaded.tips(q), n_frames=n_frames
     )
     film.name = "tip (model)"
-    staging = out.with_name(f".{out.stem}-unfinished{out.suffix}")
+    options = {"unit": unit, "speed": speed, "progress": partial(progress, "drawing frames")}
     try:
-        film.save(staging, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
-        os.replace(staging, out)
+        write_file(out, partial(film.save, **options))
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
-    finally:
-        staging.unlink(missing_ok=True)
     return {
         "path": str(out),
         "bytes": out.stat().st_size,

@@ -1,0 +1,137 @@
+"""Files that are written whole or not at all, whatever ends the process or the power."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from glob import escape
+from pathlib import Path
+from typing import Any
+
+if sys.platform != "win32":
+    import fcntl
+
+_NEW = ".new"  # folder of complete files that are about to replace those beside it
+
+Writer = Callable[[Path], Any]
+"""Writes a file when handed its path."""
+
+
+def write_file(path: str | Path, write: Writer) -> None:
+    """Write a file, which is replaced only once all is on the disk.
+
+    Of a symbolic link the target is replaced. A file that is replaced keeps its permissions.
+    """
+    path = Path(os.path.realpath(path))
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"`path` must lie in a folder that exists, got {path}.")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"`path` must name a file, got {path}, which is none; add a file name.")
+    with _staged(path, path.parent) as staging:
+        write(staging)
+        _flush(staging)
+        if path.exists():
+            os.chmod(staging, path.stat().st_mode)
+        os.replace(staging, path)
+        _flush(path.parent)
+
+
+def write_files(folder: str | Path, files: Mapping[str, Writer]) -> None:
+    """Write files into a folder, which is made when absent: all of them or none.
+
+    An interrupt in the middle is raised before anything is replaced, or after everything is.
+    """
+    folder = Path(os.path.realpath(folder))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    home = folder if folder.is_dir() else folder.parent
+    if taken := [name for name in files if (folder / name).is_dir()]:
+        raise IsADirectoryError(f"{folder / taken[0]} must be a file or absent, but is a folder.")
+    with _staged(folder, home) as staging:
+        staging.mkdir()
+        for name, write in files.items():
+            write(staging / name)
+            _flush(staging / name)
+        _flush(staging)
+        late, new = None, folder / _NEW if home == folder else folder
+        while staging.exists() or (folder / _NEW).exists():
+            try:
+                _finish(folder)
+                if staging.exists():
+                    os.rename(staging, new)
+                _flush(home)
+            except KeyboardInterrupt as interrupt:
+                late = interrupt
+                if staging.exists():
+                    raise
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                new = folder / _NEW  # another run has written meanwhile
+    if late is not None:
+        raise late
+
+
+def newest(path: Path) -> Path:
+    """Return the file of that path, or the one that a killed `write_files` was about to put there."""
+    waiting = path.with_name(_NEW) / path.name
+    return waiting if waiting.is_file() else path
+
+
+def _finish(folder: Path) -> None:
+    """Put the complete files of a folder in their places."""
+    if (folder / _NEW).is_dir():
+        for path in (folder / _NEW).iterdir():
+            with suppress(FileNotFoundError):  # another run does the same
+                os.replace(path, folder / path.name)
+        with suppress(OSError):
+            (folder / _NEW).rmdir()
+
+
+def _flush(path: Path) -> None:
+    """Wait until a file or a folder is on the disk."""
+    if path.is_dir() and sys.platform == "win32":  # it opens no folders
+        return
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    except OSError:  # of folders some file systems cannot
+        if not path.is_dir():
+            raise
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _staged(path: Path, home: Path) -> Iterator[Path]:
+    """Yield a name in a folder to write to, and remove what is left there in the end.
+
+    What killed writers left goes too. Every writer holds a shared lock on the folder, which ends
+    with its process: whoever gets the folder alone finds no other at work.
+    """
+    staging = home / f".{path.name}-{secrets.token_hex(8)}.part{path.suffix}"
+    handle = os.open(os.devnull if sys.platform == "win32" else home, os.O_RDONLY)
+    try:
+        if sys.platform != "win32":
+            with suppress(OSError):  # others are at work, or the file system has no locks
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                parts = f".{escape(path.name)}-{16 * '[0-9a-f]'}.part{escape(path.suffix)}"
+                for left in home.glob(parts):
+                    _remove(left)
+            with suppress(OSError):
+                fcntl.flock(handle, fcntl.LOCK_SH)
+        yield staging
+    finally:
+        _remove(staging)
+        os.close(handle)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
