@@ -77,7 +77,7 @@ def write_files(folder: str | Path, files: Mapping[str, Writer]) -> None:
 
 
 def newest(path: Path) -> Path:
-    """Return the file of that path, or the one that a killed `write_files` was about to put there."""
+    """Return the file of that path, or the one that a killed `write_files` has made for it."""
     waiting = path.with_name(_NEW) / path.name
     return waiting if waiting.is_file() else path
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from xml.parsers.expat import ExpatError, ParserCreate
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
 UNLIMITED = (-math.inf, math.inf)
 _BYTES = 4_000_000  # of a robot description
 _MOST = 1000  # moving joints
+_SIZES, _MOST_COPIES = ("count", "nrow", "ncol", "width", "height"), 1e7
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 
 
@@ -107,13 +111,14 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
             "RigidChain.from_mjcf needs MuJoCo: pip install 'hybridkin[sim]'."
         ) from error
     source = source_of(text_or_path)
+    _check_sizes(source.encode() if isinstance(source, str) else source.read_bytes())
     try:
         if isinstance(source, Path):
             model = mujoco.MjModel.from_xml_path(str(source))
         else:
             model = mujoco.MjModel.from_xml_string(source)
-    except ValueError as error:
-        raise ValueError(f"`text_or_path` must be a valid MJCF: {error}.") from error
+    except (ValueError, RuntimeError, MemoryError) as error:
+        raise ValueError(f"`text_or_path` must be a valid MJCF: {error!s:.400}.") from error
     bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
     sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
     one_of(end_link, [*bodies, *sites], "`end_link`")
@@ -130,6 +135,29 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
     if body != root:
         raise ValueError(f"`root_link` must lead to {end_link!r}, but {root_link!r} does not.")
     return path
+
+
+def _check_sizes(data: bytes) -> None:
+    """Raise where an MJCF asks for copies or arrays without bound, or has NaN.
+
+    MuJoCo checks neither; of NaN it writes a file. Files that the MJCF includes are its own affair.
+    """
+    parser, copies = ParserCreate(), [1.0]
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        size = copies[-1] * (1000.0 if "count" in attributes else 1.0)
+        for name, value in attributes.items():
+            words = value.lower().split()
+            if name in _SIZES or name.startswith("nuser"):
+                size *= math.prod(float(word) for word in words if re.fullmatch(r"\d+", word))
+            if "nan" in words or size > _MOST_COPIES:
+                need = f"numbers, and sizes within bounds ({_MOST_COPIES:.0g} in all)"
+                raise ValueError(f"`text_or_path` must have {need}, got {name}={value!r:.60}.")
+        copies.append(size if tag == "replicate" else copies[-1])
+
+    parser.StartElementHandler, parser.EndElementHandler = start, lambda _: copies.pop()
+    with suppress(ExpatError):  # MuJoCo judges the rest
+        parser.Parse(data, True)
 
 
 def _mjcf_joints(model: Any, body: int) -> list[Joint]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import reprlib
 import sys
 from collections.abc import Callable, Mapping
@@ -27,6 +28,7 @@ _PLAIN, _ELASTIC = "constant-curvature", "elastic-tendon"
 _MOST = 64  # segments of a robot, actuators of a segment
 
 _LEAST, _LARGEST = 1e-18, 1e9  # of positive numbers, and of all: beyond lie only mistakes
+_DOTS = 40  # between two commas; keys of many dots cost the square of their number
 _BYTES = 30_000  # of a file; the time to read hostile TOML grows with its square
 _Test = Callable[[Any], bool]
 
@@ -99,7 +101,10 @@ def read_tables(path: Path) -> dict[str, Any]:
     if path.stat().st_size > _BYTES:
         raise ValueError(f"a robot description must be at most {_BYTES} bytes long.")
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if any(part.count(".") > _DOTS for part in re.split(r"[,=\n]", text)):
+            raise ValueError(f"a key has more than {_DOTS} dots")
+        content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # some numbers raise plain ValueErrors
         raise ValueError(f"this is not a TOML file: {error}.") from error
     _check(content, "file", "the file")

@@ -170,7 +170,7 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
 
 
 def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str) -> dict[str, NDArray]:
-    """Return the arrays of a recording once they are as published; the shapes are those of a row."""
+    """Return the arrays of a recording, whose rows have these shapes, or say that it is damaged."""
     file = arrays_of(path)
     n = {len(array) for name, array in file.items() if name in shapes and array.ndim}
     for name in (*shapes, *names):

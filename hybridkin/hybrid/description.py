@@ -128,6 +128,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]), ())
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
+    if not (model._drift.scale > 0).all():
+        raise ValueError("`drift_scale` must be positive")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     if "play_width" in stored.arrays:
         one = stored.array("play_width").ndim == 0

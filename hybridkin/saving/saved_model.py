@@ -142,7 +142,8 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
         model.module_.to(at)
         return model
     except _DAMAGE as error:
-        raise ValueError(f"{path} is damaged: {str(error).rstrip('.') or repr(error)}.") from error
+        what = (str(error) or repr(error))[:400].rstrip(".")
+        raise ValueError(f"{path} is damaged: {what}.") from error
 
 
 def model_header(path: str | Path) -> dict[str, Any]:

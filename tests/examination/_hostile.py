@@ -1,6 +1,6 @@
-"""Hostile and damaged files: from a whole file of each format, what accidents and malice make of it.
+"""Hostile and damaged files: what accidents and malice make of a whole file of each format.
 
-Every maker takes the bytes of a whole file and a random generator, and returns the bytes of another.
+Each maker takes the bytes of a whole file and a random generator, and returns those of another.
 """
 
 from __future__ import annotations
@@ -142,6 +142,8 @@ def repaired(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _other_array(array: Any, others: list[Any], rng: np.random.Generator) -> Any:
+    if array.dtype.kind not in "fi":
+        return array[:-1]
     hostile = [np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, 0.0, -1.0, 1e6, 1e-6, -0.0]
     single = hostile[int(rng.integers(len(hostile)))]
     one, all_of_it = array.copy(), np.full_like(array, 0)
@@ -276,6 +278,11 @@ def described(data: bytes, rng: np.random.Generator) -> bytes:
             b"<child link='m%d'/></joint>" % (k, k, k - 1, k) for k in range(1, n)
         ) + b"<link name='m0'/>" + rest,
         first + b"><include file='/dev/zero'/>" + rest,
+        first + b"><worldbody><replicate count='%d'><geom size='1'/>" % 10 ** (n % 12)
+        + b"</replicate></worldbody>" + rest,
+        first + b"><size nuser_body='%d'/>" % 10 ** (n % 12) + rest,
+        first + b"><asset><texture name='t' builtin='flat' type='2d' width='%d'" % (n * n)
+        + b" height='%d'/></asset>" % n + rest,
         first + b"><include filename='/etc/hostname'/>" + rest,
         first + b"><asset><hfield name='h' nrow='9' ncol='9' size='1 1 1 1' file='/dev/zero'/>"
         b"</asset>" + rest,

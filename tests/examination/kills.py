@@ -1,0 +1,323 @@
+"""Kills, signals and power loss: a file is the old or the new one, never half, and nothing stays.
+
+Each run is a process forked from this one, so that a kill costs no import; it is killed at a moment
+drawn uniformly over the time that a whole run takes (seed 20). Real processes of the command line
+are killed too. Afterwards all files of the folder must be those before, or all those after; then
+the same work is done once more, to the end, and must leave its files and nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from _line import Line
+from saved_models import arm, trunk
+from tqdm import tqdm
+
+from hybridkin import robots, save_model
+from hybridkin._core.files import write_files
+from hybridkin.cli.main import main
+from hybridkin.datasets import _trunk, make_trunk
+
+ROBOT = """calibrate = []
+[[segment]]
+radius = 0.005
+length = 0.1
+[log]
+q = ["a", "b", "c"]
+x = ["x", "y", "z"]
+groups = "motion"
+time = "t"
+[limits]
+q_min = -0.006
+q_max = 0.006
+"""
+FIT = ["fit", "log.csv", "--robot", "robot.toml", "--seeds", "1", "--folds", "2", "--no-auto"]
+TRACK = [
+    "track",
+    "model",
+    "--shape",
+    "line",
+    "--size",
+    "0.005,0.005,0",
+    "--unit",
+    "m",
+    "--duration",
+]
+PAPER = ["paper", "--splits", "1", "--n-seeds", "1", "--jobs", "1", "--out", "out"]
+COUNTS = {"save_model": 120, "fit --out": 24, "track --out": 30, "make_trunk": 30, "processes": 4}
+SETTINGS = {**os.environ, "SOURCE_DATE_EPOCH": "86400"}
+Files = dict[str, bytes]
+
+
+def examine(full: bool) -> Iterator[Line]:
+    """Yield a line for each writer, each signal, and what is flushed to the disk."""
+    rng, share = np.random.default_rng(20), 1.0 if full else 0.1
+    os.environ["SOURCE_DATE_EPOCH"] = "86400"
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        write_log()
+        forked(lambda: main([*FIT, "--out", "model"]))
+        for name, (old, new, out) in works().items():
+            n = max(2, round(share * COUNTS[name]))
+            yield killed(name, n, old, new, Path(out), rng)
+        yield killed_at_every_step()
+        yield flushed()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            for name, command in {"fit": FIT, "track": [*TRACK, "4"], "paper": PAPER}.items():
+                yield signalled(name, command, number, 20 if full else 2, rng)
+
+
+def write_log() -> None:
+    """Write a log of a segment and its description."""
+    rng = np.random.default_rng(0)
+    turns = np.linspace(0, 6, 20)[:, None] * rng.uniform(0.5, 1, (6, 1, 3))
+    q = 0.004 * np.sin(turns + rng.uniform(0, 6, (6, 1, 3))).reshape(-1, 3)
+    Path("robot.toml").write_text(ROBOT)
+    x = robots.from_toml("robot.toml")(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(300 * q)
+    table = np.column_stack([0.1 * np.arange(120), q, x, np.arange(120) // 20])
+    np.savetxt("log.csv", table, delimiter=",", header="t,a,b,c,x,y,z,motion", comments="")
+
+
+def works() -> dict[str, tuple[Callable[[], Any], Callable[[], Any], str]]:
+    """Return by name what makes the old files, what makes the new ones, and where."""
+    small = {"n_segment": 2, "n_random": 2, "checkpoint": "out"}
+
+    def simulate(seed: int) -> None:
+        _trunk.CHUNK = 2
+        make_trunk(**small, random_state=seed)
+
+    command = [sys.executable, "-m", "hybridkin", *FIT, "--out", "out"]
+    return {
+        "save_model": (lambda: save_new(arm()), lambda: save_new(trunk()), "out"),
+        "fit --out": (
+            lambda: main([*FIT, "--out", "out", "--loss", "huber"]),
+            lambda: main([*FIT, "--out", "out"]),
+            "out",
+        ),
+        "track --out": (
+            lambda: main([*TRACK, "2", "--out", "out"]),
+            lambda: main([*TRACK, "4", "--out", "out"]),
+            "out",
+        ),
+        "make_trunk": (lambda: None, lambda: simulate(0), "out"),
+        "processes": (
+            lambda: main([*FIT, "--out", "out", "--loss", "huber"]),
+            lambda: os.execve(sys.executable, command, SETTINGS),
+            "out",
+        ),
+    }
+
+
+def save_new(model: Any) -> None:
+    Path("out").mkdir(exist_ok=True)
+    save_model(model, "out/model")
+
+
+def forked(work: Callable[[], Any], delay: float | None = None, number: int = 9) -> int:
+    """Do work in a process of its own, which gets a signal after a time; return its status."""
+    if not (child := os.fork()):
+        try:
+            for stream, name in ((1, "stdout"), (2, "stderr")):
+                os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+            os._exit(work() or 0)
+        except BaseException:
+            os._exit(99)
+    if delay is not None:
+        time.sleep(delay)
+        os.kill(child, number)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def content(folder: Path) -> Files:
+    """Return the files of a folder that readers see, those of a write that was committed."""
+    files = {p.name: p.read_bytes() for p in folder.glob("[!.]*")} if folder.is_dir() else {}
+    return files | {p.name: p.read_bytes() for p in folder.glob(".new/*")}
+
+
+def litter(folder: Path) -> list[str]:
+    return sorted(p.name for p in [*folder.glob(".*"), *folder.parent.glob(".out*")])
+
+
+def killed(name: str, n: int, old: Any, new: Any, out: Path, rng: Any) -> Line:
+    """Kill n runs, and see what is left and whether the next run succeeds."""
+    after, durations = {}, []
+    forked(old)
+    before = content(out)
+    shutil.rmtree("before", ignore_errors=True)
+    shutil.copytree(out, "before") if before else Path("before").mkdir()
+    for attempt in range(2):
+        start = time.perf_counter()
+        if code := forked(new):
+            return Line(f"kill -9: {name}", f"the run without a kill ends by {code}", False)
+        durations.append(time.perf_counter() - start)
+        after = content(out)
+        if attempt == 0 and before:
+            shutil.rmtree(out)
+            shutil.copytree("before", out)
+    wrong, counts = [], {"old": 0, "new": 0, "half": 0}
+    for delay in tqdm(rng.uniform(0, 1.05 * max(durations), n), desc=name, mininterval=10):
+        shutil.rmtree(out, ignore_errors=True)
+        if before:
+            shutil.copytree("before", out)
+        forked(new, delay)
+        found = content(out)
+        part = name == "make_trunk" and found.items() <= after.items()
+        kind = "new" if found == after else "old" if found == before or part else "half"
+        counts[kind] += 1
+        if kind == "half":
+            differ = [k for k in found if found[k] not in (before.get(k), after.get(k))]
+            wrong.append(f"half after {delay:.3f} s: neither {differ}; {sorted(found)}")
+        if (code := forked(new)) or content(out) != after or litter(out):
+            wrong.append(f"after {delay:.3f} s the next run ends by {code}, left {litter(out)}")
+    shutil.rmtree("before")
+    shutil.rmtree(out)
+    print(*wrong, sep="\n", file=sys.stderr)
+    figure = f"{n} kills in {max(durations):.2f} s: {counts['old']} old, {counts['new']} new, "
+    figure += f"{counts['half']} half; {len(wrong)} wrong"
+    return Line(f"kill -9: {name}", figure, not wrong)
+
+
+def killed_at_every_step() -> Line:
+    """Kill the writing of a folder before each of its calls of the system, one after another."""
+    out, kinds, wrong = Path("out"), [], []
+
+    def write(text: str, at: int = 0) -> Callable[[], None]:
+        def run() -> None:
+            counter = iter(range(1, 10_000))
+            for name in ("fsync", "rename", "replace", "rmdir", "mkdir", "unlink"):
+                before_call(name, lambda *_: next(counter) == at and os.kill(os.getpid(), 9))
+            write_files(out, {k: lambda path, k=k: path.write_text(text + k) for k in "abcd"})
+
+        return run
+
+    for earlier in (False, True):  # the folder is not there, or has files
+        for step in range(1, 10_000):
+            shutil.rmtree(out, ignore_errors=True)
+            if earlier:
+                forked(write("old"))
+            ended = forked(write("new", step))
+            texts = sorted({value[:3].decode() for value in content(out).values()})
+            kinds.append(", ".join(texts) or "none")
+            if len(texts) > 1 or (len(content(out)) != 4 and (earlier or texts)):
+                wrong.append(f"step {step}: {content(out)}")
+            if forked(write("new")) or {*content(out)} != {*"abcd"} or litter(out):
+                wrong.append(f"step {step}: the next run leaves {litter(out)}")
+            if ended == 0:
+                break
+    shutil.rmtree(out)
+    print(*wrong, sep="\n", file=sys.stderr)
+    figure = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("old", "new", "none"))
+    return Line(
+        "kill -9 before each call that writes a folder", f"{figure}; {len(wrong)} wrong", not wrong
+    )
+
+
+def before_call(name: str, hook: Callable[..., Any]) -> None:
+    """Call a hook before a function of `os`, from now on; in a process of its own."""
+    call = getattr(os, name)
+
+    def hooked(*given: Any, **more: Any) -> Any:
+        hook(name, *given)
+        return call(*given, **more)
+
+    setattr(os, name, hooked)
+
+
+def flushed() -> Line:
+    """Check that all files are on the disk before they get their names, and the names after."""
+    film = ["animate", "model", "old", "--out", "film.gif", "--frames", "3"]
+    writers: dict[str, Callable[[], Any]] = {
+        "save_model": lambda: save_model(arm(), "out"),
+        "fit": lambda: main([*FIT, "--out", "out"]),
+        "evaluate": lambda: main(["evaluate", "model", "log.csv", "--out", "out"]),
+        "track": lambda: main([*TRACK, "2", "--out", "old"]),
+        "next": lambda: main(["next", "robot.toml", "-n", "5", "--out", "out"]),
+        "export": lambda: main(["export", "model", "--out", "out"]),
+        "animate": lambda: main(film),
+        "make_trunk": lambda: make_trunk(n_segment=1, n_random=1, checkpoint="out") and None,
+    }
+    wrong, count = [], 0
+    for name, write in writers.items():
+        for out in (Path("out"), Path("film.gif")):
+            shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
+        Path("steps").unlink(missing_ok=True)
+        code = forked(lambda write=write: recorded(write))
+        steps = [line.split("\t") for line in Path("steps").read_text().splitlines()]
+        synced: set[str] = set()
+        for step, path, to in steps:
+            if step == "fsync":
+                synced.add(path)
+            else:  # what lies below moves too; the folders have to be flushed again
+                moved = {to + p[len(path) :] for p in synced if (p + "/").startswith(path + "/")}
+                wrong += [] if moved else [f"{name}: {path} got its name first"]
+                synced = (synced | moved) - {os.path.dirname(path), os.path.dirname(to)}
+        renamed = [to for step, _, to in steps if step != "fsync"]
+        last = Path(renamed[-1]) if renamed else Path()
+        files = [p for p in last.glob("*") if p.is_file()] if last.is_dir() else [last]
+        files = [p for p in last.parent.glob("*") if str(p) in renamed] or files
+        missing = [str(p) for p in [*files, last.parent] if str(p) not in synced]
+        count += len(files)
+        if code or missing or not renamed:
+            wrong.append(f"{name} ends by {code}, not flushed: {missing}")
+    print(*wrong, sep="\n", file=sys.stderr)
+    figure = f"{count} files of {len(writers)} writers: {len(wrong)} wrong"
+    return Line(
+        "power loss: files are flushed before their names, folders after", figure, not wrong
+    )
+
+
+def recorded(write: Callable[[], Any]) -> int:
+    """Write, and record what was flushed and renamed."""
+    with open("steps", "w") as steps:
+
+        def note(name: str, *given: Any) -> None:
+            places = [given[0], given[0]] if name == "fsync" else given[:2]
+            if name == "fsync":
+                places = 2 * [os.readlink(f"/proc/self/fd/{given[0]}")]
+            print(name, *map(os.path.abspath, places), sep="\t", file=steps)
+
+        for name in ("fsync", "rename", "replace"):
+            before_call(name, note)
+        return write() or 0
+
+
+def signalled(name: str, command: list[str], number: int, n: int, rng: Any) -> Line:
+    """Interrupt runs at moments of a whole run, and compare what they say with what is there."""
+    out, wrong, counts = Path("out"), [], {}
+    run = [*command, *(() if "--out" in command else ("--out", "out"))]
+    start = time.perf_counter()
+    shutil.rmtree(out, ignore_errors=True)
+    if name != "paper" and (code := forked(lambda: main(run))):
+        return Line(f"{signal.Signals(number).name}: {name}", f"ends by {code}", False)
+    duration = 3.0 if name == "paper" else time.perf_counter() - start
+    whole = {*content(out)}
+    for delay in rng.uniform(0.0, 1.02 * duration, n):
+        shutil.rmtree(out, ignore_errors=True)
+        code = forked(lambda: main(run), delay, number)
+        said = Path("stderr").read_text()
+        kept = "nothing" if not content(out) else "all" if {*content(out)} == whole else "half"
+        last = said.strip().splitlines()[-1] if said.strip() else ""
+        fate = {"nothing": "nothing was written", "all": "all was written"}.get(kept, "?")
+        right = code == 128 + number and last == f"hybridkin: interrupted; {fate}"
+        if (code, kept) == (0, "all"):
+            right = True
+        counts[f"{code}, {kept} written"] = counts.get(f"{code}, {kept} written", 0) + 1
+        if not right or "Traceback" in said or litter(out):
+            wrong.append(
+                f"{name} after {delay:.3f} s: {code}, {kept}, {litter(out)}, {said[-600:]}"
+            )
+    print(*wrong, sep="\n", file=sys.stderr)
+    shutil.rmtree(out, ignore_errors=True)
+    figure = "; ".join(f"{k}: {v}" for k, v in sorted(counts.items())) + f"; {len(wrong)} wrong"
+    return Line(f"{signal.Signals(number).name}: {name}, code and sentence", figure, not wrong)
