@@ -172,8 +172,6 @@ class QuadraticLeverage(LeverageModule):
 
     def __init__(self, center: Tensor, half_width: Tensor, factor: Tensor) -> None:
         super().__init__()
-        if not (factor.diagonal() > 0).all():
-            raise ValueError("the diagonal of `factor` must be positive")
         self.register_buffer("center", center)
         self.register_buffer("half_width", half_width)
         self.register_buffer("factor", factor)

@@ -121,9 +121,11 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     center = torch.tensor(stored.array("drift_center", (n,)), device="cpu")
     try:  # arrays that do not fit together fail here, not in use
         with torch.no_grad():
-            x, _ = model.module_.rows().forward_and_jacobian(center[None])
+            x, J = model.module_.rows().forward_and_jacobian(center[None])
     except RuntimeError as error:
         raise ValueError("the arrays do not fit together") from error
+    if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
+        raise ValueError("the arrays do not give finite numbers")
     stored.arrays.setdefault("drift_squares", np.zeros(()))  # older files do not have it
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]), ())
     names = [f"drift_{name}" for name in Drift._fields]

@@ -11,13 +11,16 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ from _line import Line
 from _readers import READERS, made, outcome
 from tqdm import tqdm
 
+HERE = Path(__file__).resolve().parent
 SECONDS, MEGABYTES = 2.0, 300.0  # that a file may take
 NUMBERS = {"model": 20_000}  # of the full run; of other formats 700
 SPACE = 1_500_000_000
@@ -37,6 +41,25 @@ def examine(full: bool) -> Iterator[Line]:
         for kind in READERS:
             number = NUMBERS.get(kind, 700)
             yield of_kind(kind, number if full else number // 20, Path(folder))
+        yield no_files(Path(folder))
+        yield fuzzed(300 if full else 10, Path(folder))
+
+
+def fuzzed(seconds: int, folder: Path) -> Line:
+    """Return what a fuzzer that is guided by the lines reached finds in the readers."""
+    what = "files made by a fuzzer (atheris, seed 20)"
+    if find_spec("atheris") is None:
+        return Line(what, "not examined: atheris is not installed here", True)
+    (folder / "corpus").mkdir()
+    command = [sys.executable, str(HERE / "_fuzz_readers.py"), "corpus", "-seed=20", "-timeout=20"]
+    command += [f"-max_total_time={seconds}", "-max_len=20000", "-rss_limit_mb=1500"]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    print(done.stderr[-2000:], file=sys.stderr)
+    runs = re.findall(r"Done (\d+) runs", done.stderr)
+    places = re.findall(r"cov: (\d+)", done.stderr)
+    figure = f"{(runs or ['?'])[-1]} files in {seconds} s, {(places or ['?'])[-1]} places reached"
+    wrong = done.returncode or not runs
+    return Line(what, figure + (f"; ends by {done.returncode}" if wrong else ""), not wrong)
 
 
 def of_kind(kind: str, n: int, folder: Path) -> Line:
@@ -59,6 +82,25 @@ def of_kind(kind: str, n: int, folder: Path) -> Line:
     figure += f"; slowest {most[0]:.2f} s, peak {most[1]:.0f} MB more"
     figure += f"; left or executed: {left}" if left else ""
     return Line(f"hostile and damaged files: {kind}", figure, not wrong and not left)
+
+
+def no_files(folder: Path) -> Line:
+    """Check that devices, pipes, folders and links to themselves are refused, at once."""
+    wrong = []
+    os.mkfifo("pipe")
+    os.symlink("loop", "loop")
+    Path("folder").mkdir()
+    names = ["pipe", "loop", "folder", "absent", "/dev/zero", "/dev/null", "nul\0", ""]
+    for kind in [kind for kind in READERS if kind != "recording"]:
+        for k, name in enumerate(names):
+            signal.alarm(20)
+            said = outcome(kind, k, Path(name))
+            if said != "refused":
+                wrong.append(f"{kind} {name[:9]!r}: {said}")
+    signal.alarm(0)
+    print(*wrong, sep="\n", file=sys.stderr)
+    figure = f"{len(names)} names, {len(READERS) - 1} readers: {len(wrong)} wrong"
+    return Line("devices, pipes, folders, links, no name", figure, not wrong)
 
 
 def in_child(kind: str, first: int, n: int, folder: Path) -> list[Any]:
