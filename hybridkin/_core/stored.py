@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, check_shape
 
-_LARGEST = 1e75  # of a number: the squares of larger ones, and their products, overflow
+_LARGEST = np.float64(1e75)  # of a number: the squares of larger ones, and their products, overflow
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
 
@@ -163,8 +163,6 @@ class Stored:
             array = self.array(name, [lengths.get(letter, letter) for letter in letters])
             lengths |= dict(zip(letters, array.shape, strict=True))
             found[name] = torch.tensor(array, device="cpu")
-        if len({tensor.dtype for tensor in found.values()}) > 1:
-            raise ValueError(f"the arrays of {self.kind!r} must be of one type")
         return found
 
     def part(self, name: str) -> Stored:

@@ -28,7 +28,7 @@ _PLAIN, _ELASTIC = "constant-curvature", "elastic-tendon"
 _MOST = 64  # segments of a robot, actuators of a segment
 
 _LEAST, _LARGEST = 1e-18, 1e9  # of positive numbers, and of all: beyond lie only mistakes
-_DOTS = 40  # between two commas; keys of many dots cost the square of their number
+_DOTS = 600  # between two commas; keys of many dots cost the square of their number
 _BYTES = 30_000  # of a file; the time to read hostile TOML grows with its square
 _Test = Callable[[Any], bool]
 

@@ -19,7 +19,7 @@ def check_expansion(path: Path, size: int) -> None:
 def arrays_of(path: Path) -> dict[str, NDArray]:
     """Return the arrays of an npz file by name, without pickled objects."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             size = sum(entry.file_size for entry in file.zip.infolist())
             check_expansion(path, size)
             arrays = {name: file[name] for name in file.files}

@@ -578,7 +578,7 @@ def test_mjcf_limits(compiler, joint, limits):
     ("joint", "message"),
     [
         ('range="30 -30"', "joint 'j' must have a lower and an upper limit"),
-        ('range="nan 1"', "joint 'j' must have a lower and an upper limit"),
+        ('range="nan 1"', "must have numbers, .* got range='nan 1'"),
         ('range="5 5"', "`range` of joint 'j' must be an interval"),
         ('limited="true"', "must be a valid MJCF"),
     ],
@@ -843,3 +843,43 @@ def test_calibration_finds_links_and_joint_zeros(rng):
     options = {name: getattr(result.chain, name) for name in ("base", "tool")}
     again = RigidChain.from_urdf(text, "flange", root_link="base", **options)
     assert_close(again(q), result.chain(q), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        '<worldbody><replicate count="1000000000"><geom size="1"/></replicate></worldbody>',
+        '<worldbody><replicate count="500"><replicate count="500"/></replicate></worldbody>',
+        '<asset><texture name="t" builtin="flat" width="100000" height="100000"/></asset>',
+        '<size nuser_body="2000000000"/>',
+        '<worldbody><body pos="nan 0 0"/></worldbody>',
+    ],
+)
+def test_mjcf_that_would_fill_the_memory_or_write_a_file(part):
+    with pytest.raises(ValueError, match="`text_or_path` must have numbers, and sizes within"):
+        RigidChain.from_mjcf(f"<mujoco>{part}</mujoco>", "hand")
+
+
+def test_urdf_of_any_size_takes_bounded_time(tmp_path):
+    path = tmp_path / "arm.urdf"
+    names = [f"<link name='l{k}'/>" for k in range(2_001)]
+
+    def joints(n, tags):
+        return [
+            f"<joint name='j{k}' type='revolute'><parent link='l{k}'/><child link='l{k + 1}'/>"
+            f"<limit lower='-1' upper='1'/>{tags(k)}</joint>"
+            for k in range(n)
+        ]
+
+    def written(n, tags=lambda k: ""):
+        path.write_text(f"<robot>{''.join([*names[: n + 1], *joints(n, tags)])}</robot>")
+        return path
+
+    with pytest.raises(ValueError, match="at most 1000 moving joints, got 2000"):
+        RigidChain.from_urdf(written(2_000), "l2000")
+    row = written(100, lambda k: f"<mimic joint='j{k + 1}'/>" if k < 99 else "")
+    with pytest.raises(ValueError, match="must mimic through at most 64 others"):
+        RigidChain.from_urdf(row, "l100")
+    path.write_text("<robot>" + " " * 4_000_000)
+    with pytest.raises(ValueError, match="`text_or_path` must be at most 4000000 bytes long"):
+        RigidChain.from_urdf(path, "l1")

@@ -380,6 +380,7 @@ LOG = "[log]\nq = ['a', 'b', 'c']\nx = ['x', 'y', 'z']\n"
         ("x = " + 5000 * "1", "this is not a TOML file: .* digits"),
         ("name." + 500 * "x." + "x = 1", "`name` in the file must be text, got {'x': {'x'"),
         ("#" * 30_001, "at most 30000 bytes"),
+        (".".join(["a"] * 9_000) + " = 1", "a key has more than 600 dots"),
     ],
 )
 def test_every_value_is_checked(write, text, message):

@@ -1,8 +1,10 @@
 import contextlib
 import io
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -371,6 +373,25 @@ def test_an_interrupt_leaves_cleanly(log, robot, tmp_path, capsys, monkeypatch):
     assert code == 130
     assert printed == ""
     assert errors.split("\n\n")[-1] == "hybridkin: interrupted; nothing was written\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
+@pytest.mark.parametrize("written", [False, True])
+def test_a_request_to_end_is_an_interrupt_and_says_what_was_written(
+    log, robot, tmp_path, capsys, monkeypatch, written
+):
+    def asked(log, robot, out, **_):
+        if written:
+            (out / "model").parent.mkdir()
+            (out / "model").touch()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(workflow, "fit_log", asked)
+    code, printed, errors = run(capsys, "fit", log, "--robot", robot, "--out", tmp_path / "m")
+    assert (code, printed) == (143, "")
+    fate = "all was written" if written else "nothing was written"
+    assert errors.split("\n\n")[-1] == f"hybridkin: interrupted; {fate}\n"
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 @pytest.mark.slow

@@ -147,18 +147,20 @@ def _other_array(array: Any, others: list[Any], rng: np.random.Generator) -> Any
     hostile = [np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, 0.0, -1.0, 1e6, 1e-6, -0.0]
     single = hostile[int(rng.integers(len(hostile)))]
     one, all_of_it = array.copy(), np.full_like(array, 0)
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):
         if array.dtype.kind == "f":
             one.ravel()[rng.integers(max(1, one.size)) :][:1] = single
             all_of_it[...] = single
-    ways = [
-        one, one, one, all_of_it, None, array[:0] if array.ndim else array[None],
-        array[:-1] if array.ndim else array * 2, np.stack([array, array]), array.ravel(), array.T,
-        array.astype(np.float16), array.astype(np.int64), array.astype(bool), -array,
-        array * 1e3, rng.permutation(array.ravel()).reshape(array.shape),
-        array.astype(np.float32), others[int(rng.integers(len(others)))],
-        np.repeat(array, 3, axis=-1) if array.ndim else array, np.zeros((0, 7)),
-    ]  # fmt: skip
+    with np.errstate(all="ignore"):
+        ways = [
+            one, one, one, all_of_it, None, array[:0] if array.ndim else array[None],
+            array[:-1] if array.ndim else array * 2, np.stack([array, array]), array.ravel(),
+            array.T,
+            array.astype(np.float16), array.astype(np.int64), array.astype(bool), -array,
+            array * 1e3, rng.permutation(array.ravel()).reshape(array.shape),
+            array.astype(np.float32), others[int(rng.integers(len(others)))],
+            np.repeat(array, 3, axis=-1) if array.ndim else array, np.zeros((0, 7)),
+        ]  # fmt: skip
     return ways[int(rng.integers(len(ways)))]
 
 

@@ -249,6 +249,37 @@ def test_headers_that_say_something_else_are_refused_or_do_no_harm(tmp_path, kin
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "message"),
+    [
+        ("elastic_chain", "tendon_zeros", 1e300, "must be finite, and less than 1e.75"),
+        (
+            "rigid_hybrid",
+            "drift_scale",
+            0.0,
+            "(the arrays do not give finite numbers|must be positive)",
+        ),
+        ("parallel_linear", "module.corrections.0.guard.model.factor", 0.0, "finite numbers"),
+    ],
+)
+def test_numbers_that_predict_nothing_finite(tmp_path, kind, name, value, message):
+    source, path = FOLDER / f"{kind}.safetensors", tmp_path / "model"
+    header, arrays = model_header(source), load_file(source)
+    write(path, header, {**arrays, name: np.full_like(arrays[name], value)})
+    with pytest.raises(ValueError, match=f"is damaged: .*{message}"):
+        load_model(path)
+
+
+def test_an_activation_that_is_none_and_a_message_that_ends(tmp_path):
+    source, path = FOLDER / "elm.safetensors", tmp_path / "model"
+    header, arrays = model_header(source), load_file(source)
+    header["parts"]["network"]["settings"]["activation"] = 10_000 * "x"
+    write(path, header, arrays)
+    with pytest.raises(ValueError, match="is damaged: `activation` must be one of") as caught:
+        load_model(path)
+    assert len(str(caught.value)) < 1_000
+
+
 def test_rule_for_files_of_other_versions(tmp_path):
     source, path = FOLDER / "serial_elm.safetensors", tmp_path / "model"
     header, arrays = model_header(source), load_file(source)

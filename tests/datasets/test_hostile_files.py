@@ -1,0 +1,126 @@
+"""Logs, recordings and checkpoints that are damaged, or cost more to read than their size says."""
+
+import io
+import os
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+
+from hybridkin.datasets import _npz, load_armlab, load_log, make_trunk
+from hybridkin.ik import trajectories
+
+Q, X = ["q1", "q2", "q3"], ["x", "y", "z"]
+HEADER = "q1,q2,q3,x,y,z,motion\n"
+
+
+def npy(shape, descr="<f8"):
+    """An npy file whose header says something else than its content."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": descr, "fortran_order": False, "shape": shape}
+    )
+    return file.getvalue() + bytes(16)
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        b"no magic number",
+        npy((0, 10**9)),
+        npy((10**18,)),
+        npy((2 * 10**9,), "|S0"),
+        npy((3,), "|O"),
+        npy((3,)).replace(b"(3,)", b"(3, "),
+    ],
+)
+def test_sizes_of_an_npz_that_are_not_there(tmp_path, member):
+    for path in (tmp_path / "log.npz", tmp_path / "armlab_3cable" / "armlab_3cable.npz"):
+        path.parent.mkdir(exist_ok=True)
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("q1.npy", member)
+    with pytest.raises(ValueError, match="is not an npz file of plain arrays"):
+        load_log(tmp_path / "log.npz", Q, X)
+    with pytest.raises(ValueError, match="is not an npz file of plain arrays"):
+        load_armlab(tmp_path)
+
+
+def test_an_npz_that_expands_without_measure(tmp_path, monkeypatch):
+    monkeypatch.setattr(_npz, "_MOST", 10**6)
+    path = tmp_path / "log.npz"
+    np.savez_compressed(path, q=np.zeros((10**5, 3)))
+    with pytest.raises(ValueError, match="expands to 2 MB, over 100 times its size"):
+        load_log(path, Q, X)
+
+
+def test_an_array_of_many_columns_and_one_of_complex_numbers(tmp_path):
+    path = tmp_path / "log.npz"
+    np.savez(path, q=np.zeros((2, 10_001)), x=np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="must have at most 10000 columns, got 10001"):
+        load_log(path, "q", "x")
+    np.savez(path, q=np.full((2, 3), 1j), x=np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="must hold numbers, got complex128"):
+        load_log(path, "q", "x")
+
+
+def test_a_parquet_of_one_value_repeated(tmp_path, monkeypatch):
+    monkeypatch.setattr(_npz, "_MOST", 10**6)
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    path = tmp_path / "log.parquet"
+    pd.DataFrame({"q1": np.zeros(400_000, dtype=bool)}).to_parquet(path)
+    with pytest.raises(ValueError, match="is not a parquet file: it expands to 3 MB"):
+        load_log(path, Q, X)
+
+
+def test_a_wide_header_over_short_rows_costs_what_the_file_holds(tmp_path):
+    path = tmp_path / "log.csv"
+    wide = HEADER.strip() + "".join(f",c{k}" for k in range(9_000)) + "\n"
+    path.write_text(wide + "0,0,0,0,0,0,a\n" * 3_000)
+    assert load_log(path, Q, X).q.shape == (3_000, 3)
+    path.write_text(wide.replace("\n", 2_000 * ",c" + "\n") + "0,0,0\n")
+    with pytest.raises(ValueError, match="must have at most 10000 columns, got 11007"):
+        load_log(path, Q, X)
+
+
+def test_names_of_motions_have_an_end(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER + "0,0,0,0,0,0," + "a" * 300 + "\n")
+    with pytest.raises(ValueError, match="`groups` must name motions in at most 256 characters"):
+        load_log(path, Q, X, "motion")
+
+
+def test_messages_have_an_end(tmp_path):
+    path = tmp_path / "log.csv"
+    for text in ("q" * 9_999 + ",a\n0,0\n", HEADER + "9" * 9_999 + "x,0,0,0,0,0,a\n"):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"log\.csv") as caught:
+            load_log(path, Q, X)
+        assert len(str(caught.value)) < 3_000
+
+
+def test_paths_that_are_no_text_or_no_file(tmp_path):
+    path = tmp_path / "path.csv"
+    path.write_bytes(b"t,x,y,z\n0,0,0,\xae\n")
+    with pytest.raises(ValueError, match=r"path\.csv is no text"):
+        trajectories.from_csv(path)
+    if sys.platform != "win32":
+        os.mkfifo(tmp_path / "pipe")
+        with pytest.raises(FileNotFoundError, match="`path` must be a CSV file of points"):
+            trajectories.from_csv(tmp_path / "pipe")
+
+
+@pytest.mark.slow
+def test_a_damaged_checkpoint_is_made_again_and_runs_nothing(tmp_path):
+    pytest.importorskip("mujoco")
+    options = {"n_segment": 1, "n_random": 1, "random_state": 0, "return_X_y": True}
+    whole = make_trunk(**options, checkpoint=tmp_path)
+    (file,) = tmp_path.iterdir()
+    content = file.read_bytes()
+    objects = np.array([print, None])
+    file.write_bytes(content[:-100])
+    np.testing.assert_array_equal(make_trunk(**options, checkpoint=tmp_path)[1], whole[1])
+    assert np.load(file).files == np.load(io.BytesIO(content)).files
+    np.savez(file, q=objects)
+    np.testing.assert_array_equal(make_trunk(**options, checkpoint=tmp_path)[1], whole[1])
