@@ -16,7 +16,6 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, check_shape
 
-_LARGEST = np.float64(1e75)  # of a number: the squares of larger ones, and their products, overflow
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
 
@@ -145,8 +144,8 @@ class Stored:
             raise ValueError(f"{name!r} must be float32 or float64, got {array.dtype}")
         if shape is not None:
             check_shape(array, name, shape)
-        if finite and not (np.abs(array) < _LARGEST).all():
-            raise ValueError(f"{name!r} must be finite, and less than {_LARGEST:g}")
+        if finite and not np.isfinite(array).all():
+            raise ValueError(f"{name!r} must be finite")
         return array
 
     def tensors(self, **shapes: str) -> dict[str, Tensor]:

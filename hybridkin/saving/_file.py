@@ -30,6 +30,7 @@ from hybridkin._core.stored import Stored
 FORMAT = "hybridkin-model"
 VERSION = 3
 _HEADER, _CHECKSUM = "hybridkin", "sha256"
+_LARGEST = 1e75  # of a number: the squares of larger ones, and their products, overflow
 _UNREADABLE = (SafetensorError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 Header = dict[str, Any]
@@ -58,6 +59,9 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
 
     Parts that say the same are one object, as the parts of the model were.
     """
+    for name, array in arrays.items():
+        if array.dtype == np.float64 and (np.isfinite(array) & (np.abs(array) >= _LARGEST)).any():
+            raise ValueError(f"the numbers of {name!r:.60} must be less than {_LARGEST:g}")
     found: dict[str, Stored] = {}
     kinds = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
 
