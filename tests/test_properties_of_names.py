@@ -44,6 +44,9 @@ ELSEWHERE = {
     "tip_transform",
     *("reset", "animate_track", "export_model"),
     "was_fitted",
+    # what a solver calls of its task; the rest by tests of its own
+    *("check", "difference", "distances", "evaluate", "reached"),
+    *("predict_and_jacobian", "score", "set_params", "follow", "export_c"),
 }
 
 

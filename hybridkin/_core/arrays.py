@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Collection, Iterable, Sequence
-from numbers import Integral, Real
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -83,7 +83,7 @@ def number(value: Any, name: str) -> float:
 
 def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
     """Return a caller's whole number within these limits."""
-    if not isinstance(value, Integral) or not least <= value <= most:
+    if not isinstance(value, (int, np.integer)) or not least <= value <= most:
         need = f"at least {least}" if most == math.inf else f"{least} to {most}"
         raise ValueError(f"`{name}` must be {need}, a whole number, got {value!r:.80}.")
     return int(value)

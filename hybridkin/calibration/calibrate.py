@@ -7,6 +7,7 @@ import difflib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -380,6 +381,8 @@ def _check_parameters(
                 f"`parameters` must not hold both {entry!r} and {alias!r}, which moves a part of "
                 f"them; leave {alias!r} out."
             )
+    if not isinstance(bounds, (Mapping, NoneType)):
+        raise TypeError(f"`bounds` must map names to (low, high), got {bounds!r:.80}.")
     for argument, given in (("bounds", bounds), ("prior", prior)):
         if isinstance(given, Mapping) and not set(given) <= set(names):
             raise ValueError(f"`{argument}` must name only {names}, got {sorted(given)}.")

@@ -154,6 +154,7 @@ class PlayOperator:
             For wrong shapes or entries that are not finite.
         """
         rows = real_array(q, "q")
+        check_shape(rows, "q", ("N", "n"))
         q = q if isinstance(q, Tensor) else rows
         groups = labels(groups, len(q))
         order = np.argsort(groups, kind="stable")  # a motion's rows keep their order

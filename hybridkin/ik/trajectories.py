@@ -310,15 +310,15 @@ def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.nda
 
 def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a right-handed frame (across, up, normal)."""
-    normal = _checked(normal, "normal", _POINT, (3,))
-    if not normal.any():
+    given = _checked(normal, "normal", _POINT, (3,))
+    if not given.any():
         raise ValueError("`normal` must not be zero; it is the normal of the plane.")
-    normal = normal / np.abs(normal).max()  # squares neither overflow nor vanish
-    normal /= np.linalg.norm(normal)
-    axis = np.eye(3)[0 if abs(normal[0]) < 1.0 - 1e-9 else 1]
-    across = axis - (axis @ normal) * normal
+    along = given / np.abs(given).max()  # squares neither overflow nor vanish
+    along = along / np.linalg.norm(along)
+    axis = np.eye(3)[0 if abs(along[0]) < 1.0 - 1e-9 else 1]
+    across = axis - (axis @ along) * along
     across /= np.linalg.norm(across)
-    return across, np.cross(normal, across), normal
+    return across, np.cross(along, across), along
 
 
 def _checked(

@@ -93,7 +93,7 @@ def _around_arcs(
         about = np.stack([-bending[:, s, 1], bending[:, s, 0], 0.0 * bending[:, s, 0]], axis=-1)
         turn = Rotation.from_rotvec((t[:, None] * about[:, None]).reshape(-1, 3)).as_matrix()
         centres.append(centre)
-        turns.append(frames[:, s, None, :3, :3] @ turn.reshape(len(q), -1, 3, 3))
+        turns.append(frames[:, s, None, :3, :3] @ turn.reshape(len(q), len(t), 3, 3))
     corner = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
     rim = _RIM * np.stack([np.cos(corner), np.sin(corner), 0.0 * corner])
 

@@ -209,7 +209,7 @@ class ActuatorDisplay:
                     f"says, got {q.shape} for {name!r}; the first has {rows} rows."
                 )
         self.t, self.names = times(t, *rows), None if names is None else [*map(str, names)]
-        if names is not None and len(self.names) != n:
+        if self.names is not None and len(self.names) != n:
             raise ValueError(f"`names` must hold {n} names, one per actuator, got {names!r:.80}.")
         self.limits = None if limits is None else shaped(limits, "limits", ("2", n))
 
