@@ -117,6 +117,9 @@ class RigidChain(JointChain):
         if couplings is not None:
             couplings = shaped(couplings, "couplings", "nm", n_joints)
         self.n_actuators = n = n_joints if couplings is None else couplings.shape[1]
+        for name, value in (("kinds", kinds), ("names", names)):
+            if value is not None and not np.iterable(value):
+                raise TypeError(f"`{name}` must be a sequence of texts, got {value!r:.80}.")
         self.kinds = ("revolute",) * n_joints if kinds is None else tuple(map(str, kinds))
         default = [f"joint_{k + 1}" for k in range(n)]
         self.names = tuple(map(str, default if names is None else names))
