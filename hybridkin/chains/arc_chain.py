@@ -161,10 +161,14 @@ class ArcChain(MarkedChain):
         tensor([0., 0., 1.], dtype=torch.float64)
         """
         self._check_tangents(tangents)
-        arcs, change = self._arcs_and_change(self._rows(q))
         tangents = {name: value.to(q) for name, value in tangents.items()}
-        J = torch.cat([one._along(arcs, change, tangents) for one in self.tips()], dim=1)
-        return J.reshape(*q.shape[:-1], *J.shape[1:])
+        tips = self.tips()
+
+        def along(rows: Tensor) -> tuple[Tensor]:
+            arcs, change = self._arcs_and_change(self._rows(rows))
+            return (torch.cat([one._along(arcs, change, tangents) for one in tips], dim=1),)
+
+        return in_blocks(along, q)[0]
 
     def _along(self, arcs: Tensor, change: Change, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return how the tip (N, 3, P) moves along changes of the geometry, of arcs (3 S, N)."""
@@ -278,7 +282,10 @@ class ArcChain(MarkedChain):
         """Return a warning where lengths exceed 10 m, or length changes the backbone's 4-fold."""
         name = name if self.in_metres else f"{name}` times `gains"
         # Of limits that are not there, and of speeds, q itself is small.
-        metres = torch.minimum((self.gains.to(q) * q).abs(), self.metres(q).abs())
+        gains = self.gains.to(q)
+        (metres,) = in_blocks(
+            lambda rows: (torch.minimum((gains * rows).abs(), self.metres(rows).abs()),), q
+        )
         pull = LONGEST_PULL * self.reach.detach()
         beyond = metres > factor * torch.where(self.absolute, 10.0, pull).to(q)
         beyond[..., : self.stage is not None] = False  # an angle

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform, identity
+from hybridkin._core.blocks import in_blocks
 from hybridkin._core.stored import Layout
 from hybridkin.chains._arcs import free_arcs, levers, reading_matrix, turned_by_first
 from hybridkin.chains._checks import bend_counts, filled, float_dtype
@@ -216,9 +217,12 @@ class ConstantCurvatureChain(ArcChain):
             The number of rows that are `contradictory`, and the worst of them. None where there
             are none; extensible segments do not count.
         """
+        if all(self.extensible):
+            return None
         with torch.no_grad():
             rows = self._rows(q)
-            wrong = self.contradictory(rows) & ~torch.tensor(self.extensible, device=q.device)
+            given = ~torch.tensor(self.extensible, device=q.device)
+            (wrong,) = in_blocks(lambda some: (self.contradictory(some) & given,), rows)
             if not wrong.any():
                 return None
             residual = self.consistency(rows) * wrong

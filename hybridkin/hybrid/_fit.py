@@ -15,6 +15,7 @@ from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 
 from hybridkin._core.arrays import countable
+from hybridkin._core.blocks import in_blocks
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.units import motion_message
@@ -325,7 +326,8 @@ def _fit_part(
     alone = HybridModule(mechanical, [correction], q.new_ones(1))
     with torch.no_grad():
         own = correction.module if isinstance(correction, TipCorrection) else None
-        correction.guard = fit_guard(spec.guard, alone.error_part(q), own, q, errors.counts)
+        (found,) = in_blocks(lambda rows: (alone.error_part(rows),), q)
+        correction.guard = fit_guard(spec.guard, found, own, q, errors.counts)
     return fitted, correction
 
 

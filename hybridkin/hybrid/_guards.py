@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import PortableModule, reverse_jacobian
 from hybridkin._core.stored import Layout
 from hybridkin.hybrid._features import center_and_scale
@@ -17,6 +18,7 @@ GUARDS = ("leverage", "box", None)
 _STILL = 1e-3  # of the largest spread: the log does not move in such a direction
 _AS_IF = 0.1  # of the range: the spread that is assumed in such a direction
 _ROWS = 128  # that stand for the training rows
+_BLOCK = 4096  # training rows whose distances are computed at a time
 _TESTED = 0.98  # share of these rows, whose distances from other groups count as tested
 _STEP = 0.2  # the least distance to be tested, where the range of an actuator is 2
 
@@ -123,7 +125,7 @@ class LeverageGuard(Guard):
 
         That is h / (1 - c h), with h the leverage of a row that took part in the fit c times.
         """
-        h = model.leverage(q)
+        h = in_blocks(lambda rows: (model.leverage(rows)[:, None],), q)[0][:, 0]
         return cls(model, (h / (1.0 - counts * h).clamp(min=1e-9)).max(), largest)
 
     def domain_distance(self, q: Tensor) -> Tensor:
@@ -272,7 +274,10 @@ class GroupDistance(PortableModule):
                 break
             picked.append(gap.argmax())
         rows = torch.stack(picked)
-        apart = torch.cdist(y[rows], y).masked_fill(of[rows, None] == of, torch.inf).amin(1)
+        own, apart = of[rows, None], y.new_full((len(rows),), torch.inf)
+        for some, theirs in zip(y.split(_BLOCK), of.split(_BLOCK), strict=True):
+            far = torch.cdist(y[rows], some).masked_fill(own == theirs, torch.inf)
+            apart = torch.minimum(apart, far.amin(1))
         # All training rows are within a gap of the picked ones, and so are their distances.
         # Where every motion was repeated, the step keeps the domain from being empty.
         return cls(q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP))

@@ -14,6 +14,7 @@ from sklearn.metrics.pairwise import euclidean_distances
 
 from hybridkin.calibration.measured import distance, folds
 
+_MOST = 10_000  # rows, for which the matrices take 3 GB
 _FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 _GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # over the mean variance of the inputs
@@ -31,6 +32,12 @@ def tuned_kernel(
 
     The search starts on a coarse grid and walks to the best neighbour until none is better.
     """
+    if len(X) > _MOST:
+        raise ValueError(
+            f"`X` must hold at most {_MOST} different rows with error_model='kernel', whose memory "
+            f"grows with the square of their number, got {len(X)}; leave rows out, or use "
+            "error_model=ELMRegressorCV()."
+        )
     splits = folds_of(X, groups)
     spread = X.var(axis=0).mean() or 1.0
     squares = euclidean_distances(X.astype(np.float64), squared=True)

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
 from hybridkin.hybrid._guards import BoxGuard, GroupDistance, LeverageGuard, QuadraticLeverage
+from hybridkin.learning.network import ELM
 
 LONGEST = torch.tensor(0.01).double()
 
@@ -120,6 +121,31 @@ def test_all_rows_of_a_long_log_are_within_the_group_distance():
     y = q @ found.axes
     apart = torch.cat([torch.cdist(y[of == k], y[of != k]).amin(1) for k in range(20)])
     assert apart.quantile(0.95) <= found.farthest < apart.max() + 0.5
+
+
+@pytest.mark.parametrize("error_model", [None, LinearRegression()], ids=["elm", "quadratic"])
+def test_a_long_log_is_fitted_block_by_block(monkeypatch, error_model):
+    """Its leverages and distances took 6 kB for each row: 6 GB for a million rows."""
+    sizes, cdist = [], torch.cdist
+    for kind in (ELM, QuadraticLeverage):
+        leverage = kind.leverage
+
+        def watched(self, q, leverage=leverage):
+            sizes.append(len(q))
+            return leverage(self, q)
+
+        monkeypatch.setattr(kind, "leverage", watched)
+    monkeypatch.setattr(torch, "cdist", lambda a, b: sizes.append(len(b)) or cdist(a, b))
+    q = 0.25 + 0.05 * rows(9000, 3)
+    chain = ConstantCurvatureChain([0.05])
+    x = chain(q) + 0.01 * torch.sin(20.0 * q)
+    model = HybridForwardModel(chain, error_model, random_state=0)
+    model.fit(q.numpy(), x.numpy(), groups=np.arange(9000) // 90)
+    assert 2 * 9000 <= sum(sizes)
+    assert max(sizes) <= 4096
+    guard = model.module_.corrections[0].guard
+    h = guard.model.leverage(q)
+    assert_close((h / (1.0 - h)).max(), guard.limit, rtol=1e-9, atol=0)
 
 
 def test_slope_of_the_group_distance():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from sklearn.kernel_ridge import KernelRidge
 
+from hybridkin import HybridForwardModel
 from hybridkin.hybrid import _kernel
 from hybridkin.hybrid._kernel import distance, folds_of, tuned_kernel
 
@@ -39,3 +40,9 @@ def test_no_neighbour_of_the_tuned_kernel_is_better(n_outputs, grouped):
     for gamma, alpha in near:
         other = held_out(X, y, weights, groups, gamma / spread, alpha)
         assert best <= other * (1.0 + 1e-9)
+
+
+def test_more_rows_than_the_memory_holds_are_refused():
+    X = np.random.default_rng(0).uniform(size=(10_001, 2))
+    with pytest.raises(ValueError, match=r"at most 10000 different rows .*, got 10001; leave rows"):
+        HybridForwardModel(None, "kernel").fit(X, X)
