@@ -268,8 +268,10 @@ class GroupDistance(PortableModule):
         y = (q - q.mean(0)) @ axes
         # Each row that is added is the farthest from those before.
         picked, gap = [y.square().sum(1).argmax()], y.new_full((len(y),), torch.inf)
+        step = torch.empty_like(y)  # a new one for each would cost more than the sums
         while True:
-            gap = torch.minimum(gap, (y - y[picked[-1]]).square().sum(1))
+            torch.sub(y, y[picked[-1]], out=step)
+            gap = torch.minimum(gap, step.square_().sum(1))
             if len(picked) == _ROWS or not gap.any():
                 break
             picked.append(gap.argmax())

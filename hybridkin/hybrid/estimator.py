@@ -65,7 +65,7 @@ class HybridForwardModel(HybridPredictor):
         - "linear" or "quadratic" features of all actuators, or "pose", features of a chain's shape
           that loads act on. Linear and other features have separate penalties, which are chosen
           by the leave-out error of rows, or groups; they may reject any correction;
-        - "kernel": Gaussian kernel ridge, its width and penalty chosen on 5 folds;
+        - "kernel": Gaussian kernel ridge tuned on 5 folds, for up to 10 000 rows;
         - "drop": the mechanical model alone;
         - "auto": the blend of these, with linear and other features in both couplings, that has
           the least error on held-out groups, or rows, and a little on rows outside those of the

@@ -177,9 +177,13 @@ def _in_words(entry: dict[str, Any]) -> list[str]:
             f"Of {len(tried)} sets of parameters auto calibrates {_of_set(entry['taken'], tried)}."
         )
     candidates = entry["candidates"]
-    least, alone = min((e, name) for name, e in candidates.items() if name != "blend")
+    # Of one that was taken alone its own error, whichever has the least: a gain must be clear.
+    names = {*candidates} - {"blend"} if len(entry["weights"]) > 1 else {*entry["weights"]}
+    least, alone = min((candidates[name], name) for name in names)
     best, without = f"{1e3 * least:.2f} mm", f"{1e3 * candidates['mechanical']:.2f} mm without any."
     text = f"Auto took the error model {alone}: {best} on held-out motions, {without}"
+    if alone == "mechanical":
+        text = f"Auto took no error model: {best} on held-out motions; no other is clearly better."
     if len(entry["weights"]) > 1:
         text = (
             "The blend of auto is the weighted mean of several hybrids: "

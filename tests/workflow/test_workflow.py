@@ -24,6 +24,7 @@ from hybridkin import (
 from hybridkin.cli.main import main
 from hybridkin.saving.saved_model import model_header
 from hybridkin.workflow._domain import Domain
+from hybridkin.workflow._fit_report import auto_entry
 from hybridkin.workflow.report import geometry_entries, statistics
 
 ROBOT = """
@@ -300,6 +301,29 @@ def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("weights", "sentence"),
+    [
+        ([1.0, 0.0, 0.0], "Auto took no error model: 2.50 mm on held-out motions; no other is"),
+        ([0.0, 1.0, 0.0], "Auto took the error model linear: 2.45 mm on held-out motions, 2.50 mm"),
+        ([0.0, 0.5, 0.5], "2.30 mm on held-out motions, 2.40 mm with the best of them alone (ELM)"),
+    ],
+    ids=["nothing", "not the least", "blend"],
+)
+def test_words_about_auto_are_those_of_what_it_took(weights, sentence):
+    names = ["mechanical", "linear", "ELM"]
+    model = HybridForwardModel(None, "auto")
+    model.mechanical_model_ = model.play_ = None
+    model.cv_results_ = {
+        "candidate": [*names, "blend"],
+        "mean_distance": np.array([2.5e-3, 2.45e-3, 2.4e-3, 2.3e-3]),
+        "chosen": "blend" if 0.5 in weights else names[weights.index(1.0)],
+        "weights": dict(zip(names, weights, strict=True)),
+        "mechanical_model": {"nothing": {"cv": 2.5e-3}},
+    }
+    assert sentence in " ".join(auto_entry(model)["words"])
+
+
 def test_play_lowers_the_errors_of_auto_on_held_out_motions():
     rng = np.random.default_rng(0)
     chain = ConstantCurvatureChain([0.005], lengths=[0.1])
