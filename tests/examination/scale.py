@@ -48,8 +48,8 @@ TO_1E6, TO_1E7 = ([10**k for k in range(3, end)] for end in (7, 8))
 FIT, SMALL, MIDDLE = "HybridForwardModel.fit", slice(2), slice(1, 3)
 CLAIMS = {
     "elm_stream": Claim("ELMRegressor.partial_fit, 10 000 rows a call", TO_1E7[2:], SMALL, 0.0),
-    "elm_fit": Claim("ELMRegressor.fit", TO_1E7, MIDDLE, 10.0),
-    "elm_predict": Claim("ELMRegressor.predict", TO_1E7, MIDDLE, 50.0),
+    "elm_fit": Claim("ELMRegressor.fit", TO_1E7, MIDDLE, 150.0),
+    "elm_predict": Claim("ELMRegressor.predict", TO_1E7, MIDDLE, 100.0),
     "hybrid_predict": Claim("HybridForwardModel.predict", TO_1E7, MIDDLE, 400.0),
     "hybrid_fit": Claim(f"{FIT}, ELM", TO_1E6, MIDDLE, 1500.0),
     "solve": Claim("InverseKinematics.solve", TO_1E6, SMALL, 1500.0),
