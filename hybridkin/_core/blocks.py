@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import check_shape
+
+if hasattr(os, "register_at_fork"):
+    # A forked child has none of the threads of OpenMP, and would wait for them forever.
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def in_blocks(

@@ -39,7 +39,8 @@ class Portable:
     """
 
     def __getstate__(self) -> dict[str, Any]:
-        return _closed({key: value for key, value in vars(self).items() if key != "_program"})
+        own = vars(self).copy()  # at once: another thread may add what it compiles
+        return _closed({key: value for key, value in own.items() if key != "_program"})
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(_opened(state))

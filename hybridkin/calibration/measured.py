@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold, KFold
 
 from hybridkin._core.arrays import countable
+from hybridkin._core.turns import TURNS
 
 _INNER, _BEYOND = 0.4, 0.65  # of rows by distance: the inner ones, where the outer ones begin
 _EXCITED = 0.01  # of the largest spread
@@ -86,7 +87,8 @@ def folds(
     if groups is None:
         return [*KFold(n_folds, shuffle=True, random_state=0).split(X)]
     splitter = GroupKFold(n_folds, shuffle=shuffle, random_state=0 if shuffle else None)
-    return [*splitter.split(X, groups=groups)]
+    with TURNS.filters:
+        return [*splitter.split(X, groups=groups)]
 
 
 def moved_directions(X: NDArray) -> tuple[NDArray, NDArray | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, NamedTuple, cast
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone
+from sklearn.kernel_ridge import KernelRidge
 from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 
@@ -18,6 +20,7 @@ from hybridkin._core.arrays import countable
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin._core.turns import TURNS
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
@@ -342,7 +345,8 @@ def _fit_regressor(model: Any, given_rows: Rows, rows: Rows, place: NDArray) -> 
     if rows.groups is not None and has_fit_parameter(model, "groups"):
         given["groups"] = rows.groups
     regressor: Any = clone(model)
-    fitted = regressor.fit(rows.X, rows.y, **given)
+    with TURNS.filters if isinstance(regressor, KernelRidge) else nullcontext():
+        fitted = regressor.fit(rows.X, rows.y, **given)
     if isinstance(fitted, ELMRegressorCV):
         fitted.left_out_errors_ = at_place(fitted.left_out_errors_, place)
     return fitted

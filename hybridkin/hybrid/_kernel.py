@@ -12,6 +12,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.metrics.pairwise import euclidean_distances
 
+from hybridkin._core.turns import TURNS
 from hybridkin.calibration.measured import distance, folds
 
 _MOST = 10_000  # rows, for which the matrices take 3 GB
@@ -40,7 +41,8 @@ def tuned_kernel(
         )
     splits = folds_of(X, groups)
     spread = X.var(axis=0).mean() or 1.0
-    squares = euclidean_distances(X.astype(np.float64), squared=True)
+    with TURNS.filters:
+        squares = euclidean_distances(X.astype(np.float64), squared=True)
     root = np.sqrt(weights).reshape(-1, *[1] * (error.ndim - 1))
     targets = root * error
 

@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from hybridkin._core.arrays import labels
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.stored import plain
+from hybridkin._core.turns import TURNS
 from hybridkin.learning._left_out import LeftOut
 from hybridkin.learning._ridge import gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
@@ -326,7 +327,9 @@ def _splits(cv, groups, n_rows, place):
         place = np.arange(n_rows)
     splits, rows = [], np.arange(len(place))
     splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
-    for train, test in splitter.split(rows, rows, groups):
+    with TURNS.filters:
+        found = [*splitter.split(rows, rows, groups)]
+    for train, test in found:
         if np.isin(rows[test], rows[train]).any():
             raise ValueError(
                 "`cv` must not test on rows that it trains on, but a split of its own does; use a "

@@ -42,15 +42,18 @@ def _scaling(X, sample_weight, input_scaling):
 
 def check_rows(estimator, X, y, sample_weight, reset=True):
     """Return the rows, `y` in float64, and their weights."""
-    checks = {"dtype": DTYPES, "order": "C", "multi_output": True, "y_numeric": True}
     X, y, sample_weight = map(table, (X, y, sample_weight), ("X", "y", "sample_weight"))
-    with np.errstate(invalid="ignore"):  # both infinities in a sum
-        X, y = map(np.asarray, validate_data(estimator, X, y, reset=reset, **checks))
-    if sample_weight is not None:
-        sample_weight = _check_sample_weight(
-            sample_weight, X, dtype=np.float64, ensure_non_negative=True
-        )
-    return X, y.astype(np.float64, copy=False), sample_weight
+    good = _is_finite(y, 1) or _is_finite(y, 2)
+    checks = {"multi_output": True, "y_numeric": True}
+    X, y = _validated(estimator, X, y, good=good, reset=reset, **checks)
+    weights = None if sample_weight is None else np.asarray(sample_weight, dtype=np.float64)
+    if weights is not None:
+        good = _is_finite(weights, 1) and len(weights) == len(X) and weights.min() >= 0.0
+        if not good or not weights.any():
+            weights = _check_sample_weight(
+                sample_weight, X, dtype=np.float64, ensure_non_negative=True
+            )
+    return X, y.astype(np.float64, copy=False), weights
 
 
 def check_inputs(estimator, X):
@@ -58,15 +61,31 @@ def check_inputs(estimator, X):
 
     A plain array that has all that it asks for passes by a quick test.
     """
-    if type(X) is np.ndarray and X.ndim == 2 and X.dtype in DTYPES and len(X):
-        named = "feature_names_in_" in vars(estimator)
-        with np.errstate(all="ignore"):
-            good = np.isfinite(X.sum()) and X.shape[1] == estimator.n_features_in_ and not named
-        if good:
+    if _is_finite(X, 2) and X.shape[1] == estimator.n_features_in_:
+        if "feature_names_in_" not in vars(estimator):
             return np.ascontiguousarray(X)
-    X = table(X, "X")
-    with np.errstate(invalid="ignore"):
-        return np.asarray(validate_data(estimator, X, reset=False, dtype=DTYPES, order="C"))
+    return _validated(estimator, table(X, "X"), reset=False)[0]
+
+
+def _is_finite(a, ndim):
+    """Return whether something is a plain array of real, finite numbers."""
+    if type(a) is not np.ndarray or a.ndim != ndim or a.dtype not in DTYPES or not a.size:
+        return False
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(a.sum()))
+
+
+def _validated(estimator, X, *y, good=True, **checks):
+    """Return X and y, checked by scikit-learn.
+
+    Its checks of arrays change the filters for warnings, which belong to all threads: arrays
+    without a fault do without them.
+    """
+    good = good and _is_finite(X, 2) and all(len(X) == len(a) for a in y)
+    checks |= {"dtype": DTYPES, "order": "C", "skip_check_array": good}
+    with np.errstate(invalid="ignore"):  # both infinities in a sum
+        found = validate_data(estimator, X, *y, **checks)
+    return [*map(np.asarray, (X, *y) if good else found if y else [found])]
 
 
 def draw_layer(params, X, sample_weight):

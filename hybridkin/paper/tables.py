@@ -8,8 +8,8 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
+from hybridkin._core.turns import one_thread
 from hybridkin.calibration.calibrate import calibrate
 from hybridkin.calibration.measured import distance
 from hybridkin.chains import robots
@@ -108,7 +108,7 @@ def summary(errors: list[list[NDArray]]) -> dict[str, float]:
     return {name: float(value) for name, value in found.items()}
 
 
-@threadpool_limits.wrap(limits=1)  # the processes share the cores already
+@one_thread()  # the processes share the cores already
 def _one_split(
     q: NDArray, x: NDArray, part: NDArray, split: int, n_seeds: int
 ) -> dict[tuple[str, str], list[tuple[NDArray, NDArray]]]:

@@ -8,9 +8,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.turns import one_thread
 from hybridkin.chains import robots
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.ik import trajectories
@@ -104,7 +104,7 @@ def tracked_models(q: NDArray, x: NDArray) -> dict[str, HybridForwardModel]:
     return {name: models[name].fit(q, x) for name in MODELS}
 
 
-@threadpool_limits.wrap(limits=1)
+@one_thread()
 def _one_track(
     model: ForwardModel,
     path: Trajectory,

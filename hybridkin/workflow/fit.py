@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
-from sklearn.model_selection import GroupKFold
-from threadpoolctl import threadpool_limits
 
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.turns import one_thread
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
-from hybridkin.calibration.measured import distances
+from hybridkin.calibration.measured import distances, folds
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -216,23 +215,22 @@ def compare_by_group(
         Errors [m] by model and row, the fold of each row, and what was chosen in each fold.
     """
     log = checked(log, robot.chain, robot.base_is_free)
-    n_folds = min(settings.n_folds, len(np.unique(log.motions)))
-    folds = list(GroupKFold(n_folds).split(log.q, groups=log.motions))
+    parts = folds(log.q, log.motions, settings.n_folds)
     rows = _Rows(log.q, log.x, log.motions, robot, settings)
-    jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in folds)
+    jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in parts)
     found = Comparison({}, {}, np.empty(len(log.q), dtype=int), [])
     most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
-    most = min(effective_n_jobs(n_jobs or 1), len(folds), most)
+    most = min(effective_n_jobs(n_jobs or 1), len(parts), most)
     # Else torch and BLAS start threads in every process, and these wait for each other.
     workers = Parallel(n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator")
     results: Any = workers(jobs)
-    for i, ((_, test), (errors, chosen)) in enumerate(zip(folds, results, strict=True)):
+    for i, ((_, test), (errors, chosen)) in enumerate(zip(parts, results, strict=True)):
         for name, values in errors.items():
             empty = np.empty((len(log.q), values.shape[1]))
             found.markers.setdefault(name, empty)[test] = values
         found.fold[test] = i
         found.choices.append(chosen)
-        progress("cross-validation by motion", i + 1, len(folds))
+        progress("cross-validation by motion", i + 1, len(parts))
     found.errors.update((name, np.nanmean(values, 1)) for name, values in found.markers.items())
     return found
 
@@ -375,7 +373,7 @@ def _add_model(
         report.file("robot.toml", partial(shutil.copyfile, robot.path))
 
 
-@threadpool_limits.wrap(limits=1)  # the processes share the cores already
+@one_thread()  # the processes share the cores already
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors on test rows of every model fitted to training rows, and the choices."""
     names = _MODELS if train.settings.auto else _MODELS[:-1]
@@ -442,8 +440,7 @@ def _choose(rows: _Rows, *, hybrid: bool) -> tuple[float | None, str | None]:
     if len(guards) > 1:
         candidates.insert(0, (None, "leverage"))
     errors = np.zeros(len(candidates))
-    folds = GroupKFold(min(_INNER_FOLDS, len(np.unique(rows.groups))))
-    for train, test in folds.split(rows.q, groups=rows.groups):
+    for train, test in folds(rows.q, rows.groups, _INNER_FOLDS):
         known, new = rows.of(train), rows.of(test)
         base = known.mechanical() if hybrid else None
         errors += [np.nansum(_held_out(_elm(base, *c), known, new)) for c in candidates]

@@ -146,3 +146,16 @@ def test_command_line(tmp_path, capsys):
     assert "every 0.002 s" in readme
     assert "change of\nthat speed below (5, 5, 5, 5, 5, 5) per second" in readme
     assert subprocess.run([built(Path(out))], capture_output=True).returncode == 0
+
+
+def test_files_are_replaced_once_all_are_written(tmp_path, monkeypatch):
+    """Another process may write or read them at the same time."""
+    before = {path: path.read_text() for path in export_c(tendon_chain(), tmp_path)}
+
+    def stopped(source):
+        raise OSError("stopped")
+
+    monkeypatch.setattr("hybridkin.native.export._measured", stopped)
+    with pytest.raises(OSError, match="stopped"):
+        export_c(ConstantCurvatureChain([0.05]), tmp_path)
+    assert {path: path.read_text() for path in tmp_path.iterdir()} == before

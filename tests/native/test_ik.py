@@ -348,3 +348,19 @@ def test_one_target_for_several_starts():
         solution = ik.solve(target, q0, restarts=2)
         status = [IKStatus.CONVERGED, IKStatus.CONVERGED, IKStatus.INVALID_INPUT]
         assert np.asarray(solution.status).tolist() == status
+
+
+@pytest.mark.parametrize("settings", [{}, {"dq_max": 0.5, "ddq_max": 5.0}, {"limits": "off"}])
+def test_targets_too_far_to_compute_with_stop_nothing_but_the_step(settings):
+    ik, here = InverseKinematics(BHA, q_min=0.1, q_max=0.4, **settings), np.array([0.1, 0.0, 0.7])
+    q0 = 0.25 + 0.01 * np.cos(np.arange(9.0))
+    for start in (q0, torch.from_numpy(q0)):
+        tracker = ik.tracker(start)
+        run = [start, *(tracker.step(x) for x in (here, *[np.full(3, 1.7e308)] * 3, here))]
+        steps = np.diff(np.stack([np.asarray(q) for q in run]), axis=0)
+        assert np.isfinite(steps).all()
+        assert steps[-1].any()
+        if settings.get("ddq_max"):
+            assert abs(np.diff(steps, axis=0)).max() < 5e-4 * (1.0 + 1e-9)
+        else:
+            assert not steps[1:-1].any()

@@ -170,7 +170,7 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
         }
         ik_step_bounds(ik, q, seconds, last, s);
         ik_limited_step(ik, J, v, ik->flags & IK_POSTURE, NULL, s);
-        if (ik_finite(n, s->dq)) return;
+        if (ik_finite(n, s->dq)) return; /* else v is too large to compute with */
     }
     ik_step_bounds(ik, q, seconds, known ? last : NULL, s);
     for (int j = 0; j < n; j++) {

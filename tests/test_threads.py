@@ -1,0 +1,151 @@
+"""Threads and forks: what belongs to the process stays as it is."""
+
+import os
+import signal
+import threading
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from saved_models import trunk, trunk_log
+
+from hybridkin import ELMRegressor, ELMRegressorCV, HybridForwardModel
+from hybridkin._core.turns import TURNS, one_thread
+
+Q, X, GROUPS = trunk_log()
+ELM = ELMRegressor(4, random_state=0)
+
+
+def hybrid(error_model, **settings):
+    return HybridForwardModel(trunk(), error_model, random_state=0, **settings)
+
+
+@pytest.fixture
+def changes(monkeypatch):
+    """Note for every change of the filters whether other threads were kept from changing them."""
+    seen = []
+
+    class Watched(warnings.catch_warnings):
+        def __enter__(self):
+            seen.append(TURNS.filters._is_owned())
+            return super().__enter__()
+
+    monkeypatch.setattr(warnings, "catch_warnings", Watched)
+    return seen
+
+
+@pytest.mark.parametrize("rows", [Q, Q.astype(np.float32), Q.tolist()], ids=type)
+@pytest.mark.parametrize("model", [ELM, hybrid(ELM)], ids=["elm", "hybrid"])
+def test_rows_without_fault_change_no_filters(changes, model, rows):
+    """The filters for warnings belong to all threads."""
+    model.fit(rows, X, sample_weight=np.ones(len(X)))
+    model.partial_fit(rows, X).predict(rows)
+    assert not changes
+    with pytest.raises(ValueError, match="NaN"):
+        model.partial_fit(np.full_like(Q, np.nan), X)
+    with pytest.raises(ValueError, match=r"[Nn]egative"):
+        model.fit(rows, X, sample_weight=-np.ones(len(X)))
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        ELMRegressorCV(4, cv=3, relevance_rounds=0, max_hidden=4, random_state=0),
+        ELMRegressorCV(4, relevance_rounds=0, max_hidden=4, random_state=0),
+        hybrid("kernel"),
+        hybrid("linear", calibrate=("radii",)),
+    ],
+    ids=["folds", "motions", "kernel", "calibrated"],
+)
+def test_threads_change_filters_in_turn(changes, model):
+    model.fit(Q, X, groups=GROUPS)
+    assert all(changes)
+
+
+def test_limits_of_overlapping_calls_end_with_them(monkeypatch):
+    inside, go_on, now = threading.Event(), threading.Event(), [2]
+
+    class Limits:
+        """As those of threadpoolctl: of the process, and what was found is put back."""
+
+        def __init__(self, limits):
+            self.found, now[0] = now[0], limits
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            now[0] = self.found
+
+    monkeypatch.setattr("hybridkin._core.turns.threadpool_limits", Limits)
+
+    @one_thread()
+    def first():
+        inside.set()
+        go_on.wait(10.0)
+
+    @one_thread()
+    def second():
+        assert go_on.is_set()  # it has waited
+
+    threads = [threading.Thread(target=work, daemon=True) for work in (first, second)]
+    threads[0].start()
+    assert inside.wait(10.0)
+    threads[1].start()
+    threads[1].join(0.05)
+    assert threads[1].is_alive()
+    assert now == [1]
+    go_on.set()
+    [thread.join(10.0) for thread in threads]
+    assert now == [2]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_child_computes_after_a_fork():
+    """Many rows in two threads of torch; another thread has a lock."""
+    model, threads = hybrid(ELM).fit(Q, X), torch.get_num_threads()
+    rows = torch.from_numpy(np.tile(Q, (2000, 1)))
+    held, done = threading.Event(), threading.Event()
+
+    def hold():
+        with TURNS.filters:
+            held.set()
+            done.wait(30.0)
+
+    holder = threading.Thread(target=hold, daemon=True)
+    holder.start()
+    try:
+        torch.set_num_threads(2)
+        expected = (rows.sin().sum(), model.module_(rows))
+        assert held.wait(10.0)
+        child = os.fork()
+        if child == 0:
+            signal.alarm(20)  # ends a child that waits
+            found = (rows.sin().sum(), model.module_(rows))
+            hybrid("kernel").fit(Q, X)
+            same = all(torch.allclose(a, b) for a, b in zip(found, expected, strict=True))
+            os._exit(0 if same else 1)
+        assert os.waitpid(child, 0)[1] == 0
+    finally:
+        torch.set_num_threads(threads)
+        done.set()
+        holder.join(10.0)
+
+
+def test_a_model_is_copied_while_another_thread_compiles_it():
+    class Name(str):
+        def __ne__(self, other):
+            vars(chain).setdefault("_program", None)
+            return str.__ne__(self, other)
+
+        __hash__ = str.__hash__
+
+    chain = trunk()
+    vars(chain).pop("_program", None)
+    vars(chain)[Name("anything")] = 1
+    state = chain.__getstate__()
+    assert "_program" in vars(chain)
+    assert "_program" not in state
