@@ -2,7 +2,7 @@
 
     python _tracker_soak.py TICKS SECONDS ROBOT ...
 
-Each robot ends after so many ticks, or seconds of CPU time. Each block of ticks has targets of its own:
+Each robot ends after so many ticks, or seconds of CPU time. Each block of ticks has other targets:
 reachable ones along a path or in jumps, unreachable ones, huge ones, and some that are not finite;
 measured tips with an offset that grows, noise and gaps. The hybrid robot is updated by these
 measurements block by block.
