@@ -146,7 +146,7 @@ def soak(robot, ticks, seed, seconds):
         x, noise, dx = targets_of(rng, chain, checked.low, checked.high)
         offset = 0.99 * offset + 2e-3 * rng.standard_normal(3)
         feed = [None] * BLOCK if dx is None else dx
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             tips = x + offset + noise
         seen = [None] * BLOCK if block % 3 == 0 or "tip_limits" in settings else tips
         commands, step = np.empty((BLOCK, len(checked.q))), tracker.step

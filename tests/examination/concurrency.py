@@ -1,7 +1,7 @@
 """The same bits in threads, workers, forks and spawned processes; nothing of the process changes.
 
 A claim that takes longer than its limit ends the part with a traceback: a deadlock is a failure.
-Python switches threads every 10 us here, so that overlaps are frequent; seeds 0 to 7.
+Python switches threads every 0.5 ms here, so that overlaps are frequent; seeds 0 to 7.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def examine(full: bool) -> Iterator[Line]:
     alone = [work(model, k) for k in range(8)]
     interval = sys.getswitchinterval()
     for name, run in (
-        ("8 threads", lambda: in_threads(lambda k: work(model, k), 20 if full else 4)),
+        ("8 threads", lambda: in_threads(lambda k: work(model, k), 20 if full else 1)),
         ("joblib, threading", lambda: jobs(model, "threading")),
         ("joblib, loky", lambda: jobs(model, "loky")),
         ("dask, threads", lambda: tasks(model, "threads")),
@@ -54,7 +54,7 @@ def examine(full: bool) -> Iterator[Line]:
         ("multiprocessing, spawn", lambda: pool(model, "spawn")),
         ("os.fork in a thread, others at work", lambda: forked(model)),
     ):
-        sys.setswitchinterval(1e-5)
+        sys.setswitchinterval(5e-4)
         with limited(), kept() as same:
             found = run()
         sys.setswitchinterval(interval)
@@ -200,7 +200,7 @@ def fits(full: bool) -> Iterator[Line]:
         def fit(k: int, model: Any = model, given: dict = given) -> bytes:
             return clone(model).fit(Q, X, **given).predict(Q).tobytes()
 
-        rounds = 20 if full else 3
+        rounds = 20 if full else 1
         alone = fit(0)
         with limited(), kept() as same:
             found = in_threads(fit, rounds)
