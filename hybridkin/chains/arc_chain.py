@@ -161,11 +161,12 @@ class ArcChain(MarkedChain):
         tensor([0., 0., 1.], dtype=torch.float64)
         """
         self._check_tangents(tangents)
+        self._rows(q)  # checks it
         tangents = {name: value.to(q) for name, value in tangents.items()}
         tips = self.tips()
 
         def along(rows: Tensor) -> tuple[Tensor]:
-            arcs, change = self._arcs_and_change(self._rows(rows))
+            arcs, change = self._arcs_and_change(rows)
             return (torch.cat([one._along(arcs, change, tangents) for one in tips], dim=1),)
 
         return in_blocks(along, q)[0]

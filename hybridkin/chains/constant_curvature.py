@@ -217,10 +217,10 @@ class ConstantCurvatureChain(ArcChain):
             The number of rows that are `contradictory`, and the worst of them. None where there
             are none; extensible segments do not count.
         """
+        rows = self._rows(q)
         if all(self.extensible):
             return None
         with torch.no_grad():
-            rows = self._rows(q)
             given = ~torch.tensor(self.extensible, device=q.device)
             (wrong,) = in_blocks(lambda some: (self.contradictory(some) & given,), rows)
             if not wrong.any():

@@ -177,7 +177,8 @@ class PlayOperator:
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
             raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
-        start = [rows[0]] * 2 if state is None else [real_array(part, "state") for part in state]
+        given = state if isinstance(state, (tuple, list)) else ()
+        start = [rows[0]] * 2 if state is None else [real_array(part, "state") for part in given]
         shapes = [tuple(part.shape) for part in start]
         finite = state is None or all(np.isfinite(part).all() for part in start)
         if shapes != [tuple(rows.shape[1:])] * 2 or not finite:
