@@ -32,6 +32,7 @@ _SETTLED = 1e-9
 _LARGE = 3.0  # remaining errors over those of the fit
 _MEAN_LENGTH = 1.596  # of a normal vector of three coordinates
 _MOST = 2000  # rows whose errors are computed for that
+_SINGULAR = np.linalg.LinAlgError, torch.linalg.LinAlgError  # pyright: ignore
 _LEAST = 0.2  # share of the errors before learning that remain at least
 
 
@@ -71,7 +72,7 @@ def adapted(
         with np.errstate(over="raise", invalid="raise"):
             theta, residual = _likeliest_change(problem, rows.groups, noise, parameters)
             rms = float(np.sqrt(np.mean(residual**2)))
-    except (ArithmeticError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+    except (ArithmeticError, *_SINGULAR) as error:
         raise too_far() from error
     if not np.isfinite(theta).all():
         raise too_far()

@@ -371,7 +371,7 @@ def _fit_features(
     given = rows.q, x, part.coupling, weight, rows.groups
     try:
         return fit_readout(mechanical, features, *given, alphas, noise_ratio, left_out)
-    except torch.linalg.LinAlgError as error:
+    except torch.linalg.LinAlgError as error:  # pyright: ignore
         raise too_far() from error
 
 

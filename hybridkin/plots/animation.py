@@ -89,12 +89,12 @@ class TrackAnimation(Display):
         self.target = None if target is None else shaped(target, "target", "T3", T)
         self.error = None if self.target is None else distance(self.x, self.target)
         self.t = times(t, T)
-        self.rows = np.arange(T) if rows is None else shaped(rows, "rows", "K")
-        K = len(self.rows)
-        inside = K > 0 and self.rows[0] >= 0 and self.rows[-1] < T
-        if not (inside and (np.diff(self.rows) > 0).all()):
-            raise ValueError(f"`rows` must increase within the {T} rows of `x`, got {self.rows}.")
-        self.rows = self.rows.astype(int)
+        shown = np.arange(T) if rows is None else shaped(rows, "rows", "K")
+        K = len(shown)
+        inside = K > 0 and shown[0] >= 0 and shown[-1] < T
+        if not (inside and (np.diff(shown) > 0).all()):
+            raise ValueError(f"`rows` must increase within the {T} rows of `x`, got {shown}.")
+        self.rows = shown.astype(int)
         if body is not None and len(body.points) != K:
             raise ValueError(f"`body` must hold {K} configurations, got {len(body.points)}.")
         self.body, self.name = body, str(name)
