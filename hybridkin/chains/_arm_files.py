@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 UNLIMITED = (-math.inf, math.inf)
 _BYTES = 4_000_000  # of a robot description
 _MOST = 1000  # moving joints
-_SIZES, _MOST_COPIES = ("count", "nrow", "ncol", "width", "height"), 1e7
+_SIZES, _MOST_COPIES = ("count", "nrow", "ncol", "width", "height"), 4e6
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 
 
@@ -145,7 +145,8 @@ def _check_sizes(data: bytes) -> None:
     parser, copies = ParserCreate(), [1.0]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        size = copies[-1] * (1000.0 if "count" in attributes else 1.0)
+        costly = any(name == "count" or name.startswith("nuser") for name in attributes)
+        size = copies[-1] * (1000.0 if costly else 1.0)
         for name, value in attributes.items():
             words = value.lower().split()
             if name in _SIZES or name.startswith("nuser"):

@@ -20,6 +20,7 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 __all__ = ["ElasticTendonChain"]
 
 _SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros gains".split()
+_LEAST = 1e-75  # of a stiffness: products of its inverse overflow below
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are stored
 
 
@@ -137,8 +138,9 @@ class ElasticTendonChain(ArcChain):
         axial = 10.0 if axial_stiffness is None else axial_stiffness
         for name, value in (("bending_stiffness", bending), ("axial_stiffness", axial)):
             geometry[name] = filled(value, name, dtype, (self.n_segments,))
-            if not (geometry[name] > 0).all():
-                raise ValueError(f"`{name}` must be positive, got {geometry[name].tolist()}.")
+            if not (geometry[name] > _LEAST).all():
+                need = f"must be positive, over {_LEAST:g}"
+                raise ValueError(f"`{name}` {need}, got {geometry[name].tolist()}.")
         zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
         self._table: tuple[list[Tensor], object, _slack.Responses] | None = None
         self._set_geometry({**geometry, "tendon_zeros": zeros})

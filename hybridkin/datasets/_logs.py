@@ -269,12 +269,11 @@ class _Table(NamedTuple):
             return self.columns[self.header.index(name)]
         close = [other for other in self.header if other.lower() == name.lower()]
         close = close or difflib.get_close_matches(name, self.header, n=3, cutoff=0.4)
-        hint = f"did you mean {', '.join(map(repr, close))}?" if close else ""
+        hint = f"did you mean {', '.join(map(repr, close))}? Its" if close else "its"
         if len(self.header) == 1:
-            hint = "it has one column only, check `delimiter`."
+            hint = "it has one column only, check `delimiter`. Its"
         raise ValueError(
-            f"There is no column {name!r} in {path!r}; {hint:.400} Its columns: "
-            f"{self.header!s:.1000}."
+            f"There is no column {name!r} in {path!r}; {hint:.400} columns: {self.header!s:.1000}."
         )
 
     def numbers(self, name: str) -> NDArray:
@@ -367,7 +366,8 @@ def _read_npz(path: Path) -> _Table:
                 f"{name!r} of {str(path)!r} must have at most {_MOST_COLUMNS} columns, got "
                 f"{array.shape[1]}; transpose it where rows and columns are swapped."
             )
-        columns |= {f"{name}[{i}]": c for i, c in enumerate(array.T) if array.ndim == 2}
+        if array.ndim == 2:
+            columns |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
     return _Table(path, [*columns], [*columns.values()])
 
 

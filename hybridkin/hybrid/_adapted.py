@@ -11,7 +11,7 @@ from typing_extensions import Self
 from hybridkin._core.blocks import check_vectors
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.rotations import rotation, rotation_vector
-from hybridkin._core.stored import Layout
+from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
@@ -41,6 +41,16 @@ class AdaptedModel(ForwardModel):
         self.register_buffer("shift", shift)
         self.register_buffer("motion", motion)
         self.n_actuators, self.n_outputs = len(shift), fitted.n_outputs
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> Self:
+        """Return the model of a description, whose arrays must fit its robot."""
+        model = super().from_stored(stored, restore)
+        try:
+            _ = model.mechanical
+        except RuntimeError as error:  # of torch, of other sizes and types
+            raise ValueError("`shift` and `motion` do not fit the robot") from error
+        return model
 
     @property
     def mechanical(self) -> ForwardModel | None:

@@ -49,6 +49,7 @@ _MODULES: dict[str, type[PortableModule]] = {
     )
 }
 # Fitted error models that describe themselves, and others that a hybrid may be given.
+_LEAST = 1e-75  # of a scale: products of its inverse overflow below
 _FITS = {"elm_regressor": ELMRegressor.from_stored, "readout_fit": ReadoutFit.from_stored}
 _REGRESSORS = {
     cls.__name__: cls for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
@@ -130,8 +131,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]), ())
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
-    if not (model._drift.scale > 0).all():
-        raise ValueError("`drift_scale` must be positive")
+    if not (model._drift.scale > _LEAST).all():
+        raise ValueError(f"`drift_scale` must be positive, over {_LEAST:g}")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     if "play_width" in stored.arrays:
         one = stored.array("play_width").ndim == 0

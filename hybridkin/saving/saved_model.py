@@ -29,7 +29,7 @@ from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.hidden_layer import device_named
 from hybridkin.saving._file import packed, read, unpacked, write
 
-_DAMAGE = (AttributeError, LookupError, TypeError, ValueError)
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError)
 Model = ForwardModel | ELMRegressor | ELMRegressorCV | HybridForwardModel
 
 

@@ -54,7 +54,7 @@ def fuzzed(seconds: int, folder: Path) -> Line:
     command = [sys.executable, str(HERE / "_fuzz_readers.py"), "corpus", "-seed=20", "-timeout=20"]
     command += [f"-max_total_time={seconds}", "-max_len=20000", "-rss_limit_mb=1500"]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    print(done.stderr[-2000:], file=sys.stderr)
+    print(done.stderr[-4000:], file=sys.stderr)
     runs = re.findall(r"Done (\d+) runs", done.stderr)
     places = re.findall(r"cov: (\d+)", done.stderr)
     figure = f"{(runs or ['?'])[-1]} files in {seconds} s, {(places or ['?'])[-1]} places reached"
@@ -76,6 +76,7 @@ def of_kind(kind: str, n: int, folder: Path) -> Line:
             wrong.append(f"{kind} {k}: {said}, {seconds:.2f} s, {memory:.0f} MB")
     left = sorted({path.name for path in folder.iterdir()} - {READERS[kind].name})
     left = [name for name in left if not name.endswith(("_3cable", "_static"))]
+    (folder / READERS[kind].name).unlink(missing_ok=True)
     print(*wrong, sep="\n", file=sys.stderr)
     most = [max(column) for column in zip(*(one[1:] for one in results), strict=True)]
     figure = f"{n} files: {counts['refused']} refused, {counts['read']} read, {len(wrong)} wrong"
