@@ -78,7 +78,7 @@ def _child(folder: str, work: Callable[[Any], str | None], task: Any, quiet: boo
     code = BROKEN
     try:
         if quiet:
-            os.setpgid(0, 0)
+            os.setsid()
             null = os.open(os.devnull, os.O_RDWR)
             for stream in range(3):
                 os.dup2(null, stream)

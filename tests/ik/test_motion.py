@@ -336,3 +336,39 @@ def test_wrong_limits_of_the_tip(given, message):
 def test_limits_of_the_tip_are_for_positions():
     with pytest.raises(ValueError, match="needs a PositionTask, got a PoseTask"):
         InverseKinematics(PoseTask(TRUNK), tip_limits=(np.eye(3), np.ones(3)))
+
+
+@pytest.mark.parametrize(("dq_max", "ddq_max"), [(None, None), (5.0, None), (1.0, None), (5.0, 90)])
+def test_two_planes_and_the_limits_of_q_hold_together(dq_max, ddq_max):
+    """Of a linear model a step ends within the planes, or from outside no further from them."""
+    draw, planes, offsets = (
+        np.random.default_rng(0),
+        [[1.0, 0.2, 0.1], [0.1, 1.0, -0.3]],
+        [1.0, 0.8],
+    )
+    A = torch.from_numpy(draw.standard_normal((3, 5)))
+    model = (lambda q: q @ A.T, lambda q: A.expand(*q.shape[:-1], 3, 5))
+    options = {"q_min": -1.0, "q_max": 1.0, "dq_max": dq_max, "ddq_max": ddq_max, "q_pref": 0.0}
+    ik = InverseKinematics(model, **options, tip_limits=(planes, offsets))
+    q = draw.uniform(-1.0, 1.0, (200, 5))
+    q[draw.random((200, 5)) < 0.4] = 1.0
+    x = q @ A.numpy().T
+    q_new = q + ik.step(q, x + draw.standard_normal((200, 3))).dq
+    before, after = (offsets - tips @ np.transpose(planes) for tips in (x, q_new @ A.numpy().T))
+    assert (before < 0.0).any(axis=1).sum() > 50
+    assert (after >= np.minimum(before, 0.0) - 1e-13).all()
+    assert (np.abs(q_new) <= 1.0).all()
+    assert np.abs(q_new - q).max() <= 0.01 * (dq_max or np.inf) + 1e-15
+    assert (np.abs(q_new - q).max(axis=1) > 1e-6).mean() > 0.9  # most of them move
+
+
+def test_the_tip_can_brake_before_a_plane():
+    """A straight push at full thrust: the tip stands at the plane, not beyond, within ddq_max."""
+    axis = torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)
+    model = (lambda q: q * axis[:, 0], lambda q: axis.expand(*q.shape[:-1], 3, 1))
+    ik = InverseKinematics(model, ddq_max=0.5, tip_limits=([[0.0, 0.0, 2.0]], [0.3]))
+    track = ik.track(np.array([[0.0, 0.0, 9.0]] * 200), q0=np.zeros(1))
+    assert (track.x[:, 2] <= 0.15 + 1e-12).all()
+    assert track.x[-1, 2] == pytest.approx(0.15, abs=1e-4)
+    assert np.abs(np.diff(track.q[:, 0], n=2)).max() <= 0.5 * 0.01**2 + 1e-12
+    assert np.diff(track.q[:, 0]).max() / 0.01 == pytest.approx(np.sqrt(0.5 * 0.15), rel=0.05)
