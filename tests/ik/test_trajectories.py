@@ -35,6 +35,8 @@ def test_figure_eight_lies_in_its_plane_and_fills_its_size(normal):
     assert_allclose(np.ptp(offset @ up), 0.2)
     u, w = offset @ across / 0.2, offset @ up / 0.1
     assert_allclose(w**2, 4 * u**2 * (1 - u**2), atol=1e-14)  # Gerono's lemniscate
+    assert (u[1:400] > 0.0).all()
+    assert (w[1:200] > 0.0).all()  # it leaves the crossing to the upper right
 
 
 def test_figure_eight_in_the_horizontal_plane_is_wide_along_x():
@@ -84,6 +86,8 @@ def test_trajectory_is_checked_frozen_and_its_own():
         Trajectory(t, np.zeros((3, 2)))
     with pytest.raises(ValueError, match=r"`t` must have shape \(3,\)"):
         Trajectory(t[:2], np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="`x` must hold at least one point"):
+        Trajectory([], np.zeros((0, 3)))
     with pytest.raises(ValueError, match="first: row 1"):
         Trajectory(t, [[0, 0, 0], [0, np.nan, 0], [0, 0, 0]])
     with pytest.raises(ValueError, match=r"must increase.*row 2"):
