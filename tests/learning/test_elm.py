@@ -621,6 +621,11 @@ def test_clear_errors():
         elm(alpha=-1).fit(X, Y)
     with pytest.raises(ValueError, match="NaN"):
         elm().fit(np.where(X > 0.29, np.nan, X), Y)
+    with pytest.raises(ValueError, match="Negative"):
+        elm().fit(X, Y, sample_weight=np.linspace(-0.1, 1.0, len(X)))
+    for width in (8, 10):
+        with pytest.raises(ValueError, match=f"has {width} features, but ELMRegressor is expect"):
+            fitted.predict(np.zeros((2, width)))
     with pytest.raises(ValueError, match="`y` must have 3 columns as in earlier calls, got 2"):
         fitted.partial_fit(X, Y[:, :2])
     with pytest.raises(ValueError, match="overflow"):

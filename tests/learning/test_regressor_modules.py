@@ -47,6 +47,8 @@ CLOSED = [
         KernelModule,
         GP(ConstantKernel(2.0) * RBF(0.5) + WhiteKernel(0.01), normalize_y=True, optimizer=None),
     ),
+    (KernelModule, GP(RBF(0.5), alpha=1e-6, optimizer=None)),
+    (KernelModule, GP(RBF(0.5) * ConstantKernel(3.0), alpha=1e-4, optimizer=None)),
     (
         KernelModule,
         make_pipeline(MinMaxScaler(), GP(WhiteKernel(0.1) + RBF([0.5, 1.0, 2.0]), optimizer=None)),
@@ -69,6 +71,19 @@ def differences(predict, X, step=1e-6):
         move[j] = step
         columns.append((predict(X + move) - predict(X - move)) / (2 * step))
     return np.stack([column.reshape(len(X), -1) for column in columns], axis=-1)
+
+
+@pytest.mark.parametrize(("kind", "regressor"), CLOSED, ids=names)
+def test_values_and_jacobians_are_those_of_the_regressor(kind, regressor):
+    X, y = data(2, 24)
+    regressor.fit(X, y)
+    module, q = error_module(regressor, torch.from_numpy(X)), torch.from_numpy(X + 0.03)
+    assert type(module) is kind
+    assert_allclose(module(q).numpy(), regressor.predict(q.numpy()), rtol=0, atol=1e-10)
+    x, J = module.forward_and_jacobian(q)
+    assert_close(x, module(q), rtol=1e-12, atol=1e-12)
+    expected = differences(regressor.predict, q.numpy())
+    assert_allclose(J.numpy(), expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.slow
@@ -96,6 +111,8 @@ def test_closed_form(kind, regressor, m):
         KernelRidge(kernel="laplacian", alpha=0.1),
         KernelRidge(kernel="poly", alpha=1e-3),
         GP(Matern(0.5, nu=2.5) + WhiteKernel(0.01), optimizer=None),
+        GP(RBF(0.5) * WhiteKernel(0.1), alpha=1e-3, optimizer=None),
+        GP(RBF(0.5) + RBF(2.0), alpha=1e-3, optimizer=None),
         make_pipeline(MinMaxScaler(clip=True), Ridge()),
         make_pipeline(PolynomialFeatures(2), LinearSVR()),
         RandomForestRegressor(5, random_state=0),
@@ -115,6 +132,27 @@ def test_others_are_differenced(regressor):
         expected = differences(regressor.predict, inside)
         kinks = np.abs(J - expected) > 1e-4 * np.abs(J).max()
         assert kinks.mean() < 0.02
+
+
+def test_differences_of_two_outputs_and_their_graph():
+    X, y = data(2)
+    regressor = KernelRidge(kernel="poly", alpha=1e-3).fit(X, y)
+    module, q = error_module(regressor, torch.from_numpy(X)), torch.from_numpy(X[:6])
+    lead = q.reshape(2, 3, 3).requires_grad_()
+    x, J = module.forward_and_jacobian(lead)
+    assert_allclose(x.detach().numpy().reshape(6, 2), regressor.predict(X[:6]))
+    assert_allclose(J.numpy().reshape(6, 2, 3), differences(regressor.predict, X[:6]), rtol=1e-4)
+    (slope,) = torch.autograd.grad(x[..., 1].sum(), lead)
+    assert_close(slope, J[..., 1, :])
+
+
+def test_powers_are_whole_numbers_below_a_hundred():
+    ones = np.ones(1)
+    for power in (-1, 0.5, 100):
+        with pytest.raises(ValueError, match="'powers' must hold whole numbers below 100"):
+            PolynomialModule([[power]], [[1.0]], ones, ones)
+    q = torch.full((1, 1), 0.9, dtype=torch.float64)
+    assert_close(PolynomialModule([[99]], [[1.0]], 0.0 * ones, ones)(q), q**99)
 
 
 def test_a_module_of_its_own_is_taken():
