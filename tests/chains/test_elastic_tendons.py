@@ -309,6 +309,26 @@ def test_geometry_jacobian_is_that_of_autograd(chain, rng):
     assert_close(J, sum(each), rtol=0, atol=1e-12 * float(J.abs().max()))
 
 
+def test_robots_and_rows_may_be_mapped_over(rng):
+    """By torch.func.vmap: several robots at the same rows, one at several, each at its own."""
+    chain = robot()
+    q = random_q(rng, 6, chain.n_actuators).reshape(2, 3, -1)
+    radii = torch.stack([chain.radii, 1.1 * chain.radii])
+
+    def tips(own, rows):
+        return chain.with_geometry(radii=own)(rows)
+
+    expected = torch.stack([torch.stack([tips(own, rows) for rows in q]) for own in radii])
+    vmap = torch.func.vmap
+    assert_close(vmap(tips, (0, None))(radii, q[0]), expected[:, 0], rtol=0, atol=1e-13)
+    assert_close(vmap(tips, (None, 0))(radii[0], q), expected[0], rtol=0, atol=1e-13)
+    assert_close(
+        vmap(tips, (None, 1))(radii[1], q.transpose(0, 1)), expected[1], rtol=0, atol=1e-13
+    )
+    each = torch.stack([expected[0, 0], expected[1, 1]])
+    assert_close(vmap(tips)(radii, q), each, rtol=0, atol=1e-13)
+
+
 @pytest.mark.slow
 def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
     chain, q = robot(), random_q(rng, 3)

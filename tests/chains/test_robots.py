@@ -195,6 +195,10 @@ def test_pairs_mixed_segments_and_stages(write):
     chain = robots.from_toml(write(text))
     assert_close(chain.pose(q), expected.pose(q), rtol=1e-14, atol=1e-15)
     assert repr(chain) == repr(expected)
+    every = "[[segment]]\nstage = 'insertion'\noffset = 0.1\nzeros = [0.02]\ngain = 0.5\n"
+    slid = robots.from_toml(write(every + SEGMENT + "gain = 1.0\n"))
+    q = torch.tensor([0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
+    assert_close(slid(q)[2] - slid(0.0 * q)[2], torch.tensor(0.15).double(), rtol=1e-7, atol=0)
     mixed = robots.from_toml(write("[[segment]]\nradius = 0.02\n" + SEGMENT.replace("0.1", "0.02")))
     assert mixed.extensible == (True, False)
     counts = "[log]\nq = ['a', 'b', 'c', 'd']\nx = ['x', 'y', 'z']\nq_unit = 'deg'\n"
@@ -274,6 +278,10 @@ def test_defaults_are_chambers_named_after_the_file(write):
         (
             "model = 'elastic-tendon'\n[[segment]]\nradius = 0.1",
             "`length` must stand in every .* missing for segment 1",
+        ),
+        (
+            "[[segment]]\nradius = 1\nangles_deg = [0, 90, 200]\nangle_deg = 1\nactuators = 3",
+            "`actuators` cannot stand beside `angles_deg` in",
         ),
         ("[[segment]]\nstage = 'slide'", "`stage` in .* must be one of"),
         ("[[segment]]\nstage = 'rotation'\nlength = 1", "beside `offset`, `zeros`"),

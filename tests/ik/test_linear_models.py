@@ -7,8 +7,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, InverseKinematics
-from hybridkin.ik._starts import even_starts
+from hybridkin import ConstantCurvatureChain, InverseKinematics, RigidChain
+from hybridkin.ik._gram import (
+    adaptive_damping,
+    apply_columns,
+    apply_rows,
+    damped_solve,
+    quick_gram,
+    row_gram,
+)
+from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik.solver import IKStatus
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
 from hybridkin.ik.trajectories import Trajectory
@@ -123,3 +131,111 @@ def test_distances_between_poses_are_those_of_the_error_for_small_turns():
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     far = task.distances(torch.eye(4, dtype=torch.float64)[None, None], half[None])
     assert_close(far, far.new_full((1, 1), 0.3 * 2.0))  # the chord of half a turn is 2
+
+
+@pytest.mark.parametrize("limits", [{"q_min": -1.0, "q_max": 1.0}, {}], ids=["shared", "own"])
+def test_further_starts_are_those_whose_tips_lie_nearest(limits):
+    ik = InverseKinematics(MODEL, **limits)
+    q = torch.zeros(4, 5, dtype=torch.float64)
+    size, target = torch.full((4,), 0.5, dtype=torch.float64), 0.5 * torch.eye(4, 3).double()
+    n = 2048 if limits else 64  # as many as there are in the sample
+    sample = even_starts(ik.settings, q, size, n).expand(4, n, 5)
+    found = nearest_starts(ik.settings, q, size, target, 3)
+    away = (sample @ A.T - target[:, None]).norm(dim=-1)
+    order = away.argsort(dim=1)[:, :3]
+    assert_close(found, sample.gather(1, order[..., None].expand(-1, -1, 5)))
+
+
+def test_a_step_is_stopped_where_a_plane_turns_it():
+    """Only then; a step along the plane, or away from it, is free. Signs of q do not matter."""
+    ik = InverseKinematics(MODEL, tip_limits=([[0.0, 0.0, 1.0]], [1e-3]), beta=0.0)
+    way = torch.tensor([[0.1, -0.2, 9.0], [0.1, -0.2, -0.3], [-0.1, 0.2, 0.0], [-0.1, 0.0, 0.9e-3]])
+    expected = torch.tensor([True, False, False, False])
+    for k, target in enumerate(way.double()):
+        tracker = ik.tracker(torch.zeros(5, dtype=torch.float64))
+        tracker.step(target)
+        assert (tracker.status is IKStatus.AT_LIMITS) == expected[k]
+        assert tracker.backend == "torch"
+        tracker.step(target)
+        assert_close(tracker.x, torch.where(target == 9.0, 1e-3, target), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("m", [2, 3, 6])
+def test_lost_rows_and_no_motion_at_all_leave_finite_numbers(m):
+    """J with dependent rows: what can be reached is, by the estimate and by the eigenvalues."""
+    draw = torch.Generator().manual_seed(3)
+    J = torch.randn(4, m, 8, generator=draw, dtype=torch.float64)
+    J[::2, -1] = J[::2, 0]
+    J[1] = 0.0
+    w = torch.randn(4, 8, generator=draw, dtype=torch.float64)
+    v = apply_rows(J, w)
+    for gram in (row_gram(J), quick_gram(J)):
+        mu = damped_solve(gram, v)
+        assert_close(apply_rows(J, apply_columns(J, mu)), v, rtol=1e-6, atol=1e-6)
+        assert (mu[1] == 0.0).all()
+        assert (gram.sigma_min[[0, 2]] < 1e-6).all()
+        assert gram.sigma_max[1] == gram.sigma_min[1] == 0.0
+        largest = torch.linalg.svdvals(J)[:, 0]
+        assert (gram.sigma_max >= largest * (1.0 - 1e-12)).all()
+        assert (gram.sigma_max <= m**0.25 * largest * (1.0 + 1e-12)).all()
+        damping = adaptive_damping(gram)
+        assert damping[1] == 0.0
+        assert_close(damping[[0, 2]], (0.02 * gram.sigma_max[[0, 2]]) ** 2, rtol=1e-3, atol=0.0)
+    only = quick_gram(J, sigma_max_only=True)
+    assert torch.isnan(only.sigma_min).all()
+    assert_close(only.sigma_max, J.flatten(1).norm(dim=1))
+
+
+def test_bounds_of_a_step_hold_to_the_last_bit():
+    """q + upper is never above q_max, nor q + lower below q_min, and no more than rounding off."""
+    draw = torch.Generator().manual_seed(4)
+    q = torch.rand(20000, 5, generator=draw, dtype=torch.float64) * 0.3 + 0.1
+    low, high = 0.1 + 1e-3 / 3.0, 0.4 - 1e-3 / 7.0
+    ik = InverseKinematics(MODEL, q_min=low, q_max=high)
+    lower, upper = ik.settings.step_bounds(q)
+    inside = (q >= low) & (q <= high)
+    assert ((q + upper <= high) & (q + lower >= low))[inside].all()
+    assert (q + upper - high).abs().max() < 2e-16
+    assert (q + lower - low).abs().max() < 2e-16
+    assert (lower <= upper).all()
+
+
+def test_angles_come_into_uneven_limits_by_whole_turns():
+    origins = np.tile(np.eye(4), (2, 1, 1))
+    arm = RigidChain(origins, [[0.0, 0.0, 1.0]] * 2, tool=[1.0, 0.0, 0.0])
+    ik = InverseKinematics(arm, q_min=[0.0, -7.0], q_max=[2.0 * np.pi, 0.0])
+    q = torch.tensor([[-0.5, 0.5], [7.0, -8.0], [20.0, -0.5], [3.0, 13.0]], dtype=torch.float64)
+    found = ik.settings.inside(q)
+    assert ((found >= ik.settings.q_min) & (found <= ik.settings.q_max)).all()
+    turns = (found - q) / (2.0 * np.pi)
+    assert_close(turns, turns.round(), rtol=0.0, atol=1e-12)
+    assert_close(found[2:, 1], q.new_tensor([-0.5, 13.0 - 6.0 * np.pi]), atol=1e-9, rtol=0)
+
+
+def test_targets_of_poses_must_hold_rotations():
+    ik = InverseKinematics(PoseTask(TENDONS), q_pref=0.0)
+    pose = np.eye(4)
+    pose[2, 3] = 0.2
+    for factor in (1.01 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.ones((3, 3))):
+        wrong = pose.copy()
+        wrong[:3, :3] = factor
+        with pytest.raises(ValueError, match="must hold rotations in its upper left"):
+            ik.solve(wrong)
+    found = ik.solve(pose, tol=(1e-4, 1e-3))
+    assert repr(found).startswith("IKSolution(1 targets: 1 CONVERGED; error mean ")
+
+
+def test_plain_numbers_take_the_short_way():
+    """Arrays and lists of three numbers go to the core as they are; others get a closer look."""
+    ik = InverseKinematics(TENDONS, q_min=-0.02, q_max=0.02)
+    tracker = ik.tracker(np.zeros(6))
+    if tracker.backend != "compiled":
+        pytest.skip("needs the compiled core")
+    tick, target = tracker._robot.tick, [0.01, 0.0, 0.19]
+    for good in (target, tuple(target), np.array(target)):
+        assert tick(good, None, None)
+        assert tick(good, good, good)
+    for bad in ([0.01, 0.0], np.zeros((1, 3)), np.zeros(3, dtype=np.float32), "abc", ["a"] * 3):
+        assert not tick(bad, None, None)
+        assert not tick(target, bad, None)
+        assert not tick(target, None, bad)

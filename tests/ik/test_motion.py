@@ -320,6 +320,7 @@ def test_solutions_near_targets_out_of_reach_obey_too():
     ("given", "message"),
     [
         (3.0, r"`tip_limits` must be a pair \(A, b\), got 3.0"),
+        ((np.eye(3), np.ones((3, 1))), r"of shapes \(k, 3\) and \(k,\)"),
         ((np.eye(3), [1.0]), r"of shapes \(k, 3\) and \(k,\)"),
         ((np.eye(2), [1.0, 1.0]), r"of shapes \(k, 3\) and \(k,\)"),
         ((np.eye(3), [1.0, np.nan, 0.0]), "finite"),

@@ -126,10 +126,16 @@ def reference_qp(J, v, z, lower, upper, damping_sq):
     return x
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("relative", "m"), [(1e-6, 3), (1e-3, 3), (1.0, 3), (1e-6, 6)])
-def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
-    N, n = 350, 9
+SIZES = [(1e-6, 3, 30), (1e-3, 6, 30)]
+SIZES += [
+    pytest.param(relative, m, 350, marks=pytest.mark.slow)
+    for relative, m in [(1e-6, 3), (1e-3, 3), (1.0, 3), (1e-6, 6)]
+]
+
+
+@pytest.mark.parametrize(("relative", "m", "N"), SIZES)
+def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m, N):
+    n = 9
     J = randn(rng, N, m, n)
     J[::9, -1] = 1e-4 * J[::9, -1] + J[::9, 0]
     v = randn(rng, N, m) * 10.0 ** uniform(rng, -2.0, 1.5, N, 1)  # the far ones are infeasible
@@ -147,8 +153,8 @@ def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
     assert_close(dq, torch.from_numpy(expected), rtol=0.0, atol=1e-8)
     out_of_reach = (v - apply_rows(J, dq)).norm(dim=-1) > 0.1
     held = (dq == lower) | (dq == upper)
-    assert out_of_reach.sum() > 30
-    assert held.any(-1).sum() > 200
+    assert out_of_reach.sum() > 0.08 * N
+    assert held.any(-1).sum() > 0.57 * N
 
 
 def test_strict_step_reaches_a_reachable_task_and_ignores_posture_in_the_task(rng):

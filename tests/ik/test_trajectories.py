@@ -97,8 +97,9 @@ def test_trajectory_is_checked_frozen_and_its_own():
 def test_paths_in_millimetres_are_noticed(tmp_path):
     file = tmp_path / "path.csv"
     file.write_text("t,x,y,z\n0,0,0,200\n1,10,0,200\n")
-    with pytest.warns(UserWarning, match="looks like millimetres"):
+    with pytest.warns(UserWarning, match="looks like millimetres") as seen:
         figure_eight([0.0, 0.0, 200.0], (40.0, 20.0))
+    assert seen[0].filename == __file__
     with pytest.warns(UserWarning, match="read a file with unit='mm'"):
         from_csv(file)
     assert from_csv(file, unit="mm").x[0, 2] == 0.2  # and says nothing: warnings are errors

@@ -146,6 +146,20 @@ def test_differences_of_two_outputs_and_their_graph():
     assert_close(slope, J[..., 1, :])
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_differences_follow_the_range_of_the_inputs(unit):
+    """In another unit the Jacobian is the same, counted in that unit."""
+    X, y = data(1)
+    jacobians = []
+    for factor in (1.0, unit):
+        regressor = make_pipeline(StandardScaler(), KernelRidge(kernel="poly", alpha=1e-3))
+        q = torch.from_numpy(factor * X)
+        module = error_module(regressor.fit(factor * X, y), q)
+        assert type(module) is RegressorModule
+        jacobians.append(factor * module.jacobian(q))
+    assert_close(*jacobians, rtol=1e-6, atol=1e-6 * float(jacobians[0].abs().max()))
+
+
 def test_powers_are_whole_numbers_below_a_hundred():
     ones = np.ones(1)
     for power in (-1, 0.5, 100):

@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_array_equal
+
+from hybridkin._core.arrays import check_shape, labels, leading, number, shaped, table
+from hybridkin._core.blocks import in_blocks
+
+
+def test_shapes_of_lengths_letters_and_leading_axes():
+    rows = np.zeros((4, 3))
+    check_shape(rows, "x", [4, 3])
+    check_shape(rows, "x", "T3")
+    check_shape(rows, "x", ("...", 3))
+    check_shape(rows[0], "x", ("...", 3))
+    check_shape(np.zeros((2, 2)), "A", "nn")
+    for need, shape, text in [
+        ([3], (2,), r"\(3,\), got \(2,\)"),
+        ("nn", (2, 3), r"\(n, n\), got \(2, 3\)"),
+        (("...", 4), (4, 3), r"\(\.\.\., 4\), got \(4, 3\)"),
+        (("...", 2, 3), (3,), r"got \(3,\)"),
+        ([4], (4, 3), r"got \(4, 3\)"),
+        ([2, 3], (3, 2), r"\(2, 3\), got \(3, 2\); a reason\."),
+    ]:
+        with pytest.raises(ValueError, match=text):
+            check_shape(np.zeros(shape), "x", need, "a reason")
+    assert_array_equal(shaped([[1, 2]], "x", "T2", 1), [[1.0, 2.0]])
+    with pytest.raises(ValueError, match=r"`t` must have shape \(3,\), got \(2,\)"):
+        shaped([0.0, 1.0], "t", "T", 3)
+
+
+def test_one_number_is_one():
+    assert number(np.float32(0.5), "at") == 0.5
+    assert type(number(torch.tensor(2), "at")) is float
+    with pytest.raises(ValueError, match=r"`at` must be one number, got \[1.0\]"):
+        number([1.0], "at")
+
+
+def test_labels_of_any_kind():
+    assert_array_equal(labels(np.array(["a", 1, None], dtype=object), 3), ["a", "1", "None"])
+    assert_array_equal(labels(torch.tensor([2, 1]), 2), [2, 1])
+    assert labels([True, False], 2).dtype == bool
+    with pytest.raises(ValueError, match=r"`groups` must have shape \(3,\).*one entry for each"):
+        labels([1, 2], 3)
+
+
+def test_batches_that_do_not_agree_are_named():
+    q, x = torch.zeros(2, 1, 9), torch.zeros(4, 3)
+    assert leading([(q, 1), (x, 1)]) == (2, 4)
+    assert leading([(torch.zeros(5, 4, 4), 2), (q[0], 1)]) == (5,)
+    with pytest.raises(
+        ValueError, match=r"agree in their batch shapes, got \[\(2, 1\), \(4, 3\)\]"
+    ):
+        leading([(q, 1), (torch.zeros(4, 3, 3), 1)])
+
+
+def test_tables_keep_what_scikit_learn_asks_for():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"a": [1.0, 2.0]})
+    assert table(frame, "X") is frame
+    assert type(table(frame, "y")) is np.ndarray
+    assert table(None, "sample_weight") is None
+    assert table(2.0, "sample_weight") == 2.0
+    assert_array_equal(table([[1, 2]], "X"), [[1.0, 2.0]])
+
+
+@pytest.mark.parametrize("lead", [(), (7,), (2, 3), (0,), (2, 0)])
+def test_blocks_are_the_whole(lead):
+    q = torch.arange(float(np.prod(lead) * 3)).reshape(*lead, 3)
+    square, outer = in_blocks(lambda rows: (rows**2, rows[:, :, None] * rows[:, None]), q, 2)
+    assert_array_equal(square, q**2)
+    assert_array_equal(outer, q[..., :, None] * q[..., None, :])
+    assert square.is_contiguous()

@@ -1,0 +1,146 @@
+"""The scores that choose a blend and a kernel, as pure functions of predictions."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.kernel_ridge import KernelRidge
+
+from hybridkin.hybrid._fit import Rows
+from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
+from hybridkin.hybrid._radius import Radius, _quantile
+from hybridkin.hybrid._selection import _OUTSIDE, _chosen, _HeldOut
+
+N, M = 40, 10  # held-out and outer rows
+NAMES = ["mechanical", "left", "right"]
+
+
+def held_out(errors, counts=None, groups=None):
+    """Return predictions that are off by errors (K, N + M, 3), of tips at random."""
+    rng = np.random.default_rng(0)
+    y = rng.standard_normal((N, 3))
+    rows = Rows(np.zeros((N, 2)), y, counts, groups)
+    outer = np.arange(0, N, N // M)
+    predicted = np.concatenate([y, y[outer]]) + errors
+    return _HeldOut.of(predicted, rows, np.arange(N) % 5, outer), rows
+
+
+def random_errors(*sizes):
+    rng = np.random.default_rng(1)
+    return np.array(sizes)[:, None, None] * rng.standard_normal((len(sizes), N + M, 3))
+
+
+def test_outer_rows_have_a_tenth_of_the_score_of_the_mechanical_model():
+    counts = np.random.default_rng(2).uniform(0.5, 2.0, N)
+    found, _ = held_out(random_errors(1.0, 0.3), counts)
+    off = np.linalg.norm(found.predicted[0] - found.y, axis=1)
+    assert found.weights[:N] @ off[:N] == pytest.approx(1.0 - _OUTSIDE)
+    assert found.weights[N:] @ off[N:] == pytest.approx(_OUTSIDE)
+    assert_allclose(found.weights[:N] / counts, found.weights[0] / counts[0])
+    assert_array_equal(found.counts[N:], counts[:: N // M])
+    assert_array_equal(found.fold[N:], found.fold[: N : N // M])
+
+
+def test_shares_are_tenths_and_the_first_of_equals_is_taken():
+    every = np.ones(N + M, dtype=bool)
+    noise = random_errors(1.0)[0]
+    found, _ = held_out(np.stack([noise, 0.1 * noise, 0.1 * noise]))
+    assert_array_equal(found.shares(every), [0.0, 1.0, 0.0])
+    found, _ = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]))
+    assert_array_equal(found.shares(every), [0.0, 0.5, 0.5])  # their errors cancel
+    found, _ = held_out(np.stack([noise, 0.25 * noise, -0.5 * noise]))
+    shares = found.shares(every)
+    assert_allclose(shares.sum(), 1.0)
+    assert_allclose(shares, [0.0, 0.7, 0.3])  # 2/3 and 1/3
+    only = np.arange(N + M) < 7  # of some rows
+    errors = np.stack([noise, 0.1 * noise, 0.1 * noise])
+    errors[1, 7:] *= 100.0
+    assert_array_equal(held_out(errors)[0].shares(only), [0.0, 1.0, 0.0])
+    assert_array_equal(held_out(errors)[0].shares(~only), [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("groups", [None, np.arange(N) // 4])
+def test_a_blend_is_taken_where_it_gains(groups):
+    noise = random_errors(1.0)[0]
+    found, rows = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]), groups=groups)
+    shares, results = _chosen(NAMES, found, rows)
+    assert_array_equal(shares, [0.0, 0.5, 0.5])
+    assert results["chosen"] == "blend"
+    assert results["candidate"] == [*NAMES, "blend"]
+    assert results["weights"] == {"mechanical": 0.0, "left": 0.5, "right": 0.5}
+    off = np.linalg.norm(found.predicted - found.y, axis=2)
+    assert_allclose(results["mean_distance"], [*off[:, :N].mean(1), 0.0], atol=1e-15)
+    assert_allclose(results["io_distance"], [*off[:, N:].mean(1), 0.0], atol=1e-15)
+    assert_array_equal(results["rank"][[0, -1]], [4, 1])
+    by_fold = [off[0, :N][np.arange(N) % 5 == k].mean() for k in range(5)]
+    assert_allclose(results["fold_distance"][0], by_fold)
+    assert_allclose(results["std_distance"][0], np.std(by_fold, ddof=1))
+
+
+def test_a_blend_without_a_sure_gain_is_left_alone():
+    errors = random_errors(1.0, 1.0, 1.0)
+    errors[0] *= 0.8
+    found, rows = held_out(errors)
+    shares, results = _chosen(NAMES, found, rows)
+    gains = results["fold_distance"][0] - results["fold_distance"][-1]
+    sure = gains.mean() > gains.std(ddof=1) / np.sqrt(5)
+    assert (shares[0] == 1.0) == (not sure)
+    errors[1:] *= 5.0
+    shares, results = _chosen(NAMES, *held_out(errors))
+    assert_array_equal(shares, [1.0, 0.0, 0.0])
+    assert results["chosen"] == "mechanical"
+
+
+@pytest.mark.parametrize("groups", [None, np.arange(60) // 6])
+def test_the_kernel_has_the_least_held_out_distance_among_its_neighbours(groups):
+    rng = np.random.default_rng(0)
+    X = rng.uniform(0.1, 0.4, (60, 2))
+    y = np.sin(20.0 * X) + 0.05 * rng.standard_normal((60, 2))
+    weights = rng.uniform(0.5, 2.0, 60)
+    spread = X.var(axis=0).mean()
+
+    def score(gamma, alpha):
+        total = 0.0
+        for train, test in folds_of(X, groups):
+            model = KernelRidge(kernel="rbf", gamma=gamma / spread, alpha=alpha)
+            model.fit(X[train], y[train], sample_weight=weights[train])
+            total += weights[test] @ np.linalg.norm(model.predict(X[test]) - y[test], axis=1)
+        return total
+
+    found = tuned_kernel(X, y, weights, groups)
+    i = int(np.argmin(np.abs(np.array(_GAMMAS) - found.gamma * spread)))
+    j = _ALPHAS.index(found.alpha)
+    assert found.gamma == pytest.approx(_GAMMAS[i] / spread)
+    best = score(_GAMMAS[i], _ALPHAS[j])
+    near = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
+    for k, m in near:
+        if k in range(len(_GAMMAS)) and m in range(len(_ALPHAS)):
+            assert best <= score(_GAMMAS[k], _ALPHAS[m]) * (1.0 + 1e-9)
+
+
+def test_folds_of_rows_are_drawn_and_those_of_groups_are_whole():
+    X, groups = np.zeros((200, 2)), np.arange(200) // 8
+    assert len(folds_of(X, None)) == 5
+    assert len(folds_of(X[:199], None)) == 10
+    for _, test in folds_of(X, None):
+        assert (np.diff(np.sort(test)) > 1).any()  # not one piece of the log
+    of_test = [np.unique(groups[test]) for _, test in folds_of(X, groups)]
+    assert_array_equal(np.sort(np.concatenate(of_test)), np.arange(25))
+    assert any((np.diff(names) > 1).any() for names in of_test)
+
+
+def test_the_quantile_of_groups_and_its_least_number():
+    """Of single rows the rank ceil((n + 1) coverage); infinite where that exceeds n."""
+    values, groups = np.arange(1.0, 20.0), np.arange(19)
+    ones = np.ones(19)
+    assert _quantile(values, groups, ones, 0.9) == 18.0
+    assert _quantile(values, groups, ones, 0.95) == 19.0
+    assert _quantile(values, groups, ones, 0.96) == np.inf
+    assert _quantile(values[::-1], groups, ones, 0.5) == 10.0
+    assert Radius(1.0, 2.0, 0.95, 19).least_groups == 19
+    assert Radius(1.0, 2.0, 0.9, 19).least_groups == 9
+    # One group of many rows has the mass of one.
+    many = np.concatenate([np.zeros(100, dtype=int), groups[1:]])
+    rows = np.concatenate([np.full(100, 50.0), values[:-1]])
+    assert _quantile(rows, many, np.ones(118), 0.9) == 18.0
+    assert _quantile(rows, many, np.ones(118), 0.95) == 50.0
+    assert_array_equal(Radius(1.0, 2.0, 0.9, 9).at(np.array([True, False])), [1.0, 2.0])
