@@ -208,6 +208,19 @@ def test_pairs_mixed_segments_and_stages(write):
     assert_close(turned.metres(q)[0], torch.tensor(math.degrees(1.0)).double(), rtol=1e-7, atol=0)
 
 
+def test_markers_of_a_log_are_the_outputs_of_the_chain(write):
+    columns = [f"{axis}{k}" for k in range(2) for axis in "xyz"]
+    log = f"[log]\nq = ['a', 'b', 'c']\nx = {columns}\n"
+    places = "markers = [[0, 0.5, 0.01, 0, 0], [0, 1.0, 0, 0, 0.02]]\n"
+    segment = "[[segment]]\nradius = 0.01\nlength = 0.1\n"
+    robot = robots.read_description(write(segment + log + places))
+    assert robot.chain.markers == ((0.5, 0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.02))
+    x = robot.chain(torch.zeros(3, dtype=torch.float64))
+    assert_close(x, x.new_tensor([0.01, 0.0, 0.05, 0.0, 0.0, 0.12]), rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"`x` in \[log\] must hold 3 names of columns"):
+        robots.read_description(write(segment + log))
+
+
 def test_elastic_tendons_by_default(write):
     text = "model = 'elastic-tendon'\nrouting = 'segment'\ncalibrate = ['base']\n"
     robot = robots.read_description(write(text + "[[segment]]\nradius = 0.01\nlength = 0.1\n"))

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.kernel_ridge import KernelRidge
 
+from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Rows
 from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
 from hybridkin.hybrid._radius import Radius, _quantile
@@ -144,3 +146,23 @@ def test_the_quantile_of_groups_and_its_least_number():
     assert _quantile(rows, many, np.ones(118), 0.9) == 18.0
     assert _quantile(rows, many, np.ones(118), 0.95) == 50.0
     assert_array_equal(Radius(1.0, 2.0, 0.9, 9).at(np.array([True, False])), [1.0, 2.0])
+
+
+def test_a_drift_is_emptied_and_learns_anew():
+    rng = np.random.default_rng(0)
+    q = rng.uniform(0.1, 0.4, (50, 2))
+    new = Drift.of_range(torch.from_numpy(q), 3)
+    shift = np.array([0.01, 0.0, -0.02])
+    moved = new.learned(q, shift + 1e-4 * rng.standard_normal((50, 3)), np.ones(50), 1.0)
+    for part, found in zip(new, moved.emptied(), strict=True):
+        assert_array_equal(found, part)
+    assert new.likeliest_alpha(1e-4) == np.inf
+    alpha = moved.likeliest_alpha(1e-4)
+    assert alpha < np.inf
+    at = moved.correction(alpha)(torch.from_numpy(q)).numpy()
+    assert_allclose(at, np.broadcast_to(shift, at.shape), rtol=0, atol=2e-4)
+    # Noise alone is no change: an offset and a slope would not pay.
+    rest = new.learned(q, 1e-4 * rng.standard_normal((50, 3)), np.ones(50), 1.0)
+    assert rest.likeliest_alpha(1e-4) == np.inf
+    assert_array_equal(rest.correction(np.inf)(torch.from_numpy(q)).numpy(), 0.0)
+    assert rest.likeliest_alpha(np.nan) == 1.0

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, InverseKinematics, RigidChain
+from hybridkin import ConstantCurvatureChain, ForwardModel, InverseKinematics, RigidChain
 from hybridkin.ik._gram import (
     adaptive_damping,
     apply_columns,
@@ -16,6 +16,7 @@ from hybridkin.ik._gram import (
     quick_gram,
     row_gram,
 )
+from hybridkin.ik._search import Search
 from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik.solver import IKStatus
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
@@ -239,3 +240,41 @@ def test_plain_numbers_take_the_short_way():
         assert not tick(bad, None, None)
         assert not tick(target, bad, None)
         assert not tick(target, None, bad)
+
+
+def test_the_way_into_the_domain_is_newtons():
+    """To 0.98 of the distance where it grows evenly; nowhere from inside, or without a slope."""
+
+    class Domain(ForwardModel):
+        n_actuators, n_outputs, even = 3, 3, True
+
+        def forward(self, q):
+            return 1.0 * q
+
+        def domain_distance(self, q):
+            return 4.0 * q.norm(dim=-1) if self.even else (q > 1.0).any(-1).to(q)
+
+    model = Domain()
+    search = Search(InverseKinematics(model).settings, 1e-4, 50)
+    q = torch.tensor([[1.0, 2.0, 2.0], [0.0, 0.0, -0.5], [0.1, 0.0, 0.0]], dtype=torch.float64)
+    found = q + search._inward(q)
+    assert_close(model.domain_distance(found[:2]), q.new_tensor([0.98, 0.98]))
+    assert_close(found[:2], q[:2] * (0.98 / model.domain_distance(q[:2]))[:, None])
+    assert_close(found[2], q[2], rtol=0.0, atol=0.0)
+    model.even = False
+    assert_close(search._inward(q), torch.zeros_like(q), rtol=0.0, atol=0.0)
+
+
+def test_what_pulls_against_limits_alone_is_blocked():
+    model = (lambda q: 1.0 * q, lambda q: torch.eye(3).to(q).expand(*q.shape[:-1], 3, 3))
+    search = Search(InverseKinematics(model, q_min=-1.0, q_max=1.0).settings, 1e-4, 50)
+    q = torch.tensor(
+        [[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 1.0, 0.5], [0.0, 0.0, 0.0]]
+    ).double()
+    way = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-1.0, 1.0, 0.1], [1.0, 0.0, 0.0]])
+    blocked = [True, True, False, False]
+    assert search._blocked(search._point(q, q + way)).tolist() == blocked
+    assert not search._blocked(search._point(q, q - way)).any()
+    found = InverseKinematics(model, q_min=-1.0, q_max=1.0).solve(q + way, q, restarts=0)
+    assert (found.status == IKStatus.UNREACHABLE).tolist() == [True, True, True, False]
+    assert (found.n_iter[:2] == 0).all()

@@ -68,6 +68,16 @@ def test_line_is_straight_and_meets_its_ends(timing):
     assert np.ptp(steps) < 1e-15 if timing == "uniform" else steps[0] < 0.1 * steps[5]
 
 
+def test_paths_take_the_documented_time():
+    for path, seconds in (
+        (figure_eight(CENTER), 10),
+        (spiral(CENTER), 15),
+        (line(CENTER, -CENTER), 5),
+    ):
+        assert path.duration == pytest.approx(seconds)
+        assert_allclose(np.diff(path.t), 0.01)
+
+
 @pytest.mark.parametrize("path", [figure_eight(CENTER), spiral(CENTER), line(CENTER, -CENTER)])
 def test_paths_start_and_end_at_rest(path):
     speed = np.linalg.norm(np.diff(path.x, axis=0), axis=1) / np.diff(path.t)
