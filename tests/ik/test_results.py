@@ -1,3 +1,5 @@
+from dataclasses import FrozenInstanceError
+
 import numpy as np
 import pytest
 
@@ -42,3 +44,11 @@ def test_a_step_has_its_fields_and_no_others(target):
 
 
 TRUNK_TIP = TRUNK(TRUNK.base.new_full((9,), 0.25)).numpy()
+
+
+def test_results_are_frozen():
+    ik = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4)
+    q, target = np.full(9, 0.25), TRUNK_TIP
+    for result in (ik.solve(target), ik.track(target[None], q0=q), ik.step(q, target)):
+        with pytest.raises(FrozenInstanceError):
+            result.error = 0.0
