@@ -3,8 +3,8 @@
 1,000 changes (shortened: 60) of _core, chains, learning, hybrid and ik are drawn with seed 0 from
 those of cosmic-ray; `_mutation` says what is left out. A change counts as killed when a fast test
 that runs the changed line fails, crashes or takes far longer than before. The tests of one mutant
-take at most 12 s: those of the same folder first, of each test function one case first, then the
-shortest. So a survivor of this part might still be killed by the rest of the suite.
+take at most 12 s: those of the same folder first, of each test function one case first, then those
+that run the fewest lines. A survivor might still be killed by the rest of the suite.
 
 Changes inside functions replace the code of the live functions in a process forked from one that
 has collected the suite; other ones (constants, decorators, default arguments) are imported anew.
@@ -42,6 +42,7 @@ class Tests:
         self.paths, self.listed = paths, OUT / f"files-{len(paths)}.json"
         self.seconds: dict[str, float] = {}
         self.failed: list[str] = []
+        self.sizes = Counter()  # how many lines a test runs
         self.lines = defaultdict(lambda: defaultdict(set))  # path, line: tests; "" is the import
         self.package = hashlib.sha256()
         for path in sorted((ROOT / "hybridkin").rglob("*.py")):
@@ -60,6 +61,7 @@ class Tests:
             for path, lines in kept["lines"].items():
                 for line, tests in lines.items():
                     self.lines[path][int(line)].update(names[k] for k in tests)
+                    self.sizes.update(names[k] for k in tests)
 
     def _collect(self, _) -> str | None:
         tracer = tracing()
@@ -122,12 +124,12 @@ class Tests:
         keys, count = [], Counter()
         for name in sorted(names, key=lambda name: (self.seconds[name], name)):
             function = name.split("[")[0]
-            near = f"/{mutant.folder}/" in name
-            keys.append((not near, count[function], self.seconds[name], name))
+            near = f"/{mutant.folder.strip('_')}/" in name
+            keys.append((not near, count[function], self.sizes[name], name))
             count[function] += 1
         chosen, total = [], 0.0
-        for *_, seconds, name in sorted(keys):
-            total += seconds
+        for *_, name in sorted(keys):
+            total += self.seconds[name]
             if total > CAP and chosen:
                 break
             chosen.append(name)
