@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
 
+from hybridkin import ELMRegressorCV, HybridForwardModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Rows
 from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
@@ -166,3 +168,23 @@ def test_a_drift_is_emptied_and_learns_anew():
     assert rest.likeliest_alpha(1e-4) == np.inf
     assert_array_equal(rest.correction(np.inf)(torch.from_numpy(q)).numpy(), 0.0)
     assert rest.likeliest_alpha(np.nan) == 1.0
+
+
+def test_the_kernel_does_not_depend_on_the_unit_of_q():
+    rng = np.random.default_rng(0)
+    X = rng.uniform(0.1, 0.4, (40, 2))
+    y, ones = np.sin(20.0 * X), np.ones(40)
+    metres, millimetres = tuned_kernel(X, y, ones, None), tuned_kernel(1e3 * X, y, ones, None)
+    assert millimetres.gamma == pytest.approx(1e-6 * metres.gamma)
+    assert millimetres.alpha == metres.alpha
+
+
+def test_a_search_of_ones_own_gets_the_groups():
+    rng = np.random.default_rng(0)
+    X, groups = rng.uniform(0.1, 0.4, (60, 2)), np.arange(60) // 12
+    y = np.sin(20.0 * X) + 0.1 * rng.standard_normal((5, 2))[groups]
+    search = ELMRegressorCV(20, max_hidden=20, random_state=0)
+    hybrid = HybridForwardModel(None, search, random_state=0).fit(X, y, groups=groups)
+    alone, rows = (clone(search).fit(X, y, groups=g) for g in (groups, None))
+    assert_array_equal(hybrid.error_model_.left_out_errors_, alone.left_out_errors_)
+    assert np.abs(alone.left_out_errors_ - rows.left_out_errors_).max() > 0.01
