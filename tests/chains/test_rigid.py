@@ -883,3 +883,11 @@ def test_urdf_of_any_size_takes_bounded_time(tmp_path):
     path.write_text("<robot>" + " " * 4_000_000)
     with pytest.raises(ValueError, match="`text_or_path` must be at most 4000000 bytes long"):
         RigidChain.from_urdf(path, "l1")
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_links_in_millimetres_are_noticed_along_any_axis(axis):
+    origins = np.tile(np.eye(4), (2, 1, 1))
+    origins[1, axis, 3] = -300.0
+    with pytest.warns(UserWarning, match="`origins` reaches 300, which looks like millimetres"):
+        RigidChain(origins, [[0, 0, 1], [0, 1, 0]])

@@ -237,6 +237,7 @@ def test_a_tree_has_no_slope_but_predicts(log):
         (lambda: HybridForwardModel(bha(), guard="ball"), "`guard` must be one of"),
         (lambda: HybridForwardModel(bha(), "cubic"), "`error_model` must be an estimator"),
         (lambda: HybridForwardModel(None, "drop"), "`mechanical_model` must be given"),
+        (lambda: HybridForwardModel(bha(), calibrate="radii"), "`calibrate` must be a sequence"),
         (lambda: HybridForwardModel(bha(), calibrate=("radius",)), "`parameters` must name"),
     ],
 )
@@ -249,6 +250,9 @@ def test_bad_data(log):
     q, x, _ = log
     with pytest.raises(TypeError, match="must be a torch module"):
         HybridForwardModel(lambda q: q).fit(q, x)
+    for regressor in ("kernel", RandomForestRegressor(2)):
+        with pytest.raises(TypeError, match="`error_model` must give features that can act inside"):
+            HybridForwardModel(bha(), regressor, coupling="serial").fit(q, x)
     with pytest.raises(TypeError, match=r"must be a chain.*SmallSum"):
         HybridForwardModel(SmallSum(), calibrate=("radii",)).fit(q, x[:, 0])
     with pytest.raises(ValueError, match=r"`X` must have shape \(..., 9\)"):

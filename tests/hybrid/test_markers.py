@@ -62,6 +62,8 @@ MODELS = {
 def test_every_kind_of_hybrid_has_several_markers(name, tmp_path):
     q, x = log(50)
     model = HybridForwardModel(CHAIN, **MODELS[name]).fit(q, without(x))
+    learned = model.error_model_
+    assert learned is None if name == "drop" else len(learned) == 3
     new = log(5, 3)[0]
     found, J = model.predict_and_jacobian(new)
     assert found.shape == (5, 9)

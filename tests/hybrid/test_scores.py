@@ -7,10 +7,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
 
-from hybridkin import ELMRegressorCV, HybridForwardModel
+from hybridkin import ELMRegressorCV, HybridForwardModel, PlayOperator
+from hybridkin._core.model import FunctionModel
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import Rows
+from hybridkin.hybrid._fit import Part, Rows, Spec
 from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
+from hybridkin.hybrid._play import choose_play
 from hybridkin.hybrid._radius import Radius, _quantile
 from hybridkin.hybrid._selection import _OUTSIDE, _chosen, _HeldOut
 
@@ -188,3 +190,20 @@ def test_a_search_of_ones_own_gets_the_groups():
     alone, rows = (clone(search).fit(X, y, groups=g) for g in (groups, None))
     assert_array_equal(hybrid.error_model_.left_out_errors_, alone.left_out_errors_)
     assert np.abs(alone.left_out_errors_ - rows.left_out_errors_).max() > 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motions", [1, 3])
+def test_the_width_of_backlash_is_found_in_the_residuals(motions):
+    """Of a robot whose tip follows q behind a play of 4 cm; without groups all is one motion."""
+    t = np.linspace(0.0, 4.0 * np.pi, 40 * motions)
+    X = 0.1 * np.stack([np.sin(t), np.cos(1.3 * t)], axis=1)
+    groups = None if motions == 1 else np.arange(len(t)) // 40
+    moved = PlayOperator(0.04).apply_by_group(X, np.zeros(len(t)) if groups is None else groups)
+    noise = 1e-4 * np.random.default_rng(0).standard_normal((len(t), 3))
+    y = np.column_stack([moved, moved.sum(axis=1)]) + noise
+    model = FunctionModel(lambda q: torch.cat([q, q.sum(-1, keepdim=True)], -1))
+    spec = Spec(model, (Part(1.0, "parallel", "drop"),))
+    found = choose_play(spec, Rows(X, y, None, groups))
+    assert found.width == pytest.approx(0.04, rel=0.1)
+    assert choose_play(spec, Rows(moved, y, None, groups)) is None

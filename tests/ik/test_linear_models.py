@@ -51,6 +51,9 @@ def test_the_first_step_starts_at_rest():
     assert (step.dq.abs() <= change).all()
     assert (step.dq.abs() == change).any(-1).all()
     assert step.saturated.any(-1).all()
+    lower, upper = ik.settings.step_bounds(q, 0.01)
+    assert_close(upper, change.expand(2, 5), rtol=1e-12, atol=0.0)
+    assert_close(lower, -upper, rtol=0.0, atol=0.0)
     again = ik.step(q, far, dq=step.dq).dq
     assert ((again - step.dq).abs() <= change * (1.0 + 1e-12)).all()
     assert (again.abs().amax(-1) > step.dq.abs().amax(-1)).all()
@@ -123,6 +126,7 @@ def test_distances_between_poses_are_those_of_the_error_for_small_turns():
     draw = torch.Generator().manual_seed(1)
     q = 1e-3 * torch.randn(5, 6, generator=draw, dtype=torch.float64)
     poses, targets, task = TENDONS.pose(q), TENDONS.pose(q.flip(0))[:3], PoseTask(TENDONS, 0.3)
+    targets[:, :3, 3] += torch.tensor([1e-3, 2e-3, 5e-3])
     expected = torch.stack(
         [task.difference(poses, t.expand(5, 4, 4)).norm(dim=-1) for t in targets]
     )

@@ -52,3 +52,9 @@ def test_results_are_frozen():
     for result in (ik.solve(target), ik.track(target[None], q0=q), ik.step(q, target)):
         with pytest.raises(FrozenInstanceError):
             result.error = 0.0
+
+
+def test_numbers_of_statuses_are_those_that_logs_hold():
+    names = "CONVERGED AT_LIMITS UNREACHABLE SINGULAR MAX_ITER OUT_OF_DOMAIN INVALID_INPUT"
+    assert [status.name for status in IKStatus] == [*names.split(), "NO_FURTHER"]
+    assert [status.value for status in IKStatus] == list(range(8))
