@@ -24,7 +24,7 @@ from _mutation import ROOT, Mutant
 from hypothesis import HealthCheck, Phase, settings
 
 PASSED, FAILED, BROKEN = 0, 1, 2  # exit codes of a process
-MEMORY = 12 << 30  # bytes of address space of one process
+MEMORY = 24 << 30  # bytes of address space of one process
 WALL = 300.0  # seconds until a process that uses no CPU is killed
 
 
