@@ -144,7 +144,7 @@ def test_the_kernel_is_tried_on_logs_that_are_not_large(monkeypatch):
     monkeypatch.setattr(_selection, "_candidates", few_candidates)
     rows = Rows(*log(30))
     candidates = [*few_candidates(None), "blend"]
-    monkeypatch.setattr(_selection, "_MOST", 30)
+    monkeypatch.setattr(_selection, "_MOST", 31)
     assert select(Spec(CHAIN, ()), rows, rows)[1]["candidate"] == candidates
     monkeypatch.setattr(_selection, "_MOST", 29)
     candidates.remove("parallel kernel")
