@@ -23,6 +23,7 @@ from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
 from hybridkin.hybrid._linearised import choose
 from hybridkin.hybrid._pose import PoseHybridModule
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
+from hybridkin.hybrid._readout_fit import fit_readout
 from hybridkin.hybrid._selection import _chosen, _HeldOut, select
 from hybridkin.hybrid._settings import check_settings
 
@@ -342,3 +343,16 @@ def test_a_choice_of_penalties_starts_where_it_is_asked_to():
     assert choose(score, start)[0] == pytest.approx(start)
     assert tried[0] == (inf, inf)
     assert tried[1] == pytest.approx(start)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_the_actuators_alone_is_found_and_allowed_for(seed):
+    rng, chain = np.random.default_rng(seed), ConstantCurvatureChain([0.03])
+    q = torch.from_numpy(rng.uniform(0.15, 0.25, (100, 3)))
+    off, noise = 0.1 * (q - 0.22), 1e-3 * torch.from_numpy(rng.standard_normal((100, 3)))
+    features, x = Features.of_range(q), chain(q + off + noise)
+    moved = chain.coordinates(q + off)[0] - chain.coordinates(q)[0]
+    found = fit_readout(chain, features, q, x)
+    ignored = fit_readout(chain, features, q, x, alphas=found.alphas)
+    assert found.noise_ratio < inf == ignored.noise_ratio
+    assert (found.readout(q) - moved).norm() < (ignored.readout(q) - moved).norm()
