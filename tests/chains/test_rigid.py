@@ -542,7 +542,7 @@ EXTRA = '<link name="c"/>' + JOINT.replace('"j"', '"k"').format("fixed", "")
     [
         (JOINT.replace('"a"', '"z"'), "<parent> of joint 'j' 'z' is not in the robot"),
         (JOINT + EXTRA.replace('"b"', '"z"'), "<child> of joint 'k' 'z' is not in the robot"),
-        (JOINT + EXTRA.replace('"a"', '"b"').replace('"b"', '"c"'), "got a cycle: c -> c"),
+        (JOINT + EXTRA.replace('"a"', '"b"').replace('"b"', '"c"'), "got a cycle: .c. -> .c."),
         (JOINT + '<link name="c"/>', r"one root, but no joint leads to any of \['a', 'c'\]"),
         (JOINT + EXTRA.replace('"a"', '"c"'), r"every <child> .* once, got \['b'\]"),
         (JOINT + '<link name="a"/>', r"every link .* once, got \['a'\]"),
