@@ -35,7 +35,7 @@ from hybridkin import ELMRegressor, ELMRegressorCV, HybridForwardModel, InverseK
 from hybridkin._core.turns import one_thread
 from hybridkin.datasets import make_trunk
 
-LIMIT = 300.0  # [s] for a claim, on a busy machine
+LIMIT = 1200.0  # [s] for a claim, on a busy machine
 Q, X, GROUPS = trunk_log()
 
 
@@ -113,7 +113,7 @@ def work(model: HybridForwardModel, k: int) -> str:
     found += [tracker.step(target) for target in x] + [ik.step(q[0], x[1]).dq]
     found.append(model.module_.jacobian(torch.from_numpy(q)).numpy())
     found.append(copy.deepcopy(model).partial_fit(q[:3], x[:3] + 0.01).predict(q))
-    found.append(clone(model).fit(Q[k:], X[k:], groups=GROUPS[k:]).predict(q))
+    found.append(clone(model).fit(Q[k % 4 :], X[k % 4 :], groups=GROUPS[k % 4 :]).predict(q))
     for a in found:
         digest.update(np.ascontiguousarray(a).tobytes())
     return digest.hexdigest()
