@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import gc
 import json
+import math
 import os
 import subprocess
 import sys
@@ -86,7 +87,7 @@ def _tracked(
 
 def _allowed(n_times: int) -> float:
     """Return the ratio of times of last and first tenth that counts as flat: few are noisy."""
-    return 1.25 if n_times >= 100 else 1.6
+    return 1.25 if n_times >= 1000 else 1.6 if n_times >= 20 else math.inf
 
 
 def _rows(calls: int) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +113,8 @@ def _stream(what: str, learn: Any, calls: int) -> tuple[str, bool]:
     slower = np.median(times[-tenth:]) / np.median(times[:tenth])
     mb = np.median(memory[-few:]) - np.median(memory[few : 2 * few])
     figure = f"{calls:,} calls of {1e4 * np.median(times):.3g} us, last tenth / first {slower:.2f}"
-    return f"{figure}; {mb:+.1f} MB", slower < _allowed(len(times)) and mb < MEGABYTES
+    flat = slower < _allowed(len(times)) and mb < MEGABYTES
+    return f"{figure}; {mb:+.1f} MB", bool(flat)
 
 
 def _elm_learns(calls: int, decay: float) -> Iterator[Line]:
@@ -137,10 +139,12 @@ def _hybrid_learns(calls: int, decay: float) -> Iterator[Line]:
     x[:, 0] += 0.01 * np.linspace(0.0, 1.0, calls)  # the robot changes
     at_once, name = copy.deepcopy(model), f"HybridForwardModel.partial_fit, decay {decay}"
     figure, flat = _stream(
-        name, lambda i: model.partial_fit(q[i : i + 1], x[i : i + 1], decay=decay), calls
+        name, lambda i: model.partial_fit(q[i : i + 1], x[i : i + 1], decay=decay, alpha=0.1), calls
     )
-    at_once.partial_fit(q, x, decay=decay)
-    yield Line(name, figure, flat)
+    fitted = at_once.predict(q)
+    at_once.partial_fit(q, x, decay=decay, alpha=0.1)
+    moved = float(abs(model.predict(q) - fitted).max())
+    yield Line(name, f"{figure}; {1e3 * moved:.2g} mm learned", flat and moved > 1e-3)
     yield _agrees(name, model.predict(q), at_once.predict(q), 1e-8)
 
 
