@@ -26,7 +26,7 @@ examine: $(VENV)/.examine $(VENV)/.native
 	$(BIN)/python tests/examination --out $(OUT)/examination
 
 coverage: $(VENV)/.examine $(VENV)/.native
-	$(BIN)/python -m pytest $(TESTS) -m "not slow" --cov --cov-report html:$(OUT)/coverage \
+	$(BIN)/python -m pytest $(TESTS) --cov --cov-report html:$(OUT)/coverage \
 		--cov-report json:$(OUT)/coverage.json --cov-report term
 
 check: $(VENV)/.installed
