@@ -147,8 +147,8 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
         tree = zip(children, parents, strict=True)
         TopologicalSorter({child: [parent] for child, parent in tree}).prepare()
     except CycleError as error:
-        loop = " -> ".join(map(repr, error.args[1]))
-        raise ValueError(f"the links of a URDF must be a tree, got a cycle: {loop:.400}.") from error
+        loop = " -> ".join(map(repr, error.args[1]))[:400]
+        raise ValueError(f"the links of a URDF must be a tree, got a cycle: {loop}.") from error
     roots = sorted({*links} - {*children})
     if len(roots) > 1:
         raise ValueError(

@@ -106,7 +106,7 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         ErrorHistogramDisplay
             Itself, drawn.
         """
-        known, ax, bins = self._known(unit), axes_or_new(ax), whole(bins, "bins")
+        known, ax, bins = self._known(unit), axes_or_new(ax), whole(bins, "bins", most=10_000)
         top = max(float(values.max()) for values in known.values()) or 1e-3
         edges = np.linspace(0.0, top, bins + 1).tolist()
         for i, (name, values) in enumerate(known.items()):
