@@ -47,8 +47,8 @@ CLOSED = [
         KernelModule,
         GP(ConstantKernel(2.0) * RBF(0.5) + WhiteKernel(0.01), normalize_y=True, optimizer=None),
     ),
-    (KernelModule, GP(RBF(0.5), alpha=1e-6, optimizer=None)),
-    (KernelModule, GP(RBF(0.5) * ConstantKernel(3.0), alpha=1e-4, optimizer=None)),
+    (KernelModule, GP(RBF(0.5), alpha=0.01, optimizer=None)),
+    (KernelModule, GP(RBF(0.5) * ConstantKernel(3.0), alpha=0.02, optimizer=None)),
     (
         KernelModule,
         make_pipeline(MinMaxScaler(), GP(WhiteKernel(0.1) + RBF([0.5, 1.0, 2.0]), optimizer=None)),
