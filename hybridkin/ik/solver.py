@@ -185,7 +185,7 @@ class InverseKinematics:
         Raises
         ------
         TypeError
-            Where it could only be stored as code, see `StepSettings`: a posture that is a function.
+            Where it could only be stored as code: a posture that is a function.
         """
         return self.settings.stored()
 

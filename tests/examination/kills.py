@@ -64,6 +64,7 @@ def examine(full: bool) -> Iterator[Line]:
     """Yield a line for each writer, each signal, and what is flushed to the disk."""
     rng, share = np.random.default_rng(20), 1.0 if full else 0.1
     os.environ["SOURCE_DATE_EPOCH"] = "86400"
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         write_log()
