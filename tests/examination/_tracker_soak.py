@@ -26,7 +26,7 @@ from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics, datas
 from hybridkin.native import available
 
 BLOCK = 500 if available() else 100
-DT = 0.01
+DT, PROBE = 0.01, 50 if available() else 10  # period [s]; ticks whose time counts
 FAR = (3.0, 1e3, 1e100, 1e160, 1.7e308)
 
 
@@ -123,6 +123,15 @@ class Checked:
         self.digests.append(self.digest.hexdigest()[:12])  # of all until now
 
 
+def probed(ik, home, way):
+    """Return the CPU time of a tick [s], of the same ticks in every call."""
+    tracker = ik.tracker(home)
+    begin = time.process_time()
+    for target in way:
+        tracker.step(target)
+    return (time.process_time() - begin) / len(way)
+
+
 def soak(robot, ticks, seed, seconds):
     """Return what was found."""
     make, settings = ROBOTS[robot]
@@ -134,7 +143,8 @@ def soak(robot, ticks, seed, seconds):
     checked.start(
         0.5 * checked.low + 0.5 * checked.high + 1e-3 * np.cos(np.arange(len(checked.low)))
     )
-    tracker, offset = ik.tracker(checked.q, memory=0.5), np.zeros(3)
+    tracker, offset, home = ik.tracker(checked.q, memory=0.5), np.zeros(3), checked.q
+    way = chain(torch.from_numpy(home)).numpy() + 0.05 * np.linspace(0.0, 1.0, PROBE)[:, None]
     times, memory, objects, start = [], [], [], time.process_time()
     every = max(1, ticks // BLOCK // 40)
     for block in tqdm(range(ticks // BLOCK), desc=robot, mininterval=20.0, file=sys.stderr):
@@ -150,10 +160,9 @@ def soak(robot, ticks, seed, seconds):
             tips = x + offset + noise
         seen = [None] * BLOCK if block % 3 == 0 or "tip_limits" in settings else tips
         commands, step = np.empty((BLOCK, len(checked.q))), tracker.step
-        begin = time.process_time()
         for i, (target, speed, tip) in enumerate(zip(x, feed, seen, strict=True)):
             commands[i] = step(target, speed, x_measured=tip)
-        times.append(time.process_time() - begin)
+        times.append(probed(ik, home, way))
         checked.take(commands)
         if learns:
             q = commands[::50]
@@ -171,7 +180,7 @@ def soak(robot, ticks, seed, seconds):
         "backend": tracker.backend,
         "ticks": len(times) * BLOCK,
         "digests": checked.digests,
-        "us": 1e6 * np.median(times) / BLOCK,
+        "us": 1e6 * np.median(times),
         "slower": np.median(times[-tenth:]) / np.median(times[:tenth]),
         # After a first tenth, in which memory is taken that stays.
         "mb": np.median(memory[-few:]) - np.median(memory[few : 2 * few + 1]),
