@@ -26,9 +26,8 @@ class Transform(Protocol):
 
 
 Numbers = ArrayLike | Tensor  # what a caller may hand over as an array
-_OVERFLOWS = np.float64(
-    1e100
-)  # squares, and fourth powers nearly; no sensor and no robot comes near
+# Fourth powers of larger numbers overflow, and those of the inverse of smaller scales.
+LARGEST = np.float64(1e75)
 
 
 def as_tensor(
@@ -104,8 +103,8 @@ def as_path(value: Any, name: str = "path") -> Path:
 
 
 def countable(value: Any) -> Any:
-    """Return where numbers are neither NaN nor so large that their squares overflow."""
-    return abs(value) < _OVERFLOWS
+    """Return where numbers are neither NaN nor so large that their fourth powers overflow."""
+    return abs(value) < LARGEST
 
 
 def check_shape(

@@ -16,7 +16,7 @@ from typing import Any
 if sys.platform != "win32":
     import fcntl
 
-_NEW = ".new"  # folder of complete files that are about to replace those beside it
+_NEW = ".hybridkin-new"  # folder of complete files that are about to replace those beside it
 
 Writer = Callable[[Path], Any]
 """Writes a file when handed its path."""

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor, check_shape, labels, one_of
+from hybridkin._core.arrays import LARGEST, Numbers, as_tensor, check_shape, labels, one_of
 from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
@@ -31,7 +31,6 @@ __all__ = ["CalibrationResult", "calibrate"]
 # Identified below this share of the prior: k parameters that share one unidentified direction
 # narrow to 1 / sqrt(k) by the prior alone.
 _IDENTIFIED = 0.1
-_LEAST_PRIOR = 1e-100  # of which the square and its inverse are numbers
 _FEW, _LEFT = 10, 0.5  # a quarter of the variance
 _MEASURED = ("radii", "lengths")  # sizes that a ruler measures:
 _UNPHYSICAL = 1.75  # a change by this factor is a warning
@@ -388,8 +387,8 @@ def _check_parameters(
         if isinstance(given, Mapping) and not set(given) <= set(names):
             raise ValueError(f"`{argument}` must name only {names}, got {sorted(given)}.")
     stds = list(prior.values()) if isinstance(prior, Mapping) else [prior]
-    if not all(std > _LEAST_PRIOR for std in stds):
-        need = f"must be positive standard deviations, over {_LEAST_PRIOR:g}"
+    if not all(std > 1.0 / LARGEST for std in stds):
+        need = f"must be positive standard deviations, over {1.0 / LARGEST:g}"
         raise ValueError(f"`prior` {need}, got {prior}.")
     return names
 

@@ -94,7 +94,7 @@ def source_of(text_or_path: str | PathLike[str]) -> str | Path:
     return path
 
 
-def one_of(name: str, known: Collection[str], what: str) -> str:
+def in_robot(name: str, known: Collection[str], what: str) -> str:
     if name not in known:
         close = difflib.get_close_matches(name, list(known)[:_MOST], n=1)
         hint = f"did you mean {close[0]!r}? It has" if close else "it has"
@@ -121,8 +121,8 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         raise ValueError(f"`text_or_path` must be a valid MJCF: {error!s:.400}.") from error
     bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
     sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
-    one_of(end_link, [*bodies, *sites], "`end_link`")
-    root = 0 if root_link is None else bodies[one_of(root_link, list(bodies), "`root_link`")]
+    in_robot(end_link, [*bodies, *sites], "`end_link`")
+    root = 0 if root_link is None else bodies[in_robot(root_link, list(bodies), "`root_link`")]
     path: list[Joint] = []
     body = bodies.get(end_link, -1)
     if body < 0:

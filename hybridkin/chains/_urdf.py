@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin.chains._arm_files import UNLIMITED, Joint, matrix_of, one_of, source_of
+from hybridkin.chains._arm_files import UNLIMITED, Joint, in_robot, matrix_of, source_of
 
 _MISSING = (
     "have no <limit>, which URDF requires; they are taken as unlimited. Add <limit>, or set "
@@ -105,8 +105,8 @@ def _elements(
     _check_tree(known, joints)
     by_child = {joint["child"].get("link", ""): joint for joint in joints}
     by_name = {joint["joint"].get("name", ""): joint for joint in joints}
-    link = one_of(end_link, known, "`end_link`")
-    root = None if root_link is None else one_of(root_link, known, "`root_link`")
+    link = in_robot(end_link, known, "`end_link`")
+    root = None if root_link is None else in_robot(root_link, known, "`root_link`")
     path: list[tuple[_Element, list[Joint]]] = []
     while link != root and link in by_child:
         element = by_child[link]
@@ -141,8 +141,8 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
             raise ValueError(f"every {what} of a URDF must occur once, got {doubled} more often.")
     known = dict.fromkeys(links)
     for name, parent, child in zip(named, parents, children, strict=True):
-        one_of(parent, known, f"<parent> of joint {name!r}")
-        one_of(child, known, f"<child> of joint {name!r}")
+        in_robot(parent, known, f"<parent> of joint {name!r}")
+        in_robot(child, known, f"<child> of joint {name!r}")
     try:
         tree = zip(children, parents, strict=True)
         TopologicalSorter({child: [parent] for child, parent in tree}).prepare()

@@ -155,7 +155,7 @@ class Chain(PoseModel):
         if bad.any():
             raise ValueError(
                 f"`{name}` must be finite, got NaN or infinity in {int(bad.sum())} of {len(rows)} "
-                f"rows (first: row {int(bad.nonzero()[0])}; more than 1e100 counts as infinite); "
+                f"rows (first: row {int(bad.nonzero()[0])}; more than 1e75 counts as infinite); "
                 "drop those rows."
             )
         self._check_rows(rows, name)

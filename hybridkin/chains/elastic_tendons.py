@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.arrays import LARGEST, Numbers, Transform
 from hybridkin._core.stored import Layout
 from hybridkin.chains import _slack
 from hybridkin.chains._arcs import levers, reading_matrix
@@ -20,7 +20,6 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 __all__ = ["ElasticTendonChain"]
 
 _SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros gains".split()
-_LEAST = 1e-75  # of a stiffness: products of its inverse overflow below
 _TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are stored
 
 
@@ -138,8 +137,8 @@ class ElasticTendonChain(ArcChain):
         axial = 10.0 if axial_stiffness is None else axial_stiffness
         for name, value in (("bending_stiffness", bending), ("axial_stiffness", axial)):
             geometry[name] = filled(value, name, dtype, (self.n_segments,))
-            if not (geometry[name] > _LEAST).all():
-                need = f"must be positive, over {_LEAST:g}"
+            if not (geometry[name] > 1.0 / LARGEST).all():
+                need = f"must be positive, over {1.0 / LARGEST:g}"
                 raise ValueError(f"`{name}` {need}, got {geometry[name].tolist()}.")
         zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
         self._table: tuple[list[Tensor], object, _slack.Responses] | None = None

@@ -40,8 +40,6 @@ class Drift(NamedTuple):
     moment : ndarray of shape (n + 1, m)
         Their weighted products with the residuals [m].
     squares : ndarray of shape ()
-        Weighted sum of squared residuals [m^2].
-    squares : ndarray of shape ()
         Weighted sum of the squared residuals [m^2].
     """
 

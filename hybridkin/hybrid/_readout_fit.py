@@ -214,7 +214,7 @@ class _Problem:
         q: Tensor,
         x: Tensor,
         weight: Tensor,
-        serial: bool = True,
+        serial: bool,
     ) -> None:
         self.mechanical, self.features = mechanical, features
         self.q, self.x, self.root = q, x, weight.sqrt()[:, None]

@@ -175,7 +175,7 @@ def _candidates(spec: Spec) -> dict[str, tuple[str, Any]]:
         "parallel linear": ("parallel", NamedFeatures("linear")),
     }
     candidates |= {f"serial {kind}": ("serial", NamedFeatures(kind)) for kind in inside}
-    candidates |= {f"parallel {kind}": ("parallel", NamedFeatures(kind)) for kind in inside[1:]}
+    candidates |= {f"parallel {kind}": ("parallel", NamedFeatures(kind)) for kind in inside}
     candidates["parallel ELM"] = ("parallel", network)
     candidates["parallel kernel"] = ("parallel", "kernel")
     return candidates

@@ -11,6 +11,7 @@ import torch
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 
+from hybridkin._core.arrays import LARGEST
 from hybridkin._core.model import PortableModule, as_forward_model
 from hybridkin._core.stored import Restore, Stored, estimator_of, params_of, plain, restore_columns
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -49,7 +50,6 @@ _MODULES: dict[str, type[PortableModule]] = {
     )
 }
 # Fitted error models that describe themselves, and others that a hybrid may be given.
-_LEAST = 1e-75  # of a scale: products of its inverse overflow below
 _FITS = {"elm_regressor": ELMRegressor.from_stored, "readout_fit": ReadoutFit.from_stored}
 _REGRESSORS = {
     cls.__name__: cls for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
@@ -131,8 +131,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]), ())
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
-    if not (model._drift.scale > _LEAST).all():
-        raise ValueError(f"`drift_scale` must be positive, over {_LEAST:g}")
+    if not (model._drift.scale > 1.0 / LARGEST).all():
+        raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     if "play_width" in stored.arrays:
         one = stored.array("play_width").ndim == 0

@@ -10,15 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import (
-    as_array,
-    give_back,
-    is_numpy,
-    leading,
-    number,
-    rows_of,
-    whole,
-)
+from hybridkin._core.arrays import as_array, give_back, is_numpy, leading, number, rows_of, whole
 from hybridkin._core.stored import Stored
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._gram import row_gram

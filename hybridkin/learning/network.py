@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from hybridkin._core.arrays import one_of
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Layout
@@ -76,10 +77,7 @@ class ELM(LeverageModule):
     def __init__(self, activation="logistic", **arrays):
         super().__init__()
         self.activation = activation
-        if activation not in ACTIVATIONS:
-            raise ValueError(
-                f"`activation` must be one of {[*ACTIVATIONS]}, got {activation!r:.60}"
-            )
+        one_of(activation, "activation", ACTIVATIONS)
         for name in LAYER + READOUT:
             array = np.asarray(arrays[name], order="C")
             self.register_buffer(name, torch.tensor(array, device="cpu"))

@@ -16,6 +16,7 @@ from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScal
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from hybridkin._core.arrays import copied
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.stored import Layout
@@ -254,8 +255,8 @@ class RegressorModule(ForwardModel):
     def evaluate(self, q: Tensor) -> Tensor:
         """Return the prediction outside any graph, shape (..., m)."""
         rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
-        x = np.asarray(self.regressor.predict(rows), dtype=np.float64)
-        return torch.from_numpy(x).to(q).reshape(*q.shape[:-1], -1)
+        x = copied(self.regressor.predict(rows), q.device, np.float64)
+        return x.to(q).reshape(*q.shape[:-1], -1)
 
 
 class _Differenced(torch.autograd.Function):

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from hybridkin._core.arrays import LARGEST, countable
 from hybridkin._core.files import write_file
 from hybridkin._core.stored import Stored
 
 FORMAT = "hybridkin-model"
 VERSION = 3
 _HEADER, _CHECKSUM = "hybridkin", "sha256"
-_LARGEST = 1e75  # of a number: the squares of larger ones, and their products, overflow
 _UNREADABLE = (SafetensorError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 Header = dict[str, Any]
@@ -60,8 +60,8 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
     Parts that say the same are one object, as the parts of the model were.
     """
     for name, array in arrays.items():
-        if array.dtype == np.float64 and (np.isfinite(array) & (np.abs(array) >= _LARGEST)).any():
-            raise ValueError(f"the numbers of {name!r:.60} must be less than {_LARGEST:g}")
+        if array.dtype == np.float64 and not (countable(array) | ~np.isfinite(array)).all():
+            raise ValueError(f"the numbers of {name!r:.60} must be less than {LARGEST:g}")
     found: dict[str, Stored] = {}
     kinds = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
 

@@ -143,7 +143,7 @@ def forked(work: Callable[[], Any], delay: float | None = None, number: int = 9)
 def content(folder: Path) -> Files:
     """Return the files of a folder that readers see, those of a write that was committed."""
     files = {p.name: p.read_bytes() for p in folder.glob("[!.]*")} if folder.is_dir() else {}
-    return files | {p.name: p.read_bytes() for p in folder.glob(".new/*")}
+    return files | {p.name: p.read_bytes() for p in folder.glob(".hybridkin-new/*")}
 
 
 def litter(folder: Path) -> list[str]:

@@ -283,7 +283,7 @@ def test_the_likeliest_noise_is_that_of_the_normal_density():
     generator = torch.Generator().manual_seed(0)
     counts = torch.randint(1, 4, (30,), generator=generator).double()
     J = CHAIN.forward_and_jacobian(q)[1]
-    problem = ReadoutProblem(CHAIN, Features.of_range(q), q, q[:, :3], counts)
+    problem = ReadoutProblem(CHAIN, Features.of_range(q), q, q[:, :3], counts, serial=True)
     spread = torch.linalg.eigvalsh(J @ J.mT)
     mean = float((counts[:, None] * spread).sum() / (3.0 * counts.sum()))
     ratios = mean * np.logspace(-2, 4, 25)

@@ -193,7 +193,7 @@ def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
     )
     assert fit.gradient < 1e-7
     # By autograd, in the problem's own variables, and no neighbour is better.
-    problem = _Problem(chain, fit.readout.features, q, x, weight)
+    problem = _Problem(chain, fit.readout.features, q, x, weight, serial=True)
     penalty = problem.penalty((0.03, 0.3))
     readout, _ = problem.minimum(problem.nothing, penalty)
 
@@ -375,7 +375,8 @@ def shaken(truth, q, rng):
 
 def test_noise_of_the_actuators_is_told_from_that_of_the_tip(rng):
     chain, q = rows_of("trunk", rng, 1500)
-    problem = _Problem(chain, Features.of_range(q), q, q[:, :3], torch.ones(len(q)).double())
+    args = Features.of_range(q), q, q[:, :3], torch.ones(len(q)).double()
+    problem = _Problem(chain, *args, serial=True)
     assert 0.1 < problem.likeliest_ratio(shaken(chain, q, rng) - chain(q)) < 0.6  # 0.25
     assert problem.likeliest_ratio(1e-3 * uniform(rng, 1500, 3)) > 100.0
 
@@ -421,7 +422,7 @@ def test_whitened_residuals_are_those_of_noise_of_unit_level(rng):
     chain, q = rows_of("tendons", rng, 40)
     weight = 1.0 + uniform(rng, 40).abs()
     args = Features.of_range(q), q, chain(q) + 0.01, weight
-    problem = _Problem(chain, *args).in_noise(0.3)
+    problem = _Problem(chain, *args, serial=True).in_noise(0.3)
     J = chain.jacobian(q)
     covariance = J @ J.mT + 0.3 * torch.eye(3, dtype=q.dtype)
     W = problem.whitening

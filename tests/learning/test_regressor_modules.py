@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
+from sklearn.dummy import DummyRegressor
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
@@ -144,6 +145,18 @@ def test_differences_of_two_outputs_and_their_graph():
     assert_allclose(J.numpy().reshape(6, 2, 3), differences(regressor.predict, X[:6]), rtol=1e-4)
     (slope,) = torch.autograd.grad(x[..., 1].sum(), lead)
     assert_close(slope, J[..., 1, :])
+
+
+class _ReadOnly(DummyRegressor):
+    def predict(self, X):
+        return np.broadcast_to(self.constant_, (len(X), 1))
+
+
+def test_a_read_only_prediction_gives_no_warning():
+    X, y = data(1)
+    regressor = _ReadOnly().fit(X, y)
+    x = error_module(regressor, torch.from_numpy(X))(torch.from_numpy(X[:3]))
+    assert_allclose(x.numpy(), regressor.predict(X[:3]))
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e4])

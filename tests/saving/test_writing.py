@@ -245,13 +245,13 @@ def test_a_folder_is_written_whole_or_as_it_was(tmp_path, there):
 
 def test_a_folder_that_a_killed_write_was_about_to_fill(tmp_path):
     write_files(tmp_path, writers("old"))
-    (tmp_path / ".new").mkdir()
-    (tmp_path / ".new" / "b").write_text("newb")
+    (tmp_path / ".hybridkin-new").mkdir()
+    (tmp_path / ".hybridkin-new" / "b").write_text("newb")
     assert newest(tmp_path / "a") == tmp_path / "a"
     assert newest(tmp_path / "b").read_text() == "newb"
     write_files(tmp_path, {"c": lambda path: path.write_text("newc")})
     assert read(tmp_path) == {"a": "old", "b": "new", "c": "new"}
-    assert not (tmp_path / ".new").exists()
+    assert not (tmp_path / ".hybridkin-new").exists()
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_is_replaced(tmp_path):
