@@ -14,7 +14,7 @@ _SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_to
 settings.register_profile("suite", max_examples=10, derandomize=True, database=None, deadline=None)
 settings.register_profile(
     "examination",
-    max_examples=int(os.environ.get("EXAMPLES", "2000")),
+    max_examples=int(os.environ.get("EXAMPLES", "500")),
     database=None,
     deadline=None,
     print_blob=True,

@@ -1,6 +1,6 @@
 """Public functions and methods, given hostile arguments at random, by the property tests.
 
-Every test of tests/**/test_properties*.py is run with the profile "examination": 2,000 examples for
+Every test of tests/**/test_properties*.py is run with the profile "examination": 500 examples for
 each property in the full examination, 5 in the shortened one, fewer where an example takes long.
 The seed is 20.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 from _line import Line
 
 TESTS = Path(__file__).parent.parent
-SEED, FULL, SHORT = 20, 2000, 5
+SEED, FULL, SHORT = 20, 500, 5
 
 
 def examine(full: bool) -> Iterator[Line]:
