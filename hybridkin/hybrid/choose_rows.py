@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import identity, labels, shaped
+from hybridkin._core.arrays import identity, labels, shaped, whole
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.rotations import cross_matrix
 from hybridkin.calibration.measured import check_finite
@@ -121,8 +121,7 @@ def choose_rows(
     names, places = np.arange(len(q)), np.arange(len(q))[:, None]
     if groups is not None:
         names, places = _few_rows_of(labels(groups, len(q)))
-    if not 1 <= n <= len(names):
-        raise ValueError(f"`n` must lie in 1 to {len(names)}, the number of candidates, got {n!r}.")
+    n = whole(n, "n", 1, len(names))  # of the candidates
     with torch.no_grad():
         errors = _TipErrors(robot, torch.cat([q, known, aim]))
         chosen, error = _greedy(errors, q[torch.from_numpy(places)], n, known, aim)

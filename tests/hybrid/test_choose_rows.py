@@ -171,9 +171,12 @@ BAD = {
     "`measured` must have shape": lambda q: choose_rows(trunk(), q, 1, measured=q[:, :5]),
     "`candidates` must be finite, got NaN": lambda q: choose_rows(trunk(), np.sqrt(q - 0.21), 1),
     "`target` must hold at least one row": lambda q: choose_rows(trunk(), q, 1, target=q[:0]),
-    "`n` must lie in 1 to 9, .* got 10": lambda q: choose_rows(trunk(), q, 10),
-    "`n` must lie in 1 to 9, .* got 0": lambda q: choose_rows(trunk(), q, 0),
-    "`n` must lie in 1 to 3, .* got 4": lambda q: choose_rows(trunk(), q, 4, groups=[*"aaabbbccc"]),
+    "`n` must be 1 to 9, a whole number, got 10": lambda q: choose_rows(trunk(), q, 10),
+    "`n` must be 1 to 9, a whole number, got 0": lambda q: choose_rows(trunk(), q, 0),
+    "`n` must be 1 to 9, a whole number, got 2.0": lambda q: choose_rows(trunk(), q, 2.0),
+    "`n` must be 1 to 3, a whole number, got 4": lambda q: choose_rows(
+        trunk(), q, 4, groups=[*"aaabbbccc"]
+    ),
     r"`groups` must have shape \(9,\)": lambda q: choose_rows(trunk(), q, 1, groups=[*"ab"]),
     "must have at most 5000 weights": lambda q: choose_rows(lambda q: q, np.ones((9, 80)), 1),
 }
