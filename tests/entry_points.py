@@ -60,7 +60,13 @@ WRONG = [None, "a", "", [], {}, (), True, object, 1j, b"a", np.nan, np.float32(0
 NUMBERS = [np.nan, np.inf, -np.inf, 0, -0.0, 1, -1, 2.5, 5e-324, 1e-300, 1e300, 2**63, True]
 # Made by this package: what else stands in their place raises as Python does.
 OBJECTS = (torch.nn.Module, HybridForwardModel, datasets.Log, robots.LogFormat)
-OBJECTS += (workflow.LoadedModel, workflow.PathLimits, trajectories.Trajectory, type(TRACK))
+OBJECTS += (
+    robots.RobotDescription,
+    workflow.LoadedModel,
+    workflow.PathLimits,
+    trajectories.Trajectory,
+    type(TRACK),
+)
 
 
 @st.composite

@@ -6,10 +6,20 @@ import torch
 from saved_models import arm, tendon_chain, trunk, trunk_log
 from torch.testing import assert_close
 
-from hybridkin import PlayOperator, PlayState, calibrate, load_model, plots, save_model
+from hybridkin import (
+    ELMRegressorCV,
+    InverseKinematics,
+    PlayOperator,
+    PlayState,
+    calibrate,
+    load_model,
+    plots,
+    save_model,
+)
 from hybridkin import trajectories as paths
 from hybridkin.calibration.choice import choose_geometry
 from hybridkin.datasets import Log, check_log, paper_protocol, paper_split
+from hybridkin.workflow import FitSettings
 
 Q, X, GROUPS = trunk_log(24)
 HUGE = np.where(np.arange(24)[:, None] == 3, 1e300, X)
@@ -38,6 +48,15 @@ META = ROWS.to("meta")
         ("path", lambda: save_model(trunk(), 3)),
         ("training", lambda: save_model(trunk(), "model", training=np.nan)),
         ("groups", lambda: Log(Q, X, GROUPS[:3])),
+        ("n_folds", lambda: FitSettings(n_folds=np.nan)),
+        ("n_seeds", lambda: FitSettings(n_seeds=2**63)),
+        ("max_rows", lambda: FitSettings(max_rows=0)),
+        ("auto", lambda: FitSettings(auto=np.nan)),
+        ("alphas", lambda: ELMRegressorCV(alphas=[5e-324]).fit(Q, X)),
+        ("damping", lambda: InverseKinematics(trunk(), damping=Q)),
+        ("limits", lambda: InverseKinematics(trunk(), limits=Q)),
+        ("dt", lambda: InverseKinematics(trunk(), beta=0.0, dt=1e300)),
+        ("t", lambda: InverseKinematics(trunk(), beta=0.0).track(X[:2], [0.0, 1e300])),
         ("groups", lambda: Log(Q, X, NAN_GROUPS)),
         ("time", lambda: Log(Q, X, time=[0.0])),
         ("random_state", lambda: paper_protocol(np.nan)),

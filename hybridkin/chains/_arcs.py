@@ -193,7 +193,9 @@ def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Seque
     in the plane of its actuators: `bends` of them.
     """
     S = len(bends)
-    free = torch.diag(angles[0].new_tensor([*extensible, *(0.5 * n for n in (*bends, *bends))]))
+    shares = [*map(float, extensible), *(0.5 * n for n in (*bends, *bends))]
+    # Not new_tensor: before torch 2.5 it does not work in functional transforms.
+    free = torch.diag(torch.tensor(shares, dtype=angles[0].dtype, device=angles[0].device))
     for k in (k for k in range(S) if bends[k] == 1):
         # In a plane at the angle psi: [[1 + cos 2 psi, sin 2 psi], [sin 2 psi, 1 - cos 2 psi]] / 2.
         x, y = bend_readings(angles[k], extensible[k])

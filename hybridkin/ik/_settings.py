@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import (
+    LARGEST,
     Numbers,
     Transform,
     as_array,
     as_tensor,
     check_shape,
+    countable,
     real_array,
     whole,
 )
@@ -113,11 +115,9 @@ class StepSettings(Portable):
         good = (self.q_min <= self.q_max).all()
         require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
         object.__setattr__(self, "posture", self.middle if self.q_pref is None else self.q_pref)
-        good = 0.0 < self.dt < math.inf
+        good = 0.0 < self.dt < LARGEST
         require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
         self.rates()
-        good = self.limits in ("saturate", "off")
-        require(good, f'`limits` must be "saturate" or "off", got {self.limits!r}.')
         share = 0.0 if self.damping == "adaptive" else self.damping
         good, text = not isinstance(share, str) and 0.0 <= share < math.inf, '"adaptive" or'
         require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
@@ -340,7 +340,7 @@ class StepSettings(Portable):
         times = as_tensor(t, "t", target.device)
         check_shape(times, "t", [n], "one time per point of `path`")
         periods = times.diff().tolist()
-        increasing = bool(torch.isfinite(times).all()) and min(periods, default=dt) > 0.0
+        increasing = bool(countable(times).all()) and min(periods, default=dt) > 0.0
         require(increasing, "`t` must be finite and increasing [s]; sort it, drop repeated times.")
         self.rates(max(periods, default=dt))
         return times, [*periods, dt]

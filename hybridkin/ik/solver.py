@@ -10,7 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import as_array, give_back, is_numpy, leading, number, rows_of, whole
+from hybridkin._core.arrays import (
+    as_array,
+    give_back,
+    is_numpy,
+    leading,
+    number,
+    one_of,
+    rows_of,
+    whole,
+)
 from hybridkin._core.stored import Stored
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._gram import row_gram
@@ -148,8 +157,8 @@ class InverseKinematics:
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
             number(beta, "beta"),
             None if gain is None else number(gain, "gain"),
-            damping,
-            limits,
+            damping if isinstance(damping, str) else number(damping, "damping"),
+            one_of(limits, "limits", ("saturate", "off")),
             number(dt, "dt"),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
             tuple(name for name, value in given.items() if value is None),

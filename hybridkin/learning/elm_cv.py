@@ -12,7 +12,7 @@ from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted
 
-from hybridkin._core.arrays import labels
+from hybridkin._core.arrays import LARGEST, labels
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.stored import plain
 from hybridkin._core.turns import TURNS
@@ -345,7 +345,7 @@ def _positive(values, name, integer=False):
     array = np.atleast_1d(np.asarray(values))
     kind = np.integer if integer else np.number
     fits = array.ndim == 1 and array.size and np.issubdtype(array.dtype, kind)
-    if not fits or not (np.isfinite(array) & (array > 0)).all():
-        what = "positive integers" if integer else "positive numbers"
+    if not fits or not (np.isfinite(array) & (array > 1.0 / LARGEST)).all():
+        what = "positive integers" if integer else f"positive numbers, over {1.0 / LARGEST:g}"
         raise ValueError(f"`{name}` must be one or more {what}, got {values!r}.")
     return array

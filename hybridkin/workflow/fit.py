@@ -15,6 +15,7 @@ import torch
 from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
 
+from hybridkin._core.arrays import whole
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.turns import one_thread
@@ -42,14 +43,7 @@ from hybridkin.workflow._fit_report import (
     write_model,
 )
 from hybridkin.workflow.log import MeasuredLog, checked
-from hybridkin.workflow.report import (
-    Progress,
-    Report,
-    check_out,
-    linear,
-    quadratic,
-    quiet,
-)
+from hybridkin.workflow.report import Progress, Report, check_out, linear, quadratic, quiet
 
 ALPHAS = tuple(10.0**k for k in range(-5, 4))
 """Ridge weights to choose from."""
@@ -100,6 +94,14 @@ class FitSettings:
     auto: bool = True
     play: float | str | None = None
     max_rows: int | None = 2000
+
+    def __post_init__(self) -> None:
+        """Check the counts."""
+        whole(self.n_folds, "n_folds", 2, 1000)
+        whole(self.n_seeds, "n_seeds", 1, 1000)
+        whole(2 if self.max_rows is None else self.max_rows, "max_rows", 2)
+        if not isinstance(self.auto, bool):
+            raise ValueError(f"`auto` must be True or False, got {self.auto!r:.80}.")
 
 
 class Comparison(NamedTuple):
@@ -283,12 +285,12 @@ def fit_log(
     check_out(out)
     if robot.chain is None and settings.play is not None:
         raise ValueError("`play` requires a robot with segments: its width is a length.")
-    whole = checked(log, robot.chain, robot.base_is_free)
-    _check(whole, settings, force)
-    data = whole.thinned(settings.max_rows)
+    complete = checked(log, robot.chain, robot.base_is_free)
+    _check(complete, settings, force)
+    data = complete.thinned(settings.max_rows)
     rows = _Rows(data.q, data.x, data.motions, robot, settings).with_geometry_chosen()
     start, result, messages = rows.calibrated()
-    messages += [] if result is None else whole.misread(result.chain)
+    messages += [] if result is None else complete.misread(result.chain)
     for message in messages:
         warnings.warn(message, stacklevel=2)
     compared = compare_by_group(data, robot, settings, n_jobs=n_jobs, progress=progress)
@@ -309,14 +311,14 @@ def fit_log(
         chosen=_chosen(model),
         log=Path(log.source).name,
         robot=robot.name,
-        n_whole=len(whole.q),
-        n_motions=len(np.unique(whole.motions)),
-        excluded=list(whole.excluded),
+        n_whole=len(complete.q),
+        n_motions=len(np.unique(complete.motions)),
+        excluded=list(complete.excluded),
         n_seeds=settings.n_seeds,
         loss=settings.loss,
         choices_by_fold=compared.choices,
     )
-    write_check(report, whole)
+    write_check(report, complete)
     write_comparison(report, compared.errors, compared.fold, data)
     write_markers(report, compared.markers[saved], f"{saved}, on held-out motions")
     write_model(report, model)
@@ -326,7 +328,7 @@ def fit_log(
         write_calibration(report, start, result, messages)
     if robot.chain is not None and rows.geometry is None:
         _write_elastic_calibration(report, robot.chain, model)
-    _add_model(report, model, robot, whole)
+    _add_model(report, model, robot, complete)
     return report, report.write(out)
 
 

@@ -39,6 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     unknown = {*options.parts} - {*PARTS}
     if unknown:
         parser.error(f"PART must be among {', '.join(PARTS)}, got {', '.join(unknown)}")
+    options.out = options.out.resolve()  # some parts work in folders of their own
     options.out.mkdir(parents=True, exist_ok=True)
     if len(options.parts) == 1:
         return examined(options.parts[0], options.full, options.out)

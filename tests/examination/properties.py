@@ -44,7 +44,7 @@ def line_of(file: Path, examples: int) -> Line:
     counts = {what: int(n) for n, what in re.findall(r"(\d+) (passed|failed|errors?)", run.stdout)}
     failed = sum(n for what, n in counts.items() if what != "passed")
     if run.returncode:
-        print(run.stdout[-8000:], run.stderr[-2000:], file=sys.stderr)
+        print(run.stdout.split("= PASSES =")[0], run.stderr[-2000:], file=sys.stderr)
     return Line(
         f"{file.stem}: an answer or an error that names the argument",
         f"{counts.get('passed', 0) + failed} properties, {tested} examples (at most {examples} "

@@ -119,7 +119,7 @@ def test_networks_that_choose_are_finite_or_refuse(data, given_rows):
     X, y, weights = given_rows
     params = {k: data.draw(LAYERS[k]) for k in ("n_hidden", "fit_intercept", "direct_link")}
     cv = data.draw(st.sampled_from([None, 2, 3, 50, 1, 0]))
-    alphas = data.draw(st.sampled_from(["auto", [0.1], [1e300], [5e-324], [0.0], [], "a"]))
+    alphas = data.draw(st.sampled_from(["auto", [0.1], [1e300], [5e-324], [1e-74], [0.0], [], "a"]))
     model = ELMRegressorCV(
         alphas=alphas, cv=cv, weight_scales=(0.4, 1.6), max_hidden=20, random_state=0, **params
     )
