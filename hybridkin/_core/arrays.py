@@ -150,10 +150,13 @@ def table(value: Any, name: str) -> Any:
 
 def labels(groups: Any, n_rows: int) -> NDArray:
     """Return the motion of every row, shape (N,)."""
+    if isinstance(groups, Tensor):
+        as_tensor(groups, "groups")
     found = groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
     check_shape(found, "groups", [n_rows], "one entry for each row of the log")
-    if found.dtype.kind == "f" and np.isnan(found).any():
-        raise ValueError("`groups` must name the motion of every row, got NaN; drop these rows.")
+    if found.dtype.kind == "f" and not np.isfinite(found).all():
+        need = "must name the motion of every row, got NaN or infinity"
+        raise ValueError(f"`groups` {need}; drop these rows.")
     return found.astype(str) if found.dtype == object else found
 
 

@@ -122,7 +122,8 @@ class ConstantCurvatureChain(ArcChain):
             geometry["angles"].split(self.actuators_per_segment), self.extensible
         )
         self.stage = stage
-        if stage not in (None, "rotation") or (stage and self.bends[0] > 0):
+        turns = isinstance(stage, str) and stage == "rotation" and self.bends[0] == 0
+        if not (turns or stage is None):
             raise ValueError(
                 '`stage` must be None or "rotation", which takes a first segment of one actuator '
                 f"and without a length, got {stage!r}."

@@ -173,6 +173,8 @@ class PlayOperator:
         as_numpy = not isinstance(given, Tensor)
         rows = real_array(given, name) if as_numpy else given.to(as_tensor(given, name).dtype)
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
+        if not rows.shape[1]:
+            raise ValueError(f"`{name}` must hold at least one actuator, got none.")
         if not (rows.isfinite() if isinstance(rows, Tensor) else np.isfinite(rows)).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):

@@ -245,7 +245,7 @@ class _Table(NamedTuple):
 
     def names(self, argument: str, asked: Sequence[str]) -> list[str]:
         """Return the names of columns, with that of an array (N, k) replaced by its columns'."""
-        asked = [asked] if isinstance(asked, str) else list(asked)
+        asked = [asked] if isinstance(asked, str) or asked is None else list(asked)
         if not asked or not all(isinstance(name, str) for name in asked):
             raise ValueError(f"`{argument}` must be column names, got {asked!r}.")
         if len(set(asked)) < len(asked):

@@ -14,16 +14,18 @@ T = TypeVar("T")
 
 
 def plain(value: Any, name: str = "array") -> NDArray:
-    """Return numbers of any kind, torch tensors too, as a float array of their own."""
-    return np.array(real_array(value, name), dtype=float)
+    """Return numbers, also torch tensors, as a new float array; infinite ones become NaN."""
+    array = np.array(real_array(value, name), dtype=float)
+    array[np.isinf(array)] = np.nan
+    return array
 
 
 def times(value: ArrayLike | None, n_rows: int) -> NDArray | None:
-    """Return times (T,) [s] that increase, or None."""
+    """Return increasing times (T,) [s], or None."""
     if value is None:
         return None
-    t = shaped(value, "t", "T", n_rows)
-    if not (np.diff(t) > 0.0).all():
+    t = shaped(plain(value, "t"), "t", "T", n_rows)
+    if np.isnan(t).any() or not (np.diff(t) > 0.0).all():
         raise ValueError("`t` must increase [s]; sort the rows and drop repeated or unknown times.")
     return t
 

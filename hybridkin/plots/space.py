@@ -172,6 +172,8 @@ class BackboneDisplay(Display):
         points = plain(points, "points")
         self.points = shaped(points[None] if points.ndim == 2 else points, "points", "KP3")
         K = len(self.points)
+        if not isinstance(actuators, Iterable):
+            raise ValueError(f"`actuators` must hold arrays (K, P, 3), got {actuators!r:.80}.")
         self.actuators = tuple(shaped(path, "actuators", "KP3", K) for path in actuators)
         self.segments = (0,) * len(self.actuators) if segments is None else tuple(segments)
         n = len(self.actuators)

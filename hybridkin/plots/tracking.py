@@ -197,7 +197,7 @@ class ActuatorDisplay:
         names: Sequence[str] | None = None,
         limits: ArrayLike | None = None,
     ) -> None:
-        given = actuators_per_segment
+        given = np.ravel(np.asarray(actuators_per_segment, dtype=object))
         self.actuators_per_segment = tuple(whole(k, "actuators_per_segment") for k in given)
         n = sum(self.actuators_per_segment)
         self.paths = {name: plain(q, "paths") for name, q in named(paths, "paths").items()}
@@ -208,7 +208,9 @@ class ActuatorDisplay:
                     f"`paths` must hold arrays of one shape (T, {n}), as `actuators_per_segment` "
                     f"says, got {q.shape} for {name!r}; the first has {rows} rows."
                 )
-        self.t, self.names = times(t, *rows), None if names is None else [*map(str, names)]
+        self.t, self.names = times(t, *rows), None
+        if names is not None:
+            self.names = [str(name) for name in np.ravel(np.asarray(names, dtype=object))]
         if self.names is not None and len(self.names) != n:
             raise ValueError(f"`names` must hold {n} names, one per actuator, got {names!r:.80}.")
         self.limits = None if limits is None else shaped(limits, "limits", ("2", n))

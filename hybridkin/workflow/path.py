@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridkin._core.arrays import as_path, number, one_of
+from hybridkin._core.arrays import as_path, number, one_of, real_array
 from hybridkin.ik import trajectories
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow._domain import Domain, PathLimits
@@ -43,7 +43,7 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     ValueError
         If it has no times and `dt` is not given, or is not a table of numbers.
     """
-    file = as_path(path)
+    file, dt = as_path(path), None if dt is None else number(dt, "dt")
     if not file.is_file():
         raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {file}.")
     try:
@@ -58,7 +58,7 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     timed = trajectories.from_csv(file, unit=unit)
     if dt is None:
         return timed
-    t = timed.t[0] + float(dt) * np.arange(int(trajectories.periods(timed.duration, dt) + 1e-9) + 1)
+    t = timed.t[0] + dt * np.arange(int(trajectories.periods(timed.duration, dt) + 1e-9) + 1)
     return Trajectory(t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1))
 
 
@@ -131,7 +131,8 @@ def shape_path(
         For another number of sizes than the shape has.
     """
     n_sizes = 3 if one_of(shape, "shape", _SHAPES) == "line" else 2
-    if np.shape(size) != (n_sizes,):
+    size = real_array(size, "size")
+    if size.shape != (n_sizes,):
         need = f"--size must be {n_sizes} numbers for a {shape}"
         raise ValueError(f"`size` does not fit: {need}, got {size!r:.80}.")
     if center is None:
@@ -145,5 +146,5 @@ def shape_path(
         return trajectories.figure_eight(center, size, normal=normal, **timing)
     if shape == "spiral":
         return trajectories.spiral(center, size, normal=normal, turns=turns, rise=rise, **timing)
-    half = 0.5 * np.asarray(size)
-    return trajectories.line(np.asarray(center) - half, np.asarray(center) + half, **timing)
+    half, center = 0.5 * size, real_array(center, "center")
+    return trajectories.line(center - half, center + half, **timing)
