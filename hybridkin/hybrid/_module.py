@@ -241,7 +241,8 @@ class HybridModule(ForwardModel):
     def _parts(self) -> list[tuple[float, Correction]]:
         """Return weight and correction, one by one."""
         corrections = cast("list[Correction]", [*self.corrections])
-        return [*zip(self.weights.tolist(), corrections, strict=True)]
+        # Not tolist: before torch 2.5 it does not work in functional transforms.
+        return [*zip(map(float, self.weights), corrections, strict=True)]
 
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""

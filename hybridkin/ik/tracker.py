@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
+from hybridkin._core.model import Portable
 from hybridkin.ik._compiled import Follower, Tick, core_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._settings import Array, StepSettings, require
@@ -27,7 +28,7 @@ def _seen(name: str, text: str) -> Any:
     return property(attrgetter(f"_robot.{name}"), doc=text)
 
 
-class Tracker:
+class Tracker(Portable):
     """Inverse kinematics tick by tick: a target goes in, the next command comes out.
 
     The law is that of `InverseKinematics.step`, for one configuration. It follows any task. Made

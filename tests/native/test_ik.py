@@ -245,10 +245,11 @@ def test_a_search_slides_into_the_domain_as_in_torch(guard):
 
 def arm_of(draw, kinds):
     origins = np.tile(np.eye(4), (len(kinds), 1, 1))
-    origins[:, :3, :3] = Rotation.random(len(kinds), rng=draw).as_matrix()
+    origins[:, :3, :3] = Rotation.from_quat(draw.standard_normal((len(kinds), 4))).as_matrix()
     origins[:, :3, 3] = draw.uniform(-0.3, 0.3, (len(kinds), 3))
     tip = np.eye(4)
-    tip[:3, :3], tip[:3, 3] = Rotation.random(rng=draw).as_matrix(), [0.05, -0.1, 0.2]
+    tip[:3, :3] = Rotation.from_quat(draw.standard_normal(4)).as_matrix()
+    tip[:3, 3] = [0.05, -0.1, 0.2]
     axes = draw.standard_normal((len(kinds), 3))
     more = {"tip": tip, "tool": [0.1, 0.0, 0.05], "base": origins[0]}
     if kinds[:2] == COUPLED[:2]:
