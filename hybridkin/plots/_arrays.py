@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import real_array, shaped
+from hybridkin._core import arrays
 
 T = TypeVar("T")
 
 
 def plain(value: Any, name: str = "array") -> NDArray:
     """Return numbers, also torch tensors, as a new float array; infinite ones become NaN."""
-    array = np.array(real_array(value, name), dtype=float)
+    array = np.array(arrays.real_array(value, name), dtype=float)
     array[np.isinf(array)] = np.nan
     return array
+
+
+def shaped(
+    value: Any, name: str, need: Sequence[int | str], length: int | None = None
+) -> NDArray[np.float64]:
+    """Return numbers of a checked shape as a new float array; infinite ones become NaN."""
+    return arrays.shaped(plain(value, name), name, need, length)
 
 
 def times(value: ArrayLike | None, n_rows: int) -> NDArray | None:
     """Return increasing times (T,) [s], or None."""
     if value is None:
         return None
-    t = shaped(plain(value, "t"), "t", "T", n_rows)
+    t = shaped(value, "t", "T", n_rows)
     if np.isnan(t).any() or not (np.diff(t) > 0.0).all():
         raise ValueError("`t` must increase [s]; sort the rows and drop repeated or unknown times.")
     return t

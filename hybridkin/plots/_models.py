@@ -9,10 +9,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin._core.arrays import shaped
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.plots._arrays import plain, positions
+from hybridkin.plots._arrays import plain, positions, shaped
 
 _RIM = 1.15  # radius of a drawn disk over that of the actuator circle
 _CORNERS = 25  # points of a disk's rim

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import shaped, whole
-from hybridkin.plots._arrays import distance, plain, times
+from hybridkin._core.arrays import whole
+from hybridkin.plots._arrays import distance, plain, shaped, times
 from hybridkin.plots._canvas import COLORS, Display, decimals, scale_of, space_or_new, steps_of
 from hybridkin.plots._models import Model, predicted
 from hybridkin.plots._page import page

@@ -11,8 +11,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import shaped, whole
-from hybridkin.plots._arrays import distance, plain
+from hybridkin._core.arrays import whole
+from hybridkin.plots._arrays import distance, plain, shaped
 from hybridkin.plots._canvas import COLORS, Display, label_space, scale_of, space_or_new
 from hybridkin.plots._models import Model, body_of
 from hybridkin.plots._scene import Line

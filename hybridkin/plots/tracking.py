@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import one_of, shaped, whole
-from hybridkin.plots._arrays import distance, named, plain, times
+from hybridkin._core.arrays import one_of, whole
+from hybridkin.plots._arrays import distance, named, plain, shaped, times
 from hybridkin.plots._canvas import (
     COLORS,
     LENGTHS,
