@@ -110,7 +110,8 @@ class StepSettings(Portable):
         """Check the settings, and take the middle of the limits where no posture is given."""
         sizes, one = self._sizes(), "give scalars or one value per actuator"
         good = len(set(sizes.values())) < 2
-        require(good, f"settings must agree in the number of actuators, got {sizes}; {one}.")
+        names = ", ".join(f"`{name}`" for name in sizes)
+        require(good, f"{names} must agree in the number of actuators, got {sizes}; {one}.")
         low, high = self.q_min.tolist(), self.q_max.tolist()
         good = (self.q_min <= self.q_max).all()
         require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")

@@ -100,7 +100,8 @@ class LeftOut:
             P = dsyrk(np.copysign(1.0, d[0]), half.T, 1.0, fixed, trans=True, lower=True)
             _, solution, failed = dposv(P, residuals[k], lower=True)
             if failed:
-                solution = linalg.solve(np.tril(P) + np.tril(P, -1).T, residuals[k], assume_a="sym")
+                whole = np.tril(P) + np.tril(P, -1).T  # by singular values: it may have none left
+                solution = np.linalg.lstsq(whole, residuals[k], rcond=None)[0]
             errors[k] = solution[among]
         return errors / self._root[asked, None]
 
