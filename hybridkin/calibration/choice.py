@@ -12,8 +12,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor, labels
-from hybridkin.calibration._least_squares import Rows, solve
+from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
+from hybridkin.calibration._least_squares import LOSSES, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration._unidentified import few_terms
 from hybridkin.calibration.calibrate import check_data
@@ -147,6 +147,7 @@ def choose_geometry(
     GeometryChoice
         What to calibrate, and the errors of all sets.
     """
+    one_of(loss, "loss", LOSSES)
     given, chain = chain, copy.deepcopy(chain).cpu()
     q, x, _ = check_data(chain, q, x)
     if groups is not None:

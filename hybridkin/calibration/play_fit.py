@@ -127,6 +127,7 @@ def fit_play(
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q, x = real_array(q, "q"), real_array(x, "x")
     check_shape(x, "x", ("N", chain.n_outputs))
+    check_shape(q, "q", (len(x), chain.n_actuators), "one row for each row of `x`")
     groups = labels(groups, len(x))
     splits = folds(groups, groups)
     sizes = [len(test) for _, test in splits]
