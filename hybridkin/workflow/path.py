@@ -131,8 +131,8 @@ def shape_path(
         For another number of sizes than the shape has.
     """
     n_sizes = 3 if one_of(shape, "shape", _SHAPES) == "line" else 2
-    size = real_array(size, "size")
-    if size.shape != (n_sizes,):
+    extent = real_array(size, "size").tolist()
+    if np.shape(extent) != (n_sizes,):
         need = f"--size must be {n_sizes} numbers for a {shape}"
         raise ValueError(f"`size` does not fit: {need}, got {size!r:.80}.")
     if center is None:
@@ -143,8 +143,8 @@ def shape_path(
         normal = (0.0, 0.0, 1.0) if loaded.chain is None else loaded.chain.base[:3, 2].tolist()
     timing: Any = {"duration": duration, "dt": dt}
     if shape == "figure-eight":
-        return trajectories.figure_eight(center, size, normal=normal, **timing)
+        return trajectories.figure_eight(center, extent, normal=normal, **timing)
     if shape == "spiral":
-        return trajectories.spiral(center, size, normal=normal, turns=turns, rise=rise, **timing)
-    half, center = 0.5 * size, real_array(center, "center")
+        return trajectories.spiral(center, extent, normal=normal, turns=turns, rise=rise, **timing)
+    half, center = 0.5 * np.array(extent), real_array(center, "center")
     return trajectories.line(center - half, center + half, **timing)
