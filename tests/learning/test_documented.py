@@ -15,7 +15,7 @@ from hybridkin.learning.regressor_modules import KernelModule
 
 @pytest.mark.parametrize("kind", [ELMRegressor, ELMRegressorCV])
 def test_documented_defaults_are_those_of_the_signature(kind):
-    stated = re.findall(r"(?m)^ {4}(\w+) : .*default=(.+)$", kind.__doc__)
+    stated = re.findall(r"(?m)^(\w+) : .*default=(.+)$", inspect.getdoc(kind))
     given = inspect.signature(kind).parameters
     assert len(stated) > 5
     for name, text in stated:
