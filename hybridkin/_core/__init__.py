@@ -1,1 +1,1 @@
-"""What stands on nothing else: the interface of models, arrays, and entire functions."""
+"""Foundations for all other folders: the interface of models, arrays, entire functions."""

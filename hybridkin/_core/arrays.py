@@ -1,4 +1,4 @@
-"""Arrays of a caller, NumPy or torch, as rows of tensors and back."""
+"""Conversion of the caller's arrays, NumPy or torch, to rows of tensors and back."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class Transform(Protocol):
         ...
 
 
-Numbers = ArrayLike | Tensor  # what a caller may hand over as an array
-# Fourth powers of larger numbers overflow, and those of the inverse of smaller scales.
+Numbers = ArrayLike | Tensor  # what a caller may pass as an array
+# Fourth powers of larger numbers overflow, and so do those of 1 / scale for tiny scales.
 LARGEST = np.float64(1e75)
 
 
 def as_tensor(
     value: Numbers | Transform, name: str, device: torch.device | str | None = None
 ) -> Tensor:
-    """Return a caller's real numbers as a tensor, without a graph; an array is copied.
+    """Return a caller's real numbers as a tensor without a graph; an array is copied.
 
-    float32 stays; all other types become float64.
+    float32 is kept; all other types become float64.
     """
     if isinstance(value, Transform):
         value = value.get_matrix()
@@ -48,13 +48,13 @@ def as_tensor(
 
 
 def real_array(value: Numbers | Transform, name: str) -> NDArray:
-    """Return a caller's real numbers as an array; float32 stays, other types become float64."""
+    """Return a caller's real numbers as an array; float32 is kept, others become float64."""
     if isinstance(value, (Tensor, Transform)):
         return as_tensor(value, name).numpy(force=True)
     if np.ma.is_masked(value):
         raise ValueError(f"`{name}` has masked entries; drop these rows, or fill them with NaN.")
     if issparse(value):
-        raise TypeError(f"`{name}` must be dense, got a sparse matrix; convert it by `.toarray()`.")
+        raise TypeError(f"`{name}` must be dense, got a sparse matrix; use `.toarray()`.")
     try:
         array = np.asarray(value)
         if array.dtype.kind in "biufO":
@@ -68,7 +68,7 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
 
 
 def copied(a: NDArray, device: torch.device | str, dtype: type | None = None) -> Tensor:
-    """Return a copy as a tensor; torch takes no negative stride, not even of a single row."""
+    """Return a copy as a tensor; torch accepts no negative strides, even for a single row."""
     return torch.from_numpy(np.array(a, dtype, order="C")).to(device)
 
 
@@ -81,7 +81,7 @@ def number(value: Any, name: str) -> float:
 
 
 def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
-    """Return a caller's whole number within these limits."""
+    """Return a caller's whole number between `least` and `most`."""
     if not isinstance(value, (int, np.integer)) or not least <= value <= most:
         need = f"at least {least}" if most == math.inf else f"{least} to {most}"
         raise ValueError(f"`{name}` must be {need}, a whole number, got {value!r:.80}.")
@@ -89,7 +89,7 @@ def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
 
 
 def one_of(value: Any, name: str, known: Collection[str], hint: str = "") -> str:
-    """Return a caller's choice among known names."""
+    """Return a caller's choice from the known names."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(f"`{name}` must be one of {[*known]}, got {value!r:.80}{hint}.")
     return value
@@ -103,16 +103,16 @@ def as_path(value: Any, name: str = "path") -> Path:
 
 
 def countable(value: Any) -> Any:
-    """Return where numbers are neither NaN nor so large that their fourth powers overflow."""
+    """Return whether numbers are not NaN and their fourth powers do not overflow."""
     return abs(value) < LARGEST
 
 
 def check_shape(
     value: NDArray | Tensor, name: str, need: Sequence[int | str], why: str = ""
 ) -> None:
-    """Raise where the shape differs from `need`.
+    """Raise if the shape differs from `need`.
 
-    There digits are lengths, equal letters equal lengths, and "..." in front any axes.
+    In `need`, digits are lengths, equal letters are equal lengths, a leading "..." is any axes.
     """
     got, sizes = tuple(value.shape), [str(size) for size in need if size != "..."]
     axes = got[-len(sizes) :] if len(sizes) < len(need) else got
@@ -131,9 +131,9 @@ def shaped(
     length: int | None = None,
     why: str = "",
 ) -> NDArray[np.float64]:
-    """Return numbers of a checked shape, see `check_shape`, as a float64 array of their own.
+    """Return numbers of a checked shape (see `check_shape`) as a new float64 array.
 
-    `length` stands for the first letter. NaN is allowed.
+    `length` replaces the first entry of `need`. NaN is allowed.
     """
     array = np.array(real_array(value, name), dtype=float)
     check_shape(array, name, need if length is None else (length, *need[1:]), why)
@@ -141,7 +141,7 @@ def shaped(
 
 
 def table(value: Any, name: str) -> Any:
-    """Return rows as scikit-learn takes them: a data frame of X as it is, else an array."""
+    """Return rows as scikit-learn expects them: a data frame `X` unchanged, else an array."""
     if value is None or isinstance(value, Real):
         return value
     array = real_array(value, name)
@@ -149,7 +149,7 @@ def table(value: Any, name: str) -> Any:
 
 
 def labels(groups: Any, n_rows: int) -> NDArray:
-    """Return the motion of every row, shape (N,)."""
+    """Return the label of the motion of every row, shape (N,)."""
     if isinstance(groups, Tensor):
         as_tensor(groups, "groups")
     found = groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
@@ -171,7 +171,7 @@ def identity(n: int, like: Tensor) -> Tensor:
 
 
 def is_numpy(value: object) -> bool:
-    """Return whether results for this argument go back as NumPy arrays."""
+    """Return whether results for this argument are returned as NumPy arrays."""
     return not isinstance(value, (Tensor, Transform))
 
 
@@ -179,7 +179,7 @@ def leading(pairs: Sequence[tuple[Tensor, int]]) -> tuple[int, ...]:
     """Return the common batch shape of tensors, each with its number of trailing axes."""
     shapes = [tuple(a.shape[: a.ndim - trailing]) for a, trailing in pairs]
     try:
-        return np.broadcast_shapes(*shapes)  # torch's loads half a second of modules first
+        return np.broadcast_shapes(*shapes)  # torch's version takes half a second to import
     except ValueError as error:
         need = "configurations (`q`) and targets (`x_target`) must agree in their batch shapes"
         raise ValueError(f"{need}, got {shapes}.") from error
@@ -192,6 +192,6 @@ def rows_of(a: Tensor, lead: tuple[int, ...], trailing: int = 1) -> Tensor:
 
 
 def give_back(results: Iterable[Tensor], lead: tuple[int, ...], as_numpy: bool) -> list[Any]:
-    """Return rows (N, ...) in the caller's batch shape and kind."""
+    """Return rows (N, ...) in the caller's batch shape and array type."""
     shaped = [a.reshape((*lead, *a.shape[1:])) for a in results]
     return [as_array(a) for a in shaped] if as_numpy else shaped

@@ -1,4 +1,4 @@
-"""Row-by-row functions in blocks of rows, and the check of their input."""
+"""Row-by-row functions evaluated in blocks of rows, and the check of their input."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torch import Tensor
 from hybridkin._core.arrays import check_shape
 
 if hasattr(os, "register_at_fork"):
-    # A forked child has none of the threads of OpenMP, and would wait for them forever.
+    # A forked child has no OpenMP threads, and would wait for them forever.
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def in_blocks(
     function: Callable[[Tensor], tuple[Tensor, ...]], q: Tensor, size: int = 4096
 ) -> tuple[Tensor, ...]:
-    """Return what a row-by-row function gives for q (..., n), computed in blocks of rows.
+    """Return the result of a row-by-row function for q (..., n), computed in blocks of rows.
 
-    The temporaries of a block stay in the cache: a million rows cost as much each as a thousand.
-    What the function gives may lie in memory with the batch last; the result is contiguous.
+    Temporary arrays of a block fit into the cache, so the time per row does not grow with the
+    number of rows. The function may return transposed memory; the result is contiguous.
     """
     check_tensor(q, "q")
     if q.ndim == 0:
@@ -35,7 +35,7 @@ def in_blocks(
 
 
 def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:
-    """Raise where `value` is not a dense tensor of float64 or float32."""
+    """Raise if `value` is not a dense tensor of float64 or float32."""
     if not isinstance(value, Tensor):
         raise TypeError(
             f"`{name}` must be a torch tensor of shape (..., {size}), got "
@@ -45,12 +45,12 @@ def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:
     if not known or value.layout != torch.strided or value.is_meta:
         raise TypeError(
             f"`{name}` must be a dense floating tensor, float64 or float32, got {value.dtype} "
-            f"with layout {value.layout} on {value.device}; convert it with `.double()`, or "
+            f"with layout {value.layout} on {value.device}; convert it with `.double()` or "
             "`.to_dense()`."
         )
 
 
 def check_vectors(value: Tensor, size: int, name: str, why: str) -> None:
-    """Raise where `value` is not a dense floating tensor of shape (..., size)."""
+    """Raise if `value` is not a dense floating tensor of shape (..., size)."""
     check_tensor(value, name, size)
     check_shape(value, name, ("...", size), why)

@@ -1,4 +1,4 @@
-"""Digests of measured rows: whether a row of a log was among those of a fit."""
+"""Digests of measured rows, to check whether a row of a log was used in a fit."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ _ODD = np.uint64(0x9E3779B97F4A7C15)
 
 
 def row_digests(q: Any, x: Any) -> NDArray[np.float64]:
-    """Return one number for each pair (q, x), equal on every machine.
+    """Return one number for each pair (q, x), the same on every machine.
 
-    Whole numbers below 2^53, so that files of float64 arrays hold them. Values are rounded to
-    micrometres first; of a pose only the position counts.
+    The numbers are integers below 2^53, so float64 arrays hold them exactly. Values are first
+    rounded to micrometres; only the position of a pose is used.
     """
     q, x = (np.asarray(a, dtype=np.float64).reshape(len(a), -1) for a in (q, x))
-    # Adding zero turns -0 into 0, which is equal and has other bits.
+    # Adding zero turns -0 into 0: the two are equal but have different bits.
     cells = (np.rint(np.hstack([q, x[:, :3]]) / _STEP) + 0.0).view(np.uint64)
     digests = np.zeros(len(q), dtype=np.uint64)
-    for column in cells.T:  # each round maps 64 bits one to one: multiply up, shift down
+    for column in cells.T:  # each round is one-to-one on 64 bits: multiply, then shift
         digests = (digests ^ column) * _ODD
         digests ^= digests >> np.uint64(32)
     return (digests >> np.uint64(11)).astype(np.float64)

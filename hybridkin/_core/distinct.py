@@ -1,4 +1,4 @@
-"""Rows of a log that are equal, merged into one: a weight counts repetitions."""
+"""Equal rows of a log, merged into one row with a weight that counts them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def distinct_rows(
     groups: ArrayLike | None = None,
     runs: bool = False,
 ) -> tuple[NDArray, NDArray | None, NDArray]:
-    """Return which rows differ, in order of first occurrence, and how many times each counts.
+    """Return the different rows, in order of first occurrence, and how often each counts.
 
-    A fit to these rows cannot tell a weight from a repetition, and equal rows are held out
+    With them a weight of k and k equal rows give the same fit, and equal rows are held out
     together.
 
     Parameters
@@ -30,16 +30,16 @@ def distinct_rows(
     groups : array-like of shape (N,), optional
         Labels; equal rows of different groups stay apart.
     runs : bool, default=False
-        Whether equal rows that do not follow each other stay apart, and rows of weight 0 remain.
+        Merge only equal rows that follow each other, and keep rows of weight 0.
 
     Returns
     -------
     first : ndarray of int of shape (K,)
         The first of each set of equal rows, ascending.
     weights : ndarray of shape (K,) or None
-        Sums of the weights of equal rows; None where all are one.
+        Sums of the weights of equal rows; None if all are 1.
     place : ndarray of int of shape (N,)
-        Which entry of `first` stands for each row; -1 for rows of weight 0.
+        Index into `first` for each row; -1 for rows of weight 0.
     """
     labels = np.zeros(len(X)) if groups is None else np.unique(groups, return_inverse=True)[1]
     rows = np.column_stack([as_array(X), as_array(y), labels]).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, whatever ends the process or the power."""
+"""Files that are written completely or not at all, even if the process or the power fails."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if sys.platform != "win32":
 _NEW = ".hybridkin-new"  # folder of complete files that are about to replace those beside it
 
 Writer = Callable[[Path], Any]
-"""Writes a file when handed its path."""
+"""A function that writes a file to the path it is given."""
 
 
 def write_file(path: str | Path, write: Writer) -> None:
-    """Write a file, which is replaced only once all is on the disk.
+    """Write a file; an old one is replaced only when the new one is completely on the disk.
 
-    Of a symbolic link the target is replaced. A file that is replaced keeps its permissions.
+    For a symbolic link the target is replaced. A replaced file keeps its permissions.
     """
     path = Path(os.path.realpath(path))
     if not path.parent.is_dir():
         raise FileNotFoundError(f"`path` must lie in a folder that exists, got {path}.")
     if path.exists() and not path.is_file():
-        raise ValueError(f"`path` must name a file, got {path}, which is none; add a file name.")
+        raise ValueError(f"`path` must name a file, got {path}, which is not one; add a file name.")
     with _staged(path, path.parent) as staging:
         write(staging)
         _flush(staging)
@@ -42,9 +42,9 @@ def write_file(path: str | Path, write: Writer) -> None:
 
 
 def write_files(folder: str | Path, files: Mapping[str, Writer]) -> None:
-    """Write files into a folder, which is made when absent: all of them or none.
+    """Write all files into a folder, or none; the folder is created if it is missing.
 
-    An interrupt in the middle is raised before anything is replaced, or after everything is.
+    A keyboard interrupt is raised before anything is replaced, or after everything is.
     """
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -71,19 +71,19 @@ def write_files(folder: str | Path, files: Mapping[str, Writer]) -> None:
             except OSError as error:
                 if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                     raise
-                new = folder / _NEW  # another run has written meanwhile
+                new = folder / _NEW  # another run wrote in the meantime
     if late is not None:
         raise late
 
 
 def newest(path: Path) -> Path:
-    """Return the file of that path, or the one that a killed `write_files` has made for it."""
+    """Return the path, or the complete newer file that a killed `write_files` left for it."""
     waiting = path.with_name(_NEW) / path.name
     return waiting if waiting.is_file() else path
 
 
 def _finish(folder: Path) -> None:
-    """Put the complete files of a folder in their places."""
+    """Move the complete new files of a folder to their final places."""
     if (folder / _NEW).is_dir():
         for path in (folder / _NEW).iterdir():
             with suppress(FileNotFoundError):  # another run does the same
@@ -94,12 +94,12 @@ def _finish(folder: Path) -> None:
 
 def _flush(path: Path) -> None:
     """Wait until a file or a folder is on the disk."""
-    if path.is_dir() and sys.platform == "win32":  # it opens no folders
+    if path.is_dir() and sys.platform == "win32":  # it cannot open folders
         return
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(handle)
-    except OSError:  # of folders some file systems cannot
+    except OSError:  # some file systems cannot sync folders
         if not path.is_dir():
             raise
     finally:
@@ -108,16 +108,16 @@ def _flush(path: Path) -> None:
 
 @contextmanager
 def _staged(path: Path, home: Path) -> Iterator[Path]:
-    """Yield a name in a folder to write to, and remove what is left there in the end.
+    """Yield a temporary path in a folder, and remove what is left there at the end.
 
-    What killed writers left goes too. Every writer holds a shared lock on the folder, which ends
-    with its process: whoever gets the folder alone finds no other at work.
+    Leftovers of killed writers are removed too. Every writer holds a shared lock on the folder
+    until its process ends, so an exclusive lock means that no other writer is at work.
     """
     staging = home / f".{path.name}-{secrets.token_hex(8)}.part{path.suffix}"
     handle = os.open(os.devnull if sys.platform == "win32" else home, os.O_RDONLY)
     try:
         if sys.platform != "win32":
-            with suppress(OSError):  # others are at work, or the file system has no locks
+            with suppress(OSError):  # others write, or the file system has no locks
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 parts = f".{escape(path.name)}-{16 * '[0-9a-f]'}.part{escape(path.suffix)}"
                 for left in home.glob(parts):

@@ -1,4 +1,4 @@
-"""The one interface: a model of a robot, q -> x, and how anything that is one becomes one."""
+"""The interface of all models, q -> x, and the conversion of other objects to it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class _Closed(NamedTuple):
-    """A tensor in a pickle: torch's own names its storage by an address."""
+    """A tensor as it is pickled; torch's own pickles contain memory addresses."""
 
     array: NDArray
     device: str
@@ -33,13 +33,12 @@ class _Closed(NamedTuple):
 class Portable:
     """An object whose pickle and joblib hash are the same in every process.
 
-    Its tensors, those in its dicts too, are pickled as plain arrays. They come back on their
-    device, or on the CPU where that device does not exist. What was compiled of the object stays
-    behind.
+    Tensors, also those in dicts, are pickled as plain arrays. They are restored on their device,
+    or on the CPU if that device does not exist. The compiled program is not pickled.
     """
 
     def __getstate__(self) -> dict[str, Any]:
-        own = vars(self).copy()  # at once: another thread may add what it compiles
+        own = vars(self).copy()  # one copy: another thread may add its program
         return _closed({key: value for key, value in own.items() if key != "_program"})
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -65,13 +64,13 @@ def _opened(value: Any) -> Any:
 class PortableModule(Portable, nn.Module):
     """A module of buffers whose pickle and joblib hash are the same in every process.
 
-    A class with a `layout` describes itself, for files and compilers.
+    A class that sets `layout` can be saved to files and compiled.
     """
 
-    layout: ClassVar[Layout] = Layout("", {})  # without a kind: it could only be stored as code
+    layout: ClassVar[Layout] = Layout("", {})  # no kind: it could only be stored as code
 
     def stored(self) -> Stored:
-        """Return how the module describes itself: kind, settings, arrays and parts.
+        """Return the description of the module: kind, settings, arrays and parts.
 
         Raises
         ------
@@ -93,7 +92,7 @@ class PortableModule(Portable, nn.Module):
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
-        """Return the module of a description; `restore` returns its parts."""
+        """Return the module built from a description; `restore` builds its parts."""
         parts = {name: stored.parts.get(name) for name in cls.layout.parts}
         return cls(
             **stored.tensors(**cls.layout.arrays),
@@ -110,15 +109,15 @@ class ForwardModel(PortableModule):
     """A model of a robot: a torch module that maps every row of q to a row of x.
 
     Chains, error models, hybrids and wrapped functions are forward models; inverse kinematics,
-    calibration and plots use nothing else. A subclass gives `forward`, and `forward_and_jacobian`
-    where it has a closed form.
+    calibration and plots use nothing else. A subclass defines `forward`, and
+    `forward_and_jacobian` if it has a closed form.
 
     Attributes
     ----------
     n_actuators : int
-        Length of q; 0 where it is not known, as of a function.
+        Length of q; 0 if unknown, e.g. for a function.
     n_outputs : int
-        Length of x; 0 where it is not known.
+        Length of x; 0 if unknown.
     """
 
     n_actuators: int = 0
@@ -126,33 +125,33 @@ class ForwardModel(PortableModule):
 
     @property
     def limits(self) -> dict[str, Any]:
-        """What `q_min`, `q_max` and `dq_max` of `InverseKinematics` are where nothing is given."""
+        """Defaults of `q_min`, `q_max` and `dq_max` of `InverseKinematics`."""
         return {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
 
     @property
     def turns(self) -> Tensor | bool:
-        """Which actuators, bool () or (n,), are angles: a whole turn more changes nothing."""
+        """Actuators that are angles with a period of one turn, bool () or (n,)."""
         return False
 
     @property
     def robot(self) -> ForwardModel:
-        """The model that knows the geometry: of a hybrid its mechanical model, else itself."""
+        """The model with the geometry: the mechanical model of a hybrid, else the model itself."""
         return self
 
     @property
     def tip_model(self) -> ForwardModel:
-        """The model of the tip alone: of several markers that of the last, else itself."""
+        """The model of the tip alone: the last one of several markers, else the model itself."""
         return self
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return warnings where q (N, n) holds values too large to be metres or radians.
+        """Return warnings if q (N, n) holds values too large to be metres or radians.
 
-        `factor` multiplies what counts as too large.
+        `factor` scales the limits.
         """
         return []
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
-        """Return warnings where tips (..., 3) lie too far from the base to be metres."""
+        """Return warnings if tips (..., 3) lie too far from the base to be in metres."""
         return []
 
     def forward(self, q: Tensor) -> Tensor:
@@ -171,18 +170,18 @@ class ForwardModel(PortableModule):
         return self.forward_and_jacobian(q)[1]
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return how far q is from the rows that the model learned from, shape (...).
+        """Return the relative distance of q from the training rows, shape (...).
 
-        At most 1 within the domain, larger outside; 0 where nothing was learned. Differentiable.
+        At most 1 inside the domain, larger outside; 0 without training rows. Differentiable.
         """
         check_tensor(q, "q")
         return q.new_zeros(q.shape[:-1])
 
     def in_domain(self, q: Tensor) -> Tensor:
-        """Return whether q lies within the domain of the model, shape (...), bool."""
+        """Return whether q lies inside the domain of the model, shape (...), bool."""
         return self.domain_distance(q) <= 1.0
 
-    # Serial coupling corrects a model inside, at coordinates z between q and x. By default z is q.
+    # Serial coupling corrects a model at inner coordinates z between q and x. By default z is q.
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inner coordinates z (N, C) of rows q (N, n) and dz/dq, (C, n) or (N, C, n)."""
@@ -198,7 +197,7 @@ class ForwardModel(PortableModule):
 
 
 class PoseModel(ForwardModel):
-    """A forward model of the tip's position with the pose of the tip as well."""
+    """A forward model of the tip position that can also return the tip pose."""
 
     n_outputs: int = 3
 
@@ -230,8 +229,8 @@ class FunctionModel(ForwardModel):
     Parameters
     ----------
     function : nn.Module or callable
-        Works row by row. Of a module the methods ``forward_and_jacobian`` or ``jacobian``,
-        ``in_domain`` and the attribute ``n_actuators`` are used where it has them.
+        Works row by row. If it has the methods ``forward_and_jacobian`` or ``jacobian``,
+        ``in_domain`` or the attribute ``n_actuators``, they are used.
     jacobian : callable, optional
         Maps q to dx/dq (..., m, n). Default: the module's own, else reverse mode.
     """
@@ -259,7 +258,7 @@ class FunctionModel(ForwardModel):
         return reverse_jacobian(self, q)
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return 0 within the domain of the function and 2 outside, shape (...)."""
+        """Return 0 inside the domain of the function and 2 outside, shape (...)."""
         if self.own_domain is None:
             return super().domain_distance(q)
         inside = torch.as_tensor(self.own_domain(q), device=q.device)
@@ -273,13 +272,13 @@ def as_forward_model(model: Any) -> ForwardModel:
     ----------
     model : ForwardModel, nn.Module, callable, (callable, callable) or fitted estimator
         A function or module maps q ``(..., n)`` to x ``(..., m)`` row by row, torch to torch; a
-        pair is such a function and its Jacobian ``(..., m, n)``. Of a fitted estimator its
-        ``module_`` is taken.
+        pair is such a function and its Jacobian ``(..., m, n)``. A fitted estimator is replaced
+        by its ``module_``.
 
     Returns
     -------
     ForwardModel
-        The model itself where it is one.
+        The model itself if it is a `ForwardModel`.
 
     Raises
     ------
@@ -312,16 +311,16 @@ def as_forward_model(model: Any) -> ForwardModel:
         raise TypeError(
             "`model` must be a torch module, a callable q -> x or a fitted regressor with a "
             f"`module_`, got {type(model).__name__}; fit another regressor or a pipeline by "
-            "HybridForwardModel(None, error_model=regressor).fit(q, x) and hand that over; "
-            "of a search hand over its `best_estimator_`, of a robot description its `chain`."
+            "HybridForwardModel(None, error_model=regressor).fit(q, x) and pass that; "
+            "for a search pass its `best_estimator_`, for a robot description its `chain`."
         )
     return FunctionModel(model)
 
 
 def jacobian(model: Any, q: Tensor) -> Tensor:
-    """Return dx/dq of any model that maps every row of q by itself to a row of x.
+    """Return dx/dq of any model that maps each row of q independently to a row of x.
 
-    In closed form where the model has one, else by one backward pass per output coordinate.
+    In closed form if the model has one, else by one backward pass per output coordinate.
 
     Parameters
     ----------
@@ -358,7 +357,7 @@ def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[T
 
 
 def slopes(x: Tensor, leaf: Tensor, create_graph: bool = False) -> Tensor:
-    """Return dx/dq (..., m, n) of rows x (..., m) that were computed from rows of a leaf q."""
+    """Return dx/dq (..., m, n) for rows x (..., m) computed from the rows of a leaf tensor q."""
     slope = partial(grad, create_graph=create_graph, retain_graph=True, materialize_grads=True)
     return torch.stack([slope(a.sum(), leaf)[0] for a in x.unbind(-1)], dim=-2)
 

@@ -1,4 +1,4 @@
-"""Rotations: their exponential, its left Jacobian, and their logarithm."""
+"""Rotations: the exponential map, its left Jacobian, and the logarithm."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rotation_vector(R: Tensor) -> Tensor:
-    """Return the logarithm (..., 3) of rotations (..., 3, 3) [rad], up to half turns and at them.
+    """Return the logarithm (..., 3) of rotations (..., 3, 3) [rad], valid up to half turns.
 
-    By the unit quaternion with the largest component first, which no rotation makes small.
+    It divides by the largest component of the unit quaternion, which is never small.
     """
     r = [[R[..., i, j] for j in range(3)] for i in range(3)]
     skew = torch.stack([r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]], dim=-1)

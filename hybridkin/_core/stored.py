@@ -1,4 +1,4 @@
-"""How a model describes itself: its kind, settings, arrays and parts; read back with checks."""
+"""Descriptions of models as kind, settings, arrays and parts, and their checked reading."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
 
 class Layout(NamedTuple):
-    """What the description of a module holds, under the names of its constructor's parameters.
+    """Contents of a module's description, named like the parameters of its constructor.
 
     Parameters
     ----------
     kind : str
-        Names the class.
+        Name of the class.
     arrays : dict of str to str
         Buffers, with one letter per axis as in `Stored.tensors`.
     settings : dict of str to type
@@ -33,7 +33,7 @@ class Layout(NamedTuple):
     parts : tuple of str
         Submodules, lists of them, or None.
     derived : tuple of str
-        Buffers that follow from the others. Kernels use them; files do not hold them.
+        Buffers computed from the others. Kernels use them; files do not contain them.
     """
 
     kind: str
@@ -45,15 +45,14 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Stored:
-    """A model as data: what a file holds of it, and what a kernel needs to compute it.
+    """A model as data: what a file contains, and what a kernel needs.
 
-    The methods read entries and check them, so that damaged data raise a ValueError that names
-    the entry.
+    The methods read entries and check them: damaged data raise a ValueError that names the entry.
 
     Parameters
     ----------
     kind : str
-        Names the class.
+        Name of the class.
     settings : dict
         JSON values by name.
     arrays : dict of str to ndarray
@@ -61,7 +60,7 @@ class Stored:
     parts : dict of str to Stored
         The models that this one is made of.
     derived : dict of str to ndarray
-        Arrays that follow from the others, for kernels; not in files.
+        Arrays computed from the others, for kernels; not in files.
     """
 
     kind: str
@@ -83,13 +82,13 @@ class Stored:
         Parameters
         ----------
         kind : str
-            Names the class.
+            Name of the class.
         arrays : mapping of str to Tensor or array-like, optional
             Numbers, on any device.
         parts : mapping of str to Stored, optional
             The models that it is made of.
         **settings
-            Values that JSON can express; arrays become lists, tuples too.
+            Values that JSON can express; arrays and tuples become lists.
         """
         numbers = {name: as_array(a) for name, a in (arrays or {}).items() if a is not None}
         models = {name: part for name, part in (parts or {}).items() if part is not None}
@@ -135,7 +134,7 @@ class Stored:
         shape : sequence of int or str, optional
             The shape that it must have, see `check_shape`.
         finite : bool, default=True
-            Whether NaN and infinite entries are refused.
+            Whether to refuse NaN and infinite entries.
         """
         if name not in self.arrays:
             raise ValueError(f"the array {name!r} of {self.kind!r} is missing")
@@ -149,12 +148,12 @@ class Stored:
         return array
 
     def tensors(self, **shapes: str) -> dict[str, Tensor]:
-        """Return finite arrays whose shapes fit together, as tensors of their own memory.
+        """Return copies of finite arrays with matching shapes, as tensors.
 
         Parameters
         ----------
         **shapes
-            For every array one letter per axis; the same letter stands for the same length:
+            One letter per axis of every array; equal letters are equal lengths:
             ``tensors(coef="mn", bias="m")``.
         """
         lengths, found = {}, {}
@@ -172,11 +171,11 @@ class Stored:
 
 
 Restore = Callable[[Stored], Any]
-"""Returns the model of a description, of a list of them a list."""
+"""A function that returns the model of a description, and a list for a list of them."""
 
 
 def plain(value: Any) -> Any:
-    """Return a value in JSON terms: arrays as lists, numbers that are not finite as null."""
+    """Return a value as JSON can express it: arrays as lists, NaN and infinity as null."""
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, (np.ndarray, np.generic, Tensor)):
@@ -189,7 +188,7 @@ def plain(value: Any) -> Any:
 def params_of(estimator: BaseEstimator) -> dict[str, Any]:
     """Return the parameters of an estimator as JSON values.
 
-    A random state that is not a number becomes None, and so does the device.
+    The device, and a random state that is not a number, become None.
     """
     params = plain(estimator.get_params(deep=False))
     lost = {name for name in ("device", "random_state") if not isinstance(params.get(name), int)}
@@ -197,7 +196,7 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
 
 
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
-    """Return an estimator with those of the parameters that it knows."""
+    """Return an estimator with the given parameters; unknown ones are ignored."""
     defaults = cls().get_params(deep=False)
     known = {
         name: tuple(value) if isinstance(defaults[name], tuple) and type(value) is list else value

@@ -1,4 +1,4 @@
-"""Entire functions of the bend angle: sines and cosines of arcs without a singular point."""
+"""Entire functions of the bend angle, for arcs without a singular point at straight."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_SERIES_END = 1.0  # [rad^2]; from here on nothing cancels in the trigonometric forms
+_SERIES_END = 1.0  # [rad^2]; above it the trigonometric forms lose no digits by cancellation
 # Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
 _DEGREE = {torch.float64: 7, torch.float32: 4}
 _SERIES = tuple(
@@ -35,8 +35,8 @@ class Stumpff(NamedTuple):
 def stumpff(s: Tensor) -> Stumpff:
     """Return the Stumpff functions of s = theta^2, smooth through theta = 0.
 
-    Up to one radian the power series is summed: no square root, no division. Beyond, where
-    nothing cancels any more, trigonometry takes over; both agree to rounding where they meet.
+    Up to one radian this is the power series, without square root or division. Above, it is the
+    trigonometric form, which has no cancellation there. Both agree to rounding at one radian.
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ def stumpff(s: Tensor) -> Stumpff:
     Stumpff
         Five tensors of the shape of `s`.
     """
-    # c3 and c4 together: one multiply-add per power, however small the batch.
-    # Not s.new_tensor: before torch 2.5 it does not work in functional transforms.
+    # c3 and c4 together need one multiply-add per power, which is fast for small batches too.
+    # Not s.new_tensor: before torch 2.5 it fails in functional transforms.
     powers = torch.tensor(_SERIES[-1 - _DEGREE.get(s.dtype, 7) :], dtype=s.dtype, device=s.device)
     powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
     near = s.clamp(max=_SERIES_END)

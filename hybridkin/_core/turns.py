@@ -1,4 +1,4 @@
-"""What belongs to the process and not to one thread: threads take turns at it."""
+"""Locks for state that all threads of the process share."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from threadpoolctl import threadpool_limits
 
 
 class _Turns:
-    """Locks: of the filters for warnings, and of the number of threads of BLAS.
+    """Locks for the warning filters and for the number of BLAS threads.
 
-    Checks of scikit-learn change the filters and put back those that they found. Where such checks
-    overlap in two threads, the filters of the first stay changed. The same is true of limits.
+    Checks of scikit-learn change the filters and restore them at the end. If such checks overlap
+    in two threads, the filters can stay changed. The same holds for limits of BLAS threads.
     """
 
     def __init__(self) -> None:
@@ -22,12 +22,12 @@ class _Turns:
 
 
 TURNS = _Turns()
-if hasattr(os, "register_at_fork"):  # other threads, which may hold a lock, are not in the child
+if hasattr(os, "register_at_fork"):  # a child lacks the threads that may hold a lock
     os.register_at_fork(after_in_child=TURNS.__init__)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit BLAS to one thread, for one block or function at a time."""
+    """Limit BLAS to one thread inside a block or function; only one such block runs at a time."""
     with TURNS.limits, threadpool_limits(limits=1):
         yield

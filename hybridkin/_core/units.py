@@ -1,4 +1,4 @@
-"""Units of length, and warnings where numbers look like millimetres instead of metres."""
+"""Units of length and angle, and warnings if numbers look like millimetres or degrees."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import math
 import warnings
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # the command line reads the table before torch is loaded
+if TYPE_CHECKING:  # the command line imports this module without loading torch
     from torch import Tensor
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
-"""Metres in each unit of length that logs, paths and options are given in."""
+"""Metres per unit, for the units of length that logs, paths and options accept."""
 
 UNITS = {**METRES, "rad": 1.0, "deg": math.pi / 180, "1": 1.0}
-"""Metres or radians in each unit of actuators; "1" is left as it is."""
+"""Metres or radians per unit of actuators; "1" keeps the values as they are."""
 
 LONGEST_PULL = 4.0
-"""Backbone lengths that no tendon moves by."""
+"""Largest plausible tendon displacement, in backbone lengths."""
 
-_TURNS = 4.0 * math.pi  # [rad]; a joint or an angle that goes further is more likely in degrees
-_SPANS = 10.0  # a tip moves within two lengths of its robot; millimetres look like 2000
+_TURNS = 4.0 * math.pi  # [rad]; larger joint angles are more likely in degrees
+_SPANS = 10.0  # tips span at most 2 robot lengths; in millimetres it would be 2000
 
 
 def span_message(name: str, tips: Tensor, reach: float, spans: float = _SPANS) -> str | None:
-    """Return a warning where tips (N, 3) lie further apart than a robot of that size reaches."""
+    """Return a warning if tips (N, 3) span more than `spans` times the reach of the robot."""
     span = float((tips.amax(dim=0) - tips.amin(dim=0)).max())
     if span <= spans * reach:
         return None
@@ -34,26 +34,26 @@ def span_message(name: str, tips: Tensor, reach: float, spans: float = _SPANS) -
 
 
 def motion_message(name: str, tips: Tensor, predicted: Tensor, reach: float) -> str | None:
-    """Return a warning where tips (N, 3) lie further apart than a model's: 20 times, and a size."""
+    """Return a warning if tips (N, 3) span 20 times what a model predicts, and two reaches."""
     moved = float((predicted.amax(dim=0) - predicted.amin(dim=0)).detach().max())
     return span_message(name, tips, reach, min(_SPANS, max(2.0, 20.0 * moved / reach)))
 
 
 def millimetres_message(name: str, value: Tensor, limit: float) -> str | None:
-    """Return a warning where values are too large to be metres."""
+    """Return a warning if values are too large to be metres."""
     what = ", which looks like millimetres; hybridkin works in metres: divide by 1000."
     return _too_large(name, value, limit, what)
 
 
 def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
-    """Warn where values are too large to be metres."""
+    """Warn if values are too large to be metres."""
     message = millimetres_message(name, value, limit)
     if message is not None:
         warnings.warn(message, stacklevel=3)
 
 
 def degrees_message(name: str, turns: Tensor, factor: float = 1.0) -> str | None:
-    """Return a warning where joint angles are too large to be radians."""
+    """Return a warning if joint angles are too large to be radians."""
     what = " on a revolute joint, which looks like degrees; hybridkin works in radians."
     return _too_large(name, turns, factor * _TURNS, what)
 

@@ -1,1 +1,1 @@
-"""Geometry and backlash of a robot from measured tips."""
+"""Calibration of a robot's geometry and backlash from measured tips."""

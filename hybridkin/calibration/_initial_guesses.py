@@ -1,4 +1,4 @@
-"""Initial guesses of a calibration: base poses, ring turns and handedness that suit the data."""
+"""Initial guesses of a calibration: base poses, ring turns and handedness that fit the data."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _ROWS = 300
 _SCALES = (0.6, 1.0, 1.6)
 _TURNS = tuple(0.5 * math.pi * k for k in range(4))
 _SWEEPS = 2
-_KEPT = 2  # guesses of either handedness
-_HOPELESS = 3.0  # times the error of the best guess, before any fit
+_KEPT = 2  # guesses per handedness
+_HOPELESS = 3.0  # times the error of the best guess, before any fit; worse ones are dropped
 
 
 class Guess(NamedTuple):
-    """A chain to start from, how far its radii are likely off, and which rings are mirrored."""
+    """A chain to start from, a likely factor on its radii, and which rings are mirrored."""
 
     chain: Chain
     scale: float = 1.0
@@ -36,8 +36,8 @@ class Guess(NamedTuple):
 def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Guess]:
     """Return the guesses to try, the given chain first.
 
-    A free base is aligned with the tips; free rings are turned and mirrored, one after the other;
-    where only the base is free, the mirror image of the whole robot is a guess.
+    A free base is aligned with the tips. Free rings are turned and mirrored, one after the other.
+    If only the base is free, the mirror image of the whole robot is a guess.
     """
     found = [Guess(chain)]
     free_base = "base" in names
@@ -57,7 +57,7 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
 
 
 def aligned(chain: _Chain, rows: Rows) -> _Chain:
-    """Return the chain at the base pose that matches the two clouds of tips (Kabsch)."""
+    """Return the chain at the base pose that aligns predicted and measured tips (Kabsch)."""
     x = torch.from_numpy(points(rows.x.numpy())[rows.seen])
     tips = x + torch.from_numpy(rows.residual(chain)).to(x)
     weight = torch.from_numpy(rows.weights).to(x)[:, None] / rows.weights.sum()

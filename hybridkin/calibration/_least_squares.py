@@ -22,7 +22,7 @@ _MAX_ROUNDS = 12
 _MEDIAN = 2.3660  # of the squared length of a normal vector with three coordinates
 
 
-# rho(s), rho'(s) and rho''(s), of the squared distance s of a row over its noise.
+# rho(s), rho'(s) and rho''(s), for the squared distance s of a row over its noise.
 LOSSES: dict[str, Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]] = {
     "linear": lambda s: (s, np.ones_like(s), np.zeros_like(s)),
     "soft_l1": lambda s: (2 * s / (1 + np.sqrt(1 + s)), (1 + s) ** -0.5, -0.5 * (1 + s) ** -1.5),
@@ -37,10 +37,10 @@ def _huber(s: NDArray, far: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 class Rows(NamedTuple):
-    """Actuator vectors (N, n), measured tips and how many times each row counts (N,).
+    """Actuator vectors (N, n), measured tips and how often each row counts (N,).
 
-    Of K markers the tips are (N, 3 K), NaN where a marker is missing. What is computed of them has
-    one entry for each of the M markers that were measured.
+    With K markers the tips are (N, 3 K), NaN if a marker is missing. Results have one entry for
+    each of the M measured markers.
     """
 
     q: Tensor
@@ -54,11 +54,11 @@ class Rows(NamedTuple):
 
     @property
     def weights(self) -> NDArray:
-        """How many times each measured marker counts, (M,)."""
+        """How often each measured marker counts, (M,)."""
         return np.repeat(self.weight.numpy(), self.seen.sum(1))
 
     def residual(self, chain: Chain) -> NDArray:
-        """Return the coordinate errors (M, 3)."""
+        """Return the coordinate errors (M, 3), predicted minus measured."""
         return points(evaluate(chain, self.q.numpy())[0] - self.x.numpy())[self.seen]
 
     def jacobian(self, problem: Problem, theta: NDArray, chain: Chain) -> NDArray:
@@ -73,7 +73,7 @@ class Rows(NamedTuple):
         return float(np.sqrt(np.average(_squares(self.residual(chain)), weights=self.weights)))
 
     def noise(self, residual: NDArray, robust: bool) -> float:
-        """Return the standard deviation of one coordinate, from the median where robust."""
+        """Return the standard deviation of one coordinate, from the median if robust."""
         squares, weight = _squares(residual), self.weights
         if not robust:
             return float(np.sqrt(np.average(squares, weights=weight) / 3.0))
@@ -90,9 +90,9 @@ def row_loss(z: NDArray, weight: NDArray, loss: str) -> NDArray:
     """Return the loss that SciPy's `least_squares` minimises, and its derivatives, (3, M).
 
     `z` holds the squares of 3 N weighted coordinates, over their noise, then those of the prior.
-    Of a row it is 3 w rho(s) with s = |e|^2 / 3, so it stays when the frame turns; the 3 keeps the
-    noise of three coordinates near s = 1. The second derivative gives all coordinates of a row the
-    mean curvature rho' + 2/3 s rho'', so that the search does not depend on the frame either.
+    The loss of a row is 3 w rho(s) with s = |e|^2 / 3: it does not depend on the frame, and noise
+    in three coordinates gives s near 1. The second derivative gives all coordinates of a row the
+    mean curvature rho' + 2/3 s rho'', so the search does not depend on the frame either.
     """
     rows, prior = np.split(z, [3 * len(weight)])
     s = rows.reshape(-1, 3).sum(axis=1) / (3.0 * weight)
@@ -104,7 +104,7 @@ def row_loss(z: NDArray, weight: NDArray, loss: str) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a search found, and the derivative of the residual there."""
+    """Result of a fit, and the derivative of the residual there."""
 
     problem: Problem
     theta: NDArray
@@ -114,14 +114,14 @@ class Fit:
     converged: bool
 
     def chain(self) -> Chain:
-        """Return the chain at the end of the search."""
+        """Return the fitted chain."""
         return self.problem.chain_at(self.theta)
 
 
 def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: bool = False) -> Fit:
-    """Alternate least squares and the noise level that weighs the prior against the data.
+    """Return a fit that alternates least squares and the noise level, the weight of the prior.
 
-    With `roughly` the search stops as soon as good and bad initial guesses differ.
+    With `roughly` it stops early, with enough accuracy to compare initial guesses.
     """
     weight = rows.weights
     root = np.sqrt(weight)[:, None]

@@ -1,4 +1,4 @@
-"""The geometry of a chain as free parameters of natural size one, zero at the start."""
+"""The geometry of a chain as free parameters in natural units, zero at the start."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hybridkin.chains.rigid import RigidChain
 
 _Vector = TypeVar("_Vector", NDArray, Tensor)
 
-# Geometry that keeps its sign, and the factor of its start within which it stays, both ways.
+# Geometry that keeps its sign, and the factor by which it can grow or shrink from its start.
 SCALED: dict[str, float] = {"bending_stiffness": 1e4, "axial_stiffness": 1e4}
 SCALED |= {"radii": 5.0, "lengths": 5.0, "gains": 5.0}
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
@@ -28,21 +28,21 @@ _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the 
 
 @dataclass(frozen=True, eq=False)
 class _Named:
-    """One name of `calibrate`, and how its free directions move an entry of the geometry.
+    """One parameter of `calibrate`, and how its free directions change an entry of the geometry.
 
     Attributes
     ----------
     name, entry : str
-        What the user calls it, and the entry of ``chain.geometry()`` that it moves.
+        Its name in `calibrate`, and the entry of ``chain.geometry()`` that it changes.
     start : Tensor
         The entry at the start.
     labels : tuple of str
-        Its free directions, as "radii[0]".
+        Its free directions, e.g. "radii[0]".
     units : ndarray
-        How far one natural unit of each direction goes: [m], [rad], [unit of q], or [-] of its
-        start.
+        Size of one natural unit of each direction: [m], [rad], [unit of q], or [-] as a fraction
+        of its start.
     kind : tuple of str
-        What each unit is: "m", "rad", "q" or "-".
+        Kind of each unit: "m", "rad", "q" or "-".
     """
 
     name: str
@@ -60,11 +60,11 @@ class _Named:
 
 @dataclass(frozen=True, eq=False)
 class Entries(_Named):
-    """Numbers moved along constant directions, each entry by at most one of them.
+    """Numbers that change along constant directions, each number along at most one of them.
 
-    Numbers that keep their sign (`log`) are moved by the logarithm of their size, which is what has
-    bounds. `physical` are the default bounds. The user's value has the entries with the indices
-    `shown`, in `shape`.
+    Numbers that keep their sign (`log`) change by the logarithm of their absolute value, which the
+    bounds refer to. `physical` are the default bounds. The user's value has the entries with the
+    indices `shown`, in `shape`.
     """
 
     directions: NDArray  # (numel, size)
@@ -99,7 +99,7 @@ class Entries(_Named):
             return np.log(low / origin), np.log(high / origin)
 
     def value(self, entry: Tensor) -> Tensor:
-        """Return the part of the entry that the user calls by this name."""
+        """Return the part of the entry that this parameter stands for."""
         return entry.flatten()[torch.as_tensor(self.shown, device=entry.device)].reshape(self.shape)
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
@@ -108,15 +108,15 @@ class Entries(_Named):
         return error * np.abs(value) if self.log else error
 
     def flags(self, identified: NDArray) -> NDArray:
-        """Return for each entry of `value` whether the directions that move it are identified."""
+        """Return for each entry of `value` whether the directions that change it are identified."""
         flags = ~((self.directions != 0) & ~identified).any(axis=1)
         return flags[self.shown].reshape(self.shape)
 
 
 class Posed(_Named):
-    """A pose, turned by a rotation vector and moved, both in the measuring frame.
+    """A pose that changes by a rotation vector and a translation, both in the measuring frame.
 
-    Its methods are those of `Entries`.
+    It has the same methods as `Entries`.
     """
 
     def moved(self, part: Tensor) -> Tensor:
@@ -136,7 +136,7 @@ class Posed(_Named):
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
         if bound is not None:
             raise ValueError(
-                f"`bounds` cannot hold {self.name!r}; tighten it by `prior={{{self.name!r}: ...}}`."
+                f"`bounds` cannot hold {self.name!r}; use `prior={{{self.name!r}: ...}}` instead."
             )
         return np.full(6, -np.inf), np.full(6, np.inf)
 
@@ -154,13 +154,13 @@ Parameter = Entries | Posed
 
 
 def parameter_names(chain: Chain) -> list[str]:
-    """Return the names that `calibrate` takes for a chain."""
+    """Return the names that `calibrate` accepts for a chain."""
     aliases = ALIASES if isinstance(chain, ArcChain) else ()
     return [*chain.geometry(), *aliases]
 
 
 def parameter(chain: Chain, name: str) -> Parameter:
-    """Return the free directions of one name, at the chain's present geometry."""
+    """Return the free directions of one parameter, at the chain's present geometry."""
     geometry = {key: value.detach().cpu() for key, value in chain.geometry().items()}
     entry = name if name in geometry else ALIASES[name]
     start, reach = geometry[entry], float(chain.reach)
@@ -213,7 +213,7 @@ def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The free parameters theta of a chain, all of natural size one, zero at the start."""
+    """The free parameters theta of a chain, all in natural units, zero at the start."""
 
     chain: Chain
     parameters: tuple[Parameter, ...]
@@ -229,7 +229,7 @@ class Problem:
         bounds: Mapping[str, tuple[float, float]],
         prior: Mapping[str, float],
     ) -> Problem:
-        """Return the problem of these names, with limits and priors from the user's."""
+        """Return the problem for these names, with limits and priors from the user's."""
         parameters = tuple(parameter(chain, name) for name in names)
         limits = [part.bounds(bounds.get(part.name)) for part in parameters]
         stds = [np.full(part.size, prior[part.name]) for part in parameters]
@@ -242,13 +242,13 @@ class Problem:
         return tuple(label for part in self.parameters for label in part.labels)
 
     def start(self, scale: float) -> NDArray:
-        """Return the start with all radii times a factor, brought inside the limits."""
+        """Return the start with all radii times a factor, clipped to the limits."""
         logs = [np.log(scale) if part.name == "radii" else 0.0 for part in self.parameters]
         sizes = [part.size for part in self.parameters]
         return np.clip(np.repeat(logs, sizes), self.low, self.high)
 
     def parts(self, theta: _Vector) -> list[_Vector]:
-        """Return theta (P,) by parameters."""
+        """Return theta (P,), split by parameters."""
         ends = np.cumsum([part.size for part in self.parameters])
         starts = [0, *ends[:-1]]
         return [theta[a:b] for a, b in zip(starts, ends, strict=True)]
@@ -264,7 +264,7 @@ class Problem:
         return self.chain.with_geometry(**{part.entry: part.moved(at) for part, at in pairs})
 
     def tangents(self, theta: Tensor) -> dict[str, Tensor]:
-        """Return the derivatives of the geometry by theta, (P, ...) for every moved entry."""
+        """Return the derivatives of the geometry by theta, (P, ...) for every changed entry."""
         rows = self.parts(identity(len(theta), theta))
         pairs = zip(self.parameters, self.parts(theta), rows, strict=True)
         return {

@@ -1,4 +1,4 @@
-"""Where the least squares of a calibration start: the best of rough fits from several guesses."""
+"""Start of the least squares of a calibration: the best of rough fits from several guesses."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
-_WIDEST = 1e6  # a prior of a million natural units is none, and stays finite
-_EQUAL = 1.0 - 1e-4  # of guesses that explain the tips alike the given chain counts
-_BETTER = 0.8  # another handedness than the given one must lower the error to this share,
-_FAR_BETTER = 0.5  # and to this share where the user has not asked for it
+_WIDEST = 1e6  # a prior of a million natural units has no effect, and is finite
+_EQUAL = 1.0 - 1e-4  # among guesses with nearly equal errors the given chain is taken
+_BETTER = 0.8  # a mirror image must lower the error to this fraction,
+_FAR_BETTER = 0.5  # and to this fraction if no angles are free
 
 
 class Start(NamedTuple):
-    """Where a search ended roughly, and a warning where the robot is mirrored."""
+    """Result of a rough search, and a warning if the robot is mirrored."""
 
     problem: Problem
     theta: NDArray
@@ -67,9 +67,9 @@ def widened(
 
 
 def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit, str | None]:
-    """Return the best fit, and a warning where it is a mirror image that nobody asked for.
+    """Return the best fit, and a warning if it is a mirror image although no angles are free.
 
-    Of equals the first is the best, a mirror image only where it is clearly better.
+    Among equal fits the first is taken; a mirror image is taken only if it is clearly better.
     """
     best, image = fits[0], None
     for fit, guess in zip(fits[1:], guesses[1:], strict=True):
@@ -82,7 +82,7 @@ def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit
     if free_angles:
         return image, None
     return image, (
-        f"the actuators run the other way round than in `chain`: its mirror image leaves "
-        f"{1e3 * image.rmse:.3g} mm rms, the given one {1e3 * best.rmse:.3g} mm. The mirror "
+        f"the actuators run in the opposite direction to `chain`: its mirror image has an error of "
+        f"{1e3 * image.rmse:.3g} mm rms, the given chain {1e3 * best.rmse:.3g} mm. The mirror "
         "image is returned; negate `angles` of the chain, or list 'turns' in `parameters`."
     )

@@ -1,4 +1,4 @@
-"""Directions that calibration data do not identify, in sentences: few parameters each, advice."""
+"""Sentences about directions that calibration data do not identify: few parameters, advice."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from scipy.optimize import linprog
 from hybridkin.calibration._least_squares import Fit
 from hybridkin.calibration._parameters import Problem
 
-_N_TERMS = 6  # moves in a sentence
-_FAIR = 0.5  # of the largest share, which may lead a sentence
-_SMALL = 0.05  # of a step, or of the tips' move: not mentioned
-_SLIGHT = 0.01  # of the largest move of the tips by one parameter alone
+_N_TERMS = 6  # parameters in a sentence
+_FAIR = 0.5  # of the largest entry: a parameter with more can be named first
+_SMALL = 0.05  # of a step, or of the motion of the tips: not mentioned
+_SLIGHT = 0.01  # of the largest motion of the tips by one parameter alone
 _ALIKE = 0.02
 _STILL = 1e-6  # [mm]
 _NO_EFFECT = "does not move the tips"
-_INSIDE = 0.05  # of a unit vector: within a span
-_DETERMINED = 0.05  # standard error of the logarithm
+_INSIDE = 0.05  # part of a unit vector outside a span that counts as zero
+_DETERMINED = 0.05  # largest standard error of the logarithm
 _STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%"), "q": (1.0, "of q")}
 
 
 def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float) -> tuple[str, ...]:
     """Return a sentence for each direction that hardly moves the tips, in few parameters.
 
-    `directions` (K, P) are orthonormal moves in units of the prior, `covariance` (P, P) is that of
-    the free parameters.
+    `directions` (K, P) are orthonormal changes in units of the prior; `covariance` (P, P) is that
+    of the free parameters.
     """
     problem = fit.problem
     units = np.concatenate([part.units for part in problem.parameters])
@@ -34,7 +34,7 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
     columns = 1e3 * fit.jacobian * problem.prior_std / np.sqrt(n_rows)  # [mm] of tip
     found = []
     for move in few_terms(directions):
-        # Led by the first with a fair share, which moves one step.
+        # The first parameter with a fair share is named first and changes by one step.
         lead = int(np.argmax(np.abs(move) > _FAIR * np.abs(move).max()))
         move = move / (move[lead] * to_steps[lead])
         tips = float(np.linalg.norm(columns @ move))
@@ -59,9 +59,9 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
 
 
 def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) -> str:
-    """Return which ratio or product of two parameters the data determine, where it is one.
+    """Return a sentence if the data identify the ratio or product of two parameters.
 
-    They do where the two move by the same share: the standard error of the logarithm is small.
+    They do if both change by the same factor and the standard error of the logarithm is small.
     """
     parts, labels, geometry = fit.problem.parameters, fit.problem.labels, fit.chain().geometry()
     kinds = [kind for part in parts for kind in part.kind]
@@ -73,14 +73,14 @@ def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) ->
     values = [v for part in parts for v in part.value(geometry[part.entry]).flatten()[: part.size]]
     value = float(values[i] / values[j] ** way)
     what = f"{labels[i]} {'/' if way > 0 else '*'} {labels[j]}"
-    shown = f" The data determine {what} = {value:.4g} (std. error {abs(value) * error:.2g})."
+    shown = f" The data identify {what} = {value:.4g} (std. error {abs(value) * error:.2g})."
     return shown if error < _DETERMINED else ""
 
 
 def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float, int]]:
-    """Return a move by (label, size, index): the leading one, then the largest first.
+    """Return a change as (label, size, index): the leading one, then the largest first.
 
-    Entries of one name that all move alike count as one.
+    Entries of one name that all change equally count as one.
     """
     terms, row = [], 0
     for part in problem.parameters:
@@ -95,9 +95,9 @@ def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float
 
 
 def few_terms(directions: NDArray) -> NDArray:
-    """Return a basis (K, P) of the span of orthonormal rows, each of few entries.
+    """Return a sparse basis (K, P) of the span of orthonormal rows (K, P).
 
-    The least sum of absolute entries for each entry held, then the shortest that are independent.
+    For each entry, fixed to 1, minimise the sum of absolute entries; take the shortest independent.
     """
     K, P = directions.shape
     if K < 2:
@@ -109,7 +109,7 @@ def few_terms(directions: NDArray) -> NDArray:
     def shortest(held: NDArray) -> NDArray:
         equal = np.concatenate([held, np.zeros(P)])[None]
         found = linprog(cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)).x
-        a = held if found is None else found[:K]  # else the nearest to it
+        a = held if found is None else found[:K]  # if it fails, the nearest vector
         return a / np.linalg.norm(a)
 
     columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
@@ -118,7 +118,7 @@ def few_terms(directions: NDArray) -> NDArray:
     chosen: list[NDArray] = []
     while len(chosen) < K:
         taken = np.array(chosen).reshape(-1, K)
-        rest = np.linalg.svd(taken)[2][len(chosen) :]  # spans what the chosen ones do not
+        rest = np.linalg.svd(taken)[2][len(chosen) :]  # spans the remaining directions
         free = [a for a in candidates if np.linalg.norm(rest @ a) > _INSIDE]
         chosen.append(free[0] if free else shortest(rest[0]))
     return np.array(chosen) @ directions

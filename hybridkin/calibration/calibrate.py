@@ -1,4 +1,4 @@
-"""Geometry of a kinematic chain from measured tips, with standard errors and identifiability."""
+"""Calibrated geometry of a chain from measured tips, with standard errors, identifiability."""
 
 from __future__ import annotations
 
@@ -28,49 +28,49 @@ from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
 
-# Identified below this share of the prior: k parameters that share one unidentified direction
-# narrow to 1 / sqrt(k) by the prior alone.
+# Identified if the standard error is below this fraction of the prior. (The prior alone narrows k
+# parameters that share one unidentified direction to 1 / sqrt(k).)
 _IDENTIFIED = 0.1
-_FEW, _LEFT = 10, 0.5  # a quarter of the variance
-_MEASURED = ("radii", "lengths")  # sizes that a ruler measures:
-_UNPHYSICAL = 1.75  # a change by this factor is a warning
+_FEW, _LEFT = 10, 0.5  # fewest rows; ratio of residual to spread, a quarter of the variance
+_MEASURED = ("radii", "lengths")  # sizes that can be measured with a ruler:
+_UNPHYSICAL = 1.75  # a change by this factor gives a warning
 
 
 @dataclass(frozen=True, repr=False)
 class CalibrationResult(Portable):
-    """Calibrated chain, and how far the data identify its geometry.
+    """Calibrated chain, and how well the data identify its geometry.
 
     Attributes
     ----------
     chain : Chain
         Copy of the given chain with the calibrated geometry.
     values : dict of str to array
-        The calibrated geometry by parameter name, in the chain's shapes and units, as
-        ``chain.geometry()`` has it; "tool" () [m] is the last of the offsets, "turns" (S,) [rad]
-        the angle of the first actuator of each segment, "gain" () the first of the gains.
+        The calibrated geometry by parameter name, in the shapes and units of ``chain.geometry()``;
+        "tool" () [m] is the last offset, "turns" (S,) [rad] the angle of the first actuator of
+        each segment, "gain" () the first gain.
     std_errors : dict of str to array
         One standard error for each entry of `values`; for "base" shape (6,), three of rotation
         [rad] and three of translation [m], in the measuring frame.
     correlations : ndarray of shape (P, P)
-        Correlation of the P free parameters, ordered as `names`.
+        Correlation of the P free parameters, in the order of `names`.
     names : tuple of P str
-        Free parameters, as "radii[0]" or "base[rot x]".
+        Free parameters, e.g. "radii[0]" or "base[rot x]".
     narrowing : ndarray of shape (P,)
-        How many times the data narrow the prior of each of `names`.
+        Prior standard deviation over standard error, for each of `names`.
     identifiable : dict of str to bool array
-        False where the data narrow the prior less than tenfold: that value is an assumption.
+        False if the data narrow the prior less than tenfold: that value is an assumption.
     singular_values : ndarray of shape (P,)
-        How many times the data narrow the prior, along P independent directions, largest first.
-        Below 10 the prior decides.
+        Factors by which the data narrow the prior, along P independent directions, largest first.
+        Directions below 10 are not identified by the data.
     unidentified : tuple of str
-        A sentence for each direction that the data do not identify, with advice.
+        One sentence with advice for each direction that is not identified by the data.
     unphysical : tuple of str
-        Parameters, as "lengths", of which a value ran into a bound or left what is physical. They
-        compensate for what the model does not describe, however well the data identify them.
+        Parameters, e.g. "lengths", with a value at a bound or outside the physical range. They
+        compensate for effects that the model does not describe, even if they are identified.
     rmse : float
-        Root mean square tip distance on the given data, of all markers [m].
+        Root mean square tip distance on the given data, over all markers [m].
     cv_rmse : float or None
-        The same on held-out groups (at most 5 folds), when `groups` was given [m].
+        The same on held-out groups (at most 5 folds), if `groups` was given [m].
     converged : bool
         Whether the solver met its tolerance.
     """
@@ -95,7 +95,7 @@ class CalibrationResult(Portable):
             lines.append(f"  {name}: {_shown(value)}")
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
         if self.unidentified:
-            lines.append("  Not identified by these data, the prior decides:")
+            lines.append("  Not identified by the data, the values are from the prior:")
             lines += [f"    {sentence}" for sentence in self.unidentified]
         return "\n".join(lines)
 
@@ -118,50 +118,50 @@ def calibrate(
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
 ) -> CalibrationResult:
-    """Return the chain whose geometry explains measured tips best.
+    """Return the chain with the geometry that fits measured tips best, with standard errors.
 
     Nonlinear least squares on the tip distance with exact derivatives. Radii, lengths and gains
-    are fitted by their logarithm and so keep their sign. A weak prior keeps every parameter near
-    its start where the data do not identify it; its weight against the data follows the noise
-    level, which is estimated from the residuals, so exact data override it. With a free base or
-    free angles several initial guesses are tried, among them other turns and mirror images of the
-    actuator rings, so that a robot wired the other way round is recognised. Tendons on a backbone
-    of given length identify gains only together with the radii: `unidentified` then has the ratio.
+    are fitted by their logarithm and keep their sign. A weak prior keeps parameters that are not
+    identified by the data near their start. Its weight follows the noise level, which is estimated
+    from the residuals, so exact data override it. With a free base or free angles several initial
+    guesses are tried, including other turns and mirror images of the actuator rings: a robot with
+    actuators in the opposite order is recognised. Tendons on a backbone of given length identify
+    only the ratio of gains and radii, which `unidentified` then contains.
 
     Parameters
     ----------
     chain : ConstantCurvatureChain, ElasticTendonChain, RigidChain or another Chain
         Start of the search; it is not changed.
     q : array or Tensor of shape (N, n_actuators)
-        Actuator vectors [m, or unit of q of a chain with gains], of revolute joints [rad].
+        Actuator vectors [m, or unit of q of a chain with gains]; [rad] for revolute joints.
     x : array or Tensor of shape (N, 3) or (N, 3 K)
-        Measured tip positions [m]; of a chain with K markers all of these, NaN where one was not
-        measured. All count alike.
+        Measured tip positions [m]; for a chain with K markers all of these, NaN if one was not
+        measured. All have the same weight.
     parameters : sequence of str, default=("radii", "base")
         Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
-        chains), "offsets", "rest_bends", "actuator_zeros", "gains", "base" (pose), of elastic
-        tendon chains "bending_stiffness", "axial_stiffness" and "tendon_zeros", of rigid arms
-        "joint_zeros", "links" and "tool"; or instead of all angles "turns", of each segment's ring
-        of actuators as a whole, instead of all offsets "tool", the last one, and instead of all
-        gains "gain", their common factor.
+        chains), "offsets", "rest_bends", "actuator_zeros", "gains", "base" (pose); for elastic
+        tendon chains also "bending_stiffness", "axial_stiffness" and "tendon_zeros"; for rigid
+        arms "joint_zeros", "links" and "tool". Smaller sets: "turns", one common turn of each
+        segment's actuators, instead of "angles"; "tool", the last offset, instead of "offsets";
+        "gain", a common factor, instead of "gains".
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
         All but "linear" bound the influence of outliers: ``rho(|e|^2 / 3)`` of SciPy's
         ``least_squares``, with the distance ``|e|`` of a row over the noise, times its weight.
     bounds : dict of str to (low, high), optional
-        Limits of all entries of a name, in its own unit, of gains those of their size. Default: a
-        factor of 5 on radii, lengths and gains and of 10 000 on stiffnesses, half a turn on rest
-        bends, and offsets that are no shorter than minus a tenth of the robot's length.
+        Limits of all entries of a name, in its own unit; for gains limits of their absolute value.
+        Default: a factor of 5 on radii, lengths and gains and of 10 000 on stiffnesses, half a
+        turn on rest bends, and offsets above minus a tenth of the robot's length.
     prior : float or dict of str to float, default=0.5
-        Standard deviation of the weak prior in natural units: a fraction of radii, lengths, gains
-        and stiffnesses, of the mean radius (over the mean gain, where q is no length) for
-        actuator and tendon zeros, of the robot's length for "offsets", "links", "tool", sliding
-        joints' zeros and the base position, radians for angles, rest bends, turning joints' zeros
-        and the base orientation. ``inf`` turns it off.
+        Standard deviation of the weak prior in natural units: a fraction of the start for radii,
+        lengths, gains and stiffnesses; of the mean radius (over the mean gain if q is not a length)
+        for actuator and tendon zeros; of the robot's length for "offsets", "links", "tool", zeros
+        of sliding joints and the base position; radians for angles, rest bends, zeros of turning
+        joints and the base orientation. ``inf`` turns it off.
     groups : array-like of shape (N,), optional
-        Motion of every row; asks for `cv_rmse` on held-out motions.
+        Motion of every row; required for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional
-        How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
-        Equal rows are held out together.
+        How often each row counts: 2 is the same as the row twice, 0 drops it. Equal rows are held
+        out together.
 
     Returns
     -------
@@ -176,11 +176,11 @@ def calibrate(
     Warns
     -----
     UserWarning
-        Where q or x look like millimetres. Where the different rows are fewer than the free
-        parameters. Where a quarter of the variance of the tips stays, as with columns of q in a
-        wrong order. Where a value ran into a bound or is no longer physical. Where the mirror image
-        of the given robot explains the data far better; it is then returned. Where tendons of a
-        ConstantCurvatureChain contradict each other, as slack tendons do.
+        If q or x look like millimetres. If there are fewer different rows than free parameters. If
+        a quarter of the variance of the tips remains, e.g. with columns of q in a wrong order. If
+        a value is at a bound or not physical. If the mirror image of the given robot fits the data
+        far better; it is then returned. If tendons of a ConstantCurvatureChain contradict each
+        other, e.g. slack tendons.
 
     References
     ----------
@@ -216,9 +216,9 @@ def fit_geometry(
     sample_weight: Numbers | None = None,
     start: Start | None = None,
 ) -> tuple[CalibrationResult, list[str]]:
-    """Return what `calibrate` returns, and the messages of its warnings; nothing is issued.
+    """Return the result of `calibrate` and its warnings as a list; no warning is issued.
 
-    A `start`, as `search` finds it for the same chain and parameters, replaces the search.
+    A `start` from `search` for the same chain and parameters replaces the search.
     """
     if not isinstance(chain, Chain):
         raise TypeError(
@@ -228,7 +228,7 @@ def fit_geometry(
     names = _check_parameters(chain, parameters, bounds, prior)
     one_of(loss, "loss", LOSSES)
     torch_given, device = isinstance(q, Tensor), chain.geometry()["base"].device
-    chain = copy.deepcopy(chain).cpu()  # where the solver works, without a graph
+    chain = copy.deepcopy(chain).cpu()  # the solver runs on the CPU, without a graph
     q, x, messages = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))
@@ -254,14 +254,14 @@ def fit_geometry(
 
 
 def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
-    """Return the chain calibrated to different rows from a start, and nothing else of it."""
+    """Return only the chain of a calibration to different rows from a start."""
     like = start.problem.chain.geometry()["base"]
     rows = Rows(*(part.to(like) for part in (q, x, weights)))
     return solve(start.problem, rows, start.theta, "linear").chain()
 
 
 def _few(fit: Fit, rows: Rows) -> str | None:
-    """Return a warning where the rmse is too good to be true: by a fifth, and more with less."""
+    """Return a warning if there are fewer rows than free parameters: `rmse` is then too small."""
     n_rows, n_free = len(rows.q), fit.theta.size
     if n_rows >= n_free:
         return None
@@ -272,21 +272,21 @@ def _few(fit: Fit, rows: Rows) -> str | None:
 
 
 def _unexplained(fit: Fit, rows: Rows) -> str | None:
-    """Return a warning where half of the rows are not explained well: not by outliers alone."""
+    """Return a warning if the median residual is large, which a few outliers cannot cause."""
     left = np.median(np.linalg.norm(rows.residual(fit.chain()), axis=1))
     around = points((rows.x - rows.x.nanmedian(dim=0).values).numpy())[rows.seen]
     spread = np.median(np.linalg.norm(around, axis=1))
     if len(rows.x) < _FEW or not 0 < _LEFT * spread < left:
         return None
     return (
-        f"the calibrated model leaves {1e3 * left:.3g} mm (median) where the tip moves by "
-        f"{1e3 * spread:.3g} mm. The columns of `q` may have another order or sign, or the robot "
-        "is described wrongly: datasets.check_log(Log(q, x), chain=chain) looks for better ones."
+        f"the calibrated model has a median residual of {1e3 * left:.3g} mm, but the tip moves by "
+        f"only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, or the description of "
+        "the robot, may be wrong: datasets.check_log(Log(q, x), chain=chain) looks for better ones."
     )
 
 
 def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
-    """Return the parameters that ran into a bound or left what is physical, and a warning."""
+    """Return the parameters at a bound or outside the physical range, and a warning."""
     problem, names, words = fit.problem, {}, []
     pieces = map(problem.parts, (fit.theta, problem.low, problem.high))
     for part, *values in zip(problem.parameters, *pieces, strict=True):
@@ -294,22 +294,22 @@ def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
         for label, at, low, high in zip(part.labels, *values, strict=True):
             if min(at - low, high - at) < 1e-6:
                 side = "lower" if at - low < high - at else "upper"
-                words.append(f"{label} ran into its {side} bound")
+                words.append(f"{label} is at its {side} bound")
             if part.name in _MEASURED and abs(at) > np.log(_UNPHYSICAL):
-                words.append(f"{label} went to {np.exp(at):.2g} times its start")
+                words.append(f"{label} is {np.exp(at):.2g} times its start")
         if part.entry == "offsets":
             before, after = (c.geometry()["offsets"] for c in (problem.chain, fit.chain()))
             worse = (before - after > 1e-3 * part.units[0]) & (after < -0.02 * part.units[0])
             for k in worse.nonzero().flatten().tolist():
                 label = "tool" if part.name == "tool" else part.labels[k]
-                words.append(f"{label} became {1e3 * float(after[k]):.3g} mm")
+                words.append(f"{label} is {1e3 * float(after[k]):.3g} mm")
         names[part.name] = len(words) > n
     if not words:
         return (), None
     return tuple(name for name, left in names.items() if left), (
-        f"calibration left what is physical: {'; '.join(words)}. Check the units and the start, "
-        "narrow the `prior`, or fit less; the robot may do what this model does not know (slack "
-        "tendons, gravity, twist)."
+        f"calibration gave unphysical values: {'; '.join(words)}. Check the units and the start, "
+        "narrow the `prior`, or fit fewer `parameters`; the robot may have effects that this model "
+        "does not describe (slack tendons, gravity, twist)."
     )
 
 
@@ -318,7 +318,7 @@ def _result(
 ) -> CalibrationResult:
     problem, chain = fit.problem, fit.chain()
     prior_std = problem.prior_std
-    # By singular values in units of the prior: squares would lose the small ones to rounding.
+    # Singular values of J in units of the prior; those of J'J would lose small ones to rounding.
     J = fit.jacobian * prior_std
     _, narrowed, directions = np.linalg.svd(J / fit.noise, full_matrices=len(J) < J.shape[1])
     narrowed = np.pad(narrowed, (0, len(prior_std) - narrowed.size))
@@ -372,14 +372,14 @@ def _check_parameters(
         close = [difflib.get_close_matches(str(name), available, 1) for name in unknown]
         hint = "".join(f"; did you mean {near[0]!r}?" for near in close[:1] if near)
         raise ValueError(
-            f"`parameters` must name different ones of {available} for this chain, got "
+            f"`parameters` must name different entries of {available} for this chain, got "
             f"{names}{hint or '.'}"
         )
     for alias, entry in ALIASES.items():
         if {alias, entry} <= set(names):
             raise ValueError(
-                f"`parameters` must not hold both {entry!r} and {alias!r}, which moves a part of "
-                f"them; leave {alias!r} out."
+                f"`parameters` must not hold both {entry!r} and {alias!r}, which is a part of it; "
+                f"leave {alias!r} out."
             )
     if not isinstance(bounds, (Mapping, NoneType)):
         raise TypeError(f"`bounds` must map names to (low, high), got {bounds!r:.80}.")

@@ -1,4 +1,4 @@
-"""Which parameters of a chain to calibrate: chosen by errors inside and outside the fitted rows."""
+"""Choice of the parameters to calibrate, by errors inside and outside the range of the fit."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
 _MOST, _FOLDS = 400, 3  # rows and folds for the scores
-_FEW = 40  # rows, below which `io` says little
-_ROWS, _CLEARLY = 7, 0.7  # rows for each parameter; a larger set must be clearly better
-_WORSE = 1.1  # times the least error on held-out motions: not taken, whatever `io`
-_USUAL = ((), ("base",), ("radii", "base"))  # sets that are calibrated from few rows, too
-_EQUAL = 0.007  # of the score: then the smaller set is taken
-_ALIKE = 0.01  # of the error: then the first of two starts is taken
+_FEW = 40  # with fewer rows `io` is not used
+_ROWS, _CLEARLY = 7, 0.7  # rows per parameter; with fewer rows a set must be clearly better
+_WORSE = 1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
+_USUAL = ((), ("base",), ("radii", "base"))  # sets that are also calibrated from few rows
+_EQUAL = 0.007  # of the score: within it the smaller set is taken
+_ALIKE = 0.01  # of the error: within it the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
-_TIED = 0.01  # of the largest spread of q: not excited
-_MOVES = 0.05  # of the largest move of the tip
+_TIED = 0.01  # of the largest spread of q: below it a direction is not excited
+_MOVES = 0.05  # of the largest motion of the tip
 
-_RIVAL = "elastic tendons: "  # names of sets that take the place of those of a plain chain
+_RIVAL = "elastic tendons: "  # prefix of sets that replace those of a plain chain
 _STIFF = ("bending_stiffness", "axial_stiffness")
 _EXTENSIBLE = (
     ("radii", "base"),
@@ -55,32 +55,32 @@ _ELASTIC = (
 
 
 class Errors(NamedTuple):
-    """Mean tip distances of a set of parameters [m]; NaN where they were not needed."""
+    """Mean tip distances of a set of parameters [m]; NaN if they were not needed."""
 
     cv: float  # held-out motions, or rows
     io: float = np.nan  # the outer rows, after a fit to the inner ones
 
     def known(self) -> dict[str, float]:
-        """Return the errors by name, without those that were not needed."""
+        """Return the errors by name, without those that were not computed."""
         return {name: error for name, error in self._asdict().items() if not np.isnan(error)}
 
 
 @dataclass(frozen=True)
 class GeometryChoice:
-    """What to calibrate, and where its search starts.
+    """The chosen parameters, and the start of their fit.
 
     Attributes
     ----------
     chain : Chain
-        The given chain, or elastic tendons of its geometry.
+        The given chain, or elastic tendons with its geometry.
     parameters : tuple of str
-        What to calibrate; empty: nothing.
+        The parameters to calibrate; may be empty.
     start : Start or None
-        Where the search for these starts, for `fit_geometry`; None without parameters.
+        Start of their fit, for `fit_geometry`; None without parameters.
     name : str
-        The set, as in `errors`.
+        Name of the set in `errors`.
     errors : dict of str to Errors
-        Errors of all sets that were tried; empty where there was nothing to choose.
+        Errors of all sets that were tried; empty if there was no choice.
     messages : tuple of str
         Warnings about the log.
     """
@@ -112,16 +112,16 @@ def choose_geometry(
     outside: bool = True,
     parameters: Sequence[str] | None = None,
 ) -> GeometryChoice:
-    """Return the set of parameters to calibrate that errs least on new motions, and outside.
+    """Return the parameters with the smallest calibration error on new motions and extrapolation.
 
-    The sets grow from nothing, the base, the radii to the whole geometry; where tendons of a
-    `ConstantCurvatureChain` contradict each other, elastic tendons of the same geometry follow. A
-    set has the score ``(cv * io**2)**(1/3)``: `cv` is the mean tip distance on held-out motions,
-    `io` that on the outer 35 % of the rows after a fit to the inner 40 %. The smallest set with
-    nearly the least score is taken, of those whose `cv` is at most a tenth above the least. A set
-    with more than one parameter in 7 rows must be clearly better, unless it is the base and the
-    radii. Of a set with more than one parameter in 7 inner rows `io` counts no more than that of
-    the last smaller one, times the ratio of their `cv`. Below 40 rows the score is `cv`.
+    The sets grow from nothing, the base and the radii to the whole geometry. If tendons of a
+    `ConstantCurvatureChain` contradict each other, elastic tendons of the same geometry follow.
+    The score of a set is ``(cv * io**2)**(1/3)``: `cv` is the mean tip distance on held-out
+    motions, `io` that on the outer 35 % of the rows after a fit to the inner 40 %. Among sets with
+    a `cv` at most a tenth above the smallest, the smallest one with nearly the best score is taken.
+    A set with more than one parameter per 7 rows must be clearly better, except base and radii.
+    For a set with more than one parameter per 7 inner rows `io` is at most that of the last smaller
+    set, times the ratio of their `cv`. Below 40 rows the score is `cv`.
 
     Parameters
     ----------
@@ -132,20 +132,20 @@ def choose_geometry(
     x : array or Tensor of shape (N, 3) or (N, 3 K)
         Measured tip positions [m], as in `calibrate`.
     groups : array-like of shape (N,), optional
-        Motion of every row. Of one motion stretches are held out, without groups rows.
+        Motion of every row. Parts of a single motion are held out; without groups, rows.
     weights : array-like of shape (N,), optional
-        How many times each row counts.
+        How often each row counts.
     loss : str, default="linear"
         As in `calibrate`.
     outside : bool, default=True
-        Whether a correction will be learned and `io` counts; else the score is `cv`.
+        Whether the score uses `io`, because a correction will be learned; else it is `cv`.
     parameters : sequence of str, optional
-        The set to calibrate. Then the only choice is whether the tendons are elastic.
+        The set to calibrate. The only choice is then whether the tendons are elastic.
 
     Returns
     -------
     GeometryChoice
-        What to calibrate, and the errors of all sets.
+        The parameters to calibrate, and the errors of all sets.
     """
     one_of(loss, "loss", LOSSES)
     given, chain = chain, copy.deepcopy(chain).cpu()
@@ -181,17 +181,17 @@ def choose_geometry(
 
 
 def _best(errors: NDArray, sure: NDArray, enough: NDArray) -> int:
-    """Return which of K sets is taken.
+    """Return the index of the chosen one of K sets.
 
     Parameters
     ----------
     errors : ndarray of shape (K, 2)
-        Their `Errors`, of the smaller sets first.
+        Their `Errors`, smaller sets first.
     sure : ndarray of bool of shape (K,)
-        Whether all rows are enough for the parameters of a set; else it must be clearly better.
+        Whether all rows suffice for the parameters of a set; else it must be clearly better.
     enough : ndarray of bool of shape (K,)
-        Whether the inner rows are; else `io` is at most that of the last set of which they are,
-        times the ratio of their `cv`.
+        Whether the inner rows suffice; else `io` is at most that of the last set for which they
+        do, times the ratio of their `cv`.
     """
     cv, io = errors.T
     last = np.maximum.accumulate(np.where(enough, np.arange(len(cv)), 0))
@@ -213,7 +213,7 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
         rungs = [_Rung(_name(names), chain, names)]
         if elastic is not None:
             own = elastic.default_parameters
-            # A plain chain's lengths and radii compensate slack; elastic tendons need no change.
+            # Lengths and radii of a plain chain compensate for slack; elastic tendons keep them.
             kept = [name for name in names if name not in ("radii", "lengths", "actuator_zeros")]
             if names != chain.default_parameters:
                 own = (*kept, *(name for name in own if name not in ("radii", "lengths", *kept)))
@@ -224,7 +224,7 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
     elif isinstance(chain, ElasticTendonChain):
         sets = ((), ("base",), *_ELASTIC)
     else:
-        gain = () if chain.in_metres else ("gain",)  # of tendons it is in the radii
+        gain = () if chain.in_metres else ("gain",)  # for tendons the radii include it
         extensible = [(*names, *gain) for names in _EXTENSIBLE]
         sets = ((), ("base",), *(extensible if chain.lengths is None else _TENDONS))
     rungs = [_Rung(_name(names), chain, names) for names in sets]
@@ -240,10 +240,10 @@ def _name(names: tuple[str, ...]) -> str:
 
 
 def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]:
-    """Return where the fit of every set starts: guesses are searched where rings become free.
+    """Return the start of the fit of every set; initial guesses are searched if rings become free.
 
-    Other sets start from the one before; elastic tendons also from a plain chain whose rings are as
-    free.
+    Other sets start from the previous one; elastic tendons also from a plain chain with the same
+    free rings.
     """
     starts: list[Start | None] = []
     for chain, names, free in ((rung.chain, rung.parameters, _rings(rung)) for rung in rungs):
@@ -266,7 +266,7 @@ def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]
 
 
 def _rings(rung: _Rung) -> set[str]:
-    """Return what of the rings of actuators is free, as far as it takes a search."""
+    """Return the free parameters of the actuator rings that require a search."""
     free = {"angles" if name == "turns" else name for name in rung.parameters}
     return free & (
         {"angles"} if isinstance(rung.chain, ElasticTendonChain) else {"angles", "radii"}
@@ -274,14 +274,14 @@ def _rings(rung: _Rung) -> set[str]:
 
 
 def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
-    """Return the start of least error, each fitted roughly; the first where it is as good."""
+    """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
     fits = [solve(start.problem, rows, start.theta, loss, roughly=True) for start in starts]
     best = min(range(len(fits)), key=lambda k: fits[k].rmse * (1.0 + (k > 0) * _ALIKE))
     return starts[best]._replace(theta=fits[best].theta)
 
 
 def _splits(rows: Rows, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
-    """Return folds of motions or rows; of a single motion stretches of it."""
+    """Return folds of motions or rows; for a single motion, of parts of it."""
     n = len(rows.q)
     if groups is not None and len(np.unique(groups)) < 2:
         groups = np.arange(n) * 10 // n
@@ -295,7 +295,7 @@ def _errors(
     splits: list[tuple[int, NDArray, NDArray]],
     loss: str,
 ) -> Errors:
-    """Return the errors of a set; a split is (1, ...) of held-out rows, (0, ...) of outer ones."""
+    """Return the errors of a set; splits are (1, ...) of held-out rows, (0, ...) of outer rows."""
     totals = np.zeros((2, 2))  # of io and cv: weighted distances, and weights
     for kind, train, test in splits:
         chain, known, new = rung.chain, *(Rows(*(part[i] for part in rows)) for i in (train, test))
@@ -309,7 +309,7 @@ def _errors(
 
 
 def _tied(chain: Chain, q: Tensor) -> tuple[str, ...]:
-    """Return a warning where q leaves directions that move the tip unexcited."""
+    """Return a warning if q does not excite directions that move the tip."""
     n = chain.n_actuators
     if len(q) <= n:
         return ()
@@ -327,6 +327,6 @@ def _tied(chain: Chain, q: Tensor) -> tuple[str, ...]:
         move = move / move[np.argmax(np.abs(move))]
         words.append(" ".join(f"{at:+.2g} q[{k}]" for k, at in enumerate(move) if abs(at) > 0.05))
     return (
-        f"the log never moves {'; '.join(words)} (directions of q that move the tip): the model "
-        "extrapolates there. Record rows that move the actuators independently.",
+        f"the log has no motion along {'; '.join(words)} (directions of q that move the tip): "
+        "predictions there are extrapolation. Record rows that move the actuators independently.",
     )

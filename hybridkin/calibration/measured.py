@@ -1,4 +1,4 @@
-"""Measured rows before a fit: missing values, values that were scaled, folds of motions."""
+"""Checks of measured rows before a fit: missing values, scaled values; folds of motions."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sklearn.model_selection import GroupKFold, KFold
 from hybridkin._core.arrays import countable
 from hybridkin._core.turns import TURNS
 
-_INNER, _BEYOND = 0.4, 0.65  # of rows by distance: the inner ones, where the outer ones begin
+_INNER, _BEYOND = 0.4, 0.65  # fractions of rows by distance: end of the inner, start of the outer
 _EXCITED = 0.01  # of the largest spread
 
 
 def check_finite(**arrays: ArrayLike) -> None:
-    """Raise where rows of numbers hold NaN or infinity."""
+    """Raise if rows of numbers hold NaN or infinity."""
     for name, values in arrays.items():
         rows = np.asarray(values)
         if rows.ndim not in (1, 2) or rows.dtype.kind != "f" or countable(rows).all():
@@ -25,12 +25,12 @@ def check_finite(**arrays: ArrayLike) -> None:
         raise ValueError(
             f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(rows)} rows "
             f"(first: row {bad.argmax()}); leave these rows out (np.isfinite finds them), or "
-            "read the log by datasets.load_log(..., drop_invalid=True)."
+            "read the log with datasets.load_log(..., drop_invalid=True)."
         )
 
 
 def points(x: NDArray) -> NDArray:
-    """Return rows x (N, 3 K) of K points as (N, K, 3); rows of other lengths m as (N, 1, m)."""
+    """Return rows x (N, 3 K) of K points as (N, K, 3), rows of another length m as (N, 1, m)."""
     return x.reshape(len(x), -1, 3 if x.shape[1] % 3 == 0 else x.shape[1])
 
 
@@ -40,14 +40,14 @@ def distances(a: NDArray, b: NDArray) -> NDArray:
 
 
 def distance(a: NDArray, b: NDArray) -> NDArray:
-    """Return their distance row by row, (N,), of several points the mean of those measured."""
+    """Return the distance (N,) of two sets of rows; for several points the mean of the measured."""
     return np.nanmean(distances(a, b), axis=1)
 
 
 def with_missing_markers(x: NDArray, name: str) -> NDArray:
-    """Return rows x (N, 3 K) in which a marker that lacks a coordinate is NaN as a whole.
+    """Return rows x (N, 3 K) in which all coordinates of an incomplete marker are NaN.
 
-    Raise where a row has no marker at all, and where numbers are infinite.
+    Raise if a row has no complete marker, or if numbers are infinite.
     """
     missing = np.any(np.isnan(points(x)), axis=2)
     allowed = missing & ~np.all(missing, axis=1, keepdims=True)
@@ -56,7 +56,7 @@ def with_missing_markers(x: NDArray, name: str) -> NDArray:
 
 
 def check_unscaled(name: str, values: NDArray, meant: str) -> None:
-    """Raise where a scaler has turned all columns (N, k) into numbers without a unit."""
+    """Raise if all columns (N, k) seem to be scaled to numbers without a unit."""
     if len(values) < 3:
         return
     rows = values.astype(np.float64, copy=False)
@@ -67,16 +67,16 @@ def check_unscaled(name: str, values: NDArray, meant: str) -> None:
         raise ValueError(
             f"`{name}` must hold {meant} for this mechanical model, but looks like the output of "
             f"{scaler}; take it out of the pipeline. Error models scale their inputs themselves; "
-            "one that needs more can bring it: error_model=make_pipeline(StandardScaler(), ...)."
+            "one that does not can include it: error_model=make_pipeline(StandardScaler(), ...)."
         )
 
 
 def folds(
     X: Sized, groups: NDArray | None, most: int = 5, shuffle: bool = False
 ) -> list[tuple[NDArray, NDArray]]:
-    """Return training and held-out rows of at most so many folds of whole groups, or of rows.
+    """Return training and held-out rows of at most `most` folds of whole groups, or of rows.
 
-    Rows are always shuffled, groups where asked.
+    Rows are always shuffled, groups only if `shuffle`.
     """
     n_folds = min(most, len(X) if groups is None else len(np.unique(groups)))
     if n_folds < 2:
@@ -92,11 +92,11 @@ def folds(
 
 
 def moved_directions(X: NDArray) -> tuple[NDArray, NDArray | None]:
-    """Return the mean of rows X (N, n), and the map M (n, n) of changes dq @ M to those they make.
+    """Return the mean of rows X (N, n), and M (n, n): dq @ M projects on directions they excite.
 
-    M is None where the rows move q every way. Tendons that are commanded in balance never move
-    together; what the rows say of such a direction is rounding. Directions are compared in units of
-    the ranges.
+    M is None if the rows excite all directions of q. For example, tendons that are commanded in
+    balance never move together: in that direction the rows contain only rounding errors. Directions
+    are compared in units of the ranges.
     """
     X = X.astype(np.float64)
     mean, scale = X.mean(axis=0), 0.5 * np.ptp(X, axis=0)
@@ -111,8 +111,8 @@ def moved_directions(X: NDArray) -> tuple[NDArray, NDArray | None]:
 def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:
     """Return the inner 40 % and the outer 35 % of rows by Mahalanobis distance from the mean.
 
-    The rows between are left out, so that the outer ones are an extrapolation. Directions that are
-    not excited do not count.
+    The rows between are left out, so that predictions of the outer rows are extrapolation.
+    Directions that are not excited are ignored.
     """
     axes, spread, _ = np.linalg.svd(X - X.mean(axis=0), full_matrices=False)
     excited = spread > _EXCITED * spread.max(initial=0.0)

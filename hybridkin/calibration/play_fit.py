@@ -1,4 +1,4 @@
-"""Backlash (play) of the actuators from a log, chosen by held-out motions."""
+"""Backlash (also called play) of the actuators from a log, chosen by held-out motions."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _WIDTHS = np.array([0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3])  # [m]
 
 @dataclass(frozen=True)
 class PlayFit:
-    """Backlash (play) identified from a log, and the chain calibrated with it.
+    """Backlash (also called play) identified from a log, and the chain calibrated with it.
 
     Attributes
     ----------
     width : float
-        Chosen play [m]; zero where none was kept.
+        Chosen play [m]; zero if none was kept.
     widths : ndarray of shape (W,)
-        Widths tried [m], ascending, the first zero; doubled ones where the largest was the best.
+        Widths tried [m], ascending from zero, including doubled ones if the largest was the best.
     cv_rmse : ndarray of shape (W,)
-        Root mean square tip distance on held-out motions, with each width [m].
+        Root mean square tip distance on held-out motions for each width [m].
     gain : float
-        By how much the best width lowers the error of a fold, on average [m].
+        Mean reduction of the error of a fold by the best width [m].
     gain_std_error : float
         Standard error of `gain` over the folds [m].
     kept : bool
@@ -54,7 +54,7 @@ class PlayFit:
 
     @property
     def play(self) -> PlayOperator:
-        """The operator to put before ``result.chain``."""
+        """The operator to apply to q before ``result.chain``."""
         return PlayOperator(self.width)
 
 
@@ -67,41 +67,41 @@ def fit_play(
     parameters: Sequence[str] | None = None,
     **calibrate_options: Any,
 ) -> PlayFit:
-    """Return the backlash (play) of the tendons, chosen by held-out motions, and the chain.
+    """Return the backlash (also called play) of the tendons, and the chain calibrated with it.
 
-    With every width the chain is calibrated on the effective changes of the training motions and
-    evaluated on the others, in at most 5 folds. The best width is kept only where its gain over no
-    play, averaged over the folds, exceeds its standard error. Calibrations of folds issue no
-    warnings; that of all rows does.
+    For every width the chain is calibrated on the effective changes of the training motions and
+    evaluated on the held-out motions, in at most 5 folds. The best width is kept only if its mean
+    gain over zero play exceeds the standard error of the gain. Only the calibration to all rows
+    issues warnings.
 
     Parameters
     ----------
     chain : ElasticTendonChain, ConstantCurvatureChain or another Chain
         Start of the calibration; it is not changed.
     q : array or Tensor of shape (N, n_actuators)
-        Commanded tendon length changes, the rows of one motion in the order of time [m].
+        Commanded tendon length changes, the rows of each motion in order of time [m].
     x : array or Tensor of shape (N, 3)
         Measured tip positions [m].
     groups : array-like of shape (N,)
-        Motion of every row; the play of each starts afresh.
+        Motion of every row; each motion starts with a new play state.
     widths : sequence of float, optional
         Total play to try, the same for all tendons [unit of q]. Default: 0, 0.05, 0.1, 0.2 and
-        0.4 mm, of a chain with gains by the mean of these. Zero is always tried. While the largest
-        width is the best, twice that width is tried as well, up to the largest range of q.
+        0.4 mm, divided by the mean gain of a chain with gains. Zero is always tried. While the
+        largest width is the best, twice that width is tried too, up to the largest range of q.
     parameters : sequence of str, optional
-        What to calibrate, see `calibrate`. Default: the chain's own list.
+        Parameters to calibrate, see `calibrate`. Default: the chain's own list.
     **calibrate_options
         `loss`, `prior` and `bounds` of `calibrate`.
 
     Returns
     -------
     PlayFit
-        ``.play`` and ``.result.chain`` make the model.
+        ``.play`` followed by ``.result.chain`` is the model.
 
     Raises
     ------
     ValueError
-        For fewer than two motions, negative widths, and what `calibrate` raises.
+        For fewer than two motions or negative widths, and as in `calibrate`.
 
     References
     ----------

@@ -1,1 +1,1 @@
-"""Mechanical models: constant curvature, elastic tendons, rigid arms; robots and backlash."""
+"""Mechanical models: constant curvature, elastic tendons, rigid arms, robots, backlash."""

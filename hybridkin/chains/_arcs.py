@@ -1,7 +1,7 @@
 """Kernels of constant curvature: lengths from arcs, tips and derivatives from arcs.
 
-Batches come last here: lengths (S, N), bending vectors (2, S, N), vectors (3, N). The formulas are
-written by components: `fma(a, b, c)` is a + b c and `fms(a, b, c)` is a - b c.
+The batch comes last here: lengths (S, N), bending vectors (2, S, N), vectors (3, N). Formulas are
+in components: `fma(a, b, c)` is a + b c and `fms(a, b, c)` is a - b c.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ fms = partial(torch.addcmul, value=-1.0)
 
 
 class _Carried(NamedTuple):
-    """A point in the start frame of a segment, and what its derivatives need."""
+    """A point in the start frame of a segment, and values that its derivatives use."""
 
     point: Vector  # in the start frame
-    tail: Vector  # in the end frame, the rigid offset included
-    rest: Tensor  # length less the tail along the bending
-    across: Tensor  # how far the point moves across, per bending
+    tail: Vector  # in the end frame, including the rigid offset
+    rest: Tensor  # length minus the component of the tail along the bending
+    across: Tensor  # transverse motion of the point per bending
 
 
 def _carried(point: Vector, length: Tensor, b: Bending, arc: Stumpff, offset: Tensor) -> _Carried:
-    """Return a point of the frame after a segment's rigid offset in the segment's start frame."""
+    """Return a point, given in the frame after a segment's offset, in the segment's start frame."""
     x, y, z = point
     c, f, g, _, _ = arc
     z = z + offset
@@ -44,10 +44,10 @@ def _carried(point: Vector, length: Tensor, b: Bending, arc: Stumpff, offset: Te
 
 
 def _columns(at: _Carried, b: Bending, arc: Stumpff) -> tuple[Vector, Vector, Vector]:
-    """Return the derivatives of a carried point by (l, bx, by) of the segment."""
+    """Return the derivatives of a carried point with respect to the segment's (l, bx, by)."""
     (bx, by), (x, y, z), m = b, at.tail, at.across
     _, f, g, c3, c4 = arc
-    slope_f, slope_g = c3 - g, 2.0 * c4 - c3  # twice the derivatives by s
+    slope_f, slope_g = c3 - g, 2.0 * c4 - c3  # twice the derivatives df/ds, dg/ds
     to = fma(slope_g * at.rest, slope_f, z)
     n = fms(slope_f * at.rest, f, z)
     to_x, to_y = fms(to * bx, g, x), fms(to * by, g, y)
@@ -59,7 +59,7 @@ def _columns(at: _Carried, b: Bending, arc: Stumpff) -> tuple[Vector, Vector, Ve
 
 
 def _turned(v: Sequence[Tensor], b: Bending, arc: Stumpff) -> Vector:
-    """Return vectors of a segment's end frame in its start frame."""
+    """Return vectors, given in a segment's end frame, in its start frame."""
     c, f, g, _, _ = arc
     along = fma(b[0] * v[0], b[1], v[1])
     m = fms(f * v[2], g, along)
@@ -67,9 +67,9 @@ def _turned(v: Sequence[Tensor], b: Bending, arc: Stumpff) -> Vector:
 
 
 def tip(length: Tensor, bending: Tensor, offsets: Tensor, beside: Sequence[float]) -> Tensor:
-    """Return the tip (3, N) in the base frame, carried from the last segment to the first.
+    """Return the tip (3, N) in the base frame, transformed from the last segment to the first.
 
-    `beside` is where it is in the frame after the last rigid offset [m].
+    `beside` is the position of the tip in the frame after the last rigid offset [m].
     """
     return torch.stack(_all_carried(length, bending, offsets, beside)[0][0].point)
 
@@ -85,14 +85,14 @@ def tip_and_columns(
 ) -> tuple[Tensor, Tensor]:
     """Return the tip (3, N) and its derivatives by the arcs of the segments, (3, 3 S, N).
 
-    Columns are the lengths of all segments, then the x-, then the y-bendings. With `angular`,
-    3 S columns of angular velocity follow, with `rigid`, S columns for the offsets.
+    Columns belong to the lengths of all segments, then the x-, then the y-bendings. `angular` adds
+    3 S columns of angular velocity, `rigid` adds S columns for the offsets.
     """
     carried, segments, (x, y), arc = _all_carried(length, bending, offsets, beside)
     tx, ty, tz = (torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
     rest = torch.stack([at.rest for at in carried])
     across = torch.stack([at.across for at in carried])
-    # The segments' own columns all at once, then turned by every segment before them.
+    # Columns of all segments in their own start frames, then turned by all earlier segments.
     at = _Carried(carried[0].point, (tx, ty, tz), rest, across)
     entries = [entry for column in _columns(at, (x, y), arc) for entry in column]
     if angular:
@@ -112,7 +112,7 @@ def _all_carried(
 ) -> tuple[list[_Carried], list[tuple[Bending, Stumpff]], Bending, Stumpff]:
     """Return the tip in the start frame of every segment, and the segments' bendings and arcs.
 
-    These for each segment by itself, then of all segments.
+    Bendings and arcs are returned segment by segment, then stacked.
     """
     x, y = bending.unbind()
     arc = stumpff(torch.addcmul(x * x, y, y))
@@ -129,7 +129,7 @@ def _all_carried(
 
 
 def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:
-    """Return the nine entries of the angular velocity by (l, bx, by), each (S, N)."""
+    """Return the nine entries of the angular velocity per (l, bx, by), each (S, N)."""
     zero, c3, g = torch.zeros_like(x), arc.c3, arc.g
     by_x = -c3 * x * y, 1.0 - c3 * y * y, -g * y
     by_y = c3 * x * x - 1.0, c3 * x * y, g * x
@@ -137,7 +137,7 @@ def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:
 
 
 def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
-    """Return the transforms (..., S, 4, 4) from segment ends, offsets included, to their starts."""
+    """Return the transforms (..., S, 4, 4) from segment ends after offsets to segment starts."""
     arc = stumpff(bending.square().sum(-1))
     x, y = bending.unbind(-1)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
@@ -153,9 +153,9 @@ def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
 
 
 def levers(radii: Tensor, angles: Tensor, counts: Sequence[int]) -> Tensor:
-    """Return where every actuator crosses its segment's cross-section (..., 2, n) [m].
+    """Return the position of every actuator in its segment's cross-section (..., 2, n) [m].
 
-    The inputs may carry leading dimensions alike.
+    The inputs may have the same leading dimensions.
     """
     repeats = torch.tensor(counts, device=radii.device)
     radius = radii.repeat_interleave(repeats, dim=-1, output_size=sum(counts))
@@ -178,9 +178,9 @@ def reading_matrix(levers: Tensor, counts: Sequence[int], starts: Sequence[int])
 
 
 def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
-    """Return how the actuators of a segment (n,) read its bending besides its length, (2, n) [-].
+    """Return how a segment's bending changes the lengths of its n actuators, (2, n) [-].
 
-    Rows are its x and y; of an extensible segment a common change is one of the length.
+    Rows are x and y. Without the mean if the segment is extensible: that is a change of its length.
     """
     at = torch.stack([angles.cos(), angles.sin()])
     return at - at.mean(dim=1, keepdim=True) if extensible else at
@@ -189,8 +189,8 @@ def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
 def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Sequence[int]) -> Tensor:
     """Return the projector (3 S, 3 S) on the arcs that the actuators of each segment determine.
 
-    Those are its length if it is extensible, and of its bending both components, none, or the one
-    in the plane of its actuators: `bends` of them.
+    These are its length if it is extensible, and `bends` components of its bending: both, none, or
+    the one in the plane of its actuators.
     """
     S = len(bends)
     shares = [*map(float, extensible), *(0.5 * n for n in (*bends, *bends))]
@@ -207,7 +207,7 @@ def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Seque
 
 
 def rolled(poses: Tensor, angle: Tensor) -> Tensor:
-    """Return poses (..., K, 4, 4), all but the first turned by an angle (..., 1) about their z."""
+    """Return poses (..., K, 4, 4), all but the first turned by an angle (..., 1) about own z."""
     moves = torch.arange(poses.shape[-3], device=poses.device) > 0
     angle = (angle * moves)[..., None, None]
     c, s = angle.cos(), angle.sin()
@@ -216,10 +216,10 @@ def rolled(poses: Tensor, angle: Tensor) -> Tensor:
 
 
 def turned_by_first(arcs: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
-    """Return arcs (3 S, N) with all bendings turned by an angle [rad] that is their first length.
+    """Return arcs (3 S, N) with all bendings turned by an angle [rad] given as the first length.
 
-    That length becomes zero. `slope` (3 S, K, N) are changes of the arcs; those of the turned arcs
-    are returned.
+    That length becomes zero. `slope` (3 S, K, N) holds changes of the arcs; the changes of the
+    turned arcs are returned too.
     """
     S = len(arcs) // 3
     c, s, slope = arcs[0].cos(), arcs[0].sin(), slope.expand(-1, -1, arcs.shape[1])

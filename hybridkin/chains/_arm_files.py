@@ -1,4 +1,4 @@
-"""Rigid arms as others describe them: the joints from a root to an end, of MJCF and chains."""
+"""Rigid arms from other formats: the joints from a root to an end, of MJCF and of chains."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain
 
 UNLIMITED = (-math.inf, math.inf)
-_BYTES = 4_000_000  # of a robot description
+_BYTES = 4_000_000  # largest size of a robot description
 _MOST = 1000  # moving joints
 _SIZES, _MOST_COPIES = ("count", "nrow", "ncol", "width", "height"), 4e6
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
@@ -33,14 +33,14 @@ class Joint(NamedTuple):
     origin: NDArray
     kind: str = "fixed"
     axis: ArrayLike = (0.0, 0.0, 1.0)
-    name: str = ""  # of the actuator that moves it, which is another joint's where it mimics one
+    name: str = ""  # of its actuator; for a mimic joint, of the joint that it mimics
     limits: Sequence[float] | None = None  # of that actuator
     speed: float = math.inf
-    factor: float = 1.0  # times the actuator is the joint's position
+    factor: float = 1.0  # joint position per actuator position
 
 
 def moving_joints(path: list[Joint]) -> dict[str, Any]:
-    """Return the arguments of a `RigidChain`, fixed joints folded into the poses of the others."""
+    """Return the arguments of a `RigidChain`, with fixed joints merged into the other poses."""
     moving: list[Joint] = []
     pending = np.eye(4)
     for joint in path:
@@ -69,7 +69,7 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
 
 
 def _limits(joint: Joint) -> tuple[float, float]:
-    """Return the limits of a joint: infinite without any; equal ones lock it."""
+    """Return the limits of a joint: infinite if it has none; equal limits lock it."""
     low, high = UNLIMITED if joint.limits is None else map(float, joint.limits)
     if not low <= high or math.inf in (low, -high):
         raise ValueError(
@@ -80,7 +80,7 @@ def _limits(joint: Joint) -> tuple[float, float]:
 
 
 def source_of(text_or_path: str | PathLike[str]) -> str | Path:
-    """Return XML text as it is, else the path of an existing file."""
+    """Return XML text unchanged, or the path of an existing file."""
     if isinstance(text_or_path, str) and text_or_path.lstrip().startswith("<"):
         return text_or_path.lstrip()
     path = Path(text_or_path)
@@ -138,9 +138,9 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
 
 
 def _check_sizes(data: bytes) -> None:
-    """Raise where an MJCF asks for copies or arrays without bound, or has NaN.
+    """Raise if an MJCF requests too many copies or too large arrays, or has NaN.
 
-    MuJoCo checks neither; of NaN it writes a file. Files that the MJCF includes are its own affair.
+    MuJoCo checks neither, and writes a file for NaN. Included files are not checked here.
     """
     parser, copies = ParserCreate(), [1.0]
 
@@ -157,12 +157,12 @@ def _check_sizes(data: bytes) -> None:
         copies.append(size if tag == "replicate" else copies[-1])
 
     parser.StartElementHandler, parser.EndElementHandler = start, lambda _: copies.pop()
-    with suppress(ExpatError):  # MuJoCo judges the rest
+    with suppress(ExpatError):  # MuJoCo reports other errors
         parser.Parse(data, True)
 
 
 def _mjcf_joints(model: Any, body: int) -> list[Joint]:
-    """Return the steps of one body: its pose, then every joint about its own anchor."""
+    """Return the joints of one body: its fixed pose, then every joint about its own anchor."""
     steps = [Joint(_mjcf_pose(model.body_pos[body], model.body_quat[body]))]
     first = model.body_jntadr[body]
     for j in range(first, first + model.body_jntnum[body]):
@@ -170,10 +170,10 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
         if kind not in _MJCF_KINDS:
             raise ValueError(
                 f"joint {name!r} of body {model.body(body).name!r} is free or a ball; only hinges "
-                "and slides are supported on the way to `end_link`; choose a `root_link` after it."
+                "and slides are supported on the path to `end_link`; use a `root_link` after it."
             )
         axis, anchor, zero = model.jnt_axis[j], model.jnt_pos[j], model.qpos0[model.jnt_qposadr[j]]
-        # MuJoCo ignores a range that is not in order; the default, two zeros, stands for none.
+        # MuJoCo ignores a range that is not in order; the default, two zeros, means no limits.
         limits = tuple(model.jnt_range[j].tolist())
         if not model.jnt_limited[j] and (limits[0] < limits[1] or not any(limits)):
             limits = None
@@ -209,7 +209,7 @@ def chain_path(chain: Chain) -> list[Joint]:
         if len(frame.children) > 1:
             raise ValueError(
                 f"`chain` must be serial, but {name!r} has {len(frame.children)} children; choose "
-                "one end by pytorch_kinematics.SerialChain(chain, end_frame_name)."
+                "one end with pytorch_kinematics.SerialChain(chain, end_frame_name)."
             )
         origin = np.eye(4)
         for offset in (frame.link.offset, frame.joint.offset):
@@ -217,6 +217,6 @@ def chain_path(chain: Chain) -> list[Joint]:
                 origin = origin @ offset.get_matrix()[0].detach().cpu().double().numpy()
         joint = frame.joint
         axis = joint.axis.detach().cpu().double().numpy()
-        limits = joint.limits if any(joint.limits or ()) else None  # two zeros: none in an MJCF
+        limits = joint.limits if any(joint.limits or ()) else None  # two zeros mean none
         path.append(Joint(origin, joint.joint_type, axis, joint.name, limits))
     return path

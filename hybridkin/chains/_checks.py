@@ -1,4 +1,4 @@
-"""Geometry as a user writes it: turned into tensors, checked, with messages that help."""
+"""Checks of a user's geometry and its conversion to tensors, with messages that help."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arcs import bend_readings
 
 _ROUTINGS = ("segment", "base")
-_DETERMINED = 1e-6  # least share of a reading that determines a direction
-_MOST_UNLIKE = 1000.0  # radii of one robot; more leave too few digits to the routing "base"
+_DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
+_MOST_UNLIKE = 1000.0  # ratio of radii; more leave too few digits with the routing "base"
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
 def float_dtype(dtype: Any) -> torch.dtype:
-    """Return the precision that torch, NumPy or a string names."""
+    """Return the torch dtype given by torch, NumPy or a string."""
     name = str(np.dtype(dtype) if isinstance(dtype, type) else dtype).removeprefix("torch.")
     if name not in ("float64", "float32"):
         raise ValueError(f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}.")
@@ -63,7 +63,7 @@ def arc_geometry(
     base: Numbers | Transform | None,
     dtype: torch.dtype,
 ) -> tuple[tuple[int, ...], tuple[bool, ...], dict[str, Tensor]]:
-    """Return how many actuators each segment has, if it is extensible, and its geometry."""
+    """Return the number of actuators of each segment, whether it is extensible, its geometry."""
     radii = lengths_of(radii, "radii", dtype)
     if radii.max() > _MOST_UNLIKE * radii.min():
         raise ValueError(
@@ -99,7 +99,7 @@ def arc_geometry(
 def path_starts(routing: str, counts: Sequence[int], extensible: Sequence[bool]) -> tuple[int, ...]:
     """Return the first segment that the actuators of each segment run through.
 
-    What a rigid stage carries starts behind it.
+    Actuators carried by a rigid stage start after it.
     """
     one_of(routing, "routing", _ROUTINGS)
     S = len(counts)
@@ -108,16 +108,16 @@ def path_starts(routing: str, counts: Sequence[int], extensible: Sequence[bool])
     stages = [extensible[k] and counts[k] == 1 for k in range(S)]
     if len({extensible[k] for k in range(S) if not stages[k]}) > 1:
         raise ValueError(
-            "`routing` must be 'segment' where tendons would run through extensible segments of "
-            "several actuators, or the reverse, got 'base'; what they read is not defined."
+            "`routing` must be 'segment' if tendons would run through extensible segments of "
+            "several actuators, or the reverse, got 'base'; their lengths would not be defined."
         )
     return tuple(itertools.accumulate((k * stages[k - 1] for k in range(S)), max))
 
 
 def bend_counts(angles: Sequence[Tensor], extensible: Sequence[bool]) -> tuple[int, ...]:
-    """Return in how many directions the actuators of each segment bend it: 2, of a plane 1.
+    """Return the number of directions in which each segment bends: 2, or 1 in a plane.
 
-    A single actuator of an extensible segment bends nothing.
+    It is 0 for an extensible segment with a single actuator.
     """
     found = []
     for own, stretches in zip(angles, extensible, strict=True):
@@ -132,13 +132,13 @@ def bend_counts(angles: Sequence[Tensor], extensible: Sequence[bool]) -> tuple[i
             raise ValueError(
                 "`angles` must determine the bending of every segment, got "
                 f"{[row.tolist() for row in angles]}; give the actuators of a segment clearly "
-                "different angles [rad], or lay them in one plane exactly: psi and psi + math.pi."
+                "different angles [rad], or exactly planar ones: psi and psi + math.pi."
             )
     return tuple(found)
 
 
 def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
-    """Return the arguments of which a stored chain is made, from its entries of these names."""
+    """Return the constructor arguments of a stored chain, from its entries of these names."""
     counts = stored.list_of(int, "actuators_per_segment")
     may_lack = ("lengths", "gains")
     given: dict[str, Any] = {
@@ -147,11 +147,11 @@ def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
     if sum(counts) != len(given["angles"]):
         raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
     given["angles"] = np.split(given["angles"], np.cumsum(counts)[:-1])
-    if "stage" in stored.settings:  # files of before have neither stages nor planes
+    if "stage" in stored.settings:  # older files have neither stages nor planes
         lengths, flags = iter(given.pop("lengths", ())), stored.list_of(bool, "extensible")
         given["lengths"] = [None if own else next(lengths, math.nan) for own in flags]
         given["stage"] = stored.value("stage", (str, None))
-        # A plane stays one where calibrated angles have left it a little.
+        # Planar actuators stay planar, although calibration has moved their angles slightly.
         pairs = zip(given["angles"], stored.list_of(int, "bends"), strict=True)
         given["angles"] = [math.pi * (np.arange(len(a)) % 2) if n == 1 else a for a, n in pairs]
     return {**given, "routing": stored.value("routing", str), "n_actuators": counts}
@@ -164,9 +164,9 @@ def numeric(
     *,
     finite: bool = True,
 ) -> Tensor:
-    """Return numbers as a tensor that shares no memory with them; NaN and infinity raise.
+    """Return a copy of numbers as a tensor; NaN and infinity raise.
 
-    With ``finite=False`` only NaN does.
+    With ``finite=False`` only NaN raises.
     """
     tensor = torch.tensor(real_array(value, name), dtype=dtype, device="cpu")
     if (not torch.isfinite(tensor).all() and finite) or torch.isnan(tensor).any():
@@ -188,7 +188,7 @@ def shaped(
 
 
 def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
-    """Return `q_min`, `q_max` and `dq_max`, shape (n,), infinite where they are None."""
+    """Return `q_min`, `q_max` and `dq_max`, shape (n,), infinite if given as None."""
     limits, ends = {}, {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
     for (name, end), value in zip(ends.items(), given, strict=True):
         value = np.full(n, end) if value is None else value
@@ -267,7 +267,7 @@ def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Te
 
 
 def rigid_pose(value: Numbers, name: str) -> Tensor:
-    """Return a pose whose rotation is orthonormal to the last bit, checked."""
+    """Return a checked pose whose rotation is made orthonormal to rounding."""
     matrix = pose(value, name, torch.float64)
     u, _, vh = torch.linalg.svd(matrix[:3, :3])
     matrix[:3, :3] = u @ vh

@@ -1,8 +1,8 @@
 """Kinematics of rigid arms: tips, frames and Jacobian columns from the motions of the joints.
 
-Every joint moves by T(q) = B_0 + u_1(q) B_1 + u_2(q) B_2 with three constant matrices: u_1, u_2
-are sin q and cos q of a revolute joint (Rodrigues' formula), q and nothing of a prismatic one.
-Batches come last in the results, vectors are (3, N); all are in the base frame.
+Every joint moves by T(q) = B_0 + u_1(q) B_1 + u_2(q) B_2 with three constant matrices. (u_1, u_2)
+is (sin q, cos q) for a revolute joint (Rodrigues' formula) and (q, unused) for a prismatic one.
+The batch comes last in the results: vectors are (3, N), in the base frame.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ FAR = 10.0  # [m]; a joint that slides further is more likely in millimetres
 
 
 def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor) -> Tensor:
-    """Return B_0, B_1, B_2 of every joint, its origin included, shape (n, 3, 4, 4).
+    """Return B_0, B_1, B_2 of every joint, including its origin, shape (n, 3, 4, 4).
 
-    `zeros` (n,) are the positions at which the joints have not moved from their origins.
+    `zeros` (n,) are the positions at which the joints are at their origins.
     """
     motions = origins.new_zeros(len(axes), 3, 4, 4)
     motions[:, 0, 3, 3] = 1.0
@@ -36,7 +36,7 @@ def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor) 
     motions[:, 1, :3, :3] = torch.where(slide, 0.0, torch.linalg.cross(eye[None], axes[:, None]))
     motions[:, 2, :3, :3] = torch.where(slide, 0.0, eye - along)
     motions[:, 1, :3, 3] = torch.where(slides[:, None], axes, 0.0)
-    # T(q - zero), by the sine and cosine of a difference of angles.
+    # T(q - zero), from the sine and cosine of a difference of angles.
     still, by_u1, by_u2 = motions.unbind(1)
     zero = zeros[:, None, None]
     turn = torch.where(slide, 0.0, zero)
@@ -47,16 +47,16 @@ def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor) 
 
 
 def column_carriers(motions: Tensor, origins: Tensor, axes: Tensor) -> Tensor:
-    """Return what `last_frame_and_joints` multiplies a frame by at every joint, shape (n, 13, 4).
+    """Return the matrices that `last_frame_and_joints` applies at every joint, shape (n, 13, 4).
 
-    From the columns of one frame to those of the next, times 1, u_1 and u_2, and to the axis.
+    They map the columns of a frame to the next frame's parts times 1, u_1, u_2, and to the axis.
     """
     directions = nn.functional.pad(origins[:, :3, :3] @ axes[..., None], (0, 0, 0, 1))
     return torch.cat([motions.mT.flatten(1, 2), directions.mT], dim=1)
 
 
 def shares(rows: Tensor, slides: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return u_1 and u_2 of every joint in rows q (N, n); `slides` is None where no joint does."""
+    """Return u_1, u_2 of all joints in rows q (N, n); `slides` is None without prismatic ones."""
     first = rows.sin()
     if slides is not None:
         first = torch.where(slides.to(rows.device), rows, first)
@@ -64,7 +64,7 @@ def shares(rows: Tensor, slides: Tensor | None) -> tuple[Tensor, Tensor]:
 
 
 def carried_tip(u1: Tensor, u2: Tensor, motions: Tensor, end: Tensor) -> Tensor:
-    """Return the homogeneous tip (4, N), carried from the last joint's frame to the base."""
+    """Return the homogeneous tip (4, N), transformed from the last joint's frame to the base."""
     p = end[:, None].expand(4, len(u1))
     joints = zip(motions.flatten(1, 2).unbind(), u1.T.unbind(), u2.T.unbind(), strict=True)
     for motion, of_u1, of_u2 in reversed([*joints]):
@@ -87,10 +87,10 @@ def last_frame_and_joints(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the last moving frame (4, 3, N), joint axes and joint positions (n, 3, N).
 
-    Of the frame these are its three axes and its origin.
+    The frame is given by its three axes and its origin.
     """
     n_rows, n = u1.shape
-    # Three coordinates of every row side by side, so that a joint costs one small product.
+    # With the three coordinates of all rows side by side, a joint costs one small product.
     u1, u2 = (part.T.repeat(1, 3) for part in (u1, u2))
     frame = torch.eye(4, dtype=u1.dtype, device=u1.device)[:, :3].repeat_interleave(n_rows, 1)
     axes, points = [frame[:0]], [frame[:0]]
@@ -113,7 +113,7 @@ class JointChain(Chain):
 
     @property
     def reach(self) -> Tensor:
-        """The natural size of the arm, shape () [m]: links, finite strokes and tool end to end."""
+        """Size of the arm, shape () [m]: the sum of links, finite strokes and tool."""
         strokes = torch.maximum(self.q_min.abs(), self.q_max.abs())
         strokes = torch.where(torch.isfinite(strokes), strokes, 0.0)
         if self.couplings is not None:
@@ -127,8 +127,8 @@ class JointChain(Chain):
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name.
 
-        Besides entries of the constructor "links", shape (n_joints, 3) [m]: where the origin of
-        every joint lies in the frame that the joint before it moves. The last link is the `tool`.
+        Besides arguments of the constructor this has "links", shape (n_joints, 3) [m]: the origin
+        of every joint in the moving frame of the previous joint. The last link is the `tool`.
         """
         return {**super().geometry(), "links": self.origins[:, :3, 3]}
 
@@ -148,7 +148,7 @@ class JointChain(Chain):
 
     @property
     def turns(self) -> Tensor:
-        """Which actuators turn joints, shape (n,): a whole turn more changes nothing."""
+        """Which actuators are angles with a period of one turn, shape (n,), bool."""
         if self.couplings is None:
             return ~self.slides
         still = torch.where(self.slides[:, None], 0.0, self.couplings.round())
@@ -156,14 +156,14 @@ class JointChain(Chain):
 
     @property
     def units(self) -> list[str]:
-        """The unit of every actuator: "rad" where it turns a joint, else "m"."""
+        """The unit of every actuator: "rad" if it turns a joint, else "m"."""
         turns = ~self.slides
         if self.couplings is not None:
             turns = (self.couplings[turns] != 0.0).any(0)
         return ["rad" if turn else "m" for turn in turns.tolist()]
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the joint positions of rows q (N, n), and how q moves them, (n_joints, n)."""
+        """Return the joint positions at rows q (N, n), and their derivative (n_joints, n)."""
         if self.couplings is None:
             return super().coordinates(q)
         return q @ self.couplings.to(q).mT, self.couplings.to(q)
@@ -174,7 +174,7 @@ class JointChain(Chain):
         return (self.base.to(z)[:3] @ p).T
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the tip (N, 3) and its derivative by the joint positions (N, 3, n_joints)."""
+        """Return the tip (N, 3) and its Jacobian by the joint positions (N, 3, n_joints)."""
         tip, linear, _, _ = self._columns(z)
         base = self.base.to(z)
         return (base[:3, :3] @ tip + base[:3, 3:]).T, self._in_measuring_frame(linear, z)
@@ -185,7 +185,7 @@ class JointChain(Chain):
         Parameters
         ----------
         q : Tensor of shape (..., n_actuators)
-            Joint positions [rad], of prismatic joints [m].
+            Joint positions [rad]; [m] for prismatic joints.
 
         Returns
         -------
@@ -220,18 +220,18 @@ class JointChain(Chain):
         return pose, J
 
     def poses(self, q: Tensor) -> Tensor:
-        """Return the pose of the base and of the link that every joint moves.
+        """Return the pose of the base and of the link moved by each joint.
 
         Parameters
         ----------
         q : Tensor of shape (..., n_actuators)
-            Joint positions [rad], of prismatic joints [m].
+            Joint positions [rad]; [m] for prismatic joints.
 
         Returns
         -------
         Tensor of shape (..., n_joints + 1, 4, 4)
-            Homogeneous transforms into the measuring frame; the last one is the tip: the end link
-            moved to its tool.
+            Homogeneous transforms into the measuring frame; the last one is that of the tip: the
+            end link's frame, shifted to the tool.
         """
         frames = self._frames(q)
         end = torch.cat([self.tip.to(q)[:, :3], self._end(q)[:, None]], dim=1)
@@ -247,9 +247,9 @@ class JointChain(Chain):
         Parameters
         ----------
         q : Tensor of shape (..., n_actuators)
-            Joint positions [rad], of prismatic joints [m].
+            Joint positions [rad]; [m] for prismatic joints.
         n_points : int, default=1
-            Points per line; the last of each is its end.
+            Points per line; the last one is the end of the line.
 
         Returns
         -------
@@ -264,7 +264,7 @@ class JointChain(Chain):
         return torch.cat([corners[..., :1, :], torch.lerp(start, end, t).flatten(-3, -2)], dim=-2)
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return warnings where joints turn by more than two turns, or slide far."""
+        """Return warnings if joints turn by more than two turns, or slide too far."""
         turns = torch.tensor([unit == "rad" for unit in self.units], device=q.device)
         turned = degrees_message(name, q[:, turns].abs(), factor)
         slid = millimetres_message(name, q[:, ~turns].abs(), factor * FAR)
@@ -279,12 +279,12 @@ class JointChain(Chain):
         return f"this arm has {self.n_actuators} moving joints"
 
     def _joints(self, q: Tensor) -> Tensor:
-        """Return the joint positions of q (..., n), as rows (N, n_joints)."""
+        """Return the joint positions at q (..., n), as rows (N, n_joints)."""
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         return self.coordinates(q.reshape(math.prod(q.shape[:-1]), self.n_actuators))[0]
 
     def _by_actuators(self, J: Tensor) -> Tensor:
-        """Return derivatives by q of those by the joint positions (N, m, n_joints)."""
+        """Return Jacobians by q from Jacobians by the joint positions (N, m, n_joints)."""
         return J if self.couplings is None else J @ self.couplings.to(J)
 
     def _shares(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -303,8 +303,8 @@ class JointChain(Chain):
     def _columns(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return tip (3, N), its derivatives and the joint axes (n_joints, 3, N), and a frame.
 
-        All are in the base frame, at joint positions (N, n_joints); of the last joint's moving
-        frame (4, 3, N) these are the three axes and the origin.
+        All are in the base frame, at joint positions (N, n_joints). The frame (4, 3, N) holds the
+        three axes and the origin of the last joint's moving frame.
         """
         shares, carriers = self._shares(z), self.carriers.to(z)
         frame, axes, points = last_frame_and_joints(*shares, carriers)
@@ -316,7 +316,7 @@ class JointChain(Chain):
         return tip, columns, axes, frame
 
     def _in_measuring_frame(self, columns: Tensor, q: Tensor) -> Tensor:
-        """Return columns (n_joints, 3, N) of the base frame as a Jacobian (N, 3, n_joints)."""
+        """Return columns (n_joints, 3, N), in the base frame, as a Jacobian (N, 3, n_joints)."""
         return (self.base.to(q)[:3, :3] @ columns).permute(2, 1, 0)
 
     def _end(self, q: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Robot descriptions in TOML files: every key and value checked, and the chain they describe."""
+"""Robot descriptions in TOML files: checks of all keys and values, and the described chain."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _STIFFNESS = ("bending_stiffness", "axial_stiffness")
 _PLAIN, _ELASTIC = "constant-curvature", "elastic-tendon"
 _MOST = 64  # segments of a robot, actuators of a segment
 
-_LEAST, _LARGEST = 1e-18, 1e9  # of positive numbers, and of all: beyond lie only mistakes
-_DOTS = 600  # between two commas; keys of many dots cost the square of their number
-_BYTES = 30_000  # of a file; the time to read hostile TOML grows with its square
+_LEAST, _LARGEST = 1e-18, 1e9  # of positive numbers, and of all; others are mistakes
+_DOTS = 600  # between two commas; the time for a key grows with the square of its dots
+_BYTES = 30_000  # of a file; the time to read hostile TOML grows with the square of its size
 _Test = Callable[[Any], bool]
 
 
@@ -61,7 +61,7 @@ _TABLE = ("be a table of keys", lambda value: isinstance(value, dict))
 _TEXT = ("be text", _is_text)
 _POSITIVE = ("be positive, or a list of positive numbers", _one_or_many(_is_positive))
 _WHOLE = (f"be a whole number from 1 to {_MOST}", lambda v: type(v) is int and 0 < v <= _MOST)
-# Tables, their keys, and what the value of a key must do, in words and as a test.
+# Tables, their keys, and the requirement on the value of a key, in words and as a test.
 _ROWS: list[tuple[str, str, str, _Test]] = [
     ("file", "name", *_TEXT),
     ("file", "model", *_among(_PLAIN, _ELASTIC)),
@@ -97,7 +97,7 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Return the content of a TOML file; a ValueError names a key that is not right."""
+    """Return the content of a TOML file; a ValueError names a wrong key."""
     if path.stat().st_size > _BYTES:
         raise ValueError(f"a robot description must be at most {_BYTES} bytes long.")
     try:
@@ -125,7 +125,7 @@ def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
             raise ValueError(f"`{key:.40}` in {where} is not known; {hint}")
         words, fits = needs[key]
         if not fits(value):
-            got = reprlib.repr(value)  # of a deep or long value not all
+            got = reprlib.repr(value)  # shortens deep or long values
             raise ValueError(f"`{key}` in {where} must {words}, got {got}.")
 
 
@@ -138,7 +138,7 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
         unused = [] if elastic else [key for key in _STIFFNESS if key in table]
         if unused:
             raise ValueError(
-                f"`{unused[0]}` in [[segment]] is not known to model {_PLAIN!r}; leave it out, or "
+                f"`{unused[0]}` in [[segment]] is not a key of model {_PLAIN!r}; remove it, or "
                 f'set model = "{_ELASTIC}".'
             )
         segments += [_segment(table, f"[[segment]] {i + 1}", elastic, unit)] * table.get(
@@ -155,7 +155,7 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
         needed = key == "length"
         if missing and (needed or len(missing) < len(segments)):
             raise ValueError(
-                f"`{key}` must stand in every [[segment]]{'' if needed else ' or in none'}, but is "
+                f"`{key}` must be in every [[segment]]{'' if needed else ' or in none'}, but is "
                 f"missing for segment {missing[0]}."
             )
         given[key] = None if missing else given[key]
@@ -164,34 +164,34 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     given |= {"routing": tables["routing"]} if "routing" in tables else {}
     stages = given.pop("stage")
     if "rotation" in stages[1:]:
-        raise ValueError('`stage` "rotation" must stand in the first [[segment]] alone.')
+        raise ValueError('`stage` "rotation" is only allowed in the first [[segment]].')
     given |= {"stage": "rotation"} if stages[0] == "rotation" else {}
-    any_radius = next(filter(None, given["radii"]), 1.0)  # of stages it has no effect
+    any_radius = next(filter(None, given["radii"]), 1.0)  # for stages it has no effect
     given["radii"] = [radius or any_radius for radius in given["radii"]]
     return ElasticTendonChain(**given) if elastic else ConstantCurvatureChain(**given)
 
 
 def _segment(table: Mapping[str, Any], where: str, elastic: bool, unit: str) -> dict[str, Any]:
-    """Return what a chain is made from for one segment; None for what may be left out."""
+    """Return the constructor arguments of one segment; None for optional ones."""
     stage = table.get("stage")
     if stage is not None and (elastic or not {*table} <= {"stage", "offset", "zeros", "gain"}):
         raise ValueError(
-            f"`stage` in {where} must stand beside `offset`, `zeros` and `gain` alone, and not in "
-            f"a robot of the model {_ELASTIC!r}."
+            f"`stage` in {where} can only be combined with `offset`, `zeros` and `gain`, and not "
+            f"with model {_ELASTIC!r}."
         )
     if "radius" not in table and stage is None:
         raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
     if "angles_deg" in table:
         angles = np.radians(np.array(table["angles_deg"], dtype=float))
         if beside := {"angle_deg", "actuators", "clockwise"} & {*table}:
-            raise ValueError(f"`{min(beside)}` cannot stand beside `angles_deg` in {where}.")
+            raise ValueError(f"`{min(beside)}` cannot be combined with `angles_deg` in {where}.")
     else:
         n = table.get("actuators", 3 if stage is None else 1)
         step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
         angles = math.radians(table.get("angle_deg", 0.0)) + step * np.arange(n)
     n = len(angles)
     gains, zeros = _gains(table, where, n, unit), each(table, "zeros", where, n)
-    if gains is not None and not elastic:  # as the log counts
+    if gains is not None and not elastic:  # in the unit of the log
         zeros *= UNITS.get(unit, 1.0)
     return {
         "radii": table.get("radius"),
@@ -208,15 +208,15 @@ def _segment(table: Mapping[str, Any], where: str, elastic: bool, unit: str) -> 
 
 
 def _gains(table: Mapping[str, Any], where: str, n: int, unit: str) -> np.ndarray | None:
-    """Return metres per unit of q (n,), of angles per radian; None where q is in metres."""
+    """Return metres per unit of q (n,), for angles per radian; None if q is in metres."""
     gains, spools = (each(table, key, where, n) for key in ("gain", "spool_radius"))
     spun = spools.any()
     if not (spun or gains.any()):
         return None
     if unit in METRES or (spun and (unit not in ("deg", "rad") or gains.any())):
         raise ValueError(
-            f"`gain` or `spool_radius` in {where} must stand with a `q_unit` in [log] that is no "
-            f'length, `spool_radius` with "deg" or "rad" and without `gain`, got {unit!r}.'
+            f"`gain` or `spool_radius` in {where} needs a `q_unit` in [log] that is not a "
+            f'length, `spool_radius` needs "deg" or "rad" and no `gain`, got {unit!r}.'
         )
     return spools + gains / UNITS.get(unit, 1.0)
 
@@ -230,7 +230,7 @@ def _base(table: Mapping[str, Any]) -> np.ndarray:
 
 
 def each(table: Mapping[str, Any], key: str, where: str, size: int) -> np.ndarray:
-    """Return one number for each of `size`, given as such or as one for all; zeros without any."""
+    """Return `size` numbers, given as a list or as one number for all; zeros by default."""
     value = np.array(table.get(key, 0.0), dtype=float)
     if value.shape not in ((), (size,)):
         raise ValueError(f"`{key}` in {where} must hold {size} numbers, got {table[key]!r}.")

@@ -1,4 +1,4 @@
-"""Which tendons are taut, and how an elastic shape answers while they are."""
+"""Sets of taut tendons, and the linear response of the elastic shape for each set."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import torch
 from torch import Tensor, nn
 
 MOST = 62  # a set of tendons is the bits of one integer
-_WHOLE_STEPS = 8  # then one tendon at a time, which ends for certain
-_MOST_TURNS = 12  # two to this power, should rounding keep it from an end
+_WHOLE_STEPS = 8  # then one tendon at a time, which always terminates
+_MOST_TURNS = 12  # 2 to this power bounds the steps if rounding prevents the end
 
 
 class Elasticity(NamedTuple):
-    """What shapes the backbone: shapes are the length changes, then the x- and y-bendings."""
+    """Elasticity of the backbone. A shape is its length changes, then x- and y-bendings."""
 
-    readings: Tensor  # (n, 3 S), tendon paths by shape
-    units: Tensor  # (3 S,), shapes of like effect on the paths
+    readings: Tensor  # (n, 3 S), change of the tendon paths per change of shape
+    units: Tensor  # (3 S,), units of the shape with similar effects on the paths
     stiffness: Tensor  # (3 S,)
     rest: Tensor  # (3 S,), the shape without tendons
     zeros: Tensor  # (n,)
@@ -26,24 +26,24 @@ class Elasticity(NamedTuple):
 
 
 class Responses(NamedTuple):
-    """For M sets of taut tendons how the shape answers; the actuators come as (q, 1)."""
+    """Linear responses to (q, 1) for M sets of taut tendons."""
 
     shape: Tensor  # (M, 3 S, n + 1)
-    stretch: Tensor  # (M, n, n + 1), slack counts as negative
-    compliance: Tensor  # (M, 3 S, 3 S), shape by a generalised force
+    stretch: Tensor  # (M, n, n + 1), negative if slack
+    compliance: Tensor  # (M, 3 S, 3 S), shape per generalised force
 
 
 class Balance(NamedTuple):
-    """Shapes at which backbones and tendons balance, and what derivatives need."""
+    """Shapes in static balance, and values that derivatives use."""
 
     shape: Tensor  # (N, 3 S)
     pull: Tensor  # (N, n), tensions
     taut: Tensor  # (N, n), bool
-    compliance: Tensor  # (N, 3 S, 3 S), shape by a generalised force
+    compliance: Tensor  # (N, 3 S, 3 S), shape per generalised force
 
 
 def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
-    """Return the linear answers of sets of taut tendons (M, n)."""
+    """Return the linear responses for M sets of taut tendons (M, n)."""
     readings, units, stiffness, rest, zeros, gains = elasticity
     pulling = readings.T * taut[:, None]  # (M, 3 S, n)
     hessian = torch.diag(stiffness) + pulling @ readings
@@ -64,17 +64,17 @@ def applied(maps: Tensor, vectors: Tensor) -> Tensor:
 
 
 def as_mask(codes: Tensor, n: int) -> Tensor:
-    """Return sets given as bits of a number (N,) as a mask (N, n)."""
+    """Return sets, given as the bits of integers (N,), as a mask (N, n)."""
     return ((codes[:, None] >> torch.arange(n, device=codes.device)) & 1) > 0
 
 
 def find_in_table(rows: Tensor, table: Tensor) -> Tensor:
-    """Return which tendons are taut (N,), from the stretches of all sets."""
+    """Return codes (N,) of the taut tendons, from the stretches of all sets."""
     return _pivoted(partial(table.index_select, 0), table[-1], extended(rows))
 
 
 def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
-    """Return which tendons are taut (N,), from the elasticity."""
+    """Return codes (N,) of the taut tendons, from the elasticity."""
     n = rows.shape[1]
 
     def maps_of(codes: Tensor) -> Tensor:
@@ -87,8 +87,8 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
 def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Tensor:
     """Return the codes (N,) of the taut tendons by block principal pivoting.
 
-    The stretches of sets of taut tendons come as maps (N, n, n + 1) from `maps_of`; `full` is the
-    map (n, n + 1) of the set of all, which gives the first guess.
+    `maps_of` returns the stretches of sets of taut tendons as maps (N, n, n + 1). `full` is the map
+    (n, n + 1) for all tendons taut, which gives the first guess.
     """
     n = x.shape[1] - 1
     bits = 2 ** torch.arange(n, device=x.device)
@@ -98,7 +98,7 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
         maps = maps_of(here)
         stretch = applied(maps, x)
         found = ((stretch >= 0) * bits).sum(-1)
-        if step >= _WHOLE_STEPS:  # one at a time, and none for a rounding error
+        if step >= _WHOLE_STEPS:  # one at a time, ignoring rounding errors
             rounding = 4.0 * torch.finfo(x.dtype).eps * applied(maps.abs(), x.abs())
             wrong = (found ^ here) & ((stretch.abs() > rounding) * bits).sum(-1)
             found = here ^ (wrong & -wrong)
@@ -111,7 +111,7 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
 
 
 class FindTaut(torch.autograd.Function):
-    """Which tendons are taut, under every transform: its result is constant between the kinks."""
+    """The set of taut tendons, for every torch transform; it is constant between kinks."""
 
     @staticmethod
     def forward(find: Callable[..., Tensor], rows: Tensor, *parts: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Rigid arms in URDF: the joints from a root to an end, read and written back."""
+"""Rigid arms in URDF: read the joints from a root to an end link, and write them back."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from scipy.spatial.transform import Rotation
 from hybridkin.chains._arm_files import UNLIMITED, Joint, in_robot, matrix_of, source_of
 
 _MISSING = (
-    "have no <limit>, which URDF requires; they are taken as unlimited. Add <limit>, or set "
-    'type="continuous" if they turn without end.'
+    "have no <limit>, which URDF requires; they are treated as unlimited. Add <limit>, or set "
+    'type="continuous" if they turn without limits.'
 )
 _LOCKED = (
-    "are locked at 0: their limits are 0 and 0, as URDF has it where `lower` and `upper` are left "
-    "out. Give both if they move."
+    "are locked at 0: both limits are 0, the default of URDF if `lower` and `upper` are missing. "
+    "Give both if the joints move."
 )
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 _FREE = {"floating": ("x", "y", "z", "yaw", "pitch", "roll"), "planar": ("x", "y", "yaw")}
 _AXES = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _MOST = 64  # joints that mimic each other in a row
-_SAME = 1e-12  # [m] or [-]: of origins that need not be written
+_SAME = 1e-12  # [m] or [-]: smaller changes of an origin are not written
 _TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 
 
 class _Tag(dict[str, str]):
-    """The attributes of a tag, and where it begins in the file [bytes]."""
+    """The attributes of a tag, and its position in the file [bytes]."""
 
     place = -1
 
@@ -43,7 +43,7 @@ _Element: TypeAlias = defaultdict[str, _Tag]  # the first tag of every name in a
 
 
 def _read(text: str) -> tuple[list[str], list[_Element]]:
-    """Return the links and the joints of a <robot>; other tags, as of vendors, are ignored."""
+    """Return the links and the joints of a <robot>; other tags, e.g. of vendors, are ignored."""
     links: list[str] = []
     joints: list[_Element] = []
     path: list[str] = []
@@ -74,7 +74,7 @@ def _read(text: str) -> tuple[list[str], list[_Element]]:
 
 
 def urdf_text(text_or_path: Any) -> str:
-    """Return the text of a URDF; what is no UTF-8 comes back the same from `_bytes`."""
+    """Return the text of a URDF; `_bytes` restores bytes that are not UTF-8."""
     source = source_of(text_or_path)
     data = source if isinstance(source, str) else source.read_bytes()
     return data if isinstance(data, str) else data.decode("utf-8-sig", "surrogateescape")
@@ -85,7 +85,7 @@ def _bytes(text: str) -> bytes:
 
 
 def _numbers(element: _Element, tag: str, key: str, default: str) -> list[float]:
-    """Return as many numbers of an attribute as the default has."""
+    """Return the numbers of an attribute, as many as the default has."""
     text, found = element[tag].get(key, default), []
     try:
         found = [float(part) for part in text.split()]
@@ -100,7 +100,7 @@ def _numbers(element: _Element, tag: str, key: str, default: str) -> list[float]
 def _elements(
     text: str, end_link: str, root_link: str | None
 ) -> list[tuple[_Element, list[Joint]]]:
-    """Return the joints from one link to another, each with what it does."""
+    """Return the <joint> elements from one link to another, each with its joints."""
     known, joints = _read(text)
     _check_tree(known, joints)
     by_child = {joint["child"].get("link", ""): joint for joint in joints}
@@ -130,7 +130,7 @@ def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
 
 
 def _check_tree(links: list[str], joints: list[_Element]) -> None:
-    """Raise unless links and joints are one tree, with names that occur once."""
+    """Raise unless links and joints form one tree with unique names."""
     named = [joint["joint"].get("name", "") for joint in joints]
     parents, children = (
         [joint[tag].get("link", "") for joint in joints] for tag in ("parent", "child")
@@ -138,7 +138,7 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
     for what, given in {"link": links, "joint": named, "<child>": children}.items():
         doubled = sorted(name for name, times in Counter(given).items() if times > 1)
         if doubled:
-            raise ValueError(f"every {what} of a URDF must occur once, got {doubled} more often.")
+            raise ValueError(f"every {what} of a URDF must occur once, got {doubled} repeatedly.")
     known = dict.fromkeys(links)
     for name, parent, child in zip(named, parents, children, strict=True):
         in_robot(parent, known, f"<parent> of joint {name!r}")
@@ -152,8 +152,8 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
     roots = sorted({*links} - {*children})
     if len(roots) > 1:
         raise ValueError(
-            f"a URDF must have one root, but no joint leads to any of {roots}; connect them by a "
-            "joint, or remove all but one."
+            f"a URDF must have one root, but no joint leads to any of {roots}; connect them with "
+            "joints, or remove all but one."
         )
 
 
@@ -184,14 +184,14 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
             raise ValueError(f"joints must not mimic each other in a circle, got {followed}.")
         followed.append(name)
         if len(followed) > _MOST:
-            raise ValueError(f"joint {followed[0]!r} must mimic through at most {_MOST} others.")
+            raise ValueError(f"joint {followed[0]!r} must mimic via at most {_MOST} other joints.")
         driver = by_name.get(name) or defaultdict(_Tag, joint=_Tag(type=kind))  # not in the file
     driven_by = driver["joint"].get("type", "")
     if not {kind, driven_by} <= {*_ONE_AXIS, "fixed"}:
         known = (*_ONE_AXIS, "fixed", *_FREE)
         raise ValueError(
-            f"`type` of joint {followed[0]!r} must be one of {known}, of the first four where it "
-            f"mimics another, got {kind!r}"
+            f"`type` of joint {followed[0]!r} must be one of {known}, or one of the first four "
+            f"if it mimics another joint, got {kind!r}"
             + f" that mimics {driven_by!r}."
             * bool(element["mimic"])
         )
@@ -208,7 +208,7 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
         if math.inf > low > high > -math.inf:
             limits = (high, low)
             warnings.warn(
-                f"limits of joint {name!r} are swapped and taken in order: {high:g}, {low:g}.",
+                f"limits of joint {name!r} are swapped; they are used in order: {high:g}, {low:g}.",
                 stacklevel=5,
             )
     speed = _numbers(driver, "limit", "velocity", "0")[0]
@@ -218,7 +218,7 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
 def placed_urdf(
     text: str, end_link: str, root_link: str | None, names: Sequence[str], origins: NDArray
 ) -> str:
-    """Return a URDF whose moving joints have other origins (n, 4, 4); the rest stays as it is."""
+    """Return a URDF whose moving joints have new origins (n, 4, 4); the rest is not changed."""
     path, data = _elements(text, end_link, root_link), _bytes(text)
     moving = [joint.name for _, joints in path for joint in joints if joint.kind != "fixed"]
     if [*dict.fromkeys(moving)] != [*names] or len(moving) != len(origins):
@@ -228,11 +228,11 @@ def placed_urdf(
     for element, (joint, *free) in path:
         origin = _origin(element)
         if free:
-            raise ValueError(f"joint {free[0].name!r} is free; choose a `root_link` after it.")
+            raise ValueError(f"joint {free[0].name!r} is free; use a `root_link` after it.")
         if joint.kind == "fixed":
             before = before @ joint.origin
             continue
-        # After fixed joints, and before the offset of a joint that mimics another.
+        # Exclude the fixed joints before it and the offset of a mimic joint.
         ahead = np.linalg.solve(before, next(wanted))
         placed = ahead @ np.linalg.solve(joint.origin, origin)
         before = matrix_of()

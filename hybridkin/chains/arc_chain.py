@@ -1,4 +1,4 @@
-"""What all chains of circular arcs share: tip, poses and derivatives from one arc per segment."""
+"""Base class of all chains of circular arcs: tip, poses and derivatives from the arcs."""
 
 from __future__ import annotations
 
@@ -24,50 +24,50 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
-"""Names of `calibrate` that move a part of an entry of the geometry, and that entry."""
+"""Parameters of `calibrate` that change a part of an entry of the geometry, and that entry."""
 
 Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
 STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "markers": list, "routing": str}
 
 
 class Frames(NamedTuple):
-    """The frames after all segments, offsets included, in the base frame; N rows come last."""
+    """Frames after all segments and their offsets, in the base frame; the batch N comes last."""
 
     axes: Tensor  # (3, 3, S, N): axis, component
     points: Tensor  # (3, S, N) origins [m]
-    moves: Tensor  # (3, 3, S, N): how the robot's end moves by lengths, x- and y-bendings
-    spins: Tensor  # (3, 3, S, N): how it turns by these
-    slope: Tensor  # of the arcs by q, (3 S, n) or (3 S, n, N)
+    moves: Tensor  # (3, 3, S, N): velocity of the robot's end per length, x- and y-bending
+    spins: Tensor  # (3, 3, S, N): its angular velocity per the same
+    slope: Tensor  # d arcs / dq, (3 S, n) or (3 S, n, N)
 
 
 class ArcChain(MarkedChain):
-    """A chain of circular arcs; its kinds differ in how the actuators shape them.
+    """A chain of circular arcs; subclasses define how the actuators shape them.
 
-    A kind gives `_arcs_and_slope` and `_arcs_and_change`.
+    A subclass defines `_arcs_and_slope` and `_arcs_and_change`.
     """
 
     _structure = (*STRUCTURE, "n_segments", "n_actuators", "n_outputs", "extensible", "starts")
 
     actuators_per_segment: tuple[int, ...]
     routing: str
-    extensible: tuple[bool, ...]  # whether each segment is; the others have lengths
-    starts: tuple[int, ...]  # the first segment that the actuators of each run through
-    stage: str | None = None  # "rotation" where the first segment is one
+    extensible: tuple[bool, ...]  # for each segment; the others have lengths
+    starts: tuple[int, ...]  # first segment that each segment's actuators run through
+    stage: str | None = None  # "rotation" if the first segment is a rotation stage
     radii: Tensor  # (S,)
     angles: Tensor  # (n,)
     offsets: Tensor  # (S,)
     rest_bends: Tensor  # (S, 2)
     gains: Tensor  # (n,) metres per unit of q
-    lengths: Tensor | None  # of the segments that are not extensible; None without such
+    lengths: Tensor | None  # of the inextensible segments; None if there are none
 
     @property
     def reach(self) -> Tensor:
-        """The natural size of the robot, shape () [m]: its backbone, or else 10 mean radii."""
+        """Size of the robot, shape () [m]: its backbone length, or 10 mean radii without one."""
         return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
 
     @property
     def absolute(self) -> Tensor:
-        """Which actuators (n,) have absolute lengths, as those of extensible segments have."""
+        """Which actuators (n,) have absolute lengths: those of extensible segments, bool."""
         own = np.repeat(self.extensible, self.actuators_per_segment)
         own[: self.stage is not None] = False
         return torch.from_numpy(own).to(self.radii.device)
@@ -79,17 +79,17 @@ class ArcChain(MarkedChain):
 
     @property
     def rest(self) -> Tensor:
-        """The q (n,) at which no tendon is pulled, or chambers have length 0."""
+        """The q (n,) at which tendons are not displaced and chambers have length 0."""
         zeros = self._buffers.get("actuator_zeros")
         return 0.0 * self.gains if zeros is None else zeros
 
     def metres(self, q: Tensor) -> Tensor:
-        """Return what q (..., n) means in metres: lengths, or changes of length."""
+        """Return q (..., n) in metres: lengths, or changes of length."""
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         return self.gains.to(q) * (q - self.rest.to(q))
 
     def _checked(self, routing: str, *given: Any) -> dict[str, Tensor]:
-        """Set the structure of the chain, and return its `arc_geometry` of what is given."""
+        """Set the structure of the chain, and return the `arc_geometry` of the arguments."""
         counts, self.extensible, geometry = arc_geometry(*given)
         self.actuators_per_segment = counts
         self.starts = path_starts(routing, counts, self.extensible)
@@ -132,7 +132,7 @@ class ArcChain(MarkedChain):
         _, columns = tip_and_columns(*self._to_point(self.up_to_tip(arcs)), angular=True)
         parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
         J = torch.cat(parts, dim=-2)
-        if self.stage is not None:  # which turns the tip's frame with all that follows
+        if self.stage is not None:  # the stage turns the tip's frame too
             J[..., 3:, 0] = (self.gains[0] * self.base[:3, 2]).to(q)
         return J
 
@@ -144,12 +144,12 @@ class ArcChain(MarkedChain):
         q : Tensor of shape (..., n_actuators)
             Actuator lengths, or tendon length changes [m].
         tangents : dict of str to Tensor of shape (P, ...)
-            P changes of entries of `geometry()`, stacked; other entries stay as they are.
+            P changes of entries of `geometry()`, stacked; other entries do not change.
 
         Returns
         -------
         Tensor of shape (..., 3, P)
-            How fast the tip moves along every change [m per unit of the change].
+            Derivative of the tip along every change [m per unit of the change].
 
         Examples
         --------
@@ -172,7 +172,7 @@ class ArcChain(MarkedChain):
         return in_blocks(along, q)[0]
 
     def _along(self, arcs: Tensor, change: Change, tangents: Mapping[str, Tensor]) -> Tensor:
-        """Return how the tip (N, 3, P) moves along changes of the geometry, of arcs (3 S, N)."""
+        """Return the derivative (N, 3, P) of the tip along P changes, at arcs (3 S, N)."""
         place = self._to_point(self.up_to_tip(arcs))
         tail, columns = tip_and_columns(*place, rigid=True)
         columns, S = self._turned(columns).permute(2, 0, 1).contiguous(), len(place[0])
@@ -198,13 +198,13 @@ class ArcChain(MarkedChain):
         length : Tensor of shape (..., S)
             Centre-line lengths [m].
         bending : Tensor of shape (..., S, 2)
-            Bending vectors [rad]: their norm is the bend angle, they point where it bends. On a
-            rotation stage they are turned with it.
+            Bending vectors [rad]: the norm is the bend angle, the direction is that of the bend.
+            A rotation stage turns them too.
         """
         return self._leading(self._arcs(q), q)
 
     def poses(self, q: Tensor) -> Tensor:
-        """Return the pose of the base and of the end of every segment, its offset included.
+        """Return the pose of the base and of the end of every segment, after its offset.
 
         Parameters
         ----------
@@ -230,14 +230,14 @@ class ArcChain(MarkedChain):
         return self.pose(q), self.pose_jacobian(q)
 
     def frames_and_moves(self, rows: Tensor) -> Frames:
-        """Return the frames after all segments at rows q (N, n), and what moves the last one."""
+        """Return the frames after all segments at rows q (N, n), with derivatives of the end."""
         arcs, slope = self._arcs_and_slope(rows)
         length, bending = self._split(arcs)
         S, offsets = len(length), self.offsets.to(arcs)
         columns = tip_and_columns(length, bending, offsets, angular=True, rigid=True)[1]
         moves, spins, z = columns.split([3 * S, 3 * S, S], dim=1)
-        # An arc of length l and bending b goes l c along c, the derivative by its length, and
-        # turns the axes across it by -b c.
+        # An arc of length l and bending b moves the end by l c, where c is its derivative with
+        # respect to the length, and changes the transverse axes by -b c.
         along = moves[:, :S]
         x, y = identity(3, arcs)[:2, :, None, None] - (bending[:, None] * along).cumsum(2)
         points = (length * along + offsets[:, None] * z).cumsum(1)
@@ -252,7 +252,7 @@ class ArcChain(MarkedChain):
         q : Tensor of shape (..., n_actuators)
             Actuator lengths, or tendon length changes [m].
         n_points : int, default=20
-            Points per segment; the last of each is the segment's end, its offset included.
+            Points per segment; the last one is the segment's end after its offset.
 
         Returns
         -------
@@ -280,9 +280,9 @@ class ArcChain(MarkedChain):
         return f"{size}{where}, routing {self.routing!r}"
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return a warning where lengths exceed 10 m, or length changes the backbone's 4-fold."""
+        """Return a warning if lengths exceed 10 m, or length changes 4 backbone lengths."""
         name = name if self.in_metres else f"{name}` times `gains"
-        # Of limits that are not there, and of speeds, q itself is small.
+        # Also test q itself, without zeros: `q` may hold speeds, or limits that are absent.
         gains = self.gains.to(q)
         (metres,) = in_blocks(
             lambda rows: (torch.minimum((gains * rows).abs(), self.metres(rows).abs()),), q
@@ -294,22 +294,22 @@ class ArcChain(MarkedChain):
         return [] if message is None else [message]
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return arcs (3 S, N) of rows (N, n) and their derivative, (3 S, n) or (3 S, n, N).
+        """Return arcs (3 S, N) of rows (N, n) and d arcs / dq, (3 S, n) or (3 S, n, N).
 
         Arcs are the lengths of all segments, then the x-, then the y-bendings.
         """
         raise NotImplementedError
 
     def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
-        """Return arcs (3 S, N), and what makes slopes (N, 3, P) of those (N, 3, 3 S) by them."""
+        """Return arcs (3 S, N), and a function from slopes (N, 3, 3 S) by arcs to (N, 3, P)."""
         raise NotImplementedError
 
     def _changes(
         self, rows: Tensor, tangents: Mapping[str, Tensor]
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the changes (P, ...) of all entries, and those of the actuators' paths.
+        """Return the changes (P, ...) of all entries, and of the actuator paths.
 
-        The paths are those by the bendings of all segments, (P, n, 2 S).
+        The latter are changes of d path / d bending, for all segments, (P, n, 2 S).
         """
         counts, P = self.actuators_per_segment, len(next(iter(tangents.values())))
         change = {
@@ -322,10 +322,10 @@ class ArcChain(MarkedChain):
         return change, reading_matrix(moved, counts, self.starts)[..., self.n_segments :]
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the arcs (N, 3 m) up to the tip and their derivative, (3 m, n) or (N, 3 m, n).
+        """Return the arcs (N, 3 m) up to the tip and d arcs / dq, (3 m, n) or (N, 3 m, n).
 
-        Lengths [m], then x-, then y-bendings [rad] of the m segments up to the tip; of several
-        markers the arcs of all segments.
+        Lengths [m], then x-, then y-bendings [rad] of the m segments up to the tip. With several
+        markers these are the arcs of all segments.
         """
         arcs, slope = self._arcs_and_slope(q)
         if len(self.markers) == 1:
@@ -333,7 +333,7 @@ class ArcChain(MarkedChain):
         return arcs.mT, slope if slope.ndim == 2 else slope.permute(2, 0, 1)
 
     def from_coordinates(self, z: Tensor) -> Tensor:
-        """Return the tip (N, 3), or all markers (N, 3 K), of their `coordinates` (N, C)."""
+        """Return the tip (N, 3), or all markers (N, 3 K), at `coordinates` (N, C)."""
         if len(self.markers) == 1:
             return self._tip_of(z.mT, z)
         tips = [one.from_coordinates(one.up_to_tip(z.mT).mT) for one in self.tips()]
@@ -364,7 +364,7 @@ class ArcChain(MarkedChain):
         return self._arcs_and_slope(self._rows(q))[0]
 
     def _to_point(self, arcs: Tensor) -> tuple[Tensor, Tensor, Tensor, Sequence[float]]:
-        """Return lengths, bendings and rigid offsets up to the tip, and its own offset."""
+        """Return lengths, bendings and rigid offsets up to the tip, and the tip's own offset."""
         offsets = self._tip_offsets(self.offsets).to(arcs)
         return *self._split(arcs), offsets, self.markers[-1][1:]
 
@@ -383,7 +383,7 @@ class ArcChain(MarkedChain):
     def _poses(
         self, length: Tensor, bending: Tensor, offsets: Tensor, q: Tensor | None = None
     ) -> Tensor:
-        """Return the poses of the base and after all arcs; at a q turned with the stage."""
+        """Return the poses of the base and after all arcs; with q, turned by the stage."""
         steps = transforms(length, bending, offsets.to(length))
         base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
         poses = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
@@ -409,11 +409,11 @@ class ArcChain(MarkedChain):
         return torch.cat(x, dim=-1), torch.cat(J, dim=-2)
 
     def _tip_of(self, arcs: Tensor, q: Tensor) -> Tensor:
-        """Return the tips (..., 3) of arcs (3 m, N) up to them, in the batch shape of q."""
+        """Return the tips (..., 3) of arcs (3 m, N) up to the tip, in the batch shape of q."""
         return self._in_measuring_frame(tip(*self._to_point(arcs)), q)
 
     def _turned(self, columns: Tensor) -> Tensor:
-        """Return columns (3, k, N) of the base frame in the measuring frame."""
+        """Return columns (3, k, N), given in the base frame, in the measuring frame."""
         base = self.base.to(columns)[:3, :3]
         return (base @ columns.flatten(1)).unflatten(1, columns.shape[1:])
 
@@ -422,7 +422,7 @@ class ArcChain(MarkedChain):
         return (base[:3, :3] @ tail + base[:3, 3:]).T.reshape(*q.shape[:-1], 3)
 
     def _by_actuators(self, columns: Tensor, slope: Tensor, q: Tensor) -> Tensor:
-        """Fold the slope of the arcs and the base into columns (3, 3 m, N)."""
+        """Return the Jacobian by q from columns (3, 3 m, N) by arcs and the slope of the arcs."""
         columns, slope = self._turned(columns), self.up_to_tip(slope)
         if slope.ndim == 3:
             J = torch.matmul(columns.permute(2, 0, 1), slope.permute(2, 0, 1))
@@ -432,13 +432,13 @@ class ArcChain(MarkedChain):
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
-        """Return the chain of a description."""
+        """Return the chain built from a description."""
         given = stored_arguments(stored, cls._entries)
         chain = cls(**given, dtype=torch.from_numpy(given["base"]).dtype)
         angles = stored.array("angles").astype(given["base"].dtype, copy=False)
         chain = chain.with_geometry(angles=torch.from_numpy(angles))
         at = stored.value("tip_at", float)
-        markers = stored.settings.get("markers", [[at, 0.0, 0.0, 0.0]])  # earlier files have none
+        markers = stored.settings.get("markers", [[at, 0.0, 0.0, 0.0]])  # missing in older files
         markers = [*markers[:-1], [at, *markers[-1][1:]]]
         found = [(math.ceil(place) - 1, place, beside) for place, *beside in markers]
         return chain.with_markers([(k, place - k, beside) for k, place, beside in found])

@@ -1,4 +1,4 @@
-"""What every mechanical model offers: a tip, poses, and a geometry that can be calibrated."""
+"""Base class of all mechanical models: a tip, poses, and a geometry that can be calibrated."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Chain"]
 
-_FAR = 50.0  # times the robot's size; some extensible robots are long and thin
+_FAR = 50.0  # robot sizes; some extensible robots are long and thin
 
 
 class Chain(PoseModel):
     """A mechanical model of a robot: q -> tip position, with a geometry.
 
-    A kind names the buffers of its geometry in `_entries` and what else makes it in `_structure`.
+    A subclass lists its geometry buffers in `_entries` and its other attributes in `_structure`.
 
     Attributes
     ----------
@@ -39,26 +39,26 @@ class Chain(PoseModel):
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
-        """The geometry that a calibration fits by default."""
+        """Names of the parameters that a calibration fits by default."""
         raise NotImplementedError
 
     @property
     def reach(self) -> Tensor:
-        """The natural size of the robot, shape () [m]."""
+        """Size of the robot, shape () [m]."""
         raise NotImplementedError
 
     def geometry(self) -> dict[str, Tensor]:
-        """Return the geometry by name, as in the constructor; without what a kind lacks."""
+        """Return the geometry by name, as in the constructor; entries that are None are omitted."""
         entries = {name: self._buffers[name] for name in self._entries}
         return {name: value for name, value in entries.items() if value is not None}
 
     def with_geometry(self, **geometry: Tensor) -> Self:
-        """Return a chain with some of the geometry replaced, differentiable in the new values.
+        """Return a chain with parts of the geometry replaced, differentiable in the new values.
 
         Parameters
         ----------
         **geometry : Tensor
-            Entries of `geometry()`, in the same shapes and units. Their values are not checked.
+            Entries of `geometry()`, in the same shapes and units. The values are not checked.
 
         Returns
         -------
@@ -76,25 +76,25 @@ class Chain(PoseModel):
         chain = type(self).__new__(type(self))
         nn.Module.__init__(chain)
         chain.__dict__.update({name: self.__dict__[name] for name in self._structure})
-        if set(geometry) <= {"base"}:  # from which nothing follows
+        if set(geometry) <= {"base"}:  # no other buffer depends on it
             chain._buffers.update({**self._buffers, **geometry})
         else:
             chain._set_geometry({**self._buffers, **geometry})
         return chain
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
-        """Register the buffers, those of `_entries` and what follows from them."""
+        """Register the buffers of `_entries` and those computed from them."""
         raise NotImplementedError
 
     def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-        """Return how fast the tip moves along P changes of the geometry, shape (..., 3, P).
+        """Return the derivative of the tip along P changes of the geometry, shape (..., 3, P).
 
         Parameters
         ----------
         q : Tensor of shape (..., n_actuators)
             Actuator vectors.
         tangents : dict of str to Tensor of shape (P, ...)
-            P changes of entries of `geometry()`, stacked; other entries stay as they are.
+            P changes of entries of `geometry()`, stacked; other entries do not change.
         """
         self._check_tangents(tangents)
         check_vectors(q, self.n_actuators, "q", self._why_shape())
@@ -129,14 +129,14 @@ class Chain(PoseModel):
         raise NotImplementedError
 
     def check_actuators(self, q: Tensor, name: str = "q") -> list[str]:
-        """Raise where q cannot be a log of this robot; return warnings about its units.
+        """Return warnings about the units of q; raise if q cannot be a log of this robot.
 
         Parameters
         ----------
         q : Tensor of shape (..., n_actuators)
-            Actuator vectors [m], of revolute joints [rad].
+            Actuator vectors [m]; [rad] for revolute joints.
         name : str, default="q"
-            What to call `q` in a message.
+            Name of `q` in messages.
 
         Returns
         -------
@@ -162,22 +162,22 @@ class Chain(PoseModel):
         return self.unit_messages(rows, name)
 
     def _why_shape(self) -> str:
-        """Return the reason why q needs its shape, for messages."""
+        """Return why q must have its shape, for messages."""
         return f"this robot has {self.n_actuators} actuators"
 
     def _check_rows(self, rows: Tensor, name: str) -> None:
-        """Raise where finite rows (N, n) are no log of this robot."""
+        """Raise if finite rows (N, n) cannot be a log of this robot."""
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
-        """Return a warning where tips lie farther away than 50 times the robot's size."""
+        """Return a warning if tips span more than 50 times the robot's size."""
         points = torch.cat([self.base[:3, 3].detach().to(x)[None], x.reshape(-1, 3)])
         points = points[torch.isfinite(points).all(-1)]
         message = span_message(name, points, float(self.reach.detach()), _FAR)
         return [] if message is None else [message]
 
     def contradiction(self, q: Tensor, name: str = "q") -> str | None:
-        """Return a warning where the actuators of q (..., n) contradict each other, else None.
+        """Return a warning if the actuators of q (..., n) contradict each other, else None.
 
-        None for a robot whose actuators cannot contradict each other.
+        Always None for a robot whose actuators cannot contradict each other.
         """
         return None

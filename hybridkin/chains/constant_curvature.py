@@ -25,20 +25,20 @@ _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
 class ConstantCurvatureChain(ArcChain):
     """Tip position of a chain of constant-curvature segments, from its actuator lengths.
 
-    Straight parallel actuators at angle psi_i on a circle of radius r see an arc of centre-line
-    length l and bending vector b (norm: bend angle, direction: where it bends) as
-    ``l_i = l - r (b_x cos psi_i + b_y sin psi_i)``. The least-squares inverse of that relation is
-    one constant matrix per robot, q -> (l, b), followed by one smooth chain of arcs; there is no
-    division by a bend angle anywhere, so value and derivatives are right at the straight robot.
+    An arc has a centre-line length l and a bending vector b (norm: bend angle, direction: that of
+    the bend). Parallel actuators at angle psi_i on a circle of radius r then have the lengths
+    ``l_i = l - r (b_x cos psi_i + b_y sin psi_i)``. The least-squares inverse of this relation is
+    one constant matrix per robot, q -> (l, b). A smooth chain of arcs follows. Nothing is divided
+    by a bend angle, so value and derivatives are exact at the straight robot.
 
     Parameters
     ----------
     radii : array-like of shape (S,)
         Radius of the actuator circle of each segment, base to tip [m].
     n_actuators : int or sequence of S ints, default=3
-        Actuators of each segment. Actuators in one plane, as an antagonistic pair, bend a segment
-        in that plane only; across it keeps its rest bend. A single actuator of an extensible
-        segment moves it straight: a rigid insertion stage.
+        Actuators of each segment. Actuators in one plane, e.g. an antagonistic pair, bend a
+        segment in that plane only; in the other plane it keeps its rest bend. An extensible
+        segment with a single actuator does not bend: it is a rigid insertion stage.
     angles : array-like, optional
         Actuator angles about the backbone, counter-clockwise from the base x-axis [rad]: shape
         ``(n,)`` for all segments alike, ``(S, n)``, or one sequence per segment. Default: evenly
@@ -46,31 +46,31 @@ class ConstantCurvatureChain(ArcChain):
     lengths : array-like of shape (S,), optional
         None for extensible segments: q holds absolute actuator lengths [m] (pneumatic trunk).
         Otherwise backbone lengths [m] of inextensible segments: q holds the *changes* of tendon
-        length from straight [m], negative where a tendon is shortened. A list with None for some
+        length from straight [m], negative if a tendon is shortened. A list with None for some
         segments mixes both.
     routing : {"segment", "base"}, default="segment"
         "segment": each actuator spans its own segment. "base": actuators of a segment also run
-        through all segments nearer the base, at their own radius and angle, back to the last stage,
-        which carries them.
+        through all segments nearer the base, at their own radius and angle, from the last stage
+        before them, which carries them.
     offsets : float or array-like of shape (S,), default=0.0
         Rigid length after each segment along its tangent [m]; the last one is the tool.
     rest_bends : float or array-like of shape (S, 2), default=0.0
-        Pre-curvature: bending vector of each segment while all its actuators agree [rad].
+        Pre-curvature: bending vector of each segment with equally long actuators [rad].
     actuator_zeros : float or array-like of shape (n,), default=0.0
         Offset of each sensor [unit of q]: the chain bends by ``gains * (q - actuator_zeros)``. A
         list of lists, one per segment, is accepted too.
     gains : float or array-like of shape (S,) or (n,), default=1.0
-        Metres per unit of q, of all actuators, of each segment or of each actuator; negative where
-        q counts the other way. q, Jacobians and limits are then in that unit, for example motor
+        Metres per unit of q, for all actuators, each segment or each actuator; negative if q has
+        the opposite sign. q, Jacobians and limits are then in that unit, for example motor
         counts. A list of lists, one per segment, is accepted too.
     stage : {None, "rotation"}, default=None
-        "rotation": the first segment is a rigid stage of one actuator, an angle [rad] that turns
-        all that follows about the z-axis of the base. Its length is None, and its radius has no
-        effect.
+        "rotation": the first segment is a rigid stage with one actuator, an angle [rad] that
+        turns all later segments about the z-axis of the base. Its length must be None; its radius
+        has no effect.
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
         Pose of the robot's base in the measuring frame. Default: identity.
     dtype : torch.dtype, default=torch.float64
-        Precision in which the geometry is held. Results come in the dtype of q.
+        Precision of the stored geometry. Results have the dtype of q.
 
     References
     ----------
@@ -94,7 +94,7 @@ class ConstantCurvatureChain(ArcChain):
     )
     _structure = (*ArcChain._structure, "bends", "stage")
 
-    bends: tuple[int, ...]  # how many directions each segment bends in
+    bends: tuple[int, ...]  # number of directions in which each segment bends
 
     def __init__(
         self,
@@ -125,25 +125,25 @@ class ConstantCurvatureChain(ArcChain):
         turns = isinstance(stage, str) and stage == "rotation" and self.bends[0] == 0
         if not (turns or stage is None):
             raise ValueError(
-                '`stage` must be None or "rotation", which takes a first segment of one actuator '
-                f"and without a length, got {stage!r}."
+                '`stage` must be None or "rotation"; "rotation" needs a first segment with one '
+                f"actuator and without a length, got {stage!r}."
             )
         self._set_geometry({**geometry, "actuator_zeros": zeros})
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
-        """The geometry that a calibration fits by default."""
+        """Names of the parameters that a calibration fits by default."""
         gain = () if self.in_metres else ("gain",)
         if self.lengths is None:
             return ("radii", *gain, "base")
         return ("radii", "turns", "rest_bends", "lengths", *gain, "base")
 
     def consistency(self, q: Tensor) -> Tensor:
-        """Return how far the actuator readings of each segment contradict each other.
+        """Return by how much the actuator lengths of each segment contradict each other.
 
-        The readings are compared with those that the fitted arcs would give. Three chambers always
-        agree; with more actuators a broken cable or sensor shows, and on tendon chains a common
-        pull of all tendons of a segment, which bends nothing here.
+        The lengths are compared with those of the fitted arc. Three chambers always agree. With
+        more actuators, a broken cable or sensor gives a residual; on tendon chains so does a
+        common pull of all tendons of a segment, which causes no bend in this model.
 
         Parameters
         ----------
@@ -169,12 +169,12 @@ class ConstantCurvatureChain(ArcChain):
         return self._by_segment(residual, q)
 
     def contradictory(self, q: Tensor) -> Tensor:
-        """Return where the readings of a segment contradict each other.
+        """Return whether the actuator lengths of each segment contradict each other.
 
-        That is where their `consistency` residual exceeds both 30 % of the readings that the arcs
-        explain and a tenth of the segment's radius, which a bend of 0.1 rad would read. On tendon
-        chains slack does that: a single tendon pulled while the others stay leaves 71 % of what
-        bends the segment, balanced tendons leave nothing. In extensible segments a common
+        They do if the `consistency` residual exceeds both 30 % of the part that the arcs explain
+        and a tenth of the segment's radius (the length change at a bend of 0.1 rad). On tendon
+        chains slack is the usual cause: one tendon pulled while the others stay leaves a residual
+        of 71 % of the explained part; balanced tendons leave none. In extensible segments a common
         change is a change of length.
 
         Parameters
@@ -203,20 +203,20 @@ class ConstantCurvatureChain(ArcChain):
         return residual > least
 
     def contradiction(self, q: Tensor, name: str = "q") -> str | None:
-        """Return a warning where the tendons of an inextensible chain contradict each other.
+        """Return a warning if the tendons of inextensible segments contradict each other.
 
         Parameters
         ----------
         q : Tensor of shape (..., n_actuators)
             Tendon length changes [m].
         name : str, default="q"
-            What to call `q` in the message.
+            Name of `q` in the message.
 
         Returns
         -------
         str or None
-            The number of rows that are `contradictory`, and the worst of them. None where there
-            are none; extensible segments do not count.
+            The number of rows that are `contradictory`, and the worst of them. None if there are
+            none; extensible segments are not checked.
         """
         rows = self._rows(q)
         if all(self.extensible):
@@ -230,15 +230,15 @@ class ConstantCurvatureChain(ArcChain):
         row, segment = divmod(int(residual.argmax()), self.n_segments)
         return (
             f"{int(wrong.any(-1).sum())} of {len(rows)} rows of `{name}` pull the tendons of a "
-            "segment together or let them go, which bends nothing in a ConstantCurvatureChain "
-            "but compresses a robot or leaves tendons slack: worst is row "
+            "segment together or release them, which bends nothing in a ConstantCurvatureChain "
+            "but compresses a robot or leaves tendons slack: the worst is row "
             f"{row}, segment {segment + 1}, {1e3 * float(residual[row, segment]):.3g} mm rms. "
             "ElasticTendonChain models tendons that can only pull."
         )
 
     @property
     def limits(self) -> dict[str, Any]:
-        """None for tendons; the actuators of extensible segments have lengths above 0 m."""
+        """Limits of q: none for tendons, lengths above 0 m in extensible segments."""
         if not self.absolute.any():
             return super().limits
         if self.absolute.all() and self.in_metres and not self.actuator_zeros.any():
@@ -265,7 +265,7 @@ class ConstantCurvatureChain(ArcChain):
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         super()._set_geometry(geometry)
         radii, free = self.radii, self._free_arcs(self.angles)
-        # In bendings times radius: one unit for all, or half of the digits would go.
+        # Scaled to bendings times radius: with mixed units half of the digits would be lost.
         units = torch.cat([torch.ones_like(radii), 1.0 / radii, 1.0 / radii])
         scaled = self._readings() * units @ free
         held = identity(len(free), free) - free
@@ -279,7 +279,7 @@ class ConstantCurvatureChain(ArcChain):
         self.register_buffer("arc_offset", offset)
 
     def _by_segment(self, rows: Tensor, q: Tensor) -> Tensor:
-        """Return the root mean square (..., S) of rows (N, n) over each segment's actuators."""
+        """Return the RMS (..., S) of rows (N, n) over the actuators of each segment."""
         parts = rows.split(self.actuators_per_segment, dim=-1)
         norms = [torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5 for part in parts]
         return torch.stack(norms, dim=-1).reshape(*q.shape[:-1], self.n_segments)
@@ -289,7 +289,7 @@ class ConstantCurvatureChain(ArcChain):
         return (arcs, matrix) if self.stage is None else turned_by_first(arcs, matrix[..., None])
 
     def _linear(self, rows: Tensor) -> Tensor:
-        """Return the arcs (3 S, N) of rows (N, n) before a rotation, whose angle is a length."""
+        """Return the arcs (3 S, N) of rows (N, n) before the stage turns them by length 0."""
         return torch.addmm(self.arc_offset.to(rows)[:, None], self.arc_matrix.to(rows), rows.T)
 
     def _readings(self) -> Tensor:
@@ -300,7 +300,7 @@ class ConstantCurvatureChain(ArcChain):
         return free_arcs(angles.split(self.actuators_per_segment), self.extensible, self.bends)
 
     def _placed(self, lengths: Tensor) -> Tensor:
-        """Return lengths (..., S) of all segments, zero where extensible, from those of others."""
+        """Return lengths (..., S) of all segments, 0 if extensible, from those that are given."""
         return lengths @ identity(self.n_segments, lengths)[np.logical_not(self.extensible)]
 
     def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
@@ -317,9 +317,9 @@ class ConstantCurvatureChain(ArcChain):
         change, by_reading = self._changes(rows, tangents)
         readings, free = self._readings().to(rows), self._free_arcs(self.angles).to(rows)
         by_reading = nn.functional.pad(by_reading, (self.n_segments, 0)) @ free
-        # The derivative of the pseudo-inverse M of the readings B of free arcs, with M B = free
-        # (Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12).
-        M, by_matrix = (self.arc_matrix / self.gains).to(rows), 0.0  # of actuators in metres
+        # Derivative of the pseudo-inverse M of the matrix B from free arcs to actuator lengths,
+        # M B = free (Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12).
+        M, by_matrix = (self.arc_matrix / self.gains).to(rows), 0.0  # for actuators in metres
         if 1 in self.bends:  # planes turn with their actuators
             turns = torch.func.jacfwd(self._free_arcs)(self.angles).to(rows)
             turns = (turns @ change["angles"].mT).permute(2, 0, 1)

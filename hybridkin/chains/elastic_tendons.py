@@ -1,4 +1,4 @@
-"""Tendons that can only pull on an elastic backbone, as a torch module q -> x."""
+"""An elastic backbone with tendons that can only pull, as a torch module q -> x."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 __all__ = ["ElasticTendonChain"]
 
 _SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros gains".split()
-_TABLE = 12  # up to so many tendons the responses of all sets of taut tendons are stored
+_TABLE = 12  # largest number of tendons for which all responses are stored
 
 
 class ElasticTendonChain(ArcChain):
-    """Tip position of an elastic backbone behind tendons that can pull but not push.
+    """Tip position of an elastic backbone with tendons that can pull but not push.
 
     A shape a = (length changes, bending vectors of all segments) stretches the tendons by
-    ``e = B a - (gains * q - tendon_zeros)``, B the path lengths of `ConstantCurvatureChain`. A
-    taut tendon pulls with its stretch, in units of the tendons' stiffness; a slack one (e < 0) does
-    nothing. The backbone takes the shape of least energy,
-    ``1/2 (a - a0)' K (a - a0) + 1/2 sum max(0, e)^2``, with a0 the rest bends: strictly convex, one
-    answer for every q, continuous in it and linear while the same tendons are taut.
+    ``e = B a - (gains * q - tendon_zeros)``, with the path lengths B of `ConstantCurvatureChain`.
+    The force of a taut tendon is its stretch e, in units of the tendon stiffness; a slack tendon
+    (e < 0) has no force. The backbone takes the shape of least energy,
+    ``1/2 (a - a0)' K (a - a0) + 1/2 sum max(0, e)^2``, with the rest bends a0. It is strictly
+    convex: every q has one shape, continuous in q and linear while the same tendons are taut.
 
-    Where all tendons are taut and the bending stiffness goes to zero the bends become those of
-    `ConstantCurvatureChain` (for evenly spaced tendons at any axial stiffness, else where that is
-    large), while a common pull shortens the backbone.
+    If all tendons are taut and the bending stiffness goes to zero, the bends become those of
+    `ConstantCurvatureChain`. If the tendons are unevenly spaced, this also needs a large axial
+    stiffness. A common pull shortens the backbone.
 
     Parameters
     ----------
     radii : array-like of shape (S,)
         Radius of the tendon circle of each segment, base to tip [m].
     lengths : array-like of shape (S,)
-        Backbone lengths without any pull [m].
+        Backbone lengths without tendon forces [m].
     n_actuators : int or sequence of S ints, default=3
         Tendons that end at each segment.
     angles : array-like, optional
@@ -53,16 +53,16 @@ class ElasticTendonChain(ArcChain):
         "base": tendons of a segment also run through all segments nearer the base, at their own
         radius and angle. "segment": each tendon spans its own segment (sheathed before).
     bending_stiffness : float or array-like of shape (S,), optional
-        Moment per bend of a segment over the stiffness of a tendon [m^2/rad^2]. Default: a
-        hundredth of the squared radius. Three segments then bend 2 % less than the plain chain
-        while all tendons are taut, 7 % where the far side goes slack.
+        Bending moment per bend of a segment, divided by the stiffness of a tendon [m^2/rad^2].
+        Default: a hundredth of the squared radius. Three segments then bend 2 % less than the
+        plain chain while all tendons are taut, 7 % if the outer side of the bend is slack.
     axial_stiffness : float or array-like of shape (S,), optional
-        Of a segment over that of a tendon [-]. Default: 10.
+        Axial stiffness of a segment, divided by that of a tendon [-]. Default: 10.
     tendon_zeros : float or array-like of shape (n,), default=0.0
-        Pre-tension: stretch of each tendon at q = 0 on the straight backbone [m]; negative where it
-        hangs slack. A list of lists, one per segment, is accepted too.
+        Pre-tension: stretch of each tendon at q = 0 on the straight backbone [m]; negative if it
+        is slack. A list of lists, one per segment, is accepted too.
     gains : float or array-like of shape (S,) or (n,), default=1.0
-        Metres per unit of q, as of `ConstantCurvatureChain`.
+        Metres per unit of q, as in `ConstantCurvatureChain`.
     rest_bends : float or array-like of shape (S, 2), default=0.0
         Pre-curvature: bending vector of each segment without tendons [rad].
     offsets : float or array-like of shape (S,), default=0.0
@@ -70,19 +70,19 @@ class ElasticTendonChain(ArcChain):
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
         Pose of the robot's base in the measuring frame. Default: identity.
     dtype : torch.dtype, default=torch.float64
-        Precision in which the geometry is held. Results come in the dtype of q.
+        Precision of the stored geometry. Results have the dtype of q.
 
     Notes
     -----
-    q holds the *changes* of tendon length from straight [m], negative where a tendon is shortened.
+    q holds the *changes* of tendon length from straight [m], negative if a tendon is shortened.
 
-    The taut tendons are found by block principal pivoting: all tendons with the wrong sign change
-    their role at once, and after eight such steps only the first, by Murty's rule, which always
-    terminates. Up to twelve tendons the linear responses of all sets of taut tendons are stored at
-    the first use; with more tendons they are solved for row by row.
+    The taut tendons are found by block principal pivoting: all tendons with the wrong sign switch
+    between taut and slack at once. After eight such steps only the first one switches (Murty's
+    rule), which always terminates. For up to twelve tendons the linear responses of all sets of
+    taut tendons are stored at first use; for more tendons they are computed row by row.
 
-    Derivatives are those of the present set of taut tendons: where a tendon is just about to pull,
-    the one-sided derivative towards its taut side.
+    Derivatives are those of the present set of taut tendons. If a tendon is just becoming taut,
+    they are the one-sided derivatives towards the taut side.
 
     References
     ----------
@@ -146,19 +146,19 @@ class ElasticTendonChain(ArcChain):
 
     @classmethod
     def from_chain(cls, chain: ConstantCurvatureChain, **options: Any) -> ElasticTendonChain:
-        """Return elastic tendons on the geometry of a plain chain with tendons.
+        """Return an elastic chain with the geometry of a plain chain with tendons.
 
         Parameters
         ----------
         chain : ConstantCurvatureChain
-            With `lengths`; its `actuator_zeros`, times the gains, become the `tendon_zeros`.
+            A chain with `lengths`. Its `actuator_zeros` times the gains become `tendon_zeros`.
         **options
-            Further arguments, `bending_stiffness` for example.
+            Further arguments, for example `bending_stiffness`.
 
         Returns
         -------
         ElasticTendonChain
-            Which steers the same point.
+            A chain with the same tip.
 
         Examples
         --------
@@ -170,7 +170,7 @@ class ElasticTendonChain(ArcChain):
         if any(chain.extensible):
             raise ValueError(
                 "`chain` must have `lengths` in all segments: the actuators of extensible segments "
-                "are no tendons."
+                "are not tendons."
             )
         geometry, counts = chain.geometry(), chain.actuators_per_segment
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
@@ -180,13 +180,13 @@ class ElasticTendonChain(ArcChain):
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
-        """The geometry that a calibration fits by default."""
+        """Names of the parameters that a calibration fits by default."""
         stiffness = ("bending_stiffness", "axial_stiffness")
         geometry = ("radii", "turns", "rest_bends", "lengths", "tool", "base")
         return (*geometry, *stiffness, "tendon_zeros", *(() if self.in_metres else ("gain",)))
 
     def tensions(self, q: Tensor) -> Tensor:
-        """Return how far every tendon is stretched.
+        """Return the stretch of every tendon, which is proportional to its force.
 
         Parameters
         ----------
@@ -196,7 +196,7 @@ class ElasticTendonChain(ArcChain):
         Returns
         -------
         Tensor of shape (..., n_actuators)
-            Stretch [m], zero where slack; times the stiffness of the tendons it is their force.
+            Stretch [m], zero if slack; multiply by the tendon stiffness to get the force.
 
         Examples
         --------
@@ -209,7 +209,7 @@ class ElasticTendonChain(ArcChain):
         return self._balance(self._rows(q)).pull.reshape(q.shape)
 
     def slack(self, q: Tensor) -> Tensor:
-        """Return which tendons hang slack, a bool tensor of the shape of q."""
+        """Return which tendons are slack, a bool tensor of the shape of q."""
         return ~self._balance(self._rows(q)).taut.reshape(q.shape)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -229,7 +229,7 @@ class ElasticTendonChain(ArcChain):
         )
 
     def _all_responses(self, rows: Tensor) -> _slack.Responses:
-        """Return the responses of all sets of taut tendons, stored while the geometry stays."""
+        """Return the responses of all sets of taut tendons, cached until the geometry changes."""
         geometry = self.geometry()
         shaping = [geometry[name] for name in _SHAPING]
         learning = torch.is_grad_enabled() and any(value.requires_grad for value in shaping)
@@ -240,7 +240,7 @@ class ElasticTendonChain(ArcChain):
             if key == kept_key and all(a is b for a, b in zip(kept, shaping, strict=True)):
                 return responses
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
-        # Outside inference mode, or derivatives could not use what is stored.
+        # Outside inference mode: derivatives cannot use inference tensors.
         guard = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
         with guard:
             elasticity = _slack.Elasticity(*(part.double() for part in self._elasticity()))
@@ -251,7 +251,7 @@ class ElasticTendonChain(ArcChain):
         return responses
 
     def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, _slack.Responses]:
-        """Return the sets of taut tendons (N,) as bits, and where among responses they stand."""
+        """Return the sets of taut tendons (N,) as bits, their places in responses, and those."""
         if self.n_actuators <= _TABLE:
             table = self._all_responses(rows)
             codes = _slack.FindTaut.apply(
@@ -290,8 +290,8 @@ class ElasticTendonChain(ArcChain):
             bending = new["bending_stiffness"]
             by_stiffness = torch.cat([new["axial_stiffness"], bending, bending], dim=-1)
             by_rest = nn.functional.pad(new["rest_bends"].mT.flatten(1), (S, 0))
-            # By the implicit function theorem: the forces out of balance, times the compliance.
-            # Here from the tip: how it moves by a force on the shape, and by the pull of a tendon.
+            # Implicit function theorem: compliance times the unbalanced forces, accumulated from
+            # the tip: its motion per force on the shape, and per pull of a tendon.
             by_force = by_arcs @ compliance
             by_pull = (by_force @ readings.mT) * taut[:, None]
             turned = pull[:, None, :, None] * by_force[:, :, None, S:]

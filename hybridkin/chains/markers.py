@@ -1,4 +1,4 @@
-"""Points of a robot of arcs that are measured or steered: places on the backbone, and offsets."""
+"""Markers, the measured or controlled points of a chain of arcs: places and offsets."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 Marker = tuple[float, float, float, float]
-"""Where on the backbone [segments from the base], and how far beside it in the frame there [m]."""
+"""Place on the backbone [segments from the base], and offset in the frame at that place [m]."""
 
 
 class MarkedChain(Chain):
-    """A chain whose outputs are one point of the robot, or several; the last one is its tip.
+    """A chain whose outputs are one or several points of the robot; the last one is the tip.
 
     Attributes
     ----------
     markers : tuple of K tuples of four floats
-        Of every point its place on the backbone, in segments from the base, and its offset from
-        there in the frame there [m]. By default the robot's end.
+        For every point its place on the backbone, in segments from the base, and its offset in
+        the frame at that place [m]. By default the robot's end.
     tip_at : float
-        The place of the last one, the tip.
+        The place of the last marker, the tip.
     """
 
     n_segments: int
@@ -37,19 +37,19 @@ class MarkedChain(Chain):
     tip_at: float
 
     def with_tip(self, at: float) -> Self:
-        """Return a chain that steers another point of the same robot.
+        """Return a chain whose tip is another point of the same robot.
 
         Parameters
         ----------
         at : float
-            Where on the backbone, in segments from the base: 1.5 is the middle of the second
-            segment's arc, 2.0 its end with its rigid offset, S (the default) the robot's end.
+            Place on the backbone, in segments from the base: 1.5 is the middle of the second
+            segment's arc, 2.0 its end after its rigid offset, S (the default) the robot's end.
 
         Returns
         -------
         ArcChain
-            Its tip, Jacobians and tip transform are those of that point; actuators, arcs, poses and
-            backbone stay those of the whole robot.
+            Tip, Jacobians and tip transform belong to that point; actuators, arcs, poses and
+            backbone still belong to the whole robot.
 
         Examples
         --------
@@ -71,9 +71,9 @@ class MarkedChain(Chain):
         Parameters
         ----------
         markers : sequence of K tuples (segment, fraction) or (segment, fraction, offset)
-            Of every point the segment, counted from 0; how far along its arc, in (0, 1], where 1
-            is the end of the segment with its rigid offset; and its `offset` (3,) from there in
-            the frame there [m], by default zero. The last point is the tip: poses are its.
+            For every point: the segment, counted from 0; the fraction of its arc, in (0, 1], where
+            1 is the end of the segment after its rigid offset; and the `offset` (3,) in the frame
+            at that place [m], by default zero. The last point is the tip: poses refer to it.
 
         Returns
         -------
@@ -83,7 +83,7 @@ class MarkedChain(Chain):
         Raises
         ------
         ValueError
-            For a place that is not on the robot, and a wrong shape.
+            For a place that is not on the robot, and for a wrong shape.
 
         Examples
         --------
@@ -119,14 +119,14 @@ class MarkedChain(Chain):
         return self.tips()[-1]
 
     def tips(self) -> list[Self]:
-        """Return the chains of all markers, one by one, each q (..., n) to x (..., 3)."""
+        """Return one chain per marker, each mapping q (..., n) to x (..., 3)."""
         one = len(self.markers) == 1
         return [self] if one else [self._marked([marker]) for marker in self.markers]
 
     def up_to_tip(self, arcs: Tensor) -> Tensor:
-        """Return the rows (3 m, ...) of arcs (3 S, ...), or of their slope, up to the tip.
+        """Return the rows (3 m, ...) up to the tip, of arcs (3 S, ...) or of their slope.
 
-        The last of the m segments ends at the tip.
+        The last of the m segments is cut at the tip.
         """
         if self.tip_at == self.n_segments:
             return arcs
@@ -136,7 +136,7 @@ class MarkedChain(Chain):
         return torch.cat([parts[:, :-1], last], dim=1).flatten(0, 1)
 
     def _marked(self, markers: Sequence[Any]) -> Self:
-        chain = self.with_geometry()  # of the same buffers
+        chain = self.with_geometry()  # shares the buffers
         chain._set_markers(markers)
         return chain
 

@@ -1,4 +1,4 @@
-"""Play of tendons: backlash and dry friction as the classical play operator."""
+"""Backlash (also called play) of tendons, modelled by the classical play operator."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["PlayOperator", "PlayState"]
 
 
 class PlayState(NamedTuple):
-    """Where a play operator stands, to be carried from one call to the next.
+    """State of a play operator, passed from one call to the next.
 
     Attributes
     ----------
     command : array or Tensor of shape (n,)
         Last command q [m].
     effective : array or Tensor of shape (n,)
-        Last effective change y [m], within half the width of the command.
+        Last effective change y [m], at most half the width from the command.
     """
 
     command: Any
@@ -35,17 +35,17 @@ _Step = Callable[[Tensor, PlayState, Tensor], PlayState]  # row, state before, h
 
 
 class PlayOperator:
-    """Play between commanded and effective tendon length changes.
+    """Backlash (also called play) between commanded and effective tendon length changes.
 
-    The effective change stands still until the command has moved away by half the width, then
-    follows at that distance: ``y_t = clip(y_{t-1}, q_t - width / 2, q_t + width / 2)``. The
-    outcome depends on the order of the commands, not on their speed. The operator holds no state:
-    it is handed over and returned, so that several robots or branches of a plan share one.
+    The effective change stays constant until the command is half the width away, then follows at
+    that distance: ``y_t = clip(y_{t-1}, q_t - width / 2, q_t + width / 2)``. The result depends on
+    the order of the commands, not on their speed. The operator itself has no state. The state is
+    passed and returned, so several robots or branches of a plan can share one operator.
 
     Parameters
     ----------
     width : float or array-like of shape (n,)
-        Total play of all or of each tendon [m], zero or more. Zero is the identity.
+        Total play of all tendons or of each tendon [m], zero or more. Zero is the identity.
 
     References
     ----------
@@ -78,16 +78,16 @@ class PlayOperator:
         Parameters
         ----------
         q : array or Tensor of shape (T, n)
-            Commanded tendon length changes in the order of time [m].
+            Commanded tendon length changes in order of time [m].
         state : PlayState, optional
-            Where the motion before ended. None: the first row counts as it is, y_0 = q_0.
+            State at the end of the previous motion. None: start without play, y_0 = q_0.
 
         Returns
         -------
         y : array or Tensor of shape (T, n)
-            Effective changes [m], what the robot's model is to be given.
+            Effective changes [m], the input of the robot's model.
         state : PlayState
-            For the rows that follow.
+            State for the rows that follow.
 
         Raises
         ------
@@ -103,23 +103,23 @@ class PlayOperator:
         return self._run(q, state, "q", follow, 1)
 
     def command(self, y: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
-        """Return the commands by which the effective changes become y: the inverse of `apply`.
+        """Return the commands that give the effective changes y: the inverse of `apply`.
 
-        A tendon that moves is sent half the width further; one that rests keeps its command.
+        A moving tendon gets a command half the width ahead; a tendon at rest keeps its command.
 
         Parameters
         ----------
         y : array or Tensor of shape (T, n)
-            Wanted effective changes in the order of time [m].
+            Desired effective changes in order of time [m].
         state : PlayState, optional
-            Where the motion before ended. None: the first row is sent as it is, q_0 = y_0.
+            State at the end of the previous motion. None: start without play, q_0 = y_0.
 
         Returns
         -------
         q : array or Tensor of shape (T, n)
-            Commands to send [m]. They jump by the width where a tendon turns back.
+            Commands to send [m]. They jump by the width when a tendon reverses.
         state : PlayState
-            For the rows that follow.
+            State for the rows that follow.
 
         Raises
         ------
@@ -134,12 +134,12 @@ class PlayOperator:
         return self._run(y, state, "y", lead, 0)
 
     def apply_by_group(self, q: Any, groups: ArrayLike) -> Any:
-        """Return the effective changes of a log of several motions, each started afresh.
+        """Return the effective changes of a log of several motions, each with a new state.
 
         Parameters
         ----------
         q : array or Tensor of shape (N, n)
-            Commanded tendon length changes, the rows of one motion in the order of time [m].
+            Commanded tendon length changes, the rows of each motion in order of time [m].
         groups : array-like of shape (N,)
             Motion of every row.
 
@@ -169,7 +169,7 @@ class PlayOperator:
     def _run(
         self, given: Any, state: PlayState | None, name: str, step: _Step, wanted: int
     ) -> tuple[Any, PlayState]:
-        """Return the entry `wanted` of the state after every row given, and the last state."""
+        """Return the entry `wanted` of the state after every given row, and the last state."""
         as_numpy = not isinstance(given, Tensor)
         rows = real_array(given, name) if as_numpy else given.to(as_tensor(given, name).dtype)
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
@@ -178,13 +178,13 @@ class PlayOperator:
         if not (rows.isfinite() if isinstance(rows, Tensor) else np.isfinite(rows)).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
-            raise ValueError(f"`{name}` must hold at least one row where there is no `state`.")
+            raise ValueError(f"`{name}` must hold at least one row if `state` is not given.")
         given = state if isinstance(state, (tuple, list)) else ()
         start = [rows[0]] * 2 if state is None else [real_array(part, "state") for part in given]
         shapes = [tuple(part.shape) for part in start]
         finite = state is None or all(np.isfinite(part).all() for part in start)
         if shapes != [tuple(rows.shape[1:])] * 2 or not finite:
-            need = f"must hold vectors of shape ({rows.shape[1]},), finite"
+            need = f"must hold two finite vectors of shape ({rows.shape[1]},)"
             raise ValueError(f"`state` {need}, got {state!r:.200}.")
         if isinstance(rows, np.ndarray):
             if len(rows) and rows.dtype == np.float64 and available():

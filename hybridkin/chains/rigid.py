@@ -28,38 +28,38 @@ _KINDS = ("revolute", "prismatic")
 class RigidChain(JointChain):
     """Tip position of a rigid serial arm, from its joint positions.
 
-    Every joint moves by an affine function of sin q and cos q (Rodrigues' formula), of q where it
-    is prismatic. Tip and Jacobian follow in one pass from base to tip, without autograd.
+    The motion of a revolute joint is affine in sin q and cos q (Rodrigues' formula), that of a
+    prismatic joint in q. One pass from base to tip gives tip and Jacobian, without autograd.
 
     Parameters
     ----------
     origins : array-like of shape (n_joints, 4, 4)
-        Pose of every joint's frame at q = 0 in the frame that the joint before it moves; of the
-        first one in the base. Without joints the tip is a constant.
+        Pose of every joint's frame at q = 0 in the moving frame of the previous joint; of the
+        first one in the base. Without joints the tip is constant.
     axes : array-like of shape (n_joints, 3)
-        Joint axes in the joints' frames, normalised here.
+        Joint axes in the joints' frames; they are normalised.
     kinds : sequence of n_joints {"revolute", "prismatic"}, optional
-        What every joint does about or along its axis. Default: all revolute.
+        Type of every joint. Default: all revolute.
     couplings : array-like of shape (n_joints, n), optional
-        How far every actuator moves every joint [-], for differentials and joints that mimic
-        others: joint positions are ``couplings @ q``. Default: one actuator per joint.
+        Motion of every joint per motion of every actuator [-], for differentials and mimic
+        joints: joint positions are ``couplings @ q``. Default: one actuator per joint.
     names : sequence of n str, optional
         Names of the actuators. Default: "joint_1", ...
     joint_zeros : float or array-like of shape (n,), default=0.0
-        What q is where the joints are at the zeros of `origins` [rad] or [m].
+        Value of q at which the joints are at their `origins` [rad] or [m].
     q_min, q_max : array-like of shape (n,), optional
         Joint limits [rad] or [m], the defaults of `InverseKinematics`; the arm itself ignores them.
-        Default: none, infinite.
+        Default: infinite.
     dq_max : array-like of shape (n,), optional
-        Largest speeds of the joints [rad/s] or [m/s], likewise. Default: none, infinite.
+        Largest joint speeds [rad/s] or [m/s], used likewise. Default: infinite.
     tip : array-like of shape (4, 4), optional
-        Pose of the end link in the frame that the last joint moves. Default: identity.
+        Pose of the end link in the moving frame of the last joint. Default: identity.
     tool : array-like of shape (3,), default=(0, 0, 0)
-        The point steered, in the end link's frame [m].
+        The controlled point (the tip), in the end link's frame [m].
     base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
         Pose of the arm's base in the measuring frame. Default: identity.
     dtype : torch.dtype, default=torch.float64
-        Precision in which the geometry is held. Results come in the dtype of q.
+        Precision of the stored geometry. Results have the dtype of q.
 
     References
     ----------
@@ -119,7 +119,7 @@ class RigidChain(JointChain):
         self.n_actuators = n = n_joints if couplings is None else couplings.shape[1]
         for name, value in (("kinds", kinds), ("names", names)):
             if value is not None and not np.iterable(value):
-                raise TypeError(f"`{name}` must be a sequence of texts, got {value!r:.80}.")
+                raise TypeError(f"`{name}` must be a sequence of strings, got {value!r:.80}.")
         self.kinds = ("revolute",) * n_joints if kinds is None else tuple(map(str, kinds))
         default = [f"joint_{k + 1}" for k in range(n)]
         self.names = tuple(map(str, default if names is None else names))
@@ -158,64 +158,64 @@ class RigidChain(JointChain):
         Parameters
         ----------
         text_or_path : str or path
-            XML text, or the file that holds it.
+            XML text, or the path of a file with it.
         end_link : str
             The link whose frame carries the tool.
         root_link : str, optional
-            The link that is the base. Default: the root of the tree that `end_link` is in.
+            The base link. Default: the root of the tree of `end_link`.
         **options
             `tool`, `base` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
         RigidChain
-            Its actuators are the moving joints of the path, in order; where a joint mimics another,
-            that other one, whether on the path or not, with its own limits. A floating joint is six
-            (x, y, z, yaw, pitch, roll) and a planar one three (x, y, yaw, in the frame of the
-            joint). Equal limits lock a joint; continuous joints, and with a warning joints without
-            <limit>, have infinite ones; a velocity of 0 stands for none. Without moving joint the
-            tip is a constant. Tags that URDF does not know are ignored.
+            Its actuators are the moving joints of the path, in order. A mimic joint is replaced by
+            the joint it mimics, on the path or not, with that joint's limits. A floating joint
+            becomes six (x, y, z, yaw, pitch, roll), a planar one three (x, y, yaw, in the frame of
+            the joint). Equal limits lock a joint. Continuous joints have infinite limits, and so
+            have, with a warning, joints without <limit>. A velocity of 0 means no speed limit.
+            Without moving joints the tip is constant. Tags that are not part of URDF are ignored.
 
         Raises
         ------
         FileNotFoundError
             If there is no such file.
         ValueError
-            For text that is no URDF or declares entities, links that are not one tree, numbers that
-            are none, and joints that mimic each other in a circle.
+            For text that is not a URDF or declares entities, links that are not one tree, invalid
+            numbers, and joints that mimic each other in a circle.
 
         Warns
         -----
         UserWarning
-            Of joints without <limit>, with swapped limits, and with limits that are both zero.
+            For joints without <limit>, with swapped limits, and with limits that are both zero.
         """
         return cls(**moving_joints(urdf_path(text_or_path, end_link, root_link)), **options)
 
     def to_urdf(
         self, text_or_path: str | PathLike[str], end_link: str, *, root_link: str | None = None
     ) -> str:
-        """Return a URDF with the calibrated geometry of this arm, its links and joint zeros.
+        """Return a URDF with the calibrated geometry of this arm: links and joint zeros.
 
         Parameters
         ----------
         text_or_path : str or path
-            XML text, or the file that holds it, from which the arm was read.
+            The XML text, or the path of the file, from which the arm was read.
         end_link, root_link : str
             As for `from_urdf`.
 
         Returns
         -------
         str
-            The same text with other <origin> tags of those moving joints that lie elsewhere. It is
-            read as this arm with zero `joint_zeros`; `base` and `tool` are no part of a URDF.
+            The same text with new <origin> tags for moving joints whose origin has changed. Reading
+            it gives this arm with zero `joint_zeros`. A URDF does not contain `base` and `tool`.
 
         Raises
         ------
         FileNotFoundError
             If there is no such file.
         ValueError
-            Where the URDF is not that of this arm, and where links or zeros have moved within a
-            floating or planar joint.
+            If the URDF is not that of this arm, or if links or zeros have moved within a floating
+            or planar joint.
 
         Examples
         --------
@@ -248,11 +248,11 @@ class RigidChain(JointChain):
         Parameters
         ----------
         text_or_path : str or path
-            XML text, or the file that holds it.
+            XML text, or the path of a file with it.
         end_link : str
             The body, or else the site, whose frame carries the tool.
         root_link : str, optional
-            The body that is the base. Default: the world.
+            The base body. Default: the world.
         **options
             `tool`, `base` and `dtype`, as for `RigidChain`.
 
@@ -260,17 +260,17 @@ class RigidChain(JointChain):
         -------
         RigidChain
             Its actuators are the hinges and slides of the path, in order; q is MuJoCo's qpos.
-            Limits are those of `range`, infinite without one or with ``limited="false"``.
+            Limits are those of `range`; without it or with ``limited="false"`` they are infinite.
 
         Raises
         ------
         ImportError
-            Without mujoco.
+            If mujoco is not installed.
         FileNotFoundError
             If there is no such file.
         ValueError
-            For text that is no MJCF, bodies that are not there or not connected, a path without
-            moving joint, a `range` that is no interval, and free or ball joints.
+            For text that is not an MJCF, bodies that are missing or not connected, a path without
+            a moving joint, a `range` that is not an interval, and free or ball joints.
         """
         return cls(**moving_joints(mjcf_path(text_or_path, end_link, root_link)), **options)
 
@@ -281,7 +281,7 @@ class RigidChain(JointChain):
         Parameters
         ----------
         chain : pytorch_kinematics SerialChain
-            Starts at the base and ends at the end link. It is not changed.
+            A chain from the base to the end link. It is not changed.
         **options
             `tool`, `base` and `dtype`, as for `RigidChain`.
 
@@ -305,12 +305,12 @@ class RigidChain(JointChain):
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
-        """The geometry that a calibration fits by default."""
+        """Names of the parameters that a calibration fits by default."""
         return ("base",)
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
-        """Return the arm of a description."""
+        """Return the arm built from a description."""
         settings = {key: stored.list_of(str, key) for key in cls.layout.settings}
         arrays = {
             name: stored.array(name, finite=not name.startswith(("q_", "dq_")))

@@ -65,22 +65,22 @@ def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
 
 @dataclass(frozen=True)
 class LogFormat:
-    """How a robot's log is written: columns, units and sign.
+    """Format of a robot's logs: columns, units and sign.
 
     Attributes
     ----------
     q, x : tuple of str
-        Columns of the actuator vector and of the tip position, in the chain's order; of several
-        markers three each, in the order of ``chain.markers``.
+        Columns of the actuator vector and of the tip position, in the chain's order; with several
+        markers three for each, in the order of ``chain.markers``.
     q_unit, x_unit : {"m", "cm", "mm", "um", "in"}
-        Units of these columns. Of a chain with `gains` that of q is any name but these; of a robot
-        without segments it may be "rad", "deg" or "1" as well.
+        Units of these columns. For a chain with `gains` the unit of q is any other name; for a
+        robot without segments it may also be "rad", "deg" or "1".
     q_sign : int or tuple of int
-        -1 where the log counts a pulled (shortened) tendon as positive.
+        -1 if the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
-        Rows whose motion ends in this belong to the motion named without it.
+        A motion whose name ends in this suffix belongs to the motion named without it.
     groups, time : str or None
-        Columns of the motion that a row belongs to, and of its time stamp [s].
+        Columns of the motion of each row, and of its time stamp [s].
     """
 
     q: tuple[str, ...]
@@ -94,24 +94,24 @@ class LogFormat:
 
     @property
     def q_factor(self) -> np.ndarray:
-        """What the model counts per unit of the log, sign included, shape () or (n,)."""
+        """Units of the model per unit of the log, including the sign, shape () or (n,)."""
         return np.multiply(self.q_sign, UNITS.get(self.q_unit, 1.0))
 
     @property
     def reading(self) -> dict[str, Any]:
-        """The arguments of `datasets.load_log` for such a log."""
+        """The arguments of `datasets.load_log` for this format."""
         unit = self.q_unit if self.q_unit in UNITS else "1"
         return {k: v for k, v in vars(self).items() if k != "group_suffix"} | {"q_unit": unit}
 
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the actuators can do.
+    """Limits of the actuators.
 
     Attributes
     ----------
     q_min, q_max : ndarray of shape (n,) or None
-        Least and largest value of every actuator, as the chain counts them [unit of q].
+        Smallest and largest value of every actuator, with the chain's sign [unit of q].
     dq_max, ddq_max : ndarray of shape (n,) or None
         Largest speed [unit of q per s] and acceleration [unit of q per s^2].
     """
@@ -122,7 +122,7 @@ class Limits:
     ddq_max: np.ndarray | None = None
 
     def intersect(self, other: Limits) -> Limits:
-        """Return the limits that keep to both; what one does not know the other decides."""
+        """Return the intersection of two limits; an entry that is None sets no limit."""
         found = {}
         for name, mine in vars(self).items():
             given = [limit for limit in (mine, vars(other)[name]) if limit is not None]
@@ -131,7 +131,7 @@ class Limits:
         return Limits(**found)
 
     def scaled(self, factor: float | np.ndarray) -> Limits:
-        """Return the limits in other units; where `factor` is negative, low and high swap."""
+        """Return the limits in other units; a negative `factor` swaps low and high."""
         ends = [
             np.multiply(factor, side if value is None else value)
             for value, side in ((self.q_min, -np.inf), (self.q_max, np.inf))
@@ -145,7 +145,7 @@ class Limits:
         )
 
     def narrowed(self, by: float | np.ndarray) -> Limits:
-        """Return the limits with the range of every actuator smaller by `by` at both ends [m]."""
+        """Return the limits with the range of every actuator reduced by `by` at both ends [m]."""
         low, high = self.q_min, self.q_max
         ends = None if low is None else low + by, None if high is None else high - by
         return replace(self, q_min=ends[0], q_max=ends[1])
@@ -153,20 +153,20 @@ class Limits:
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """A robot as its TOML file describes it.
+    """Content of a robot's TOML file.
 
     Attributes
     ----------
     name : str
-        What to call it.
+        Name of the robot.
     chain : ConstantCurvatureChain, ElasticTendonChain or None
-        Its nominal kinematics; None of a robot without segments, for models of data alone.
+        Its nominal model; None for a robot without segments (a model of data alone).
     calibrate : tuple of str or "auto"
-        Geometry that should be fitted to data; "auto": chosen by errors on the data.
+        Parameters to fit to data; "auto": chosen by errors on held-out data.
     log : LogFormat or None
-        How its logs are written.
+        Format of its logs.
     limits : Limits
-        What its actuators can do, as far as it is known.
+        Limits of its actuators, as far as known.
     path : Path or None
         The file it was read from.
     """
@@ -197,20 +197,20 @@ def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
     Parameters
     ----------
     path : str or Path
-        A robot description; `read_description` has its format, and returns the rest of it too.
+        A robot description; for its format, and its other entries, see `read_description`.
 
     Returns
     -------
     ConstantCurvatureChain or ElasticTendonChain
-        The nominal kinematics, lengths in metres.
+        The nominal model, lengths in metres.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not TOML, lacks a key, or has one that is not known or whose value is not
-        of its kind; the message names it.
+        If the file is not TOML, lacks a key, or has an unknown key or a wrong value; the message
+        names the key.
 
     Examples
     --------
@@ -239,57 +239,57 @@ def read_description(path: str | Path) -> RobotDescription:
 
             name = "my trunk"
             model = "constant-curvature"    # the default, or "elastic-tendon"
-            routing = "base"                # or "segment", the default; of elastic tendons "base"
-            calibrate = ["radii", "base"]   # optional, else "auto": chosen by errors on the log;
-                                            # "default": the chain's own list
+            routing = "base"                # or "segment" (default; "base" for elastic tendons)
+            calibrate = ["radii", "base"]   # optional, else "auto": chosen by cross-validated
+                                            # errors; "default": the chain's own list
 
             [[segment]]                     # base to tip
             radius = 0.0045                 # of the actuator circle [m]
             length = 0.060                  # [m]; leave out for extensible segments
-            stage = "rotation"              # of the first segment, or "insertion": a rigid stage of
-                                            # one actuator; beside offset, zeros and gain alone
+            stage = "rotation"              # only in the first segment, or "insertion": a rigid
+                                            # stage with one actuator; only offset, zeros and gain
             actuators = 3                   # the default; 2 at opposite angles bend in a plane
             angle_deg = 0.0                 # of the first actuator; or angles_deg = [0, 120, 240]
-            clockwise = false               # which way the others follow
+            clockwise = false               # direction in which the others follow
             offset = 0.0                    # rigid length after the segment [m]
             rest_bend_deg = [0.0, 0.0]      # its pre-curvature: a bending vector
             zeros = [0.0, 0.0, 0.0]         # offset of the sensor of each actuator, in metres or,
-                                            # with a gain, in the unit of the log; of elastic
-                                            # tendons their `tendon_zeros` [m]
-            gain = 2.7e-5                   # of counts, pressures ...: metres per unit of the log,
+                                            # with a gain, in the unit of the log; for elastic
+                                            # tendons the `tendon_zeros` [m]
+            gain = 2.7e-5                   # for counts, pressures ...: metres per unit of the log,
                                             # one number or one each; in all segments or in none
-            spool_radius = 0.006            # or of motors [m]; their q_unit is "deg" or "rad"
-            bending_stiffness = 2.0e-7      # of elastic tendons only, in all segments or in none
+            spool_radius = 0.006            # or for motors [m], with a q_unit of "deg" or "rad"
+            bending_stiffness = 2.0e-7      # elastic tendons only, in all segments or in none
             axial_stiffness = 10.0          # likewise; units and defaults: `ElasticTendonChain`
-            repeat = 2                      # as many segments like this one
+            repeat = 2                      # number of segments like this one
 
             [base]                          # optional
             position = [0.0, 0.0, 0.0]      # [m]
             rotation_vector_deg = [0.0, 0.0, 0.0]
 
-            [log]                           # how its logs are written, optional
+            [log]                           # format of its logs, optional
             q = ["servo_1", "servo_2", "servo_3"]
-            x = ["tip_x", "tip_y", "tip_z"] # of several markers three columns each, the tip last;
-                                            # then where they are: segment, counted from 0, fraction
+            x = ["tip_x", "tip_y", "tip_z"] # with several markers three columns each, the tip last,
+                                            # and their places: segment (counted from 0), fraction
                                             # of its arc, and offset in the frame there [m]:
                                             # markers = [[0, 1.0, 0, 0, 0], [1, 1.0, 0, 0, 0.01]]
-            q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; with a gain any other
+            q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; with a gain another name
             x_unit = "mm"
             q_sign = -1                     # -1: a pulled tendon counts as positive; or one each
-            groups = "motion"               # column that names the motion of a row, optional
+            groups = "motion"               # column with the motion of each row, optional
             group_suffix = "_hold"          # rows of motion "a_hold" belong to motion "a"
             time = "t"                      # column of the time stamp [s], optional
 
             [limits]                        # of the actuators, optional; one number or one each
-            q_min = -0.010                  # as the chain counts them: shortening < 0 [m]
+            q_min = -0.010                  # with the chain's sign: shortening < 0 [m]
             q_max = 0.010
             dq_max = 0.020                  # [m/s]
             ddq_max = 0.200                 # [m/s^2]
-            unit = "m"                      # the default; "log": in unit and sign of [log], which
-                                            # it must be with a gain
+            unit = "m"                      # the default; "log": in unit and sign of [log]; with a
+                                            # gain it must be "log"
 
-        A file of [log] alone, with [limits] or without, is a robot whose model is learned from data
-        alone. Its `q_unit` may also be "deg", "rad" or "1" (as it is) without a spool.
+        A file with only [log], and optionally [limits], describes a robot whose model is learned
+        from data alone. Its `q_unit` may also be "deg", "rad" or "1" (values unchanged).
 
     Returns
     -------
@@ -301,12 +301,12 @@ def read_description(path: str | Path) -> RobotDescription:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not TOML, lacks a key, or has one that is not known or whose value is not
-        of its kind; the message names it.
+        If the file is not TOML, lacks a key, or has an unknown key or a wrong value; the message
+        names the key.
     """
     path = as_path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"`path` must name a robot description, got {path}: no such file.")
+        raise FileNotFoundError(f"`path` must be a robot description, got {path}: no such file.")
     try:
         return replace(_description(read_tables(path), path.stem), path=path)
     except ValueError as error:
@@ -319,13 +319,13 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
     if chain is None and ("log" not in tables or of_chains):
         raise ValueError(
             "`segment` is missing; describe each segment in a [[segment]] table. For a model of "
-            "data alone give [log], and none of `model`, `routing`, `calibrate` and `base`."
+            "data alone give [log] without `model`, `routing`, `calibrate` and `base`."
         )
     log = _log_format(tables["log"], chain) if "log" in tables else None
     markers = tables.get("log", {}).get("markers")
     if log is not None and len(log.x) != 3 * len((chain and markers) or [0]):
         raise ValueError(
-            f"`x` in [log] must hold 3 names of columns, or 3 for each of `markers`, got {log.x}."
+            f"`x` in [log] must hold 3 column names, or 3 for each of `markers`, got {log.x}."
         )
     if markers and chain is not None:
         chain = chain.with_markers([(k, at, beside) for k, at, *beside in markers])
@@ -335,7 +335,7 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
         names = chain.default_parameters
     if names != "auto" and (not {*names} <= {*known} or len({*names}) < len(names)):
         raise ValueError(
-            f'`calibrate` must name different ones of {known}, or be "auto" or "default", got '
+            f'`calibrate` must name different entries of {known}, or be "auto" or "default", got '
             f"{names}."
         )
     names = names if isinstance(names, str) else tuple(names)
@@ -353,7 +353,7 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
         )
     columns = [*table["q"], *table["x"], *(table[key] for key in _COLUMNS if key in table)]
     if doubled := sorted({name for name in columns if columns.count(name) > 1}):
-        raise ValueError(f"[log] must name every column once, got {doubled} more often.")
+        raise ValueError(f"[log] must name every column once, got {doubled} repeatedly.")
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
     given.pop("markers", None)
     gained = chain is not None and not chain.in_metres
@@ -361,9 +361,9 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     known = [*UNITS] if chain is None else [*METRES]
     if not gained and unit not in known:
         raise ValueError(
-            f'`q_unit` in [log] must be one of {known}; of motors "deg" or "rad", with a '
-            "`spool_radius` [m] in every [[segment]]; of pressures or other units any name, with "
-            f"`gain` [m per unit] instead; got {unit!r}."
+            f'`q_unit` in [log] must be one of {known}; for motors "deg" or "rad", with a '
+            "`spool_radius` [m] in every [[segment]]; for pressures or other units any name, with "
+            f"a `gain` [m per unit] instead; got {unit!r}."
         )
     each(table, "q_sign", "[log]", len(table["q"]))
     return LogFormat(**given)

@@ -1,4 +1,4 @@
-"""Steps within a box of limits, the exact least-squares optimum, and points within half-spaces."""
+"""Exact least-squares steps within a box of limits, and points within half-spaces."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class BoxProblem(NamedTuple):
     J : Tensor of shape (N, m, n)
         Jacobians.
     v : Tensor of shape (N, m)
-        Wanted task steps J dq.
+        Desired task steps J dq.
     z : Tensor of shape (N, n)
-        Preferred steps; the optimum is the one nearest to them.
+        Preferred steps; the optimum is as near to them as the task allows.
     lower, upper : Tensor of shape (N, n)
         Bounds of the step, lower <= upper.
     """
@@ -46,13 +46,13 @@ class BoxProblem(NamedTuple):
 
 
 class HalfSpaces(NamedTuple):
-    """Where the tip must stay: normals x <= offsets, with normals (k, m) of length one."""
+    """Half-spaces in which the tip must stay: normals x <= offsets, unit normals (k, m)."""
 
     normals: Tensor
     offsets: Tensor
 
     def __repr__(self) -> str:
-        """Return how many they are."""
+        """Return the number of half-spaces, for printing."""
         return f"{len(self.offsets)} half-spaces"
 
     def margin(self, x: Tensor) -> Tensor:
@@ -60,14 +60,14 @@ class HalfSpaces(NamedTuple):
         return self.offsets.to(x) - self.along(x)
 
     def along(self, way: Tensor) -> Tensor:
-        """Return the parts (N, k) of ways (N, m) along the normals."""
+        """Return the components (N, k) of displacements (N, m) along the normals."""
         return way @ self.normals.to(way).T
 
     def way_in(self, margin: Tensor) -> Tensor:
-        """Return the shortest ways (N, m) with along(way) <= margin.
+        """Return the shortest displacements (N, m) with along(way) <= margin.
 
-        The way is -normals^T nu, and nu >= 0 minimises |normals^T nu|^2 / 2 + nu . margin. A change
-        of nu is a box-limited step, whose damping proximal rounds take out.
+        They are -normals^T nu, where nu >= 0 minimises |normals^T nu|^2 / 2 + nu . margin. A change
+        of nu is a box-limited step; proximal rounds remove the effect of its damping.
         """
         J = self.normals.to(margin).T.expand(len(margin), -1, -1)
         way, nu = margin.new_zeros(len(margin), J.shape[1]), torch.zeros_like(margin)
@@ -85,15 +85,15 @@ def box_limited_step(
 ) -> tuple[Tensor, Tensor]:
     """Return the exact minimiser of |dq - z|^2 + |J dq - v|^2 / lambda^2 in the box.
 
-    The minimiser is dq(mu) = clip(z + J^T mu, lower, upper) with mu in R^m the root of
+    The minimiser is dq(mu) = clip(z + J^T mu, lower, upper), where mu in R^m is the root of
     F(mu) = J dq(mu) + lambda^2 mu - v. F is the gradient of a strongly convex, piecewise
-    quadratic function, so that Newton's method on its active pieces, with an exact line search
-    along the few breakpoints, ends after finitely many steps at the optimum.
+    quadratic function. Newton's method on its active pieces, with an exact line search along the
+    few breakpoints, therefore reaches the optimum after a finite number of steps.
 
     Parameters
     ----------
     problem : BoxProblem
-        Jacobians, wanted and preferred steps, bounds.
+        Jacobians, desired and preferred steps, bounds.
     damping_sq : Tensor of shape (N,)
         lambda^2 > 0, in the unit of J J^T; not much below 1e-6 of its largest eigenvalue in
         float64.
@@ -103,7 +103,7 @@ def box_limited_step(
     Returns
     -------
     dq : Tensor of shape (N, n)
-        The optimal steps, inside the box.
+        The optimal steps, within the box.
     mu : Tensor of shape (N, m)
         Their multipliers, (v - J dq) / lambda^2.
 
@@ -132,13 +132,13 @@ def box_limited_step(
             )
         if rows.numel() == 0:
             break
-        # Newton's step of F on the linear piece of y, where the actuators at a limit stay there.
+        # Newton's step of F on the linear piece of y: actuators at a limit stay there.
         J, _, _, lower, upper = live
         free = (y > lower) & (y < upper)
         newton = -solve_rows(J * free[:, None], residual, damping_sq)
         slope = apply_columns(J, newton)
         full = y + slope
-        # A full step that stays on its linear piece has solved it, and with it the problem.
+        # A full step that stays on its linear piece has solved the problem.
         same = ((full > lower) == (y > lower)) & ((full < upper) == (y < upper))
         settled = (same | (lower == upper)).all(-1)
         start = (newton * residual).sum(-1)
@@ -158,25 +158,25 @@ def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
     """Return the box-limited step whose task part does not depend on the preferred step z.
 
     Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
-    would trade v against z; therefore the damped task is solved in the box for z = 0 first, and
-    z chooses among the steps that move the tip as that one does.
+    would be a compromise between v and z. Therefore the damped task is first solved in the box for
+    z = 0; z then chooses among the steps with the same tip motion.
 
     Parameters
     ----------
     problem : BoxProblem
-        Jacobians, wanted and preferred steps, bounds.
+        Jacobians, desired and preferred steps, bounds.
     damping_sq : Tensor of shape (N,)
-        lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with
-        that much, and its task error is taken out by proximal rounds on the multipliers.
+        lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with this
+        minimum, and proximal rounds on the multipliers remove its task error.
 
     Returns
     -------
     Tensor of shape (N, n)
-        Steps inside the box.
+        Steps within the box.
     """
     J, v, z, *_ = problem
     size_sq = torch.linalg.matrix_norm(J @ J.mT)  # about sigma_max^2
-    # Without any Jacobian the floor only has to be positive.
+    # If J is zero the floor only has to be positive.
     relative = max(1e-6, math.sqrt(torch.finfo(J.dtype).eps))
     floor = torch.where(size_sq > 0.0, relative * size_sq, torch.ones_like(size_sq))
     centre = torch.zeros_like(v)
@@ -185,7 +185,7 @@ def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
         damped = problem._replace(z=torch.zeros_like(z)).take(rows)
         dq, mu = _proximal_box_step(damped, damping_sq[rows], floor[rows], centre[rows])
         v = v.index_put((rows,), apply_rows(damped.J, dq))
-        # These multipliers hold what the limits hold already, also where v is out of reach.
+        # Start from these multipliers: they keep the active limits, also if v is out of reach.
         centre[rows] = mu
         damping_sq = damping_sq.index_fill(0, rows, 0.0)
     return _proximal_box_step(problem._replace(v=v), damping_sq, floor, centre)[0]
@@ -194,9 +194,9 @@ def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
 def _proximal_box_step(
     problem: BoxProblem, damping_sq: Tensor, floor: Tensor, centre: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return `box_limited_step` for any lambda^2 >= 0, what it lacks to the floor made up for.
+    """Return `box_limited_step` for any lambda^2 >= 0, without the effect of the floor.
 
-    Every round solves J dq + used mu = v + (used - lambda^2) mu_last, whose fixed point has
+    Every round solves J dq + used mu = v + (used - lambda^2) mu_last. At the fixed point
     J dq + lambda^2 mu = v.
     """
     used = torch.maximum(damping_sq, floor)
@@ -215,7 +215,7 @@ def _exact_line_search(
 ) -> Tensor:
     """Return t in (0, 1) where start + t curvature + slope . (clip(y + t slope) - clip(y)) = 0.
 
-    The left side grows with t, is linear between the points where a coordinate meets a bound,
+    The left side increases with t, is linear between the points where a coordinate reaches a bound,
     negative at 0 and positive at 1.
     """
     t = torch.cat([(lower - y) / slope, (upper - y) / slope], dim=-1)

@@ -1,4 +1,4 @@
-"""Steps, ticks and searches in the compiled core, for tasks that have kernels."""
+"""Steps, ticks and searches with the compiled core, for tasks that have kernels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hybridkin.native.plan import NoKernel, Plan
 _MODE, _PERIOD, _MEMORY, _LAST, _SIGMA_MIN, _DAMPING, _DISTANCE = range(7)
 _TARGET, _FEED, _TIP, _OFFSET, _X, _ERROR, _Q = range(7, 26, 3)
 _HAS_TARGET, _HAS_FEED, _HAS_TIP, _MUST_SEE, _FROM_REST = 1, 2, 4, 8, 16
-# What `hk_ik_find` does and finds, see native/src/ik_search.h.
+# Modes and results of `hk_ik_find`, see native/src/ik_search.h.
 _LOWER, _TO_DOMAIN, _TO_POSTURE = 1, 2, 4
 _REACHED, _AT_REST, _HELD = 1, 2, 4
 _FLOAT64 = np.dtype(np.float64)
@@ -33,7 +33,7 @@ _write_point = Struct("3d").pack_into
 
 
 class Tick(NamedTuple):
-    """What is known of a tick, in rows of one: q, the model there, the error, and the step."""
+    """Results of a tick, as single rows: q, the model there, the error, and the step."""
 
     q: Tensor
     x: Tensor
@@ -43,10 +43,10 @@ class Tick(NamedTuple):
 
 
 def core_of(settings: StepSettings, search: bool = False) -> Core | None:
-    """Return the core of settings, None where a part of the task has no kernel.
+    """Return the core of settings, or None if a part of the task has no kernel.
 
-    Poses have kernels for the search alone. The core is kept with the settings, and made anew
-    where the model has changed.
+    Poses have kernels for the search only. The core is kept with the settings, and made again if
+    the model has changed.
     """
     kept, model = vars(settings).get("_program"), program_of(settings.task.models[0])
     if kept is None or kept[0] is not model:
@@ -59,7 +59,7 @@ def core_of(settings: StepSettings, search: bool = False) -> Core | None:
 
 
 class Core:
-    """Inverse kinematics of one task in the compiled core.
+    """Inverse kinematics of one task with the compiled core.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Core:
     Attributes
     ----------
     settings : StepSettings
-        The settings, with a task that the core evaluates.
+        The settings, with a task evaluated by the core.
     n : int
         Number of actuators.
     """
@@ -83,7 +83,7 @@ class Core:
         if self.rows == 3:
             self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
         self.head = self._plan.code.ctypes.data, self._plan.data.ctypes.data, self._plan.root
-        self._idle: list[Follower] = []  # one for every thread that is in `step`
+        self._idle: list[Follower] = []  # one for every thread that has used `step`
         n = self.n
         self._places = {
             "dq": slice(_Q + n, _Q + 2 * n),
@@ -98,7 +98,7 @@ class Core:
         return Core, self._made_of
 
     def step(self, q: Any, target: Any, dx: Any, tip: Any) -> tuple[NDArray, dict] | None:
-        """Return a `Step` of one row of plain arrays and where its fields are, None for others."""
+        """Return the state of a step of one row and the places of its fields; else None."""
         if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
             return None
         follower = self._idle.pop() if self._idle else Follower(self, None, _MUST_SEE + _FROM_REST)
@@ -108,9 +108,9 @@ class Core:
         return found
 
     def steps(self, q: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
-        """Return dq, x, error, sigma_min, damping and what is held, of rows q (N, n).
+        """Return dq, x, error, sigma_min, damping and held actuators, for rows q (N, n).
 
-        `given` is the target, its motion in a period, the measured tip, and the step before.
+        `given` is the target, its motion in a period, the measured tip, and the previous step.
         """
         n, mode = self.n, _MUST_SEE
         for bit, a in zip((_HAS_TARGET, _HAS_FEED, _HAS_TIP), given[:3], strict=True):
@@ -122,11 +122,11 @@ class Core:
         return dq, x, *numbers.unbind(1), torch.from_numpy(held)
 
     def search(self, tol: Tolerance, max_iter: int) -> Search:
-        """Return the search for targets."""
+        """Return the search for configurations that reach targets."""
         return _CoreSearch(self.settings, tol, max_iter, self)
 
     def find(self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int) -> Found:
-        """Return what `hk_ik_find` makes of starts q (N, n)."""
+        """Return the result of `hk_ik_find` for starts q (N, n)."""
         best, rows = _plain(q).copy(), len(q)
         J, e = np.empty((rows, self.rows, self.n)), np.empty((rows, self.rows))
         found, n_iter = np.empty((2, rows), dtype=np.int32)
@@ -138,11 +138,11 @@ class Core:
         reached, at_rest, held = (found & bit > 0 for bit in (_REACHED, _AT_REST, _HELD))
         n_iter = n_iter.long()
         ends = n_iter, torch.ones_like(n_iter)
-        x = target - e if self.rows == 3 else torch.full_like(target, math.nan)  # not asked for
+        x = target - e if self.rows == 3 else torch.full_like(target, math.nan)  # not used
         return Found(at, x, J, e, target.clone(), reached, at_rest, held, *ends)
 
     def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
-        """Call a function of the library for the rows of arrays."""
+        """Call a function of the library for all rows of arrays."""
         function, (code, data, root) = _function(name), self.head
         head = ctypes.c_void_p(code), ctypes.c_void_p(data), ctypes.c_int32(root)
         places = [None if a is None else (a.ctypes.data, a.strides[0]) for a in arrays]
@@ -155,18 +155,18 @@ class Core:
 
 
 class Follower:
-    """A robot that follows targets in the core; its state is one array of numbers.
+    """Follows targets with the core; the state is one array of numbers.
 
     Parameters
     ----------
     core : Core
-        What computes.
+        The core that computes.
     memory : float, optional
         Time constant of the measured offset [s].
     mode : int, default=0
-        Of `ik_tick`, besides what is given.
+        Bits of the mode of `ik_tick` that are always set.
     state : ndarray, optional
-        Of a follower that goes on here.
+        State of a follower to continue.
     """
 
     backend = "compiled"
@@ -190,7 +190,7 @@ class Follower:
         return Follower, (self.core, self._memory, self._least, self.state.copy())
 
     def start(self, q: Tensor) -> None:
-        """Go to a configuration (1, n), where nothing is done yet."""
+        """Set the initial configuration (1, n), at rest."""
         state, n = self.state, self.core.n
         state[_SIGMA_MIN:] = 0.0
         state[[_SIGMA_MIN, _DISTANCE, *range(_ERROR, _Q)]] = math.nan
@@ -199,9 +199,9 @@ class Follower:
         self.q[:] = state[_Q + 2 * n : _Q + 3 * n] = q[0]
 
     def tick(self, target: Any, dx: Any, tip: Any) -> bool:
-        """Take a tick with plain arrays: the target, its velocity, the measured tip.
+        """Do a tick with plain arrays: the target, its velocity, the measured tip.
 
-        Returns False, and does nothing, where one of them needs a closer look.
+        Returns False, and does nothing, if one of them needs full checks.
         """
         mode = self._least | _HAS_TARGET
         if not self._put(_TARGET, target):
@@ -236,7 +236,7 @@ class Follower:
         return True
 
     def advance(self, period: float | None, *given: Tensor | None) -> Tick:
-        """Take a tick with checked rows: the target, its motion in the period, the measured tip."""
+        """Do a tick with checked rows: the target, its motion in the period, the measured tip."""
         mode, bits = self._least, (_HAS_TARGET, _HAS_FEED, _HAS_TIP)
         for bit, place, a in zip(bits, self._inputs.values(), given, strict=True):
             if a is not None:
@@ -250,7 +250,7 @@ class Follower:
 
     command = property(lambda self: self.q.copy())
     x = property(lambda self: self.state[_X:_ERROR].copy())
-    stopped = False  # by limits of the tip, which have no kernel
+    stopped = False  # by tip limits, which have no kernel
     saturated = property(lambda self: self._held.astype(bool))
     error = property(lambda self: float(self.state[_DISTANCE]))
     sigma_min = property(lambda self: float(self.state[_SIGMA_MIN]))
@@ -261,12 +261,12 @@ class Follower:
         return self.error <= (tol[0] if isinstance(tol, tuple) else tol)
 
     def in_domain(self) -> bool:
-        """Return whether the last tick began in the domain of the model."""
+        """Return whether the last tick began inside the domain of the model."""
         n = self.core.n
         return bool(self.core.program.domain(self.state[_Q + 2 * n : _Q + 3 * n])[0] <= 1.0)
 
     def last(self) -> Tick:
-        """Return what is known of the last tick."""
+        """Return the results of the last tick."""
         a, n = torch.from_numpy(self.state.copy())[None], self.core.n
         _, dq, before, held, J = a[:, _Q:].split([n, n, n, n, 3 * n], dim=1)
         step = StepRows(dq, a[:, _SIGMA_MIN], a[:, _DAMPING], held > 0.0)
@@ -274,7 +274,7 @@ class Follower:
 
 
 class _CoreTask(PositionTask):
-    """A position task that the core evaluates."""
+    """A position task that is evaluated by the core."""
 
     def __init__(self, task: Task, program: Program) -> None:
         vars(self).update(vars(task))

@@ -1,4 +1,4 @@
-"""Damped solves and projections for few task rows, batched; three rows in closed form."""
+"""Batched damped solves and projections for few task rows; three rows in closed form."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ HEALTHY = 0.02  # sigma_min / sigma_max above which the pseudo-inverse needs no 
 
 
 class RowGram(NamedTuple):
-    """G = J J^T of a Jacobian, taken apart, and the singular values of J.
+    """G = J J^T of a Jacobian in parts, and the singular values of J.
 
-    With three rows the six entries of G are kept apart, so that a batch costs a few elementwise
-    operations instead of a LAPACK call per matrix; otherwise its eigenvalues and eigenvectors, or
-    G itself where that will do.
+    With three rows the parts are the six entries of G, so that a batch needs a few elementwise
+    operations instead of a LAPACK call per matrix. Otherwise they are its eigenvalues and
+    eigenvectors, or G itself if that is sufficient.
     """
 
     parts: tuple[Tensor, ...]
@@ -27,14 +27,14 @@ class RowGram(NamedTuple):
 
     @property
     def is_singular(self) -> Tensor:
-        """Where a direction is (nearly) lost, shape (...), bool."""
+        """Whether a direction is (nearly) lost, shape (...), bool."""
         return self.sigma_min < HEALTHY * self.sigma_max
 
 
 def row_gram(J: Tensor) -> RowGram:
     """Return G = J J^T with the smallest and largest singular value of J.
 
-    The singular values are good to sqrt(eps) of the largest, because G holds their squares.
+    The singular values are accurate to sqrt(eps) of the largest, because G holds their squares.
 
     Parameters
     ----------
@@ -64,11 +64,11 @@ def row_gram(J: Tensor) -> RowGram:
 
 
 def quick_gram(J: Tensor, sigma_max_only: bool = False) -> RowGram:
-    """Return `row_gram`, with other than three rows estimated by one Cholesky factorisation.
+    """Return `row_gram`; unless there are three rows, estimate it by a Cholesky factorisation.
 
-    sigma_max is then at most too large, sigma_min at most too small, by the fourth root of m; and
-    what a singular G cannot solve is damped by rounding, not dropped. Where only sigma_max is
-    wanted, sigma_min is NaN.
+    The estimate of sigma_max can be too large, that of sigma_min too small, by up to the fourth
+    root of m. Unsolvable parts of a singular G are damped by rounding, not dropped. With
+    `sigma_max_only`, sigma_min is NaN.
     """
     if sigma_max_only:
         size = torch.linalg.vector_norm(J, dim=(-2, -1))
@@ -85,7 +85,7 @@ def quick_gram(J: Tensor, sigma_max_only: bool = False) -> RowGram:
 def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> Tensor:
     """Return mu with (J J^T + lambda^2 1) mu = v, so that J^T mu is the damped inverse step.
 
-    Where a row of J depends on the others, to rounding, what it asks for beyond them is dropped:
+    If a row of J depends on the others, up to rounding, its inconsistent part of v is dropped. So
     without damping the result still inverts the rest.
 
     Parameters
@@ -120,7 +120,7 @@ def null_projection(J: Tensor, gram: RowGram, step: Tensor) -> Tensor:
     """Return (1 - J+ J) step, the part of a step that does not move the tip.
 
     The projector is undamped: a damped one would leak lambda^2 / (sigma^2 + lambda^2) of the step
-    into the task. Applied twice, which takes the rounding of an ill-conditioned J out again.
+    into the task. It is applied twice, which removes the rounding of an ill-conditioned J.
 
     Parameters
     ----------
@@ -152,10 +152,10 @@ def apply_columns(J: Tensor, mu: Tensor) -> Tensor:
 
 
 def adaptive_damping(gram: RowGram) -> Tensor:
-    """Return lambda^2, zero for a healthy J and growing smoothly from there.
+    """Return lambda^2: zero for a regular J, growing smoothly as J becomes singular.
 
-    With s = 0.02 sigma_max, lambda = s (1 - (sigma_min / s)^2) below sigma_min = s: free of units,
-    and once differentiable as a square.
+    With s = 0.02 sigma_max, lambda = s (1 - (sigma_min / s)^2) if sigma_min < s. This does not
+    depend on units, and lambda^2 is once differentiable.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def adaptive_damping(gram: RowGram) -> Tensor:
 
 
 def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
-    """Return mu with (J J^T + lambda^2 1) mu = v, for lambda^2 > 0, which nothing is added to."""
+    """Return mu with (J J^T + lambda^2 1) mu = v, for lambda^2 > 0 and without any floor."""
     if J.shape[-2] == 3:
         return _solve_3x3(_entries_3x3(J), v, damping_sq)
     damping = damping_sq[..., None, None] * identity(J.shape[-2], J)
@@ -220,6 +220,6 @@ def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | floa
 
 
 def _reciprocal(pivot: Tensor, floor: Tensor) -> Tensor:
-    """Return 1 / pivot, and 0 for a pivot that is only rounding."""
+    """Return 1 / pivot, or 0 if the pivot is only rounding error."""
     keep = pivot > floor
     return torch.where(keep, 1.0 / torch.where(keep, pivot, torch.ones_like(pivot)), 0.0)

@@ -15,16 +15,16 @@ _POLISHES = 4
 def differentiable(settings: StepSettings, q: Tensor, target: Tensor, reached: Tensor) -> Tensor:
     """Return q with its graph to the targets and to the model's parameters.
 
-    A solution is a root of F = (W (q_pref - q) + J^T mu, f(q) - x) in q and mu, what lies at a
-    limit held. One Newton step from there, its matrix held fixed, does not move it and has its
+    A solution is a root of F = (W (q_pref - q) + J^T mu, f(q) - x) in q and mu, with actuators at a
+    limit fixed. A Newton step from the root, with a constant matrix, is zero but has the right
     derivatives.
 
     Parameters
     ----------
     settings : StepSettings
-        Task, limits and posture that were solved for.
+        Task, limits and posture of the solutions.
     q : Tensor of shape (N, n)
-        Solutions; first polished to a root.
+        Solutions; they are first polished to a root.
     target : Tensor of shape (N, ...)
         Their targets, with a graph.
     reached : Tensor of shape (N,)
@@ -36,7 +36,7 @@ def differentiable(settings: StepSettings, q: Tensor, target: Tensor, reached: T
         Polished q, differentiable.
     """
     rows = reached.nonzero()[:, 0]
-    if rows.numel() == 0:  # an empty write, so that there is a graph all the same
+    if rows.numel() == 0:  # an empty write, so that there is a graph
         return q.index_put((rows,), target[rows].flatten(1)[:, :1].expand(-1, q.shape[-1]))
     part, goal = q[rows], target[rows]
     lower, upper = settings.box(part)
@@ -56,7 +56,7 @@ def differentiable(settings: StepSettings, q: Tensor, target: Tensor, reached: T
 def _newton(
     settings: StepSettings, q: Tensor, target: Tensor, free: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the Newton step of F in q, its matrix a constant, and |F|; what is held stays."""
+    """Return the Newton step of F in q with a constant matrix, and |F|; only `free` moves."""
     n = q.shape[-1]
     unit = settings.unit(q)
     weights = unit.square().reciprocal().expand_as(q)
@@ -77,6 +77,6 @@ def _newton(
     upper, lower = torch.cat([H, held.mT], dim=-1), torch.cat([held, corner], dim=-1)
     right = torch.cat([torch.where(free, -pull, 0.0), e], dim=-1)
     step = torch.linalg.solve_ex(torch.cat([upper, lower], dim=-2), right)[0][:, :n]
-    # A root in metres per metre of posture: both parts count alike.
+    # Posture in its unit and task in metres: both parts have the same weight.
     lacking = torch.cat([unit * right[:, :n], e], dim=-1).detach().norm(dim=-1)
     return step.nan_to_num(0.0, 0.0, 0.0), lacking

@@ -1,4 +1,4 @@
-"""Batched search for configurations that reach targets, and the descent in their null space."""
+"""Batched search for configurations that reach targets, and descent in their null space."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
 
 _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
-_LAST_DAMPING = 1e8  # no descent even with this one: the point is as good as it gets
-_STATIONARY = 1e-4  # sine of the angle between the error and what the limits leave free
-_SLOW_STEPS = 8  # iterations in a row that gain less than 1 % of tol
+_LAST_DAMPING = 1e8  # no descent even with this damping: the point is stationary
+_STATIONARY = 1e-4  # sine of the angle between the error and the directions left by the limits
+_SLOW_STEPS = 8  # consecutive iterations that gain less than 1 % of tol
 _NULL_STEPS = 30  # iterations of a null-space descent
-_NULL_SLIP = 0.3  # error per tip-sized motion that a null-space step may leave to the next
-_NULL_GAIN = 1e-8  # of the square of what is left to go; the descent ends where it gains less
-_INSIDE = 0.98  # domain distance to go to from outside the domain
+_NULL_SLIP = 0.3  # largest error after a null-space step, per motion of the tip without projection
+_NULL_GAIN = 1e-8  # smallest gain of a null-space step, per square of the remaining step
+_INSIDE = 0.98  # target domain distance for starts outside the domain
 _OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
-_RETURNS = 30  # of rows that ended outside the limits of the tip, towards these
-_PARTS = [4, 8, 16]  # further starts in all, before there are more
-_ROWS = 256  # that start elsewhere at once
-_FINE = 0.01  # of tol, for configurations that are compared
-_SAME = 0.01  # of the ranges: nearer configurations are one
+_RETURNS = 30  # attempts to return rows that ended outside the tip limits
+_PARTS = [4, 8, 16]  # where further starts are split; only rows still open use the next part
+_ROWS = 256  # rows searched again at once
+_FINE = 0.01  # factor on tol when configurations are compared
+_SAME = 0.01  # of the ranges: closer configurations count as the same
 
 RowsT = TypeVar("RowsT", bound="Point")
 
 
 @dataclass
 class Point:
-    """Configurations and what the task gives there, one row per target."""
+    """Configurations and the task's values there, one row per target."""
 
     q: Tensor
     x: Tensor
@@ -60,7 +60,7 @@ class Point:
 
 @dataclass
 class Found(Point):
-    """The best points so far of every row, owned by the search and updated in place."""
+    """The best point so far of every row, updated in place by the search."""
 
     reached: Tensor
     stationary: Tensor
@@ -73,35 +73,35 @@ class Found(Point):
 class _Descent(Found):
     """Rows on their way to a target."""
 
-    start: Tensor  # their first error
-    nu: Tensor  # lambda^2 / sigma_max^2 of the first error
-    growth: Tensor  # of nu after a step that does not lower the error
-    slow: Tensor  # steps in a row that gained little
+    start: Tensor  # initial error
+    nu: Tensor  # lambda^2 / sigma_max^2 at the initial error
+    growth: Tensor  # factor on nu after a step that does not lower the error
+    slow: Tensor  # consecutive steps that gained little
 
 
 @dataclass
 class _Slide(Point):
     """Rows on their way along the null space."""
 
-    wish: Tensor  # wanted step
+    wish: Tensor  # desired step
     free: Tensor  # its part in the null space
-    share: Tensor  # of it to take
+    share: Tensor  # fraction of it to take
 
 
 @dataclass(frozen=True)
 class Search:
-    """Levenberg-Marquardt with box-limited steps; a step is taken where it lowers the error."""
+    """Levenberg-Marquardt with box-limited steps; a step is taken if it lowers the error."""
 
     settings: StepSettings
     tol: Tolerance
     max_iter: int
 
     def solve(self, q: Tensor, target: Tensor, cold: bool, restarts: int) -> Found:
-        """Return the best points from starts q (N, n), and from further ones where they fail."""
+        """Return the best points from starts q (N, n), and from further starts if these fail."""
         settings = self.settings
         q, target = settings.inside(q), settings.allowed(target)
         if cold and len(q) > 0 and row_gram(settings.evaluate(q[:1])[1]).is_singular.all():
-            # A straight backbone: motions that cancel to first order would be missed.
+            # At a straight backbone, motions that cancel to first order would be missed.
             at_start = self._start(q, target)
             nudged = settings.inside(self._nudged(at_start))
             stay = at_start.reached | ~torch.isfinite(at_start.error)
@@ -129,7 +129,7 @@ class Search:
     def several(self, best: Found, start: Tensor, restarts: int, count: int) -> Found:
         """Return `count` different points for each row of `best`, the nearest to `start` first.
 
-        Rows that are left when no further point was found have NaN as q.
+        Rows without a further point have NaN as q.
         """
         settings, s, tol = self.settings, restarts + 1, self.tol
         tol = tuple(_FINE * t for t in tol) if isinstance(tol, tuple) else _FINE * tol
@@ -163,7 +163,7 @@ class Search:
         self._descend(found, lambda q: self.settings.preferred(q) - q)
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
-        """Return what one start leads to; from outside the models' domain slide towards it."""
+        """Return the result of one start; results outside the domain are moved towards it."""
         found = self._lower(q, target)
         rows = (self._cost(found) == _OUTSIDE).nonzero()[:, 0]
         part = found.take(rows)
@@ -172,7 +172,7 @@ class Search:
         return found
 
     def _try_again(self, found: Found, rows: Tensor, starts: Tensor) -> None:
-        """Search rows (k,) from further starts (k, s, n) at once, and keep what is best."""
+        """Search rows (k,) from further starts (k, s, n) at once, and keep the best results."""
         n_starts = starts.shape[1]
         if rows.numel() == 0 or n_starts == 0:
             return
@@ -188,7 +188,7 @@ class Search:
         found.n_iter[rows], found.n_starts[rows] = n_iter, n_tried
 
     def _cost(self, found: Found) -> Tensor:
-        """Return the error, -1 for rows that are reached outside the domain, -2 inside."""
+        """Return the error, or -1 for rows reached outside the domain, -2 for inside."""
         inside = self.settings.task.in_domain(found.q)
         return torch.where(found.reached, torch.where(inside, _DONE, _OUTSIDE), found.error)
 
@@ -223,16 +223,16 @@ class Search:
                     break
                 rows, live = rows[going], live.take(going)
             error = live.error
-            # Damping in proportion to the error, so that the last iterations are Gauss-Newton's.
+            # Damping proportional to the error: the last iterations are Gauss-Newton steps.
             trust = live.nu * (error / live.start)
             bounds = self.settings.step_bounds(live.q)
-            # What turns on beyond a limit comes back at the other one.
+            # A turning joint may pass its limit and continue at the other one.
             bounds = (a.where(~turning, b) for a, b in zip(bounds, (-half, half), strict=True))
             step = limited_step(self.settings, live.J, live.e, None, *bounds, trust, quick=True)
             new = self._point(self.settings.inside(live.q + step.dq), live.target)
             error_new = new.error
             predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
-            # The damping follows the share of the predicted gain that came true.
+            # The damping follows the ratio of actual to predicted gain.
             gained = error.square() - error_new.square()
             quality = gained / (error.square() - predicted.square()).clamp_min(1e-30)
             better = error_new < error
@@ -248,10 +248,10 @@ class Search:
         return found
 
     def _inward(self, q: Tensor) -> Tensor:
-        """Return Newton's step of the domain distance to a little less than 1.
+        """Return Newton's step to a domain distance slightly below 1.
 
-        Zero where the distance has no gradient, as that of a function that only says whether q is
-        in its domain.
+        Zero if the distance has no gradient, e.g. for a function that only returns whether q is in
+        its domain.
         """
         slope = torch.zeros_like(q)
         with torch.enable_grad():
@@ -264,13 +264,13 @@ class Search:
         return -(beyond / torch.where(square > 0.0, square, 1.0))[:, None] * slope
 
     def _descend(self, found: Found, wanted: Callable[[Tensor], Tensor]) -> None:
-        """Slide reached rows along their null space as far as the wanted steps lead, then polish.
+        """Move reached rows along their null space in the direction of the desired steps.
 
-        On the way the error may exceed tol by a share of the motion, for the next step takes it
-        back; only what is within tol is recorded. What a step gains is the way times the part of
-        the wanted step that is free, before and after, on average: the trapezoidal rule for the
-        Lagrangian, in which what a step does for the task does not count. How much of the wanted
-        step is taken follows the curvature seen on the last one.
+        The error may exceed tol temporarily, by a fraction of the motion, because the next step
+        corrects it; only points within tol are recorded. The gain of a step is its displacement
+        times the mean of the free (null-space) part of the desired step before and after it: the
+        trapezoidal rule for the Lagrangian, which ignores the task part of the step. The fraction
+        of the desired step to take follows from the curvature of the last step.
         """
         all_rows = rows = found.reached.nonzero()[:, 0]
         if rows.numel() == 0:
@@ -315,7 +315,7 @@ class Search:
     def _try_step(
         self, at: Point, posture: Tensor | None, hold: bool = False
     ) -> tuple[StepRows, Point]:
-        """Return a step and the point after it; `hold` what lies at a limit."""
+        """Return a step and the point after it; `hold` fixes actuators at a limit."""
         lower, upper = self.settings.step_bounds(at.q)
         if hold:
             held = (lower >= 0.0) | (upper <= 0.0)
@@ -327,7 +327,7 @@ class Search:
         return self.settings.task.reached(e, self.tol)
 
     def _blocked(self, at: Point) -> Tensor:
-        """Return where no motion within the limits lowers the error to first order."""
+        """Return whether no motion within the limits lowers the error to first order."""
         q, (lower, upper) = at.q, self.settings.box(at.q)
         pull = apply_columns(at.J, at.e)
         out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
@@ -336,21 +336,21 @@ class Search:
         return left <= _STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
 
     def _nudged(self, found: Found) -> Tensor:
-        """Return starts beside singular points, where the first-order motion is blind.
+        """Return starts beside singular points, where first-order motion does not help.
 
-        A straight backbone asked to shorten, or a stretched arm: the error is stationary without
-        being smallest. The way out is of second order, hence not short where the error is small:
-        5 % of the limits, or what moves a healthy tip by a tenth of the error.
+        Examples are a straight backbone that has to shorten, or a stretched arm: the error is
+        stationary but not minimal. A second-order motion is needed, which is large even for small
+        errors: 5 % of the limits, or the motion that moves a regular tip by a tenth of the error.
         """
         n, settings = found.q.shape[-1], self.settings
         size = 0.1 * _per_tip(found.J, found.error)[:, None].expand_as(found.q)
         span = 0.05 * (settings.q_max - settings.q_min).to(found.q)
         size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)
-        # Unequal shares, because equal ones may cancel in a symmetric robot.
+        # Unequal factors, because equal ones can cancel in a symmetric robot.
         return found.q + size * torch.cos(found.q.new_ones(n).cumsum(0))
 
 
 def _per_tip(J: Tensor, error: Tensor) -> Tensor:
-    """Return the motion (N,) of an actuator that moves a healthy tip by the error."""
+    """Return the motion (N,) of an actuator that moves the tip by about the error."""
     size = J.flatten(1).norm(dim=-1)
     return torch.where(size > 0.0, error / size, error)

@@ -1,4 +1,4 @@
-"""The checked settings of inverse kinematics, and the arrays that come in with them."""
+"""The checked settings of inverse kinematics, and the conversion of the caller's arrays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hybridkin._core.stored import Stored
 from hybridkin.ik._box import HalfSpaces
 from hybridkin.ik.tasks import PoseTask, PositionTask, Task, Tolerance
 
-Array: TypeAlias = Numbers | Transform  # what comes in
+Array: TypeAlias = Numbers | Transform  # what a caller may pass
 Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 
@@ -38,7 +38,7 @@ def bound(value: Array, name: str, *, finite: bool = False, positive: bool = Fal
     require(good, f"`{name}` must be a number or of shape (n,), without NaN, got {a.tolist()}.")
     good = torch.isfinite(a).all() or not finite
     require(good, f"`{name}` must be finite, got {a.tolist()}.")
-    lock = "to lock an actuator give it equal limits"
+    lock = "to lock an actuator, give it equal limits"
     require(
         (a > 0.0).all() or not positive, f"`{name}` must be positive, got {a.tolist()}; {lock}."
     )
@@ -46,7 +46,7 @@ def bound(value: Array, name: str, *, finite: bool = False, positive: bool = Fal
 
 
 def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
-    """Return limits of the tip, a pair (A, b) with A x <= b, with normals of length one."""
+    """Return tip limits, a pair (A, b) with A x <= b, as half-spaces with unit normals."""
     need, m, got = "`tip_limits` must be a pair (A, b)", task.shape[0], type(task).__name__
     require(isinstance(task, PositionTask), f"`tip_limits` needs a PositionTask, got a {got}.")
     require(isinstance(given, Sequence) and len(given) == 2, f"{need}, got {given!r:.200}.")
@@ -58,35 +58,35 @@ def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
     require(good, f"{need} {shapes}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
     found = HalfSpaces(A / size[:, None], b / size)
     inside = found.margin(found.way_in(found.offsets[None])) >= -1e-9
-    require(inside.all(), "`tip_limits` must leave a point; these half-spaces have none in common.")
+    require(inside.all(), "`tip_limits` must have a common point; these half-spaces have none.")
     return found
 
 
 def require(good: bool | Tensor, message: str) -> None:
-    """Raise a ValueError where an argument is not what it must be."""
+    """Raise a ValueError with this message if an argument is not good."""
     if not good:
         raise ValueError(message)
 
 
 def stopping(way: Tensor, change: Tensor) -> Tensor:
-    """Return the largest first step from which steps that shrink by `change` stop within `way`."""
+    """Return the largest first step for which steps that shrink by `change` stop within `way`."""
     stops = way / (0.5 + 0.5 * (1.0 + 2.0 * (way.clamp_min(0.0) / change)).sqrt())
     return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
 
 
-_FAST = 5.0  # times the largest plausible q in a second is too fast
+_FAST = 5.0  # largest plausible speed: this many times the largest plausible q per second
 _TURN = 2.0 * math.pi
-_FULL = 0.999  # share of a turn between limits that counts as all of it
+_FULL = 0.999  # a range of this share of a turn counts as a whole turn
 
 
 @dataclass(frozen=True)
 class StepSettings(Portable):
-    """What a step depends on besides q and the target; see `InverseKinematics`.
+    """All inputs of a step except q and the target; see `InverseKinematics`.
 
     Limits, weights and a fixed posture are float64 tensors of shape () or (n,). `posture` is
-    `q_pref`, and the middle of the limits where none is given; `of_model` names the limits that are
-    those of the model; `periods`, shape () or (n,), is what q counts modulo: a turn of an angle
-    whose limits leave a whole one, else inf.
+    `q_pref`, or by default the middle of the limits. `of_model` names the limits taken from the
+    model. `periods`, shape () or (n,), are the periods of q: a turn for an angle with a range of a
+    whole turn, else inf.
     """
 
     task: Task
@@ -107,11 +107,11 @@ class StepSettings(Portable):
     periods: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check the settings, and take the middle of the limits where no posture is given."""
+        """Check the settings; without `q_pref` the posture is the middle of the limits."""
         sizes, one = self._sizes(), "give scalars or one value per actuator"
         good = len(set(sizes.values())) < 2
         names = ", ".join(f"`{name}`" for name in sizes)
-        require(good, f"{names} must agree in the number of actuators, got {sizes}; {one}.")
+        require(good, f"{names} must have the same number of actuators, got {sizes}; {one}.")
         low, high = self.q_min.tolist(), self.q_max.tolist()
         good = (self.q_min <= self.q_max).all()
         require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
@@ -129,7 +129,7 @@ class StepSettings(Portable):
         object.__setattr__(self, "periods", periods)
 
     def unit_messages(self) -> list[str]:
-        """Return warnings where limits or a posture look like another unit than the model's."""
+        """Return warnings if limits or a posture seem to have another unit than the model."""
         found, n = [], self.n_actuators
         for name in ("q_min", "q_max", "dq_max", "q_pref"):
             value = vars(self)[name]
@@ -140,12 +140,12 @@ class StepSettings(Portable):
         return found
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
-        """Return warnings where targets lie too far from the robot to be metres."""
+        """Return warnings if targets lie too far from the robot to be in metres."""
         points = x[..., :3, 3] if self.task.shape == (4, 4) else x
         return self.task.models[0].robot.far_messages(points, name) if points.shape[-1] == 3 else []
 
     def _sizes(self) -> dict[str, int]:
-        """Return the numbers of actuators that the settings and the model know, by name."""
+        """Return the numbers of actuators given by the settings and the model, by name."""
         vectors = {k: a for k, a in vars(self).items() if isinstance(a, Tensor) and a.ndim == 1}
         sizes = {name: len(a) for name, a in vectors.items()}
         n = self.task.n_actuators
@@ -153,12 +153,12 @@ class StepSettings(Portable):
 
     @property
     def n_actuators(self) -> int | None:
-        """Length of q, where settings or model know it."""
+        """Length of q, or None if neither settings nor model define it."""
         return next(iter(self._sizes().values()), None)
 
     @property
     def middle(self) -> Tensor | None:
-        """The middle of the limits, where they are finite."""
+        """The middle of the limits, or None if they are not finite."""
         middle = 0.5 * (self.q_min + self.q_max)
         return middle if torch.isfinite(middle).all() else None
 
@@ -179,22 +179,22 @@ class StepSettings(Portable):
 
     @property
     def has_posture(self) -> bool:
-        """Whether there is a preferred configuration to go to."""
+        """Whether there is a preferred configuration."""
         return self.posture is not None and self.beta > 0.0
 
     def stored(self) -> Stored:
-        """Return how the settings describe themselves, with the model as their part.
+        """Return the description of the settings, with the model as their part.
 
         Raises
         ------
         TypeError
-            Where they could only be stored as code: other tasks than a `PositionTask` or a
-            `PoseTask`, or a posture that is a function; and with limits of the tip.
+            If they could only be stored as code: tasks other than a `PositionTask` or a
+            `PoseTask`, a posture that is a function, or tip limits.
         """
         model, n = self.task.models[0], self.n_actuators
         of_code = callable(self.posture) or self.tip_limits is not None
         if type(self.task) not in (PositionTask, PoseTask) or of_code or n is None:
-            raise TypeError("only a position or a pose, with a fixed posture, can be data")
+            raise TypeError("only a position or pose task with a fixed posture can be data")
         arrays = {
             "q_min": self.q_min,
             "q_max": self.q_max,
@@ -223,7 +223,7 @@ class StepSettings(Portable):
         return wanted.to(q)
 
     def start(self, like: Tensor) -> Tensor:
-        """Return the preferred configuration (n,); where it is a function, that at the middle."""
+        """Return the preferred configuration (n,); if it is a function, evaluate it mid-range."""
         start = self.posture if isinstance(self.posture, Tensor) else self.middle
         need = "give `q0` or `q_pref` of shape (n,)"
         if start is None:
@@ -234,20 +234,20 @@ class StepSettings(Portable):
         return self.preferred(start) if callable(self.q_pref) else start
 
     def rates(self, period: float | None = None) -> tuple[float, float, float]:
-        """Return gain dt and beta dt, both at most 1, and dt, of a period [s], by default `dt`."""
+        """Return gain dt and beta dt, both at most 1, and dt, for a period [s], default `dt`."""
         dt = self.dt if period is None else period
         gain = 1.0 if self.gain is None else self.gain * dt
         beta = self.beta * dt
         for name, share, good in (("gain", gain, gain > 0.0), ("beta", beta, beta >= 0.0)):
             need = "must lie in [0, 1], and a gain above 0"
             got = f"got {share / dt:.6g} 1/s x {dt:.6g} s = {share:.4g}"
-            way = f"take a {name} up to {1.0 / dt:.4g} 1/s or a shorter period"
+            way = f"use a {name} up to {1.0 / dt:.4g} 1/s or a shorter period"
             good = good and share <= 1.0 + 1e-9
             require(good, f"`{name}` times the period {need}, {got}; {way}.")
         return min(gain, 1.0), min(beta, 1.0), dt
 
     def unit(self, q: Tensor) -> Tensor:
-        """Return the units, shape () or (n,), of q in which nothing has a weight."""
+        """Return the units of q, shape () or (n,), in which all weights are 1."""
         return q.new_ones(()) if self.weights is None else self.weights.to(q).rsqrt()
 
     def box(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -257,18 +257,18 @@ class StepSettings(Portable):
         return self.q_min.to(q), self.q_max.to(q)
 
     def inside(self, q: Tensor) -> Tensor:
-        """Return q moved into the limits: by whole turns where they leave one, else clipped."""
+        """Return q moved into the limits: by whole turns if q is periodic, then clipped."""
         low, high = self.box(q)
         turned = q - self.whole_turns(q - 0.5 * (low + high))
         return torch.clamp(torch.where((q < low) | (q > high), turned, q), low, high)
 
     def allowed(self, x: Tensor) -> Tensor:
-        """Return the points nearest to x where the tip may be."""
+        """Return the points nearest to x within the tip limits."""
         limits = self.tip_limits
         return x if limits is None else x + limits.way_in(limits.margin(x))
 
     def change(self, q: Tensor, period: float) -> Tensor:
-        """Return by how much a step may differ from the one before."""
+        """Return the largest difference between consecutive steps."""
         return self.ddq_max.to(q) * period**2
 
     def step_bounds(
@@ -276,15 +276,14 @@ class StepSettings(Portable):
     ) -> tuple[Tensor, Tensor]:
         """Return the bounds of dq: position, and for a period [s] speed and acceleration.
 
-        They are intersected and never empty. `last` is the step before, for a period as long as
-        this one. From outside the limits both bounds meet at the way back, at most
-        the largest step; where the speed cannot be stopped in time they meet at the hardest
-        braking. The nextafter makes q + upper <= q_max hold after rounding, and with it q + dq for
-        every dq.
+        They are intersected and never empty. `last` is the previous step, scaled to this period.
+        Outside the limits both bounds are the step back to them, limited by the largest step. If
+        the speed cannot be stopped in time, both bounds are the hardest braking. The nextafter
+        ensures q + upper <= q_max after rounding, and so q + dq <= q_max for every dq.
 
-        With speed u = dq / period and acceleration a the way until the robot stands is at most
-        u period + u^2 / (2 a), whatever the periods to come: within d it can stop if
-        dq <= 2 d / (1 + sqrt(1 + 2 d / (a period^2))). Braking in the next period keeps this.
+        With speed u = dq / period and acceleration a, the distance to a stop is at most
+        u period + u^2 / (2 a), whatever the following periods are. The robot can stop within d if
+        dq <= 2 d / (1 + sqrt(1 + 2 d / (a period^2))). Braking in the next period preserves this.
         """
         q_min, q_max = self.box(q)
         lower, upper = q_min - q, q_max - q
@@ -305,7 +304,7 @@ class StepSettings(Portable):
         """Return the smallest distance of an actuator to its limits."""
         return torch.minimum(q - self.q_min.to(q), self.q_max.to(q) - q).amin(-1)
 
-    # What comes in from a caller, as tensors.
+    # Conversion of a caller's arrays to tensors.
 
     def configurations(self, value: Array, name: str, like: Tensor | None = None) -> Tensor:
         """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
@@ -325,7 +324,7 @@ class StepSettings(Portable):
     ) -> Tensor:
         """Return targets or tips (..., *shape), by default in the shape of the task's targets.
 
-        `lead` says which axes come first: "..." any, "T" one, "" none.
+        `lead` gives the leading axes: "..." any, "T" one, "" none.
         """
         x, one = as_tensor(value, name, self.task.device), shape or self.task.shape
         check_shape(x, name, [*filter(None, [lead]), *one], "one point [m] per row")
@@ -334,7 +333,7 @@ class StepSettings(Portable):
         return x if like is None else x.to(like)
 
     def times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
-        """Return the times of a path's points, and the period that follows each."""
+        """Return the times of a path's points, and the period after each point."""
         n, dt = len(target), self.dt
         if t is None:
             return dt * torch.arange(n, dtype=target.dtype, device=target.device), [dt] * n
@@ -347,13 +346,13 @@ class StepSettings(Portable):
         return times, [*periods, dt]
 
     def places(self, n_solutions: int | None, differentiable: bool) -> int:
-        """Return how many configurations a target takes."""
+        """Return the number of configurations per target."""
         if n_solutions is None:
             return 1
         require(not differentiable, "`n_solutions` must be None for differentiable=True.")
         n_solutions = whole(n_solutions, "n_solutions", 1, 10_000)
         good, way = torch.isfinite(self.spans).all(), "give finite `q_min` and `q_max`"
-        require(good, f"`n_solutions` compares configurations by the range of q; {way}.")
+        require(good, f"`n_solutions` needs finite ranges of q to compare configurations; {way}.")
         return n_solutions
 
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:

@@ -1,4 +1,4 @@
-"""Where a search starts again: configurations of an even sample whose tips lie near the target."""
+"""Further starts of a search: configurations of an even sample with tips near the target."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 from hybridkin.ik._settings import StepSettings
 
-_SHARED = 2048  # configurations in the limits, the same for every row
-_OWN = 64  # around a row's start, where an actuator has no limits
-_OUTSIDE = 4.0  # factor on the distance from starts outside the domain of the models
+_SHARED = 2048  # configurations within the limits, the same for every row
+_OWN = 64  # around a row's start, if an actuator has no limits
+_OUTSIDE = 4.0  # factor on the distance of starts outside the domain of the models
 
 
 def nearest_starts(
@@ -18,14 +18,14 @@ def nearest_starts(
     """Return the `count` configurations of a sample whose tips are nearest to each target.
 
     The sample is the same in every call and for every batch. It fills the limits, their faces and
-    their corners; where an actuator has no limits, a range around its start.
+    their corners; for an actuator without limits, a range around its start.
 
     Parameters
     ----------
     settings : StepSettings
         Task and limits.
     q : Tensor of shape (N, n)
-        Where the rows started.
+        Starts of the rows.
     size : Tensor of shape (N,)
         Motion of an actuator that moves the tip by about the error.
     target : Tensor of shape (N, ...)
@@ -51,7 +51,7 @@ def nearest_starts(
 def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> Tensor:
     """Return `count` configurations (1, count, n) that fill the limits, their faces and corners.
 
-    Where an actuator has no limits they fill a range around q (N, n): (N, count, n).
+    If an actuator has no limits they fill a range around q (N, n): (N, count, n).
     """
     low, high = (a.to(q).expand(1, q.shape[-1]) for a in (settings.q_min, settings.q_max))
     if not torch.isfinite(high - low).all():
@@ -65,10 +65,10 @@ def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> 
 
 
 def _even_shares(n: int, count: int, device: torch.device) -> Tensor:
-    """Return `count` points that fill the unit cube of n axes evenly, and its faces.
+    """Return `count` points that fill the n-dimensional unit cube and its faces evenly.
 
-    A Kronecker sequence of the generalised golden ratio in n + 1 axes, from the middle. The last
-    axis stretches a point away from the middle; what leaves the cube is clipped to its faces.
+    A Kronecker sequence of the generalised golden ratio in n + 1 dimensions, from the middle. The
+    last one moves a point away from the middle; points outside the cube are clipped to its faces.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""The law of one step, eq. (1): a task, a posture in its null space, and limits inside the step."""
+"""The law of one step, eq. (1): a task, a posture in its null space, and limits of the step."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from hybridkin.ik._gram import (
 )
 from hybridkin.ik._settings import StepSettings, stopping
 
-_PROJECTIONS, _EXCESS = 8, 1.5  # of a step that would leave the limits of the tip
+_PROJECTIONS, _EXCESS = 8, 1.5  # for a step that would leave the tip limits
 
 
 class StepRows(NamedTuple):
-    """A step and what came with it, a row each."""
+    """Steps and further results, one row each."""
 
     dq: Tensor
     sigma_min: Tensor
     damping: Tensor
     saturated: Tensor
-    stopped: Tensor | bool = False  # by a limit of the tip
+    stopped: Tensor | bool = False  # by a tip limit
 
 
 def control_step(
@@ -43,10 +43,10 @@ def control_step(
     last: Tensor | None = None,
     tip: Tensor | None = None,
 ) -> StepRows:
-    """Return eq. (1) for one period, v = dx dt + gain dt e; rows that are not finite hold still.
+    """Return the step of eq. (1) for one period, with v = dx dt + gain dt e.
 
-    So do rows whose numbers overflow. With a limit of acceleration they brake until they stand;
-    from outside the limits the actuators that are known walk back.
+    Rows that are not finite, or overflow, do not move. With a limit of acceleration they brake to
+    a stop; outside the limits their known actuators return.
 
     Parameters
     ----------
@@ -57,20 +57,20 @@ def control_step(
     J : Tensor of shape (N, m, n)
         Jacobians of the task.
     e : Tensor of shape (N, m)
-        Errors of the task, to be taken back by the gain [m].
+        Errors of the task, to be corrected by the gain [m].
     feed_forward : Tensor of shape (N, m), optional
         Motion of the targets in this period [m]. Default: none.
     period : float, optional
         Time to the next step [s]. Default: `settings.dt`.
     last : Tensor of shape (N, n), optional
-        Step before, for a period as long as this one. Default: at rest.
+        Previous step, scaled to this period. Default: at rest.
     tip : Tensor of shape (N, m), optional
-        Where the tip is, for limits of it.
+        Position of the tip, for tip limits.
 
     Returns
     -------
     StepRows
-        With sigma_min NaN where a row held still.
+        The steps; sigma_min is NaN for rows that are not finite.
     """
     gain, beta, seconds = settings.rates(period)
     v = gain * e if feed_forward is None else feed_forward + gain * e
@@ -84,7 +84,7 @@ def control_step(
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
     change = settings.change(q, seconds)
     if settings.accelerates:
-        # No faster towards the target, and the posture, than the actuators can brake in time.
+        # Limit the speed towards target and posture so that the actuators can brake in time.
         brake = _braking(settings, J, e, change)
         gain = stopping(torch.ones_like(brake), brake).clamp_max(gain)[:, None]
         if posture is not None:
@@ -113,7 +113,7 @@ def control_step(
 
 
 def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
-    """Return by how many `way` the motion of the tip in a period can change to the next (N,)."""
+    """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
     return (change / limited_step(settings, J, way, None, -free, free).dq.abs()).amin(-1)
 
@@ -123,10 +123,10 @@ def _step_inside(
 ) -> StepRows:
     """Return a step within the bounds after which, to first order, the tip is within its limits.
 
-    The wanted motion v is projected onto what the half-spaces allow. Where the bounds turn the
-    motion J dq out of them, alternating projections between both look for one that keeps them, with
-    some excess, so that they end. What they leave is taken out by going part of the way from a step
-    that stays or returns.
+    The desired motion v is projected onto the half-spaces. If the bounds then move J dq out of
+    them, alternating projections look for a motion that meets both, with some excess, so that they
+    end. A remaining violation is removed by taking a fraction of the way from a safe step, one
+    that stays or returns, to this step.
     """
     limits, close = settings.tip_limits, 32.0 * torch.finfo(v.dtype).eps  # [m]
     assert limits is not None
@@ -167,8 +167,8 @@ def limited_step(
 ) -> StepRows:
     """Return the step for the task v and the posture step, within the bounds.
 
-    Weights are a change of unit: in u = W^(1/2) q nothing has a weight. A search checks every step
-    it takes: there estimates of singular values will do (`quick`), and `trust`,
+    Weights are a change of unit: in u = W^(1/2) q all weights are 1. A search checks all its steps,
+    so it can use estimates of the singular values (`quick`), and `trust`,
     lambda^2 / sigma_max^2, in place of the damping.
     """
     box, unit = (lower, upper), settings.unit(v)
@@ -186,7 +186,7 @@ def limited_step(
     z = torch.zeros_like(dq) if posture is None else null_projection(J, gram, posture)
     dq = dq + z
     if settings.limits != "off":
-        # Rows that meet no limit keep the unlimited step; the others are solved in the box.
+        # Rows within all limits keep the unlimited step; the others are solved in the box.
         clipped = torch.clamp(dq, lower, upper)
         over = (clipped != dq).any(-1).nonzero()[:, 0]
         if over.numel() > 0:
@@ -201,7 +201,7 @@ def limited_step(
 
 
 def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:
-    """Return the part of steps (N, n) that does not move what the rows of J (N, m, n) steer."""
+    """Return the part of steps (N, n) in the null space of J (N, m, n)."""
     unit = settings.unit(J)
     J = J * unit
     return unit * null_projection(J, quick_gram(J), step / unit)

@@ -19,18 +19,18 @@ ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
 class IKStatus(IntEnum):
     """Outcome for one target.
 
-    In `InverseKinematics.track` a step that misses its target is AT_LIMITS where a limit held
-    the motion back, SINGULAR where damping did, else MAX_ITER (one step was not enough).
+    In `InverseKinematics.track`, a step that misses its target is AT_LIMITS if a limit restricted
+    the motion, SINGULAR if damping did, else MAX_ITER (one step was not enough).
     """
 
     CONVERGED = 0
     """The error is within `tol`."""
     AT_LIMITS = 1
-    """Not converged; limits held the last step of the best start, which was not finished."""
+    """Not converged; limits restricted the last step of the best start, which did not finish."""
     UNREACHABLE = 2
-    """No motion within the limits brings the tip nearer, from any start: the nearest point found.
+    """No motion within the limits brings the tip nearer, from any start; the nearest is returned.
 
-    ``IKSolution.n_starts`` says how many starts were tried."""
+    ``IKSolution.n_starts`` is the number of starts tried."""
     SINGULAR = 3
     """Not converged; the Jacobian has (nearly) lost a direction."""
     MAX_ITER = 4
@@ -38,26 +38,26 @@ class IKStatus(IntEnum):
     OUT_OF_DOMAIN = 5
     """Converged, but outside the domain of the model (its `in_domain` is False)."""
     INVALID_INPUT = 6
-    """The target, the start, the model's answer or the measured tip is not finite."""
+    """The target, the start, the model's output or the measured tip is not finite."""
     NO_FURTHER = 7
-    """Of several configurations that were asked for (`n_solutions`), no further one was found."""
+    """No further one of the requested configurations (`n_solutions`) was found."""
 
 
 def statuses(
     task: Task, q: Tensor, error: Tensor, reached: Tensor, held: Tensor, singular: Tensor
 ) -> Tensor:
-    """Return the `IKStatus` of rows, int (N,); of what holds, the last one named here counts.
+    """Return the `IKStatus` of rows, int (N,); later conditions override earlier ones.
 
     Parameters
     ----------
     task : Task
-        Task whose domain counts.
+        Task whose domain is checked.
     q : Tensor of shape (N, n)
         Configurations.
     error : Tensor of shape (N,)
-        Errors [m], not finite where an input was not.
+        Errors [m], not finite if an input was not.
     reached, held, singular : bool Tensor of shape (N,)
-        Whether the error is within the tolerance, limits held the motion back, or it was damped.
+        Whether the error is within the tolerance, limits restricted the motion, it was damped.
     """
     status = torch.full(error.shape, IKStatus.MAX_ITER.value, device=error.device)
     status[singular] = IKStatus.SINGULAR
@@ -70,7 +70,7 @@ def statuses(
 
 @dataclass(frozen=True, repr=False)
 class Step(Generic[ArrayT]):
-    """One control step; arrays are of the kind that was given (numpy or torch).
+    """One control step; arrays are NumPy or torch, like the input.
 
     Attributes
     ----------
@@ -79,13 +79,13 @@ class Step(Generic[ArrayT]):
     x : array of shape (..., 3)
         Tip of the model at q, before the step [m].
     error : array of shape (...,)
-        Distance from the tip to the target before the step [m]; NaN or infinite where q, the target
-        or the tip was not finite (such a row holds still).
+        Distance from the tip to the target before the step [m]; NaN or infinite if q, the target
+        or the tip was not finite (such a row stops).
     sigma_min : array of shape (...,)
-        Smallest singular value of the Jacobian at q; NaN where the row holds still because an input
-        was not finite.
+        Smallest singular value of the Jacobian at q; NaN if the row stops because an input was not
+        finite.
     damping : array of shape (...,)
-        lambda used, in the unit of `sigma_min`; 0 where the step is the pseudo-inverse's.
+        lambda used, in the unit of `sigma_min`; 0 for the plain pseudo-inverse.
     saturated : bool array of shape (..., n)
         Actuators held at a limit of position, speed or acceleration by this step.
     """
@@ -98,7 +98,7 @@ class Step(Generic[ArrayT]):
     saturated: ArrayT
 
     def __getattr__(self, name: str) -> Any:
-        """Return a field of a step that the core took; it is cut out when asked for."""
+        """Return a field of a step of the compiled core, extracted on access."""
         row, places = vars(self).get("_row", (None, {}))
         if name not in places:
             raise AttributeError(name)
@@ -112,7 +112,7 @@ class Step(Generic[ArrayT]):
 
 @dataclass(frozen=True, repr=False)
 class IKSolution(Generic[ArrayT]):
-    """Configurations found for a batch of targets, in the kind that was given.
+    """Configurations found for a batch of targets; arrays are NumPy or torch, like the input.
 
     With `n_solutions` every target has an axis of that length: q is of shape (..., n_solutions, n).
 
@@ -123,14 +123,14 @@ class IKSolution(Generic[ArrayT]):
     x : array of shape (..., 3)
         Tips of the model at `q` [m].
     error : array of shape (...,)
-        Distances from `x` to the targets [m], computed on the returned `q`; of tasks with several
+        Distances from `x` to the targets [m], computed at the returned `q`; for tasks with several
         parts the root of the weighted sum of squares.
     status : int array of shape (...,)
         `IKStatus` of every target.
     n_iter : int array of shape (...,)
-        Iterations spent, restarts included.
+        Number of iterations, including restarts.
     n_starts : int array of shape (...,)
-        Configurations that the search started from: 1 where the first one led to the target.
+        Number of starts tried: 1 if the first one led to the target.
     sigma_min : array of shape (...,)
         Smallest singular value of the Jacobian at `q`.
     limit_margin : array of shape (...,)
@@ -148,7 +148,7 @@ class IKSolution(Generic[ArrayT]):
 
     @property
     def converged(self) -> ArrayT:
-        """Bool array of shape (...,), true where the status is CONVERGED."""
+        """Whether the status is CONVERGED, bool array of shape (...,)."""
         return self.status == IKStatus.CONVERGED.value  # pyright: ignore[reportReturnType]
 
     def __repr__(self) -> str:
@@ -160,7 +160,7 @@ class IKSolution(Generic[ArrayT]):
 
 @dataclass(frozen=True, repr=False)
 class Track(Generic[ArrayT]):
-    """A followed path, in the kind that was given.
+    """A followed path; arrays are NumPy or torch, like the input.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class Track(Generic[ArrayT]):
     x : array of shape (T, 3)
         Tips of the model at `q` [m].
     x_measured : array of shape (T, 3) or None
-        Tips measured on the plant [m], NaN where it failed; None without a plant.
+        Tips measured on the plant [m], NaN if it failed; None without a plant.
     target : array of shape (T, 3)
         The path [m].
     error : array of shape (T,)
@@ -196,12 +196,12 @@ class Track(Generic[ArrayT]):
 
     @property
     def mean_error(self) -> float:
-        """Mean of `error` over the points where it is known [m]."""
+        """Mean of `error` over all points where it is not NaN [m]."""
         return float(np.nanmean(as_array(self.error)))
 
     @property
     def p95_error(self) -> float:
-        """Error that 95 % of the points stay below [m]."""
+        """Error that 95 % of the points do not exceed [m]."""
         return float(np.nanquantile(as_array(self.error), 0.95))
 
     @property

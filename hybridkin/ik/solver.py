@@ -36,79 +36,74 @@ from hybridkin.ik.trajectories import Trajectory
 class InverseKinematics:
     """Resolved-rate inverse kinematics with a null-space posture and hard limits.
 
-    The law is eq. (1) of the paper in discrete time: with the wanted tip change
+    The law is eq. (1) of the paper in discrete time: with the desired tip change
     ``v = dx dt + gain dt e`` and the posture step ``p = beta dt (q_pref - q)``,
-    ``dq = J^T (J J^T + lambda^2 1)^-1 v + (1 - J+ J) p``. lambda is zero, and the inverse the
-    pseudo-inverse, unless J is nearly singular. The posture goes through the undamped
-    projector, so that it never moves the tip to first order.
+    ``dq = J^T (J J^T + lambda^2 1)^-1 v + (1 - J+ J) p``. lambda is zero, and the inverse is the
+    pseudo-inverse, unless J is nearly singular. The projector of the posture is undamped, so the
+    posture does not move the tip, to first order.
 
     Parameters
     ----------
     model : ForwardModel, fitted estimator, nn.Module, callable, (callable, callable) or Task
         Maps q ``(..., n)`` to tips ``(..., 3)`` [m], row by row, torch to torch; a pair is such a
-        function and its Jacobian, see `as_forward_model`. Its `in_domain` decides between CONVERGED
-        and OUT_OF_DOMAIN. Poses, several points and NumPy functions are tasks, see
-        `hybridkin.tasks`; then x has the shape of their targets.
+        function and its Jacobian, see `as_forward_model`. Its `in_domain` separates CONVERGED from
+        OUT_OF_DOMAIN. For poses, several points and NumPy functions pass a task, see
+        `hybridkin.tasks`; then x has the shape of its targets.
     q_min, q_max : float or array-like of shape (n,), optional
-        Limits of q, in the unit of q. Default: those of the model, as the joint limits of a
-        `RigidChain` and 0 as `q_min` of extensible segments; infinite ones switch them off.
+        Limits of q, in the unit of q; infinity means none. Default: those of the model, e.g. the
+        joint limits of a `RigidChain`, or ``q_min=0`` for extensible segments.
     dq_max : float or array-like of shape (n,), optional
         Largest speed of every actuator [unit of q per second]: a step is at most ``dq_max dt``.
-        Default: that of the model, as of a URDF; infinity switches it off.
+        Default: that of the model, e.g. from a URDF; infinity means none.
     ddq_max : float or array-like of shape (n,), optional
         Largest acceleration of every actuator [unit of q per second squared]: the speed changes by
-        at most ``ddq_max dt`` from step to step, and always lets it stop within `q_min` and
-        `q_max`.
+        at most ``ddq_max dt`` per step, and every actuator can stop within `q_min` and `q_max`.
     q_pref : float, array-like of shape (n,) or callable, optional
-        Preferred configuration, or a function that gives it for configurations (..., n), torch to
-        torch, such as a step against a gradient. Default: the middle of the limits where both are
-        finite, else there is no posture term.
+        Preferred configuration, or a function that returns it for configurations (..., n), torch
+        to torch, e.g. a gradient step. Default: the middle of the limits if they are finite, else
+        there is no posture term.
     beta : float, default=1.0
         Rate of the posture [1/s], with 0 <= beta dt <= 1.
     gain : float, optional
-        Feedback gain [1/s], with 0 < gain dt <= 1. Default: 1 / dt, the whole error is taken
-        back in one period.
+        Feedback gain [1/s], with 0 < gain dt <= 1. Default: 1 / dt, the whole error in one period.
     damping : "adaptive" or float, default="adaptive"
-        "adaptive": lambda grows smoothly from zero where sigma_min / sigma_max < 0.02. A number
-        is lambda / sigma_max everywhere; 0.0 is the plain pseudo-inverse of the paper.
+        "adaptive": lambda grows smoothly from zero if sigma_min / sigma_max < 0.02. A number is
+        lambda / sigma_max everywhere; 0.0 is the plain pseudo-inverse of the paper.
     limits : {"saturate", "off"}, default="saturate"
-        "saturate": the limits are part of the step, and the free actuators take over what the
-        held ones cannot do; "off": the plain law.
+        "saturate": limits are part of the step: if some actuators are at a limit, the others
+        provide the missing motion. "off": the plain law without limits.
     dt : float, default=0.01
         Control period [s].
     weights : float or array-like of shape (n,), optional
-        What a unit of every actuator's motion costs: steps minimise ``sum_i weights_i dq_i^2``,
-        and the preferred configuration is the nearest one in that measure. Default: all alike.
+        Cost of the motion of every actuator: steps minimise ``sum_i weights_i dq_i^2``, and the
+        distance to the preferred configuration is weighted in the same way. Default: all equal.
     tip_limits : tuple of array-like of shape (k, 3) and (k,), optional
-        Half-spaces (A, b) in which the tip must stay, ``A x <= b`` [m], in the frame of x; of a
-        position task only. A box ``low <= x <= high`` is
+        Half-spaces (A, b) in which the tip must stay, ``A x <= b`` [m], in the frame of x; for
+        position tasks only. A box ``low <= x <= high`` is
         ``(np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]))``.
 
     Attributes
     ----------
     model : object
-        The model that was given.
+        The model as given.
     settings : StepSettings
         The other arguments, checked; limits, weights and a fixed posture as float64 tensors.
 
     Notes
     -----
-    With limits="saturate" a step that meets no limit is the unlimited one exactly. Otherwise it
-    minimises ``|dq - z|^2 + |J dq - v|^2 / lambda^2`` in the box, z the projected posture step.
-    The task must stay strict there too, so (a) lambda^2 is only 1e-6 of sigma_max^2 in float64
-    and two proximal rounds take the remaining task error (a relative 1e-6, squared and cubed)
-    out again where v can be reached; (b) near a singularity, where lambda is larger, the
-    damped task is solved in the box without posture first, and the posture then only chooses
-    among the steps that move the tip the same way (to 1e-8 of the step; where v is also out of
-    reach, up to 1e-3 was seen). A start outside the limits walks back at
-    `dq_max`. Limits hold to the last bit for ``q + dq``, in the dtype of q. With `ddq_max` a step
-    that could not be stopped within the limits is not taken; where the speed that is given cannot
-    be stopped, the step brakes as hard as it may, beyond a limit if it must.
+    With limits="saturate" a step within all limits is exactly the unlimited step. Otherwise it
+    minimises ``|dq - z|^2 + |J dq - v|^2 / lambda^2`` in the box, with the projected posture step
+    z. The task keeps priority: (a) lambda^2 is only 1e-6 of sigma_max^2 in float64, and two
+    proximal rounds remove the remaining task error (a relative 1e-6, squared and cubed) if v can be
+    reached; (b) near a singularity the damped task is first solved in the box without posture. The
+    posture then only chooses among steps with the same tip motion (to 1e-8 of the step; up to 1e-3
+    was seen if v was also out of reach). ``q + dq`` meets the limits exactly, in the dtype of q;
+    from outside, q returns at `dq_max`. With `ddq_max` every step can be stopped within the limits;
+    if the given speed cannot, the step brakes as hard as possible and may cross a limit.
 
     References
     ----------
-    Reinhart & Steil (2016), eq. (1); Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108
-    (1986), for the damped inverse.
+    Reinhart & Steil (2016), eq. (1); Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
 
     Examples
     --------
@@ -143,7 +138,7 @@ class InverseKinematics:
         self.model, task = model, as_task(model)
         own, given = task.models[0].robot.limits, {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
         good = 0 not in np.shape(own["q_min"])
-        require(good, "`model` must have an actuator, but its joints are all fixed: a constant.")
+        require(good, "`model` must have an actuator, but all its joints are fixed.")
         bounds = {
             name: bound(own[name] if value is None else value, name, positive=name == "dq_max")
             for name, value in given.items()
@@ -168,7 +163,7 @@ class InverseKinematics:
             warnings.warn(message, stacklevel=2)
 
     def __repr__(self) -> str:
-        """Return the model's name, the limits, and the settings that are not the default ones."""
+        """Return the model's name, the limits, and the settings that differ from their defaults."""
         parts = [type(self.model).__name__]
         for name, default in signature(type(self)).parameters.items():
             value = vars(self.settings).get(name)
@@ -181,12 +176,12 @@ class InverseKinematics:
         return f"InverseKinematics({', '.join(parts)})"
 
     def stored(self) -> Stored:
-        """Return how the solver describes itself, with its model as a part, for kernels.
+        """Return the description of the solver, with its model as a part, for kernels.
 
         Raises
         ------
         TypeError
-            Where it could only be stored as code: a posture that is a function.
+            If it could only be stored as code, e.g. a posture that is a function.
         """
         return self.settings.stored()
 
@@ -210,15 +205,15 @@ class InverseKinematics:
         dx : array-like of shape (..., 3), optional
             Velocities of the targets [m/s], one for every row of the task. Default: at rest.
         x_measured : array-like of shape (..., 3), optional
-            Measured tips [m], to close the loop on. Default: the model's tips.
+            Measured tips [m] for feedback. Default: the model's tips.
         dq : array-like of shape (..., n), optional
-            The steps before, from which `ddq_max` counts. Default: at rest.
+            The previous steps, to which `ddq_max` refers. Default: at rest.
 
         Returns
         -------
         Step
-            `dq` and what came with it. A row with a NaN, infinite or overflowing input holds still,
-            with `ddq_max` after it has braked; outside the limits its known actuators walk back.
+            `dq` and further results. A row with a NaN, infinite or overflowing input stops (with
+            `ddq_max` it brakes first); outside the limits its known actuators return to them.
         """
         core = core_of(self.settings)
         found = None if core is None or dq is not None else core.step(q, x_target, dx, x_measured)
@@ -270,31 +265,29 @@ class InverseKinematics:
     ) -> IKSolution:
         """Return configurations that reach the targets, or come as near as the limits allow.
 
-        Levenberg-Marquardt on the error with the box-limited step; a joint that can turn all the
-        way round turns on beyond its limit. Targets that one start missed are searched again from
-        up to `restarts` further ones, a few at first. Rows that have converged leave the work, and
-        then slide along their null space towards `q_pref`. `dq_max` plays no part here.
+        This is Levenberg-Marquardt with box-limited steps. A joint with a range of a whole turn can
+        pass its limit and continue at the other one. Targets missed from one start are searched
+        again from up to `restarts` further starts, a few at first. Converged rows then move along
+        their null space towards `q_pref`. `dq_max` is not used.
 
         Parameters
         ----------
         x_target : array-like of shape (..., 3)
             Targets [m].
         q0 : array-like of shape (..., n), optional
-            Start, moved into the limits first. Default: `q_pref`.
+            Start; it is first moved into the limits. Default: `q_pref`.
         tol : float or sequence of floats, default=1e-4
-            Error that counts as reached [m], or one for every part of the task, as ([m], [rad])
-            for a pose.
+            Largest error of a reached target [m], or one for every part, ([m], [rad]) for a pose.
         max_iter : int, default=50
             Iterations per start.
         restarts : int, default=32
-            Further starts for targets that the first one missed, or reached only outside the
-            model's domain: of an even sample of the limits, the same in every call, those whose
-            tips lie nearest to the target. Without limits the sample lies around the start. 0:
-            none.
+            Largest number of further starts for targets that are not reached, or only outside the
+            domain. They are the configurations with the nearest tips in an even sample of the
+            limits, which is the same in every call. Without limits the sample is around the start.
         n_solutions : int, optional
-            Return up to this many configurations per target, in an axis of this length, nearest to
-            `q0`, or else to `q_pref`, first. They differ by more than 1 % of the range of an
-            actuator, whole turns left out. Places that are left have NaN as q and NO_FURTHER.
+            Return up to this many configurations per target, in an axis of this length, those
+            nearest to `q0` (else to `q_pref`) first. They differ by more than 1 % of the range of
+            an actuator, not counting whole turns. Unused places have NaN as q and NO_FURTHER.
         differentiable : bool, default=False
             Keep the graph from q to `x_target`, and to parameters of the model that require
             gradients, by the implicit function theorem at the solution.
@@ -302,15 +295,14 @@ class InverseKinematics:
         Returns
         -------
         IKSolution
-            Never raises for an unreachable target; a NaN target or start marks only its own row.
+            An unreachable target does not raise; a NaN target or start affects only its own row.
 
         Notes
         -----
-        The derivatives are those of the configuration nearest to `q_pref` among the solutions
-        around the one found, with the actuators that lie at a limit held there; without posture
-        they are J+. They are exact where that configuration is unique and the set of held
-        actuators does not change nearby; rows that have not converged get none. The model must be
-        twice differentiable by torch.
+        The derivatives are those of the solution nearest to `q_pref` near the one found, with
+        actuators at a limit fixed there; without posture they are J+. They are exact if that
+        solution is unique and the set of fixed actuators does not change nearby. Rows that have
+        not converged have no derivatives. The model must be twice differentiable by torch.
         """
         settings, task = self.settings, self.settings.task
         tolerance = settings.tolerance(tol)
@@ -327,7 +319,7 @@ class InverseKinematics:
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q, target = rows_of(q, lead), rows_of(target, lead, axes)
-        q = torch.where(torch.isfinite(q), q, torch.nan)  # or the limits would make it finite
+        q = torch.where(torch.isfinite(q), q, torch.nan)  # limits must not make it finite
         core = core_of(settings, search=True) if as_numpy and q.dtype == torch.float64 else None
         search = Search(settings, tolerance, max_iter)
         if core is not None:
@@ -337,12 +329,12 @@ class InverseKinematics:
         if n_solutions is not None:
             found, lead = search.several(found, q, restarts, places), (*lead, places)
             target = target.repeat_interleave(places, 0)
-        q, moved = found.q, (found.target != target).flatten(1).any(-1)  # by limits of the tip
+        q, moved = found.q, (found.target != target).flatten(1).any(-1)  # by tip limits
         if differentiable:
             with torch.enable_grad():
                 goal = rows_of(torch.as_tensor(x_target, device=q.device).to(q), lead, axes)
                 q = with_derivatives(settings, q, goal, found.reached & ~moved)
-        # The error and the status are those of the q that is returned.
+        # Error and status refer to the returned q.
         x, J = settings.evaluate(q.detach())
         e = task.difference(x, target)
         error, gram = e.norm(dim=-1), row_gram(J)
@@ -372,38 +364,36 @@ class InverseKinematics:
     ) -> Track:
         """Return the motion that follows a path, one step per point, eq. (1).
 
-        The feed-forward is the difference to the next point. With gain 1 / dt and feedback the
-        error is of second order in the period, without feedback of first order.
+        The feed-forward is the difference to the next point. With feedback and gain 1 / dt the
+        error is of second order in the period; without feedback it is of first order.
 
         Parameters
         ----------
         path : array-like of shape (T, 3) or Trajectory
-            Points to pass [m]; a `Trajectory` brings its own times.
+            Points to follow [m]; a `Trajectory` includes its times.
         t : array-like of shape (T,), optional
             Times of the points [s], increasing. Default: multiples of `dt`.
         q0 : array-like of shape (n,), optional
-            Start. Default: solved for the first point.
+            Start. Default: the solution for the first point.
         plant : callable, optional
-            The robot: takes a commanded q of shape (n,), returns the measured tip of shape (3,)
-            [m]. It gets numpy or torch, as the path is.
+            The robot: maps a commanded q (n,) to the measured tip (3,) [m]; NumPy or torch as path.
         feedback : {"model", "measured"} or None, default="model"
-            Where the error comes from: the model's tip (with a plant: the paper's feed-forward
-            control), the measured tip, or nowhere.
+            Source of the error: the model's tip (with a plant: the paper's feed-forward control),
+            the measured tip, or none.
         memory : float, optional
             Time constant [s] with which the last measured offset between tip and model decays while
-            measurements are NaN. Make it several times longer than the gaps: a short one soon goes
-            back to the model's tip, which may be worse than the default, to go on by feed-forward
-            without a reading.
+            measurements are NaN; make it several times longer than the gaps. Default: feed-forward
+            only while there is no measurement, which can be better than a short memory.
         tol : float, default=1e-4
-            Error up to which a point counts as CONVERGED [m].
+            Largest error of a CONVERGED point [m].
         progress : callable, optional
             Called as ``progress(i, T)`` before point i.
 
         Returns
         -------
         Track
-            Where the plant raises, the point is NaN in `x_measured` with status INVALID_INPUT,
-            a warning is given and the motion goes on by feed-forward.
+            If the plant raises, the point is NaN in `x_measured` with status INVALID_INPUT, a
+            warning is given, and the motion continues with feed-forward only.
         """
         settings, task = self.settings, self.settings.task
         good = feedback in ("model", "measured", None)
@@ -411,7 +401,7 @@ class InverseKinematics:
         good = feedback != "measured" or plant is not None
         require(good, '`feedback="measured"` needs `plant`, a callable q -> measured tip.')
         good = memory is None or feedback == "measured"
-        require(good, '`memory` must be a positive time [s], with feedback="measured" only.')
+        require(good, '`memory` requires feedback="measured"; set it, or remove `memory`.')
         points = path.x if isinstance(path, Trajectory) else path
         if isinstance(path, Trajectory) and t is None:
             t = path.t
@@ -441,21 +431,20 @@ class InverseKinematics:
     def tracker(
         self, q0: Array, *, tol: float | Sequence[float] = 1e-4, memory: float | None = None
     ) -> Tracker:
-        """Return what follows targets tick by tick, for one robot at its control rate.
+        """Return a tracker that follows targets step by step, for one robot at its control rate.
 
         Parameters
         ----------
         q0 : array-like of shape (n,)
-            Present actuator vector, in the unit of q. NumPy or torch: commands are of its kind.
+            Present actuator vector, in the unit of q. Commands are NumPy or torch, like this.
         tol : float or sequence of floats, default=1e-4
-            Error that counts as reached [m], or one for every part of the task, for `status`.
+            Largest error of a reached target [m], or one for every part of the task, for `status`.
         memory : float, optional
             As for `track` [s].
 
         Returns
         -------
         Tracker
-            Its `step` takes a target, and the measured tip if there is one, and gives the next
-            command.
+            Its `step` takes a target, and optionally the measured tip, and returns the command.
         """
         return Tracker(self.settings, q0, self.settings.tolerance(tol), memory)

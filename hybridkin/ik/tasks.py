@@ -1,4 +1,4 @@
-"""What inverse kinematics steers: positions, poses, several points."""
+"""Tasks of inverse kinematics: positions, poses, several points."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Tolerance: TypeAlias = float | tuple[float, ...]
 
 
 class Task:
-    """What is steered: x(q), its Jacobian, and the error of x to a target in m rows.
+    """A controlled quantity: x(q), its Jacobian, and the error of x to a target in m rows.
 
-    A subclass sets the attributes and gives `evaluate` and `difference`.
+    A subclass sets the attributes and defines `evaluate` and `difference`.
 
     Attributes
     ----------
     shape : tuple of int
-        Of one target, and of one x.
+        Shape of one target and of one x.
     parts : tuple of int
-        Rows of the error that belong together, as the position and the rotation of a pose.
+        Numbers of rows of the parts of the error, e.g. position and rotation of a pose.
     units : tuple of float
-        What one unit of every part counts in metres.
+        Metres per unit of every part.
     models : tuple of ForwardModel
         The models that are evaluated.
     """
@@ -44,27 +44,27 @@ class Task:
     models: tuple[ForwardModel, ...]
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x ``(N, *shape)`` and how fast the error falls along q (N, m, n), q (N, n).
+        """Return x ``(N, *shape)`` and minus the derivative of the error (N, m, n), q (N, n).
 
-        Rows that are angles count `units` metres per radian.
+        Rows that are angles are scaled by `units` [m/rad].
         """
         raise NotImplementedError
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the error (N, m) of x with respect to targets, both ``(N, *shape)`` [m].
 
-        To first order, J dq = difference(x, x_target) leads from x to the target.
+        To first order, a step with J dq = difference(x, x_target) moves x to the target.
         """
         raise NotImplementedError
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return how far x ``(1 or N, k, *shape)`` are from targets ``(N, *shape)``, (N, k)."""
+        """Return distances (N, k) of x ``(1 or N, k, *shape)`` to targets ``(N, *shape)``."""
         n, k = len(x_target), x.shape[1]
         x = x.expand(n, k, *self.shape).flatten(0, 1)
         return self.difference(x, x_target.repeat_interleave(k, 0)).norm(dim=-1).view(n, k)
 
     def check(self, x_target: Tensor, name: str) -> None:
-        """Raise where targets ``(..., *shape)`` are not valid, as of rotations."""
+        """Raise if targets ``(..., *shape)`` are not valid, e.g. their rotations."""
 
     def reached(self, error: Tensor, tol: Tolerance) -> Tensor:
         """Return whether errors (N, m) are within one tolerance [m], or one for every part."""
@@ -76,12 +76,12 @@ class Task:
 
     @property
     def n_actuators(self) -> int | None:
-        """Length of q, where a model knows it."""
+        """Length of q, or None if no model defines it."""
         return next((model.n_actuators for model in self.models if model.n_actuators), None)
 
     @property
     def device(self) -> torch.device:
-        """Device of the first model that holds tensors; the CPU where none does."""
+        """Device of the first model with tensors; the CPU if there is none."""
         tensors = (a for model in self.models for a in (*model.parameters(), *model.buffers()))
         return next((a.device for a in tensors), torch.device("cpu"))
 
@@ -90,12 +90,12 @@ class Task:
         return torch.stack([model.domain_distance(q) for model in self.models]).amax(0)
 
     def in_domain(self, q: Tensor) -> Tensor:
-        """Return whether q lies within the domains of all models, shape (N,)."""
+        """Return whether q lies inside the domains of all models, shape (N,)."""
         return self.domain_distance(q) <= 1.0 if len(q) > 0 else q.new_ones(0, dtype=torch.bool)
 
 
 class PositionTask(Task):
-    """Bring the tip to a point: the default task of `InverseKinematics`.
+    """Task to bring the tip to a point: the default of `InverseKinematics`.
 
     Parameters
     ----------
@@ -104,8 +104,8 @@ class PositionTask(Task):
         ``(..., size, n)``; row by row, torch to torch, see `as_forward_model`. NumPy functions:
         `from_numpy`.
     size : int, default=3
-        Number of coordinates. With 3 a model of several markers brings its last one, the tip, to
-        the target; with three times their number all of them.
+        Number of coordinates. For a model with several markers, 3 means that its last marker, the
+        tip, goes to the target; three times their number means all markers.
 
     Examples
     --------
@@ -151,18 +151,18 @@ class PositionTask(Task):
         Returns
         -------
         PositionTask
-            Without derivatives of solutions (`differentiable`).
+            A task without derivatives of solutions (`differentiable`).
         """
         return cls([partial(_through_numpy, f) for f in (function, jacobian)], size)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x (N, size) and J (N, size, n), in closed form where the model has one."""
+        """Return x (N, size) and J (N, size, n), in closed form if the model has one."""
         x, J = self.models[0].forward_and_jacobian(q)
         if x.shape != (len(q), *self.shape):
             raise ValueError(
                 f"`model` must map q of shape {tuple(q.shape)} to tips of shape "
-                f"{(len(q), *self.shape)}, got {tuple(x.shape)}; other sizes: PositionTask(model, "
-                "size=...)."
+                f"{(len(q), *self.shape)}, got {tuple(x.shape)}; for other sizes use "
+                "PositionTask(model, size=...)."
             )
         return x.to(q), J.to(q)
 
@@ -172,9 +172,9 @@ class PositionTask(Task):
 
 
 class PoseTask(Task):
-    """Bring the tip to a pose, position and orientation: six rows.
+    """Task to bring the tip to a pose, position and orientation: six rows.
 
-    The error of the rotation is its logarithm, the rotation vector from the present to the wanted
+    The error of the rotation is its logarithm: the rotation vector from the present to the desired
     frame, in the measuring frame. Targets are homogeneous (4, 4) matrices, or a
     pytorch_kinematics Transform3d.
 
@@ -183,7 +183,7 @@ class PoseTask(Task):
     model : PoseModel
         A chain, or a hybrid fitted with ``output="pose"``.
     radian : float, default=0.1
-        Metres that a radian counts as.
+        Weight of the rotation: metres per radian.
 
     Examples
     --------
@@ -199,12 +199,12 @@ class PoseTask(Task):
 
     def __init__(self, model: object, radian: float = 0.1) -> None:
         if not 0.0 < number(radian, "radian") < math.inf:
-            raise ValueError(f"`radian` must be positive metres, got {radian!r}.")
+            raise ValueError(f"`radian` must be a positive length [m], got {radian!r}.")
         model = as_forward_model(model)
         if not isinstance(model, PoseModel):
             raise TypeError(
-                "`model` must be a PoseModel, which knows the pose of the tip, got "
-                f"{type(model).__name__}; take a chain, or fit a hybrid with output='pose'."
+                "`model` must be a PoseModel, which returns the pose of the tip, got "
+                f"{type(model).__name__}; use a chain, or fit a hybrid with output='pose'."
             )
         self.models, self._model = (model,), model
         self.shape, self.parts, self.units = (4, 4), (3, 3), (1.0, float(radian))
@@ -215,12 +215,12 @@ class PoseTask(Task):
         return T.to(q), torch.cat([J[:, :3], self.units[1] * J[:, 3:]], dim=-2).to(q)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return the way [m] and the rotation vector [rad] times `radian`, (N, 6)."""
+        """Return the displacement [m] and the rotation vector [rad] times `radian`, (N, 6)."""
         turn = rotation_vector(x_target[..., :3, :3] @ x[..., :3, :3].mT)
         return torch.cat([x_target[..., :3, 3] - x[..., :3, 3], self.units[1] * turn], dim=-1)
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return how far x is from targets, with the chords of rotations for their angles."""
+        """Return distances of x to targets, with chords instead of angles of rotations."""
         share = self.units[1] / math.sqrt(2.0)
         x, x_target = (
             torch.cat([T[..., :3, 3], share * T[..., :3, :3].flatten(-2)], dim=-1)
@@ -231,7 +231,7 @@ class PoseTask(Task):
         return torch.cdist(x_target[:, None], x)[:, 0]
 
     def check(self, x_target: Tensor, name: str) -> None:
-        """Raise where a finite target does not hold a rotation."""
+        """Raise if a finite target does not hold a rotation."""
         R = x_target[..., :3, :3]
         R = R[torch.isfinite(R).all(-1).all(-1)]
         off = (R.mT @ R - identity(3, R)).abs().amax((-2, -1))
@@ -244,23 +244,23 @@ class PoseTask(Task):
 
 @runtime_checkable
 class _WithPoints(Protocol):
-    """A chain that can be cut at a point of its backbone."""
+    """A chain whose tip can be moved to another point of its backbone."""
 
     def with_tip(self, at: float) -> ForwardModel: ...
 
 
 class PointsTask(Task):
-    """Bring several points along the backbone to points: 3 P rows, targets (P, 3).
+    """Task to bring several points of the backbone to target points: 3 P rows, targets (P, 3).
 
     Parameters
     ----------
     chain : chain
-        With the method ``with_tip(at)``, as chains of arcs have.
+        A chain with the method ``with_tip(at)``, e.g. a chain of arcs.
     at : sequence of float
-        Where on the backbone, in segments from the base.
+        Places on the backbone, in segments from the base.
     weights : sequence of float, optional
-        Factor on every point's error, which trades them where not all can be reached. Default: 1
-        each.
+        Factor on the error of every point, a compromise if not all points can be reached. Default:
+        1 each.
 
     Examples
     --------
@@ -280,7 +280,7 @@ class PointsTask(Task):
     ) -> None:
         if not isinstance(chain, _WithPoints):
             raise TypeError(
-                f"`chain` must have with_tip(at), as chains of arcs, got {type(chain).__name__}."
+                f"`chain` must have with_tip(at), e.g. a chain of arcs, got {type(chain).__name__}."
             )
         self.models, n = tuple(chain.with_tip(number(a, "at")) for a in at), len(at)
         self.units = (1.0,) * n if weights is None else tuple(number(w, "weights") for w in weights)
@@ -301,15 +301,15 @@ class PointsTask(Task):
 
 
 def as_task(model: object) -> Task:
-    """Return a task as it is, and a model as the task to bring its tip to a point."""
+    """Return a task unchanged, and for a model the task to bring its tip to a point."""
     return model if isinstance(model, Task) else PositionTask(model)
 
 
 def _through_numpy(function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:
-    """Return what a NumPy function gives, without a graph."""
+    """Return the result of a NumPy function as a tensor without a graph."""
     if q.requires_grad and torch.is_grad_enabled():
         raise ValueError(
             "`model` must be twice differentiable by torch for derivatives of the solution, got "
-            "functions for NumPy."
+            "NumPy functions."
         )
     return as_tensor(function(q.numpy(force=True)), "model", q.device)

@@ -1,4 +1,4 @@
-"""Following targets one step per period: tick by tick, or a whole path at once."""
+"""Following targets with one step per period: step by step, or a whole path at once."""
 
 from __future__ import annotations
 
@@ -29,29 +29,28 @@ def _seen(name: str, text: str) -> Any:
 
 
 class Tracker(Portable):
-    """Inverse kinematics tick by tick: a target goes in, the next command comes out.
+    """Inverse kinematics step by step: each target gives the next command.
 
-    The law is that of `InverseKinematics.step`, for one configuration. It follows any task. Made
-    by `InverseKinematics.tracker`; arrays are of the kind of its `q0`, NumPy or torch.
+    The law is that of `InverseKinematics.step`, for one configuration and any task. Trackers are
+    made by `InverseKinematics.tracker`; arrays are NumPy or torch, like its `q0`.
 
     Attributes
     ----------
     q : array of shape (n,)
-        The present command: what the last `step` returned, or `reset` was given.
+        The present command: the result of the last `step`, or the argument of `reset`.
     x : array of shape (3,)
-        The model's tip at the configuration that the last step started from [m], in the shape of
-        the task.
+        The model's tip at the start of the last step [m], in the shape of the task.
     error : float
-        Distance from the tip, the measured one where it was given, to the target before the last
-        step [m]; NaN where it is not known.
+        Distance from the tip, the measured one if it was given, to the target before the last step
+        [m]; NaN if unknown.
     saturated : bool array of shape (n,)
         Actuators that the last step held at a limit of position, speed or acceleration.
     sigma_min : float
-        Smallest singular value of the Jacobian there, NaN where an input was not finite.
+        Smallest singular value of the Jacobian there, NaN if an input was not finite.
     damping : float
         Damping lambda of the last step, in the unit of `sigma_min`.
     backend : str
-        What computes: "compiled", for NumPy and models that have kernels, or "torch".
+        "compiled" for NumPy and models that have kernels, else "torch".
 
     Examples
     --------
@@ -80,7 +79,7 @@ class Tracker(Portable):
         n = len(self.q)
         return f"Tracker({n} actuators, {self.status.name}, error {self.error:.3g} m)"
 
-    backend = _seen("backend", 'What computes: "compiled", for NumPy and known models, or "torch".')
+    backend = _seen("backend", '"compiled" for NumPy and models that have kernels, else "torch".')
     q = _seen("command", "The present command, shape (n,).")
     x = _seen("x", "The model's tip before the last step [m], in the shape of the task.")
     error = _seen("error", "Distance from the tip, measured or the model's, to the target [m].")
@@ -92,10 +91,10 @@ class Tracker(Portable):
     def status(self) -> IKStatus:
         """Outcome of the last step.
 
-        CONVERGED where `error` is within the tolerance (OUT_OF_DOMAIN where the model is not in its
-        domain there); else AT_LIMITS where a limit held the step, SINGULAR where it was damped,
-        MAX_ITER where it was free. INVALID_INPUT where the target, the measured tip or the model's
-        answer was not finite, and before the first step.
+        CONVERGED if `error` is within the tolerance, or OUT_OF_DOMAIN if the configuration is
+        outside the model's domain. Else AT_LIMITS if a limit restricted the step, SINGULAR if it
+        was damped, MAX_ITER otherwise. INVALID_INPUT before the first step, and if the target, the
+        measured tip or the model's output was not finite.
         """
         robot = self._robot
         if not math.isfinite(robot.error + robot.sigma_min):
@@ -107,12 +106,12 @@ class Tracker(Portable):
         return IKStatus.SINGULAR if robot.damping > 0.0 else IKStatus.MAX_ITER
 
     def reset(self, q: Array) -> None:
-        """Start anew, at rest, from an actuator vector, as read from the robot.
+        """Restart at rest from an actuator vector, as read from the robot.
 
         Parameters
         ----------
         q : array-like of shape (n,)
-            Actuator vector, in the unit of q. Outside the limits it is led back at `dq_max`.
+            Actuator vector, in the unit of q. From outside the limits it returns at `dq_max`.
         """
         given, settings = as_tensor(q, "q", self._settings.task.device), self._settings
         n = settings.n_actuators
@@ -140,15 +139,15 @@ class Tracker(Portable):
             Velocity of the target [m/s], one for every row of the task; (next target - target) / dt
             for second order in dt. Default: at rest.
         x_measured : array-like of shape (3,), optional
-            Measured tip [m], to close the loop on. NaN is no reading: the step is feed-forward
-            alone, or with `memory` goes by the model's tip, moved by the last measured offset.
-            Default: the model's tip.
+            Measured tip [m] for feedback. NaN means no measurement: the step is then feed-forward
+            only, or with `memory` uses the model's tip plus the last measured offset. Default: the
+            model's tip.
 
         Returns
         -------
         array of shape (n,)
-            The command, within the limits to the last bit; the caller's to keep. Where `x_target`
-            or `dx` is not finite the robot holds still, with `ddq_max` after it has braked.
+            The command, exactly within the limits; a new array. If `x_target` or `dx` is not
+            finite, the robot stops (with `ddq_max` it brakes first).
         """
         settings, like, robot = self._settings, self._like, self._robot
         if robot.tick(x_target, dx, x_measured):
@@ -171,10 +170,10 @@ class Tracker(Portable):
         feedback: str | None,
         progress: Callable[[int, int], None] | None,
     ) -> list[Tensor]:
-        """Return q, x, the measured tip, sigma_min, and whether limits or damping held the step.
+        """Return q, x, the measured tip, sigma_min, and whether a step was held or damped.
 
-        Rows are the points of the path (T, ...), with what was seen before the step that leaves
-        them; held and damped is the step that led there.
+        Rows are the points of the path (T, ...). Held and damped refer to the step to the point,
+        all others to the state at the point.
         """
         task, n = self._settings.task, len(targets)
         ahead = task.difference(targets, torch.cat([targets[1:], targets[-1:]]))
@@ -197,22 +196,20 @@ class Tracker(Portable):
         return [q, x, seen, row_gram(J).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
-        """Return the plant's tip (1, ...), NaN where the plant raises.
+        """Return the plant's tip (1, ...), NaN if the plant raises.
 
-        The plant is the user's robot, and may fail with any exception: the motion goes on, so that
-        the rows before it are not lost.
+        The plant is the user's robot and may raise any exception. The motion continues, so that
+        earlier rows are not lost.
         """
         try:
             return self._settings.points(plant(self.q), "tip", self._like, lead="")[None]
         except Exception as error:
-            warnings.warn(
-                f"`plant` failed at point {i}: {error!r}; it counts as NaN.", stacklevel=6
-            )
+            warnings.warn(f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=6)
             return self._like.new_full((1, *self._settings.task.shape), math.nan)
 
 
 class _InTorch:
-    """A robot that follows targets of any task in torch; as `Follower`."""
+    """The torch counterpart of `Follower`, for any task."""
 
     backend = "torch"
 
@@ -222,16 +219,16 @@ class _InTorch:
 
     @torch.no_grad()
     def start(self, q: Tensor) -> None:
-        """Go to a configuration (1, n), where nothing is done yet."""
+        """Set the initial configuration (1, n), at rest."""
         self._q, (x, J) = q, self._settings.evaluate(q)
-        self._offset = x.new_zeros(1, sum(self.task.parts))  # of the model at the last reading
+        self._offset = x.new_zeros(1, sum(self.task.parts))  # last measured minus model
         unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(q)
         step = StepRows(none, unknown[:, 0], none[:, 0], none > 0.0)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 
     def tick(self, target: Array, dx: Array | None, tip: Array | None) -> bool:
-        """Return False: all arguments need a closer look."""
+        """Return False: all arguments need full checks."""
         return False
 
     @torch.no_grad()
@@ -242,9 +239,9 @@ class _InTorch:
         feed_forward: Tensor | None,
         tip: Tensor | None,
     ) -> Tick:
-        """Take one step towards a target (1, ...), and return what is known of it.
+        """Take one step towards a target (1, ...), and return its results.
 
-        A tip of None stands for the model's. Without a target the step is feed-forward alone.
+        If `tip` is None the model's is used. Without a target the step is feed-forward only.
         """
         settings, task = self._settings, self.task
         x, J = settings.evaluate(self._q)
@@ -252,8 +249,8 @@ class _InTorch:
         if target is not None:
             error = used = task.difference(x, target)
             if tip is not None:
-                # Without a reading the model's error counts, moved by the offset that is
-                # remembered; without memory no error counts.
+                # Without a measurement, use the model's error corrected by the remembered offset;
+                # without memory, use no error.
                 error = task.difference(tip, target)
                 offset = used - error
                 seen = torch.isfinite(offset).all(-1, keepdim=True)
@@ -276,7 +273,7 @@ class _InTorch:
 
     @torch.no_grad()
     def in_domain(self) -> bool:
-        """Return whether the last step began in the domain of the models."""
+        """Return whether the last step began inside the domain of the models."""
         return bool(self.task.in_domain(self._last.q))
 
     command = property(lambda self: self._given_back(self._q))

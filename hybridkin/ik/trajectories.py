@@ -1,4 +1,4 @@
-"""Paths for the tip in metres and seconds: figure eight, spiral, line, recorded points."""
+"""Paths of the tip in metres and seconds: figure eight, spiral, line, recorded points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hybridkin._core.units import METRES
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
 
 _MOST = 1e8  # points of a path; 3 GB
-_FAR = 20.0  # no tip is that far from where it is measured [m]
+_FAR = 20.0  # largest plausible distance of a tip from the measuring frame [m]
 _ABOVE_ZERO = np.finfo(float).tiny
 _POINT = "3 finite numbers [m]"
 
@@ -47,7 +47,7 @@ class Trajectory:
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(x).all(axis=1)))
         if bad.size:
             rows = f"{bad.size} rows (first: row {bad[0]})"
-            raise ValueError(f"`t` and `x` must be finite, drop the {rows} that are not.")
+            raise ValueError(f"`t` and `x` must be finite; drop the {rows} that are not.")
         late = np.flatnonzero(np.diff(t) <= 0)
         if late.size:
             row, pair = late[0] + 1, f"{t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s"
@@ -79,17 +79,17 @@ class Trajectory:
 def min_jerk(s: ArrayLike) -> np.ndarray:
     """Return the minimum-jerk timing law 10 s^3 - 15 s^4 + 6 s^5.
 
-    It runs from 0 to 1 with speed and acceleration zero at both ends.
+    It goes from 0 to 1 with zero speed and acceleration at both ends.
 
     Parameters
     ----------
     s : array-like of shape (...)
-        Share of the time, clipped to [0, 1].
+        Fraction of the time, clipped to [0, 1].
 
     Returns
     -------
     ndarray of shape (...)
-        Share of the way.
+        Fraction of the path.
 
     References
     ----------
@@ -108,24 +108,24 @@ def figure_eight(
     normal: ArrayLike = (0.0, 0.0, 1.0),
     timing: str = "min_jerk",
 ) -> Trajectory:
-    """Return a figure eight (Gerono's lemniscate) that starts and ends in its crossing.
+    """Return a figure eight (Gerono's lemniscate) that starts and ends at its crossing point.
 
     Parameters
     ----------
     center : array-like of shape (3,)
-        The crossing [m].
+        The crossing point [m].
     size : (float, float), default=(0.3, 0.15)
         Full width and height [m].
     duration : float, default=10.0
-        Time for one lap [s], rounded to whole periods.
+        Time for one lap [s], rounded to a multiple of `dt`.
     dt : float, default=0.01
         Time between points [s].
     normal : array-like of shape (3,), default=(0, 0, 1)
-        Normal of the plane. The width lies along the x-axis projected into the plane (along y
-        where the normal is the x-axis).
+        Normal of the plane. The width lies along the x-axis projected into the plane (the y-axis
+        if the normal is the x-axis).
     timing : {"min_jerk", "uniform"}, default="min_jerk"
-        "min_jerk" starts and ends at rest; "uniform" passes the curve's parameter evenly, as for
-        laps on end.
+        "min_jerk" starts and ends at rest; "uniform" increases the curve's parameter uniformly,
+        e.g. for repeated laps.
 
     Returns
     -------
@@ -172,18 +172,18 @@ def spiral(
     radius : float or (float, float), default=(0.0, 0.15)
         Radius, or radius at the start and at the end [m].
     rise : float, default=0.0
-        Way along the normal from start to end [m].
+        Displacement along the normal from start to end [m].
     turns : float, default=3.0
-        Number of turns; negative runs clockwise about the normal.
+        Number of turns; negative numbers are clockwise about the normal.
     duration : float, default=15.0
-        Time for the path [s], rounded to whole periods.
+        Time for the path [s], rounded to a multiple of `dt`.
     dt : float, default=0.01
         Time between points [s].
     normal : array-like of shape (3,), default=(0, 0, 1)
-        Axis of the spiral. It starts along the x-axis projected into the plane (along y where
+        Axis of the spiral. It starts along the x-axis projected into the plane (the y-axis if
         the normal is the x-axis).
     timing : {"min_jerk", "uniform"}, default="min_jerk"
-        "min_jerk" starts and ends at rest; "uniform" passes the angle evenly.
+        "min_jerk" starts and ends at rest; "uniform" increases the angle uniformly.
 
     Returns
     -------
@@ -228,7 +228,7 @@ def line(
     start, end : array-like of shape (3,)
         End points [m].
     duration : float, default=5.0
-        Time for the path [s], rounded to whole periods.
+        Time for the path [s], rounded to a multiple of `dt`.
     dt : float, default=0.01
         Time between points [s].
     timing : {"min_jerk", "uniform"}, default="min_jerk"
@@ -247,18 +247,18 @@ def line(
     """
     start, end = (_checked(*a, _POINT, (3,)) for a in ((start, "start"), (end, "end")))
     t, s = _timing(duration, dt, timing)
-    # Weighting both ends meets both exactly.
+    # The weighted mean is exact at both ends.
     return Trajectory(t, (1.0 - s)[:, None] * start + s[:, None] * end)
 
 
 def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = "m") -> Trajectory:
-    """Return a recorded path.
+    """Return a recorded path from a CSV file.
 
     Parameters
     ----------
     path : path-like
-        A text file with columns t, x, y, z, or x, y, z together with `dt`, with commas between
-        them. One line of names and lines that start with # are allowed.
+        A text file with comma-separated columns t, x, y, z, or x, y, z if `dt` is given. One line
+        of names and lines that start with # are allowed.
     dt : float, optional
         Time between rows [s], for files without a time column.
     unit : {"m", "cm", "mm"}, default="m"
@@ -267,7 +267,7 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     Returns
     -------
     Trajectory
-        In metres and seconds, as timed in the file.
+        In metres and seconds, with the times of the file.
     """
     one_of(unit, "unit", METRES)
     path = as_path(path)
@@ -277,7 +277,7 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
         with open(path, encoding="utf-8-sig") as file:
             rows = [text.split(",") for text in map(str.strip, file) if text and text[0] != "#"]
     except UnicodeDecodeError as error:
-        raise ValueError(f"`path` must be a CSV file of points, {path} is no text.") from error
+        raise ValueError(f"`path` must be a CSV file of points, {path} is not text.") from error
     columns, need = (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
     named = bool(rows) and not re.match(r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE)
     try:
@@ -292,7 +292,7 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
 
 
 def periods(duration: float, dt: float) -> float:
-    """Return how many times `dt` goes into a duration [s]; raise for more points than fit."""
+    """Return the number of periods `dt` in a duration [s]; raise if there are too many."""
     n = duration / _period(dt, "dt")
     if n > _MOST:
         raise ValueError(f"`duration` must be at most {_MOST:g} times `dt`, got {n:g} times.")
@@ -300,7 +300,7 @@ def periods(duration: float, dt: float) -> float:
 
 
 def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and the share of the way at each."""
+    """Return times [s] and the fraction of the path at each."""
     n = max(1, round(periods(_period(duration, "duration"), dt)))
     one_of(timing, "timing", ("min_jerk", "uniform"))
     s = np.arange(n + 1) / n
@@ -312,7 +312,7 @@ def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     given = _checked(normal, "normal", _POINT, (3,))
     if not given.any():
         raise ValueError("`normal` must not be zero; it is the normal of the plane.")
-    along = given / np.abs(given).max()  # squares neither overflow nor vanish
+    along = given / np.abs(given).max()  # squares neither overflow nor underflow
     along = along / np.linalg.norm(along)
     axis = np.eye(3)[0 if abs(along[0]) < 1.0 - 1e-9 else 1]
     across = axis - (axis @ along) * along

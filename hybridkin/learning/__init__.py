@@ -1,1 +1,1 @@
-"""Regressors, independent of any robot: extreme learning machines, and others as torch modules."""
+"""Regressors without knowledge of robots: extreme learning machines, others as torch modules."""

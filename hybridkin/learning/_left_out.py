@@ -1,4 +1,4 @@
-"""Exact errors of a ridge readout on held-out rows, for a whole grid of penalties, in one pass."""
+"""Exact errors of a ridge readout on held-out rows, for a grid of penalties in one pass."""
 
 import numpy as np
 import torch
@@ -15,24 +15,24 @@ _BLOCK_ELEMENTS = 2_000_000  # 16 MB of float64 per temporary
 class LeftOut:
     """Errors of the readout of a hidden layer on held-out rows.
 
-    With the residuals ``r = y - Phi W`` of all rows and their operator ``P = 1 - Phi A^-1 Phi'``,
-    ``A = Phi' Phi + alpha 1``, the errors on rows S without S are ``P_SS^-1 r_S``: no refit. In the
-    eigenbasis of ``Phi' Phi``, with coordinates Z, ``P = 1 - Z D Z'`` and ``r = y - Z D Z'y`` with
-    a diagonal D. For fewer rows than features, Z is the eigenbasis of ``Phi Phi'`` itself and
-    ``P = Z D Z'``, ``r = Z D Z'y``: nothing cancels. Rows carry the root of their weight.
+    All rows have the residuals ``r = y - Phi W = P y`` with ``P = 1 - Phi A^-1 Phi'`` and
+    ``A = Phi' Phi + alpha 1``. The errors on rows S of a fit without S are ``P_SS^-1 r_S``; no
+    refit is needed. In the eigenbasis of ``Phi' Phi``, with coordinates Z, ``P = 1 - Z D Z'`` with
+    a diagonal D. If there are fewer rows than features, Z is the eigenbasis of ``Phi Phi'`` and
+    ``P = Z D Z'``, without cancellation. Rows are multiplied by the root of their weight.
 
     Parameters
     ----------
     elm : ELM
         Hidden layer; its readout is not used.
     stats : Statistics
-        Of all rows.
+        Statistics of all rows.
     X, y : ndarray of shape (n_samples, n_inputs) and (n_samples, n_outputs)
         All rows.
     weights : ndarray of shape (n_samples,)
         Positive weights of the rows.
     fit_intercept : bool
-        Whether the readout has an intercept; it is fitted anew without the held-out rows.
+        Whether the readout has an intercept; it is refitted without the held-out rows.
 
     References
     ----------
@@ -52,7 +52,7 @@ class LeftOut:
         if self._wide:
             phi = self._features(np.arange(len(X)))
             gram = phi @ phi.T
-            if fit_intercept:  # the direction of the mean, which has no residual, comes last
+            if fit_intercept:  # the direction of the mean, without residual, comes last
                 gram += (1 + np.trace(gram)) * np.outer(self._root, self._root) / self._n
             eigenvalues, self._basis = linalg.eigh(gram)
             if fit_intercept:
@@ -64,11 +64,11 @@ class LeftOut:
         self.eigenvalues = np.maximum(eigenvalues, 0.0)
 
     def rows_at_a_time(self, n_alphas):
-        """Return how many rows can be computed at once in little memory."""
+        """Return the number of rows to compute at once within the limit of memory."""
         return max(1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1]))
 
     def each(self, rows, alphas):
-        """Return the errors (n_alphas, n_rows, n_outputs) on rows each held out alone."""
+        """Return the errors (n_alphas, n_rows, n_outputs) on rows, each held out alone."""
         Z, D, root = self._z(rows), self._d(alphas), self._root[rows]
         p = D @ (Z * Z).T
         if not self._wide:
@@ -83,7 +83,7 @@ class LeftOut:
         out : ndarray of int of shape (n_out,)
             Held-out rows, ascending.
         asked : ndarray of int of shape (n_asked,)
-            Some of them.
+            Rows of `out` to evaluate.
         alphas : ndarray of shape (n_alphas,)
             Penalties.
         """
@@ -123,7 +123,7 @@ class LeftOut:
         return r if self._wide else self._y[rows] + r
 
     def _refitted(self, out, asked, alphas):
-        """Return the same as `together` by the sums of the rows that stay: for many rows out."""
+        """Return the same as `together`, from sums over the remaining rows; faster for large S."""
         n_features = len(self._center)
         scatter = np.diag(np.append(self.eigenvalues, np.zeros(self._y.shape[1])))
         scatter[:n_features, n_features:] = self._Zy

@@ -1,4 +1,4 @@
-"""Ridge readouts from streamed statistics: sums in float64, exact to add, to merge, to solve."""
+"""Ridge readouts from sums in float64 to which rows and other sums can be added exactly."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near 
 
 
 class Statistics(NamedTuple):
-    """Total weight, mean, and scatter about the mean, of the rows [features, targets]."""
+    """Total weight, mean and scatter about the mean of rows [features, targets]."""
 
     n: float
     mean: np.ndarray
@@ -25,10 +25,10 @@ class Statistics(NamedTuple):
 
 @torch.no_grad()
 def gather(stats, elm, X, y, sample_weight, block_size):
-    """Return the statistics `stats` (None: of no rows) with the rows of `X` and `y` added.
+    """Return the statistics `stats` (None: no rows yet) with the rows of `X` and `y` added.
 
-    A block is centred about its own mean. The step from the old mean to the block's enters as one
-    more row, so that all of it is one symmetric product per block, and exact.
+    Each block is centred about its own mean. The step from the old mean to the block's mean is
+    added as one more row, so each block needs one symmetric product, and the result is exact.
     """
     n_features, device = len(elm.output_weights), elm.input_center.device
     n_columns = n_features + y.shape[1]
@@ -36,7 +36,7 @@ def gather(stats, elm, X, y, sample_weight, block_size):
         stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
     block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
     n, mean = stats.n, torch.tensor(stats.mean, device=device)
-    scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is kept up
+    scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is updated
     buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
     for rows in gen_batches(len(X), block_size):
         q = copied(X[rows], device, np.float64)
@@ -65,7 +65,7 @@ def gather(stats, elm, X, y, sample_weight, block_size):
 
 @np.errstate(over="ignore", invalid="ignore")
 def merge(a, b):
-    """Return the statistics of the rows of both (parallel variance formula)."""
+    """Return the statistics of the rows of `a` and `b` (parallel variance formula)."""
     n, step = a.n + b.n, b.mean - a.mean
     scatter = a.scatter + b.scatter + np.outer(step, step) * (a.n / n * b.n)
     return Statistics(n, a.mean + step * (b.n / n), scatter)
@@ -74,12 +74,12 @@ def merge(a, b):
 def ridge(G, C, alpha):
     """Return W = (G + alpha 1)^-1 C, R with R R' = (G + alpha 1)^-1, tr(R' G R), and the solver.
 
-    Where G + alpha 1 is singular, W is the solution of minimum norm, and R takes the eigenvalues
-    that rounding has swallowed at their rounding error: large, as there are no data.
+    If G + alpha 1 is singular, W is the solution of minimum norm. R then replaces eigenvalues
+    below rounding by their rounding error: it is large in directions without data.
     """
     A = G + alpha * np.eye(len(G))
     eps = len(G) * np.finfo(np.float64).eps
-    # Unit diagonal: features of different units are not what makes a system singular.
+    # Unit diagonal: different units of the features do not make a system singular.
     root = np.sqrt(A.diagonal())[:, None]
     root[root == 0] = 1.0
     scaled = A / root / root.T
@@ -101,17 +101,17 @@ def ridge(G, C, alpha):
 def moments(stats, n_features, fit_intercept):
     """Return the means, the features' Gram matrix, their products with the targets, and y'y.
 
-    They are centred for a readout with an intercept; else about the origin, with means of zero.
+    With an intercept they are centred; else they are about the origin, and the means are zero.
     """
     n, mean, scatter = stats
     if not fit_intercept:
-        # Both terms are positive: going back from the mean to the origin cancels nothing.
+        # Both terms are positive: moving from the mean to the origin loses no digits.
         scatter = scatter + n * np.outer(mean, mean)
         mean = np.zeros_like(mean)
     if not np.isfinite(scatter).all():
         raise ValueError(
             "`X` and `y` must give finite sums of products of features and targets in float64, "
-            "got an overflow; change their unit, or scale the inputs by `input_scaling`."
+            "got an overflow; change their unit, or scale the inputs with `input_scaling`."
         )
     G, C = scatter[:n_features, :n_features], scatter[:n_features, n_features:]
     return mean, G, C, scatter.diagonal()[n_features:]
@@ -121,7 +121,7 @@ def moments(stats, n_features, fit_intercept):
 def fit_readout(stats, n_features, alpha, fit_intercept):
     """Return the arrays of the readout (eq. 3), the noise variance (m,) and the solver.
 
-    The leverage is that of the smallest entry of `alpha`, a number or an array of shape (m,).
+    The leverage belongs to the smallest entry of `alpha`, a number or an array of shape (m,).
     """
     n, (mean, G, C, yy) = stats.n, moments(stats, n_features, fit_intercept)
     alphas = np.broadcast_to(np.asarray(alpha, dtype=np.float64), yy.shape)

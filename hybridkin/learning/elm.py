@@ -21,7 +21,7 @@ from hybridkin.native.library import program_of
 
 
 class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
-    """What a fitted network tells about new inputs."""
+    """Predictions of a fitted network, their Jacobian, standard deviation and leverage."""
 
     module_: ELM
     noise_variance_: np.ndarray
@@ -29,14 +29,14 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _y_ndim: int
 
     def predict(self, X, return_std=False):
-        """Return the prediction at `X`, in the dtype of `X`.
+        """Return the prediction for `X`, in the dtype of `X`.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_inputs)
             Inputs.
         return_std : bool, default=False
-            Whether to return the standard deviation of a new measurement as well.
+            Whether to also return the standard deviation of a new measurement.
 
         Returns
         -------
@@ -53,7 +53,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return y, std.reshape(y.shape).astype(y.dtype)
 
     def jacobian(self, X):
-        """Return the derivative of the prediction by the inputs, in closed form.
+        """Return the derivative of the prediction with respect to the inputs, in closed form.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._evaluated(X, jacobian=True)[1]
 
     def predict_and_jacobian(self, X):
-        """Return ``predict(X), jacobian(X)`` for the price of one hidden layer.
+        """Return ``predict(X), jacobian(X)`` from one evaluation of the hidden layer.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         y, J : ndarray of their shapes
-            As from `predict` and `jacobian`.
+            The results of `predict` and `jacobian`.
         """
         return self._evaluated(X, jacobian=True)
 
@@ -93,13 +93,13 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         leverage : ndarray of shape (n_samples,)
-            Influence that a row of weight 1 would have had on its own prediction [-]. With an
+            Influence of a training row of weight 1 at `X` on its own prediction [-]. With an
             intercept the features are centred, and 1 / n is added.
         """
         return self._map(X, lambda elm, q: (elm.leverage(q)[:, None],))[0].ravel()
 
     def _evaluated(self, X, jacobian=False):
-        """Return the prediction and, where asked for, its derivative."""
+        """Return the prediction and, if `jacobian`, its derivative."""
         check_is_fitted(self, "module_")
         program = program_of(self.module_)
         if program is None:
@@ -109,7 +109,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._shaped(X, program.evaluate(X, jacobian)[: 1 + jacobian])
 
     def _map(self, X, function):
-        """Return the arrays that `function(module, q)` gives, computed block by block."""
+        """Return the arrays of `function(module, q)`, computed in blocks of rows."""
         check_is_fitted(self, "module_")
         X = check_inputs(self, X)
         elm = self.module_
@@ -120,48 +120,48 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._shaped(X, [part.cpu().numpy() for part in parts])
 
     def _shaped(self, X, arrays):
-        """Return arrays in the dtype of X, of a one-dimensional y without its column."""
-        with np.errstate(over="ignore"):  # beyond float32
+        """Return arrays in the dtype of X; for a one-dimensional y without the output axis."""
+        with np.errstate(over="ignore"):  # overflow of float32
             outputs = [array.astype(X.dtype, copy=False) for array in arrays]
         return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
 
 
 class ELMRegressor(FittedNetwork):
-    """Network of the paper, to repeat or vary its results; otherwise use `ELMRegressorCV`.
+    """Extreme learning machine of the paper; for other work than its results use `ELMRegressorCV`.
 
-    An extreme learning machine, a fixed random hidden layer with a readout by ridge regression:
-    ``f(x) = W_out sigma(W u + b)`` with `u` the inputs mapped to [-1, 1], W and b drawn once, and
+    A fixed random hidden layer with a readout by ridge regression:
+    ``f(x) = W_out sigma(W u + b)`` with the inputs u mapped to [-1, 1], random W and b, and
     ``W_out = (H' H + alpha 1)^-1 H' T`` (eq. 3 of [1]_). The defaults are those of [1]_: 100
-    neurons and a penalty of 0.1 whatever the data, which `ELMRegressorCV` chooses from them.
+    neurons and a fixed penalty of 0.1. `ELMRegressorCV` chooses both from the data.
 
-    The state is the mean and the scatter about it of features and targets, in float64 whatever the
-    data: rows can be added (`partial_fit`), two models can be added (`merge`), exactly.
+    The state is the mean of features and targets and the scatter about it, always in float64. Rows
+    can be added (`partial_fit`) and two models can be merged (`merge`), exactly.
 
     Parameters
     ----------
     n_hidden : int, default=100
         Number of hidden neurons H.
     alpha : float or array-like of shape (n_outputs,), default=0.1
-        Weight of the penalty on the readout (lambda of [1]_), for all outputs or for each. With 0 a
-        singular system is solved by the readout of minimum norm.
+        Weight of the penalty on the readout (lambda of [1]_), for all outputs or for each. With 0,
+        a singular system gives the readout of minimum norm.
     activation : {"logistic", "tanh", "sin"}, default="logistic"
         Activation function sigma.
     input_scaling : {"minmax", "standard"}, None or array of shape (2, n_inputs), default="minmax"
         Affine map of the inputs: the training range to [-1, 1], the training mean and standard
         deviation to 0 and 1, none, or the given bounds [low, high] [unit of X] to [-1, 1]. The
-        first call of `partial_fit` fixes it, so give bounds for a stream, or to merge.
+        first call of `partial_fit` fixes it, so give bounds for streamed data or to merge models.
     weight_scale : float, default=1.0
         W and b are uniform in [-weight_scale, weight_scale].
     fit_intercept : bool, default=False
         Whether to fit an output bias, which is not penalised.
     direct_link : bool, default=False
-        Whether the scaled inputs are features too, after the hidden neurons.
+        Whether the scaled inputs are additional features, after the hidden neurons.
     block_size : int, default=None
         Rows computed at a time; None means about 4 MB of features.
     device : str or torch.device, default=None
-        Where to compute; None means the CPU. A model unpickled where it is missing uses the CPU.
+        Where to compute; None means the CPU. A model is unpickled to the CPU if it is missing.
     random_state : int, RandomState instance or None, default=None
-        Draws W and b. Models to be merged need the same int.
+        Seed of W and b. Models to be merged need the same int.
 
     Attributes
     ----------
@@ -172,14 +172,14 @@ class ELMRegressor(FittedNetwork):
     output_weights_, intercept_ : ndarray of shape (n_features, n_outputs) and (n_outputs,)
         Readout [unit of y]; `n_features` is `n_hidden`, plus `n_inputs` with a direct link.
     leverage_center_, leverage_factor_, leverage_offset_ : ndarray of the shapes in `module_`
-        As of `module_`; of the smallest `alpha`, if each output has its own.
+        As in `module_`; for the smallest `alpha` if each output has its own.
     noise_variance_ : ndarray of shape (n_outputs,)
-        Residual sum of squares over ``n - tr(G (G + alpha 1)^-1) - fit_intercept`` [unit of y^2]; G
-        the features' Gram matrix, n the sum of the sample weights. NaN if that leaves nothing.
+        Residual sum of squares over ``n - tr(G (G + alpha 1)^-1) - fit_intercept`` [unit of y^2],
+        with the features' Gram matrix G and the sum n of the sample weights. NaN if that is 0.
     n_samples_seen_ : float
         Sum of the sample weights so far.
     solver_ : {"cholesky", "eigh"}
-        What solved for the readout: "eigh" if the system was singular.
+        Solver of the readout: "eigh" if the system was singular.
     module_ : nn.Module
         The fitted network as a torch module q -> eps.
     n_features_in_ : int
@@ -247,7 +247,7 @@ class ELMRegressor(FittedNetwork):
 
     @_fit_context(prefer_skip_nested_validation=True)
     def fit(self, X, y, sample_weight=None):
-        """Draw the hidden layer and fit the readout, forgetting earlier rows.
+        """Draw the hidden layer, fit the readout without earlier rows, and return self.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ class ELMRegressor(FittedNetwork):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets.
         sample_weight : array-like of shape (n_samples,), default=None
-            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
+            How often each row counts: 2 is the same as the row twice, 0 drops it.
 
         Returns
         -------
@@ -267,7 +267,7 @@ class ELMRegressor(FittedNetwork):
 
     @_fit_context(prefer_skip_nested_validation=True)
     def partial_fit(self, X, y, sample_weight=None, decay=1.0):
-        """Add rows to those already seen; the result is that of one `fit` to all of them.
+        """Add rows and return self; the result equals one `fit` to all rows so far.
 
         The first call draws the hidden layer and fixes the input scaling; later calls keep them.
 
@@ -276,7 +276,7 @@ class ELMRegressor(FittedNetwork):
         X, y, sample_weight : array-like of the shapes as for `fit`
             The new rows, as for `fit`.
         decay : float, default=1.0
-            Factor in (0, 1] on the weights of all earlier rows, to follow a drift.
+            Factor in (0, 1] on the weights of all earlier rows, to follow drift.
 
         Returns
         -------
@@ -286,17 +286,17 @@ class ELMRegressor(FittedNetwork):
         if not isinstance(decay, Real) or not 0.0 < decay <= 1.0:
             raise ValueError(
                 f"`decay` must lie in (0, 1], got {decay!r}; 1 keeps the weight of earlier rows, "
-                f"0.99 lowers it by a hundredth."
+                f"0.99 reduces it by 1 %."
             )
         return self._learn(X, y, sample_weight, first="module_" not in vars(self), decay=decay)
 
     def merge(self, other):
-        """Add the rows that `other` has seen; the result is that of one `fit` to all of them.
+        """Add the training rows of `other` and return self; equals one `fit` to all rows.
 
         Parameters
         ----------
         other : ELMRegressor
-            A model with the same hidden layer and input scaling; it is left as it is.
+            A model with the same hidden layer and input scaling; it is not changed.
 
         Returns
         -------
@@ -335,7 +335,7 @@ class ELMRegressor(FittedNetwork):
             if y.shape[1] != elm.n_outputs:
                 raise ValueError(
                     f"`y` must have {elm.n_outputs} columns as in earlier calls, got "
-                    f"{y.shape[1]}; call `fit` to start afresh."
+                    f"{y.shape[1]}; call `fit` to start again."
                 )
             stats, y_ndim = Statistics(decay * n, mean, decay * scatter), self._y_ndim
         elm = elm.to(device_named(self.device))
@@ -360,8 +360,8 @@ class ELMRegressor(FittedNetwork):
         )
         if self.solver_ == "eigh":
             warnings.warn(
-                f"The system of {n_features} features is singular at alpha={self.alpha}; solved "
-                f"by its eigenvectors. Raise `alpha` or lower `n_hidden`.",
+                f"The system of {n_features} features is singular at alpha={self.alpha}; it was "
+                f"solved with eigenvectors. Increase `alpha` or reduce `n_hidden`.",
                 linalg.LinAlgWarning,
                 stacklevel=2,
             )
@@ -370,14 +370,14 @@ class ELMRegressor(FittedNetwork):
         return self._hold(module.to(device_named(self.device)), stats)
 
     def _hold(self, module, stats):
-        """Take over a fitted network, its arrays as learned names too."""
+        """Store a fitted network, and its arrays as learned attributes."""
         self.module_, self._stats, self.n_samples_seen_ = module, stats, stats.n
         for name in LAYER + READOUT:
             setattr(self, f"{name}_", module.get_buffer(name).numpy(force=True))
         return self
 
     def stored(self):
-        """Return how the fitted network describes itself, with what `partial_fit` goes on from."""
+        """Return the description of the fitted network, with the state of `partial_fit`."""
         check_is_fitted(self, "module_")
         arrays = {"mean": self._stats.mean, "scatter": self._stats.scatter}
         return Stored.of(
@@ -393,7 +393,7 @@ class ELMRegressor(FittedNetwork):
 
     @classmethod
     def from_stored(cls, stored, restore):
-        """Return the fitted network of a description; `restore` returns its module."""
+        """Return the fitted network built from a description; `restore` builds its module."""
         elm = estimator_of(cls, stored.value("params", dict))
         elm._validate_params()
         network = restore(stored.part("network"))

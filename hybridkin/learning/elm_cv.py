@@ -1,4 +1,4 @@
-"""Extreme learning machine whose complexity is chosen by cross-validation."""
+"""Extreme learning machine with hyperparameters chosen by cross-validation."""
 
 from collections.abc import Iterable
 from itertools import product
@@ -22,7 +22,7 @@ from hybridkin.learning.elm import ELMRegressor, FittedNetwork
 from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
 
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)  # times the largest eigenvalue of the features' Gram matrix
-_ZOOM = (0.5, 1.0, 2.0, 4.0)  # weight scales tried with new input scales, times the best so far
+_ZOOM = (0.5, 1.0, 2.0, 4.0)  # factors on the best weight scale, tried with new input scales
 _WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
 _LEAST_RELEVANCE = 0.01
 _ROWS_OF_JACOBIANS = 10_000
@@ -30,15 +30,15 @@ _SHARED = ["activation", "input_scaling", "fit_intercept", "direct_link", "block
 
 
 class ELMRegressorCV(FittedNetwork):
-    """Extreme learning machine that chooses penalty, weight scale, size and input scales itself.
+    """Extreme learning machine with cross-validated penalty, weight scale, size and input scales.
 
-    Every choice is made by the mean squared error on held-out rows, each row alone or by groups.
-    These errors are exact for the given hidden layer and input scales, and come from one
-    factorisation for the whole grid of penalties: no model is fitted twice.
+    Every choice minimises the mean squared error on held-out rows, each row alone or by groups.
+    These errors are exact for the given hidden layer and input scales. One factorisation gives
+    them for the whole grid of penalties, without refits.
 
-    With rounds of relevance, each input is then scaled by how much the derivative along it varies
-    over the training rows, so that inputs that do nothing, or act linearly, do not spend hidden
-    neurons; with a direct link the linear part costs none. A round is kept where the error falls.
+    In relevance rounds, each input is then scaled by how much the derivative with respect to it
+    varies over the training rows. Inputs without effect, or with a linear effect, then use fewer
+    hidden neurons; a direct link models the linear part. A round is kept if the error decreases.
 
     Parameters
     ----------
@@ -50,15 +50,15 @@ class ELMRegressorCV(FittedNetwork):
     weight_scales : sequence of float, default=(0.1, 0.2, 0.4, 0.8, 1.6)
         Ranges of the random weights to try.
     cv : int, splitter or iterable of (train, test), default=None
-        Which rows are held out together. None: each group where `fit` is given groups, else each
-        row alone. Equal rows of a group are held out together, unless the splits are listed.
+        Which rows are held out together. None: each group if `fit` gets groups, else each row
+        alone. Equal rows of a group are held out together, unless the splits are listed.
     relevance_rounds : int, default=5
-        How often at most the inputs are rescaled by their relevance.
+        Largest number of relevance rounds, which rescale the inputs.
     max_hidden : int, default=2000
-        Up to so many neurons their number is doubled, as long as the error falls by 2 %. With 0
-        only `n_hidden` is tried: fewer neurons make a faster model.
+        The number of neurons is doubled up to this limit while each doubling reduces the error by
+        at least 2 %. With 0 only `n_hidden` is tried: fewer neurons make a faster model.
     activation, input_scaling, fit_intercept, direct_link, block_size, device, random_state
-        As for `ELMRegressor`. One hidden layer is drawn for all weight scales.
+        As in `ELMRegressor`. All weight scales use the same random draw.
 
     Attributes
     ----------
@@ -67,15 +67,15 @@ class ELMRegressorCV(FittedNetwork):
     best_estimator_ : ELMRegressor
         The chosen model, fitted to all rows.
     best_score_ : float
-        Minus its mean squared error on held-out rows [unit of y^2]; optimistic, because the model
-        was chosen by it. The error on new rows was 1.3 to 2.4 times as large with 20 rows, 1.2 to
-        1.6 with 40, 1.0 to 1.4 with 100 and 1.0 to 1.1 with 400 (means over draws, four sets), and
-        up to 19 times in single draws of 20.
+        Its negative mean squared error on held-out rows [unit of y^2]. It is optimistic, because
+        the model was chosen by it: the error on new rows was 1.3 to 2.4 times as large with 20
+        rows, 1.2 to 1.6 times with 40, 1.0 to 1.4 with 100 and 1.0 to 1.1 with 400 (means over
+        draws, four data sets), and up to 19 times in single draws of 20.
     alpha_ : float
         The chosen penalty.
     left_out_errors_ : ndarray of the shape of y
-        Target minus prediction of each row without it, under the chosen parameters [unit of y].
-        The mean, if a row was held out more than once; NaN, if never or of weight 0.
+        Target minus prediction of the chosen model fitted without the row [unit of y]. The mean if
+        a row was held out more than once; NaN if never, or if its weight is 0.
     cv_results_ : dict of ndarray
         One row per candidate: n_hidden, weight_scale, relevance (n_inputs,), alphas and
         mean_squared_error (n_alphas,).
@@ -88,7 +88,7 @@ class ELMRegressorCV(FittedNetwork):
 
     See Also
     --------
-    ELMRegressor : The network itself; takes further rows by `partial_fit`.
+    ELMRegressor : The network itself; `partial_fit` adds rows.
 
     References
     ----------
@@ -149,7 +149,7 @@ class ELMRegressorCV(FittedNetwork):
 
     @_fit_context(prefer_skip_nested_validation=True)
     def fit(self, X, y, sample_weight=None, groups=None):
-        """Choose the parameters by held-out rows, and fit them to all rows.
+        """Choose the parameters by errors on held-out rows, fit to all rows, and return self.
 
         Parameters
         ----------
@@ -158,10 +158,10 @@ class ELMRegressorCV(FittedNetwork):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets.
         sample_weight : array-like of shape (n_samples,), default=None
-            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
-            Equal rows are held out together.
+            How often each row counts: 2 is the same as the row twice, 0 drops it. Equal rows are
+            held out together.
         groups : array-like of shape (n_samples,), default=None
-            Rows that belong together, such as those of one motion; they are held out together.
+            Groups of rows that are held out together, e.g. the motion of each row.
 
         Returns
         -------
@@ -171,14 +171,14 @@ class ELMRegressorCV(FittedNetwork):
         X, y, sample_weight = check_rows(self, X, y, sample_weight)
         if groups is not None:
             groups = labels(groups, len(X))
-        # Splits that are listed hold out what they name, equal rows of other splits or not.
+        # Listed splits are used as given, even if equal rows fall into different splits.
         apart = np.arange(len(X)) if isinstance(self.cv, (Iterable, PredefinedSplit)) else groups
         first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
         X, y, groups = X[first], y[first], None if groups is None else groups[first]
         if len(y) < 2:
             raise ValueError(
                 f"`X` must have at least 2 different rows of positive weight, so that one can be "
-                f"held out, got n_samples={len(y)}; ELMRegressor needs no choice."
+                f"held out, got n_samples={len(y)}; use ELMRegressor, which holds out no rows."
             )
         weights = np.ones(len(X)) if sample_weight is None else sample_weight
         splits = _splits(self.cv, groups, len(X), place)
@@ -230,7 +230,7 @@ class ELMRegressorCV(FittedNetwork):
 
 
 class _Task(NamedTuple):
-    """Different rows, and which of them are held out together (None: each alone)."""
+    """The different rows, and which of them are held out together (None: each alone)."""
 
     X: np.ndarray
     targets: np.ndarray  # with two dimensions
@@ -241,7 +241,7 @@ class _Task(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A hidden layer, its errors under every penalty, and the parameters of the best."""
+    """A hidden layer, its errors for every penalty, and the parameters with the best penalty."""
 
     params: dict
     relevance: np.ndarray
@@ -251,7 +251,7 @@ class _Candidate(NamedTuple):
     left_out: LeftOut
 
 
-@np.errstate(all="ignore")  # errors that overflow lose
+@np.errstate(all="ignore")  # errors that overflow are never the smallest
 def _candidate(params, relevance, task):
     X, targets, sample_weight, weights, splits, alphas = task
     asked = ELMRegressor(**params)
@@ -290,9 +290,9 @@ def _left_out_errors(best, task):
 
 
 def _relevance(best, task):
-    """Return how much the derivative along each input varies, at most 1, and bounds to match.
+    """Return how much the derivative along each input varies (at most 1), and matching bounds.
 
-    It is measured in the units in which the inputs were scaled at first.
+    The derivative refers to inputs in their initial scaling.
     """
     model = ELMRegressor(**best.params).fit(task.X, task.targets, task.sample_weight)
     center, scale = (
@@ -314,8 +314,8 @@ def _relevance(best, task):
 def _splits(cv, groups, n_rows, place):
     """Return (rows out, rows asked) of every split of the different rows.
 
-    Splits that the user lists are of all rows; `place` has that of each among those that count.
-    An integer or a splitter sees these alone.
+    Splits listed by the user refer to all rows; `place` maps them to the different rows. An
+    integer or a splitter gets only the different rows.
     """
     if groups is None and cv is None:
         return None
@@ -332,7 +332,7 @@ def _splits(cv, groups, n_rows, place):
     for train, test in found:
         if np.isin(rows[test], rows[train]).any():
             raise ValueError(
-                "`cv` must not test on rows that it trains on, but a split of its own does; use a "
+                "`cv` must not test on rows that it trains on, but one of its splits does; use a "
                 "splitter of sklearn.model_selection."
             )
         out, asked = np.ones(n_rows + 1, dtype=bool), np.zeros(n_rows + 1, dtype=bool)

@@ -1,4 +1,4 @@
-"""Rows as an ELM takes them, and its random hidden layer."""
+"""Checks of the rows of an ELM, and its random hidden layer."""
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ def _scaling(X, sample_weight, input_scaling):
         )
     low, high = bounds / 2  # halved first: the widest range must not overflow
     center, scale = low + high, high - low
-    # A column that is constant up to rounding has no range to divide by.
+    # Do not divide by the range of a column that is constant up to rounding.
     constant = scale <= 4 * eps * np.abs(center)
     scale = np.where(constant, 1.0, scale)
     if isinstance(input_scaling, str) and input_scaling == "standard":
@@ -57,9 +57,9 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
 
 
 def check_inputs(estimator, X):
-    """Return rows of new inputs for a fitted estimator, checked as scikit-learn does.
+    """Return rows of new inputs for a fitted estimator, with the checks of scikit-learn.
 
-    A plain array that has all that it asks for passes by a quick test.
+    A plain array that meets all requirements passes a faster test.
     """
     if _is_finite(X, 2) and X.shape[1] == estimator.n_features_in_:
         if "feature_names_in_" not in vars(estimator):
@@ -68,7 +68,7 @@ def check_inputs(estimator, X):
 
 
 def _is_finite(a, ndim):
-    """Return whether something is a plain array of real, finite numbers."""
+    """Return whether an object is a plain array of real, finite numbers."""
     if type(a) is not np.ndarray or a.ndim != ndim or a.dtype not in DTYPES or not a.size:
         return False
     with np.errstate(all="ignore"):
@@ -78,18 +78,18 @@ def _is_finite(a, ndim):
 def _validated(estimator, X, *y, good=True, **checks):
     """Return X and y, checked by scikit-learn.
 
-    Its checks of arrays change the filters for warnings, which belong to all threads: arrays
-    without a fault do without them.
+    Its array checks change the warning filters of all threads, so they are skipped for arrays that
+    are known to be valid.
     """
     good = good and _is_finite(X, 2) and all(len(X) == len(a) for a in y)
     checks |= {"dtype": DTYPES, "order": "C", "skip_check_array": good}
-    with np.errstate(invalid="ignore"):  # both infinities in a sum
+    with np.errstate(invalid="ignore"):  # a sum of both infinities
         found = validate_data(estimator, X, *y, **checks)
     return [*map(np.asarray, (X, *y) if good else found if y else [found])]
 
 
 def draw_layer(params, X, sample_weight):
-    """Return the hidden layer that an estimator's parameters ask for, without a readout."""
+    """Return the hidden layer for an estimator's parameters, with a readout of zeros."""
     rng, shape = check_random_state(params.random_state), (params.n_hidden, X.shape[1])
     W = rng.uniform(-params.weight_scale, params.weight_scale, shape)
     b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
@@ -101,13 +101,13 @@ def draw_layer(params, X, sample_weight):
 
 
 def device_named(name):
-    """Return the torch device of that name (None: the CPU), where float64 works."""
+    """Return the torch device of a name (None: the CPU); raise if it lacks float64."""
     try:
         device = torch.device("cpu" if name is None else name)
         torch.zeros(1, dtype=torch.float64, device=device).item()
     except (RuntimeError, AssertionError, TypeError, ValueError, NotImplementedError) as error:
         raise RuntimeError(
-            f"`device` must name a device on which torch computes in float64 here, got "
+            f"`device` must name a device on which torch can compute in float64, got "
             f"{str(name)!r}; use device=None for the CPU."
         ) from error
     return device

@@ -1,4 +1,4 @@
-"""A random hidden layer and its readout as a torch module, with closed-form derivatives."""
+"""A random hidden layer with a readout as a torch module, with closed-form derivatives."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Layout
 
-_BLOCK = 2**17  # numbers in the hidden layer of a block of rows: a megabyte, so that it stays near
+_BLOCK = 2**17  # numbers in the hidden layer of a block of rows: 1 MB, which fits the cache
 
 # name -> sigma(a), and sigma'(a) from a and s = sigma(a)
 ACTIVATIONS = {
@@ -24,19 +24,19 @@ READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
 
 
 def seen_through(W, b, center, scale, mean, M):
-    """Return W and b of ``W u + b`` that see ``mean + (q - mean) @ M`` in place of q.
+    """Return W and b of ``W u + b`` changed so that q is replaced by ``mean + (q - mean) @ M``.
 
-    ``u = (q - center) / scale`` is the scaled q; W (h, n) are weights, b (h,) a bias.
+    ``u = (q - center) / scale`` is the scaled q; W (h, n) are weights, b (h,) is a bias.
     """
     shift = ((mean - center) - (mean - center) @ M) / scale
     return (W / scale) @ M.T * scale, b + W @ shift
 
 
 class LeverageModule(ForwardModel):
-    """A model that gives the leverage of any row with respect to those that it learned from."""
+    """A model that can return the leverage of any row with respect to its training rows."""
 
     def leverage(self, q):
-        """Return the leverage of `q`, shape (...), smooth; at most 1 on the training rows."""
+        """Return the leverage of `q`, shape (...): smooth, at most 1 on the training rows."""
         raise NotImplementedError
 
     def forward_jacobian_and_leverage(self, q):
@@ -48,15 +48,15 @@ class ELM(LeverageModule):
     """A fitted network ``eps = phi(q) @ output_weights + intercept`` as a torch module.
 
     ``phi(q) = sigma(W u + b)`` with the scaled input ``u = (q - input_center) / input_scale``,
-    followed by `u` itself where there is a direct link. Buffers only; batch dimensions lead; twice
-    differentiable; it computes in the dtype and on the device of `q`.
+    followed by `u` itself if there is a direct link. Batch dimensions lead. The module is twice
+    differentiable and computes in the dtype and on the device of `q`.
 
     Parameters
     ----------
     activation : {"logistic", "tanh", "sin"}, default="logistic"
         The function sigma.
     **arrays
-        What the state dict holds, so ``ELM(elm.activation, **elm.state_dict())`` is a copy:
+        The entries of the state dict, so ``ELM(elm.activation, **elm.state_dict())`` is a copy:
 
         - input_weights (n_hidden, n_inputs), input_bias (n_hidden,): the hidden layer W, b;
         - input_center, input_scale (n_inputs,): affine map of the inputs [unit of q];
@@ -90,7 +90,7 @@ class ELM(LeverageModule):
         self.register_buffer("tangent", (w_out.T[:, None] * w_in.T).flatten(0, 1))
 
     def seen_through(self, mean, M):
-        """Return the network that sees ``mean + (q - mean) @ M`` (n, n) in place of q (..., n)."""
+        """Return the network with its input q replaced by ``mean + (q - mean) @ M``, M (n, n)."""
         arrays = {name: self.get_buffer(name) for name in LAYER + READOUT}
         through = self.input_center, self.input_scale, mean.to(self.input_scale), M.to(self.tangent)
         W, b = seen_through(self.input_weights, self.input_bias, *through)
@@ -109,14 +109,14 @@ class ELM(LeverageModule):
     def _hidden(self, q, out=None):
         n_inputs = len(self.input_center)
         check_vectors(q, n_inputs, "q", f"this ELM was fitted on {n_inputs} inputs")
-        # Folding the scaling into W and b would cancel digits where the range is narrow.
+        # Merging the scaling into W and b would lose digits if the range is narrow.
         u = (q - self.input_center.to(q)) / self.input_scale.to(q)
         W, b = self.input_weights.to(q), self.input_bias.to(q)
         a = nn.functional.linear(u, W, b) if out is None else torch.addmm(b, u, W.T, out=out)
         return u, a, ACTIVATIONS[self.activation][0](a, out=out)
 
     def _write_features(self, q, out):
-        # In place: a large temporary per block would fragment the heap by hundreds of megabytes.
+        # In place: large temporary arrays would fragment the heap by hundreds of megabytes.
         n_hidden = len(self.input_weights)
         u, _, _ = self._hidden(q, out[:, :n_hidden])
         if len(self.output_weights) > n_hidden:
@@ -147,12 +147,12 @@ class ELM(LeverageModule):
         return self._readout(u, s)
 
     def forward_and_jacobian(self, q):
-        """Return ``forward(q), jacobian(q)`` for the price of one hidden layer."""
+        """Return ``forward(q)`` and ``jacobian(q)`` from one evaluation of the hidden layer."""
         x, J = self._in_blocks(q, lambda u, a, s: (self._readout(u, s), self._slope(a, s)))
         return x, J
 
     def forward_jacobian_and_leverage(self, q):
-        """Return ``forward(q)``, ``jacobian(q)`` and ``leverage(q)``, which share the features."""
+        """Return ``forward(q)``, ``jacobian(q)`` and ``leverage(q)`` from the same features."""
 
         def rows(u, a, s):
             leverage = self._leverage(self._features(u, s))
@@ -166,7 +166,7 @@ class ELM(LeverageModule):
         return in_blocks(lambda rows: function(*self._hidden(rows)), q, size)
 
     def leverage(self, q):
-        """Return the leverage, shape (...), of `q`: at most 1 on the training rows, smooth."""
+        """Return the leverage of `q`, shape (...): smooth, at most 1 on the training rows."""
         return self._leverage(self.features(q))
 
     def _leverage(self, phi):

@@ -1,4 +1,4 @@
-"""Fitted scikit-learn regressors as torch modules, with closed-form Jacobians where there are."""
+"""Fitted scikit-learn regressors as torch modules, with closed-form Jacobians if they exist."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     Parameters
     ----------
     regressor : estimator
-        With a torch ``module_`` of its own; or a linear model, also on `PolynomialFeatures`, or a
-        `KernelRidge` or `GaussianProcessRegressor` with an RBF kernel, each also behind standard
-        or min-max scalers: in closed form. Else its ``predict`` is differenced.
+        In closed form: a regressor with a torch ``module_``, a linear model (also on
+        `PolynomialFeatures`), and a `KernelRidge` or `GaussianProcessRegressor` with an RBF kernel,
+        each also after standard or min-max scalers. Others: finite differences of ``predict``.
     q : Tensor of shape (N, n)
-        The rows that it was fitted on.
+        The training rows.
     """
     if isinstance(getattr(regressor, "module_", None), nn.Module):
         return as_forward_model(regressor)
@@ -97,7 +97,7 @@ class AffineModule(ForwardModel):
 class PolynomialModule(ForwardModel):
     """A polynomial ``phi(u) @ readout`` of ``u = (q - center) / scale``.
 
-    The derivative of a monomial is another one: the Jacobian is a second readout of the same
+    The derivative of a monomial is a monomial, so the Jacobian is a second readout of the same
     features.
 
     Parameters
@@ -105,7 +105,7 @@ class PolynomialModule(ForwardModel):
     powers : array-like of int of shape (P, n)
         Exponents of the monomials.
     readout : array-like of shape (P, m)
-        Their coefficients; those of a monomial that stands there twice are added.
+        Their coefficients; coefficients of equal monomials are added.
     center, scale : array-like of shape (n,)
         Map of the inputs [unit of q].
     """
@@ -141,7 +141,7 @@ class PolynomialModule(ForwardModel):
         return self._monomials(q) @ self.readout.to(q)
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both for the price of one set of features."""
+        """Return the polynomial (..., m) and its Jacobian (..., m, n) from the same features."""
         x, J = in_blocks(self._forward_and_jacobian, q)
         return x, J
 
@@ -205,7 +205,7 @@ class KernelModule(ForwardModel):
         return in_blocks(lambda q: (self._kernel(q)[1] @ weights + bias,), q, self._block)[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both for the price of one kernel matrix."""
+        """Return the sum (..., m) and its Jacobian (..., m, n) from one kernel matrix."""
         x, J = in_blocks(self._forward_and_jacobian, q, self._block)
         return x, J
 
@@ -224,10 +224,10 @@ class KernelModule(ForwardModel):
 
 
 class RegressorModule(ForwardModel):
-    """Any fitted scikit-learn regressor as a torch module, its Jacobian by central differences.
+    """Any fitted scikit-learn regressor as a torch module, with a Jacobian by central differences.
 
-    The step is the cube root of machine precision times the training range of each input, which
-    leaves a relative error near 1e-10 for smooth regressors. Trees are piecewise constant: their
+    The step is the training range of each input times the cube root of machine precision. The
+    relative error is then near 1e-10 for smooth regressors. Trees are piecewise constant: their
     Jacobian is zero almost everywhere.
     """
 
@@ -247,13 +247,13 @@ class RegressorModule(ForwardModel):
         return self(q), self.differences(q)
 
     def differences(self, q: Tensor) -> Tensor:
-        """Return dx/dq outside any graph, shape (..., m, n)."""
+        """Return dx/dq without a graph, shape (..., m, n)."""
         at, steps = q.detach().cpu().double(), torch.from_numpy(np.diag(self._step))
         changes = [self.evaluate(at + step) - self.evaluate(at - step) for step in steps]
         return (torch.stack(changes, dim=-1) / (2 * steps.diag())).to(q)
 
     def evaluate(self, q: Tensor) -> Tensor:
-        """Return the prediction outside any graph, shape (..., m)."""
+        """Return the prediction without a graph, shape (..., m)."""
         rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
         x = copied(self.regressor.predict(rows), q.device, np.float64)
         return x.to(q).reshape(*q.shape[:-1], -1)
@@ -300,8 +300,8 @@ def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
 
 
 def _gaussian(kernel: gp.Kernel) -> tuple[float, Any] | None:
-    """Return height and widths of a kernel, if between different rows it is a Gaussian."""
-    if type(kernel) is gp.RBF:  # a Matern kernel is one to isinstance
+    """Return height and widths of a kernel if it is Gaussian between different rows, else None."""
+    if type(kernel) is gp.RBF:  # isinstance would accept a Matern kernel
         return 1.0, kernel.length_scale
     if isinstance(kernel, gp.KernelOperator):
         for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):

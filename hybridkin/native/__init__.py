@@ -1,4 +1,4 @@
-"""The compiled core: kernels in C that compute models and inverse kinematics for NumPy arrays."""
+"""The compiled core: C kernels that evaluate models and inverse kinematics for NumPy arrays."""
 
 from hybridkin.native.export import export_c
 from hybridkin.native.library import available, backend

@@ -1,4 +1,4 @@
-"""C code of a model for a controller: the kernels that it needs and its numbers, in one file."""
+"""C code of a model for a controller: the needed kernels and the numbers, in one file."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from hybridkin.native.plan import ARCS, ELASTIC, HYBRID, RIGID, NoKernel, Plan
 _FOLDER = Path(__file__).parent
 _REAL = {"float64": "double", "float32": "float"}
 _TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # of the test, relative to the largest numbers
-# Buffers with the middle and the half width of the rows that a learned part was fitted to.
+# Buffers with the middle and the half width of the training rows of a learned part.
 _RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "half_width"))
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
-_STEPS, _MEMORY = 4, 5.0  # steps of a run of the test; memory in periods
-# Operations of a node with a numbers, n inputs and m outputs in a model of S segments.
+_STEPS, _MEMORY = 4, 5.0  # steps per run of the test; memory in periods
+# Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
 _OPERATIONS = {
     ARCS: lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
     ELASTIC: lambda a, n, m, S: (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S,
@@ -49,33 +49,33 @@ class _Controller(Protocol):
 def export_c(
     model: object, folder: str | Path, *, name: str = "model", dtype: str = "float64"
 ) -> list[Path]:
-    """Write a model, or inverse kinematics, as C99 code for a controller.
+    """Write a model or inverse kinematics as C99 code for a controller; return the files.
 
-    The code needs no library but math.h, allocates nothing, and every loop of it has a bound.
+    The code needs only math.h, allocates no memory, and every loop has a fixed bound.
 
     Parameters
     ----------
     model : ForwardModel, fitted HybridForwardModel or ELMRegressor, or InverseKinematics
-        What to write. Of inverse kinematics the model and a step of it are written. Play of a
-        hybrid is not: q are the values after it.
+        The model to write. For inverse kinematics the model and one step are written. The play of
+        a hybrid is not written: the code takes q after play.
     folder : str or Path
-        Where to write. Files of an earlier export are replaced, others are not.
+        Output folder. Files of an earlier export are replaced, other files are not.
     name : str, default="model"
-        Of the files, and what all functions begin with.
+        Name of the files and prefix of all functions.
     dtype : {"float64", "float32"}, default="float64"
-        Numbers that the code computes with.
+        Floating-point type of the code.
 
     Returns
     -------
     list of Path
-        Header, source, test, CMakeLists.txt and README.md.
+        The header, source, test, CMakeLists.txt and README.md.
 
     Raises
     ------
     NoKernel
-        Where a part of the model cannot be written; the message says which. A ValueError.
+        If a part of the model cannot be written; the message names it. A ValueError.
     FileExistsError
-        Where the folder has a file of another origin under one of these names.
+        If the folder has a file with one of these names that hybridkin did not write.
 
     Examples
     --------
@@ -89,13 +89,13 @@ def export_c(
     if dtype not in _REAL:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-        raise ValueError(f"`name` must be a name in C, as in trunk_3, got {name!r}.")
+        raise ValueError(f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}.")
     controller = model if isinstance(model, _Controller) else None
     module = as_forward_model(model if controller is None else controller.model)
     try:
         plan = Plan((module if controller is None else controller).stored())
         if controller is not None and plan.n_outputs > 3:
-            raise NoKernel("a step towards a pose has no kernel")
+            raise NoKernel("a step to a target pose has no kernel")
     except (NoKernel, TypeError) as error:
         way = "use it from Python, or fit an error model that has a kernel"
         raise NoKernel(f"`model` cannot be written in C: {error}; {way}.") from None
@@ -104,7 +104,7 @@ def export_c(
     paths = [Path(folder) / file for file in files]
     for path in paths:
         if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
-            raise FileExistsError(f"`folder` has a {path.name} of another origin; take another.")
+            raise FileExistsError(f"`folder` has a {path.name} of another origin; use another.")
     entries = {
         **dict(NAME=name, GUARD=name.upper(), TITLE=type(model).__name__, VERSION=__version__),
         **dict(REAL=_REAL[dtype], N=plan.n_inputs, M=plan.n_outputs, TOL=_TOLERANCE[dtype]),
@@ -130,7 +130,7 @@ def _filled(template: str, entries: dict[str, Any]) -> str:
 
 
 def _with_headers(path: Path) -> str:
-    """Return the text of a file with the headers of the kernels in place."""
+    """Return the text of a file with the kernel headers inserted."""
     return re.sub(
         r'(?m)^#include "(\w+\.h)"$',
         lambda found: _with_headers(_FOLDER / "src" / found[1]),
@@ -139,9 +139,9 @@ def _with_headers(path: Path) -> str:
 
 
 def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
-    """Return sizes and numbers of a plan as C, and what README.md says of them."""
+    """Return sizes and numbers of a plan as C, and the entries of README.md about them."""
     at = int(plan.code[plan.root + 4]) if steps else plan.root
-    # Of arrays of length 1 gcc warns where it cannot see that loops over them begin.
+    # gcc warns about arrays of length 1 if it cannot see that loops over them run at all.
     sizes = {f"MAX_{s}": max(plan.largest.get(what, 0), 2) for s, what in _SIZES.items()}
     kinds = sum(1 << kind for kind in {*plan.code[plan.places].tolist()})
     lines = [f"#define HK_{a} {number}" for a, number in {**sizes, "KINDS": f"{kinds}u"}.items()]
@@ -163,12 +163,12 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
 
 
 def _operations(plan: Plan) -> int:
-    """Return about how many operations x and J take at most."""
+    """Return the approximate largest number of operations for x and J."""
     *columns, begin = (plan.code[np.add(plan.places, k)].tolist() for k in range(4))
     numbers, S = np.diff([*begin, len(plan.data)]).tolist(), plan.largest.get("segments", 0)
     work = 0
     for kind, n, m, a in zip(*columns, numbers, strict=True):
-        # Learned parts use every number once for x, and at most m times for J.
+        # Learned parts use each number once for x, and at most m times for J.
         work += _OPERATIONS[kind](a, n, m, S) if kind in _OPERATIONS else 2 * (m + 1) * a
     return work
 
@@ -180,7 +180,7 @@ def _limits(plan: Plan) -> tuple[NDArray, float]:
 
 
 def _literals(values: NDArray) -> str:
-    """Return numbers as the inside of a C array."""
+    """Return numbers as the entries of a C array."""
     single = "f" if values.dtype == np.float32 else ""
     cast = "" if single else "(double)"
     known = {"inf": f"{cast}INFINITY", "-inf": f"-{cast}INFINITY", "nan": f"{cast}NAN"}
@@ -192,13 +192,13 @@ def _literals(values: NDArray) -> str:
 def _vectors(
     module: ForwardModel, plan: Plan, controller: _Controller | None, dtype: str
 ) -> dict[str, Any]:
-    """Return what the test compares: inputs, and what torch computes of them."""
+    """Return the data of the test: inputs, and the outputs that torch computes."""
     double, rng = copy.deepcopy(module).double(), np.random.default_rng(0)
     center, half = _usual(double, plan.n_inputs)
     if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
         low, high, *_ = _limits(plan)[0]
         center, half = 0.5 * (low + high), 0.5 * (high - low)
-    # Eight usual rows, then rows further and further out; the last one is NaN.
+    # Eight usual rows, then rows at growing distance from the center; the last one is NaN.
     far = np.concatenate([np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]])
     rows = center + half * far[:, None] * rng.uniform(-1.0, 1.0, (17, len(half)))
     rows = rows.astype(dtype)
@@ -216,7 +216,7 @@ def _vectors(
 
 
 def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
-    """Return a middle and a half width of q: of the training rows, else by the robot's radii."""
+    """Return the middle and half width of q: of the training rows, else from the radii."""
     buffers = {name.rpartition(".")[2]: a.numpy() for name, a in module.named_buffers()}
     for pair in _RANGES:
         center, half = (buffers.get(name, np.empty(0)) for name in pair)
@@ -231,18 +231,18 @@ def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
 def _runs(
     controller: _Controller, plan: Plan, starts: NDArray, tips: NDArray, dtype: str
 ) -> dict[str, NDArray]:
-    """Return runs of steps, from within the limits and from their edges, and what came out."""
+    """Return runs of steps that start inside the limits and at them, and their results."""
     rng, ((low, high, *_), dt) = np.random.default_rng(1), _limits(plan)
     low, high = low.astype(dtype), high.astype(dtype)
     starts = starts.clip(low, high)
     starts[4:, ::2] = np.where(np.isfinite(high), high, starts[4:])[:, ::2]
-    # In single precision short ones: where limits and weak directions meet it has steps of its own.
+    # Short steps in single precision: at limits and in weak directions its steps can differ.
     far = np.array([0.2, 0.1, 0.01] if dtype == "float64" else [1e-4, 1e-3, 1e-4])
     changes = rng.standard_normal((3, 8, _STEPS, 3)) * np.ptp(tips, axis=0)
     changes *= far[:, None, None, None]
     changes[[0, 2]] += tips[:, None]
     target, dx, measured = changes.astype(dtype)
-    measured[:, 2] = math.nan  # no reading
+    measured[:, 2] = math.nan  # no measurement
     found = []
     for q, *run in zip(starts, target, dx, measured, strict=True):
         tracker = controller.tracker(torch.from_numpy(q.astype(float)), memory=_MEMORY * dt)
@@ -257,7 +257,7 @@ def _runs(
 
 
 def _measured(source: Path) -> str:
-    """Return what the code and its stack take, as the compiler of this machine says."""
+    """Return the size of the code and of its stack, measured by the compiler of this machine."""
     if shutil.which("cc") and shutil.which("size"):
         with tempfile.TemporaryDirectory() as home:
             built, usage = Path(home) / "a.o", Path(home) / "a.su"
@@ -266,5 +266,5 @@ def _measured(source: Path) -> str:
             if done.returncode == 0 and usage.exists():
                 stack = sum(int(line.split("\t")[1]) for line in usage.read_text().splitlines())
                 text = subprocess.check_output(["size", built], text=True).split()[6]
-                return f"{text} and {stack} bytes where it was written, by `cc -Os`"
-    return "not measured where it was written, which had no C compiler"
+                return f"{text} and {stack} bytes on the machine of the export, with `cc -Os`"
+    return "not measured: the machine of the export had no C compiler"

@@ -1,4 +1,4 @@
-"""The compiled library: how it is found and checked, and how models are computed by it."""
+"""The compiled library: find it, check it, and evaluate models with it."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from hybridkin.native.plan import NoKernel, Plan
 
 _FOLDER = Path(__file__).parent
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
-_LEVELS = {"hk_v2": 2, "hk_v3": 3, "hk_v4": 4}  # what hk_level() must be, at least
-_CHUNK = 20_000  # rows that one thread computes at a time
+_LEVELS = {"hk_v2": 2, "hk_v3": 3, "hk_v4": 4}  # smallest hk_level() of each
+_CHUNK = 20_000  # rows per task of a thread
 _BYTE = ctypes.c_char
 _version = attrgetter("_version")
 
@@ -32,20 +32,20 @@ Results = tuple[NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.floa
 
 
 def library() -> ctypes.CDLL | None:
-    """Return the compiled library, None where there is none."""
+    """Return the compiled library, or None if there is none."""
     return _opened()[0]
 
 
 def available() -> bool:
-    """Return whether the compiled core is there; without it torch computes everything.
+    """Return whether the compiled core is available; without it torch computes everything.
 
-    The environment variable HYBRIDKIN_NATIVE=off turns it off.
+    The environment variable HYBRIDKIN_NATIVE=off turns the core off.
     """
     return library() is not None
 
 
 def backend(model: ForwardModel) -> str:
-    """Return what computes a model for NumPy arrays: "compiled", or "torch: " and the reason."""
+    """Return how a model is computed for NumPy arrays: "compiled", or "torch: " and a reason."""
     missing, reason = library() is None, _opened()[1]
     if not missing:
         program_of(model)
@@ -55,8 +55,8 @@ def backend(model: ForwardModel) -> str:
 
 @cache
 def _opened() -> tuple[ctypes.CDLL | None, str]:
-    """Return the best library that this processor can use, or the reason why there is none."""
-    choice = os.environ.get("HYBRIDKIN_NATIVE", "")  # off, or the name of a variant
+    """Return the fastest library that this processor can run, or the reason why there is none."""
+    choice = os.environ.get("HYBRIDKIN_NATIVE", "")  # "off", or the name of a variant
     if choice == "off":
         return None, "HYBRIDKIN_NATIVE=off"
     paths = sorted((_FOLDER / "lib").glob(f"hk_{choice or '*'}{_SUFFIX}"))
@@ -76,7 +76,7 @@ def _opened() -> tuple[ctypes.CDLL | None, str]:
 
 
 def _fault(opened: ctypes.CDLL) -> str:
-    """Return what is wrong with a library."""
+    """Return what is wrong with a library, or an empty string."""
     sources = sorted((_FOLDER / "src").glob("*.[ch]"))
     stamp = zlib.crc32(b"".join(path.read_bytes() for path in sources))
     if opened.hk_sources() & 0xFFFFFFFF != stamp:
@@ -90,8 +90,8 @@ def _fault(opened: ctypes.CDLL) -> str:
 
 
 def _is_right(opened: ctypes.CDLL) -> bool:
-    """Return whether circles and logistic units are as their closed forms, and their slopes."""
-    # Two equal segments make one arc of length r [m] that turns by t, in the direction a.
+    """Return whether arcs and logistic units match their closed forms and finite differences."""
+    # Two equal segments form one arc of length r [m] that bends by t [rad] in the direction a.
     r, a, t = 0.7, 0.3, np.array([0.5, 2.0, 3.0, 5.0, 9.0])
     side = r * (1.0 - np.cos(t)) / t
     x = np.stack([side * np.cos(a), side * np.sin(a), r * np.sin(t) / t], 1)
@@ -119,20 +119,20 @@ def _is_right(opened: ctypes.CDLL) -> bool:
 
 
 class Program:
-    """A model that the compiled core computes.
+    """A model that the compiled core evaluates.
 
     Parameters
     ----------
     plan : Plan
         The model.
     opened : ctypes.CDLL, optional
-        The library. Default: that of `library()`.
+        The library. Default: `library()`.
     """
 
     def __init__(self, plan: Plan, opened: ctypes.CDLL | None = None) -> None:
         opened = opened or library()
         if opened is None:
-            raise RuntimeError(f"the compiled core is not there: {_opened()[1]}.")
+            raise RuntimeError(f"the compiled core is not available: {_opened()[1]}.")
         self.plan = plan
         self._sizes = plan.n_inputs, plan.n_outputs
         self._evaluate = opened.hk_evaluate
@@ -142,19 +142,19 @@ class Program:
         return Program, (self.plan,)
 
     def evaluate(self, q: NDArray, jacobian: bool = False, distance: bool = False) -> Results:
-        """Return x (..., m), and dx/dq (..., m, n) and the domain distance (...), or None.
+        """Return x (..., m), dx/dq (..., m, n) or None, and the domain distance (...) or None.
 
-        Rows beyond 20,000 are computed by the threads that torch may use. Their number does not
-        change the result.
+        More than 20,000 rows are shared among the threads that torch may use. The number of
+        threads does not change the result.
 
         Parameters
         ----------
         q : ndarray of shape (..., n)
             Actuator vectors, any strides.
         jacobian : bool, default=False
-            Whether dx/dq is computed.
+            Whether to compute dx/dq.
         distance : bool, default=False
-            Whether the domain distance is computed.
+            Whether to compute the domain distance.
         """
         lead, (n, m) = q.shape[:-1], self._sizes
         if q.shape == (n,):
@@ -171,7 +171,7 @@ class Program:
         return x, J, d
 
     def domain(self, q: NDArray, slope: bool = False) -> tuple[NDArray, NDArray | None]:
-        """Return the domain distance (...) at q (..., n), and its slope by q (..., n) or None."""
+        """Return the domain distance (...) at q (..., n), and its gradient (..., n) or None."""
         d, slopes = np.empty(q.shape[:-1]), np.empty(q.shape) if slope else None
         self._fill(q, [(None, 0), (slopes, self._sizes[0]), (d, 1)])
         return d, slopes
@@ -209,22 +209,22 @@ def in_chunks(rows: int, run: Callable[[int, int], None]) -> None:
 
 
 def play(rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool) -> list[NDArray]:
-    """Return what rows (T, n) become behind the play of tendons, and the state after them.
+    """Return rows (T, n) after the play of the tendons, and the state after the last row.
 
     Parameters
     ----------
     rows : ndarray of shape (T, n)
-        Commands, with `lead` effective changes; contiguous, float64, at least one.
+        Commands, or effective changes if `lead`; contiguous float64, at least one row.
     state : sequence of two array-likes of shape (n,)
-        The command and the effective change before.
+        The command and the effective change before the first row.
     half : ndarray of shape () or (n,)
-        Half the width of every tendon.
+        Half the play of every tendon.
     lead : bool
-        Whether commands are asked for, not effective changes.
+        Whether to return commands for effective changes instead of the reverse.
     """
     opened = library()
     if opened is None:
-        raise RuntimeError(f"the compiled core is not there: {_opened()[1]}.")
+        raise RuntimeError(f"the compiled core is not available: {_opened()[1]}.")
     n = rows.shape[1]
     vectors = np.empty((3, n))
     vectors[0], vectors[1], vectors[2] = half, *state
@@ -235,14 +235,14 @@ def play(rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool) -> list
 
 
 def _address(a: NDArray | None) -> int | None:
-    """Return where a contiguous array of our own lies; faster than `a.ctypes`."""
+    """Return the address of a contiguous, writable array; faster than `a.ctypes`."""
     if a is None:
         return None
     return ctypes.addressof(_BYTE.from_buffer(a))  # pyright: ignore[reportArgumentType]
 
 
 class _Compiled:
-    """What was made of a model, and the buffers and submodules that it was made of."""
+    """The program of a model, and the buffers and submodules from which it was made."""
 
     def __init__(self, model: ForwardModel) -> None:
         self.program, self.reason = None, ""
@@ -271,16 +271,16 @@ class _Compiled:
 
 
 def _check_classes(modules: list[torch.nn.Module]) -> None:
-    """Raise NoKernel for classes that inherit their description: they may compute otherwise."""
+    """Raise NoKernel for classes that inherit their layout: they may compute something else."""
     for module in modules:
         if isinstance(module, PortableModule) and "layout" not in vars(type(module)):
             raise NoKernel(f"a {type(module).__name__} has no kernel")
 
 
 def program_of(model: ForwardModel) -> Program | None:
-    """Return the program of a model, None where torch computes it; see `backend`.
+    """Return the program of a model, or None if torch computes it; see `backend`.
 
-    It is kept on the model until a buffer or a submodule is changed.
+    The model keeps its program until a buffer or a submodule changes.
     """
     compiled = model.__dict__.get("_program")
     if compiled is None or not compiled.holds():
@@ -297,9 +297,9 @@ def evaluate(
     jacobian: bool = False,
     distance: bool = False,
 ) -> tuple[NDArray, ...]:
-    """Return what is asked for of x (..., m), dx/dq (..., m, n) and domain distance (...).
+    """Return the requested ones of x (..., m), dx/dq (..., m, n) and domain distance (...).
 
-    The compiled core computes it where it can, else torch. `q` must be writable float64.
+    The compiled core computes them if it can, else torch. `q` must be writable float64.
     """
     program = program_of(model)
     if program is not None and not (value or jacobian):

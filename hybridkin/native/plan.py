@@ -1,4 +1,4 @@
-"""Plans: a model as one array of numbers and one of positions in it, for the compiled core."""
+"""Plans: a model as one array of numbers and one of integers, for the compiled core."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from scipy.linalg import solve_triangular
 
 from hybridkin._core.stored import Stored
 
-# Kinds of nodes, as src/plan.h numbers them.
+# Kinds of nodes, numbered as in src/plan.h.
 ARCS, ELASTIC, RIGID, AFFINE, ELM, POLYNOMIAL, KERNEL, READOUT = range(1, 9)
 LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK, GROUP_DISTANCE, ADAPTED = range(9, 16)
 GROUPED = (AFFINE, ELM, KERNEL, QUADRATIC_LEVERAGE)
-GROUP = 8  # hidden units, or columns of a leverage, that stand together
+GROUP = 8  # hidden units, or columns of a leverage, stored together
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
 QUADRATIC, POSE = 1, 3  # features of a readout
 ROUNDING = 1e-7  # of weights that sum to one
-# What the kernels have room for, see src/plan.h.
+# Largest sizes that the kernels support, see src/plan.h.
 MOST = {"actuators": 64, "segments": 16, "outputs": 64, "features": 2048, "powers": 1024}
 
 
 class NoKernel(ValueError):
-    """A part of a model has no kernel; the message says which and why."""
+    """Error: a part of a model has no kernel; the message names the part and the reason."""
 
 
 class Plan:
-    """The nodes of a model, parts before what is made of them, and the numbers they use.
+    """The nodes of a model, each after its parts, and the numbers they use.
 
     Attributes
     ----------
     code : ndarray of int32
-        Node after node: kind, lengths of input and output, place of its numbers, then sizes and
-        the places of parts.
+        For each node: kind, lengths of input and output, place of its numbers, then its sizes
+        and the places of its parts.
     data : ndarray of float64
         All numbers.
     n_inputs, n_outputs : int
         Lengths of q and of x.
     root : int
-        Place in `code` of the node that is the whole model.
+        Place in `code` of the node of the whole model.
     places : list of int
-        Places of all nodes, their numbers in the same order.
+        Places of all nodes, in the order of their numbers.
     largest : dict
         Largest sizes, named as in MOST.
     """
@@ -59,28 +59,28 @@ class Plan:
         self.n_inputs, self.n_outputs = self._code[self.root + 1 : self.root + 3]
         self.code = np.array(self._code, dtype=np.int32)
         whole = np.zeros(self._length + 2 * GROUP)
-        start = -whole.ctypes.data // 8 % GROUP  # of a line of the cache
+        start = -whole.ctypes.data // 8 % GROUP  # at the start of a cache line
         self.data = whole[start : start + self._length + GROUP]
         self.data[:-GROUP] = np.concatenate(self._data)
         self.places = [*self._known.values()]
-        self._data, self._known = [], {}  # not twice in pickles
+        self._data, self._known = [], {}  # do not pickle them twice
         for array in (self.code, self.data):
             array.flags.writeable = False
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the plan: equal for models that compute the same."""
+        """SHA-256 of the plan: equal plans compute the same."""
         return hashlib.sha256(self.code.tobytes() + self.data.tobytes()).hexdigest()
 
     def node_of(self, stored: Stored) -> int:
-        """Write the node of a description, its parts first, and return its place."""
+        """Write the node of a description after its parts, and return its place."""
         write = WRITERS.get(stored.kind)
         if write is None:
             raise NoKernel(f"a part of the kind {stored.kind!r} has no kernel")
         return write(self, stored)
 
     def node(self, kind: int, n: int, m: int, numbers: list[NDArray], *more: int) -> int:
-        """Write a node with its numbers, and return its place; equal nodes have one place."""
+        """Write a node with its numbers, and return its place; equal nodes share one place."""
         for what, size in (("actuators", n), ("outputs", m)):
             self.limit(what, size)
         flat = [np.asarray(part, dtype=np.float64).ravel() for part in numbers]
@@ -96,25 +96,25 @@ class Plan:
         return self._known[key]
 
     def entry(self, place: int, k: int) -> int:
-        """Return an entry of a node: 0 its kind, 1 and 2 its lengths, from 4 on what it adds."""
+        """Return entry k of a node: 0 its kind, 1 and 2 its lengths, from 4 on its own entries."""
         return self._code[place + k]
 
     def limit(self, what: str, size: int) -> None:
-        """Note a size, and raise where it is larger than the kernels have room for."""
+        """Record a size, and raise if it is larger than the kernels support."""
         self.largest[what] = max(size, self.largest.get(what, 0))
         if size > MOST[what]:
-            raise NoKernel(f"{size} {what}: the kernels have room for {MOST[what]}")
+            raise NoKernel(f"{size} {what}: the kernels support at most {MOST[what]}")
 
 
 def _frame(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
-    """Return the frame of a chain of arcs, and the shares (m,) of the m segments up to its tip.
+    """Return the frame of a chain of arcs, and the shares (m,) of its m segments up to the tip.
 
-    The frame is the rotation of the base, its position, the reach, and the rigid offsets.
+    The frame is the rotation and position of the base, the reach, and the rigid offsets.
     """
     base, at = stored.array("base"), stored.value("tip_at", float)
     (_, x, y, z), *others = stored.settings.get("markers", [[at, 0.0, 0.0, 0.0]])
     if others or x or y:
-        raise NoKernel("several markers, and one beside the backbone, have no kernel")
+        raise NoKernel("several markers, or a marker beside the backbone, have no kernel")
     offsets = stored.array("offsets")
     plan.limit("segments", len(offsets))
     m = math.ceil(at)
@@ -125,7 +125,7 @@ def _frame(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
 
 
 def whole_chain(plan: Plan, stored: Stored) -> int:
-    """Write the node of a chain of arcs up to the robot's end, wherever it is steered."""
+    """Write the node of a chain of arcs up to the robot's end, wherever its tip is."""
     at = float(len(stored.array("offsets")))
     end = {"tip_at": at, "markers": [[at, 0.0, 0.0, 0.0]]}
     return plan.node_of(replace(stored, settings={**stored.settings, **end}))
@@ -143,7 +143,7 @@ def _constant_curvature(plan: Plan, stored: Stored) -> int:
         for name in ("arc_matrix", "arc_offset")
     )
     n, step, width = matrix.shape[2], 0, matrix.shape[2]
-    if n % S == 0:  # each segment on the actuators that are its own
+    if n % S == 0:  # check whether each segment depends on its own actuators alone
         own = np.stack([part[:, k * n // S : (k + 1) * n // S] for k, part in enumerate(matrix)])
         if np.count_nonzero(own) == np.count_nonzero(matrix):
             matrix, step, width = own, n // S, n // S
@@ -163,7 +163,7 @@ def _elastic_tendons(plan: Plan, stored: Stored) -> int:
     segments = np.hstack([stiffness, coupled * stiffness, arcs, share, coupled * share])
     of, angles = np.repeat(np.arange(S), counts), stored.array("angles")
     x, y = -radii[of] * np.cos(angles), -radii[of] * np.sin(angles)
-    bent = (np.cumsum(rest, 0) if base else rest)[of]  # the zeros become those of bends from rest
+    bent = (np.cumsum(rest, 0) if base else rest)[of]  # zeros for bends measured from rest
     zeros = stored.array("tendon_zeros") + x * bent[:, 0] + y * bent[:, 1]
     tendons = np.stack([zeros, x, y, x * x, x * y, y * y, stored.array("gains")], 1)
     same = counts[0] if len({*counts}) == 1 else 0
@@ -179,7 +179,7 @@ def _rigid(plan: Plan, stored: Stored) -> int:
     for origin, axis in zip(motions[:, 0] + motions[:, 2], stored.array("axes"), strict=True):
         side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         side = side / np.linalg.norm(side)
-        turn = np.eye(4)  # after which the joint's axis is z
+        turn = np.eye(4)  # turns the joint's axis to z
         turn[:3, :3] = np.stack([side, np.cross(axis, side), axis], 1)
         frame = before @ origin @ turn
         numbers += [frame[:3, :3], frame[:3, 3]]
@@ -201,7 +201,7 @@ def _units(
     hidden: tuple[NDArray, NDArray],
     lever: Sequence[NDArray] = (),
 ) -> int:
-    """Write x = c + D u + V sigma(W u + b): (c, D, V) is the readout, (W, b) the hidden layer."""
+    """Write x = c + D u + V sigma(W u + b) with readout (c, D, V) and hidden layer (W, b)."""
     (intercept, direct, output), (W, b) = readout, hidden
     H, (m, n) = len(b), direct.shape
     units = np.zeros((-(-H // GROUP) * GROUP, n + 1 + m))
@@ -221,8 +221,8 @@ def _lever(
 ) -> tuple[int, list[NDArray]]:
     """Return whether a factor R (f, f) is full, and the numbers of |R' (phi - center)|^2 + offset.
 
-    R stands in blocks of columns, the first filled up by zeros in front; of an upper triangular R
-    the rows down to the diagonal.
+    R is stored in blocks of columns; the first block starts with zeros as padding. An upper
+    triangular R is stored down to its diagonal.
     """
     f = len(center)
     plan.limit("features", f)
@@ -304,7 +304,7 @@ def _readout(plan: Plan, stored: Stored) -> int:
 
 def _quadratic_leverage(plan: Plan, stored: Stored) -> int:
     center, half_width = stored.array("center"), stored.array("half_width")
-    # |L^-1 phi|^2 as the leverage of a network: R = L^-T is upper triangular.
+    # |L^-1 phi|^2 in the form of a network's leverage: R = L^-T is upper triangular.
     factor = solve_triangular(stored.array("factor"), np.eye(2 * len(center) + 1), lower=True).T
     lever = _lever(plan, np.zeros(1), np.zeros(len(factor)), np.triu(factor))[1]
     return plan.node(QUADRATIC_LEVERAGE, len(center), 0, [center, 1.0 / half_width, *lever])
@@ -332,7 +332,7 @@ def _group_distance(plan: Plan, stored: Stored) -> int:
 
 
 def _content(stored: Stored) -> tuple:
-    """Return what two descriptions without parts must share to be the same."""
+    """Return a tuple that is equal for equal descriptions without parts."""
     return stored.kind, stored.settings, {k: a.tobytes() for k, a in stored.arrays.items()}
 
 
@@ -341,7 +341,7 @@ def _hybrid(plan: Plan, stored: Stored) -> int:
     if "mechanical" in stored.parts:
         base = plan.node_of(stored.part("mechanical"))
         if plan.entry(base, 0) not in (ARCS, ELASTIC, RIGID):
-            raise NoKernel(f"the mechanical part {stored.part('mechanical').kind!r} is no chain")
+            raise NoKernel(f"the mechanical part {stored.part('mechanical').kind!r} is not a chain")
     if "drift" in stored.parts:
         drift = plan.node_of(stored.part("drift"))
     if "tested" in stored.parts:
@@ -375,10 +375,10 @@ def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     model = plan.node_of(stored.part("model"))
     n, m = plan._code[model + 1 : model + 3]
     if m != 3:
-        raise NoKernel(f"a step is computed for tips of 3 coordinates, got {m}")
+        raise NoKernel(f"the kernel of a step needs tips of 3 coordinates, got {m}")
     radian = stored.settings["radian"]
     if radian and plan.entry(model, 0) != RIGID:
-        raise NoKernel("poses are computed for rigid arms only")
+        raise NoKernel("the kernels for poses support rigid arms only")
     names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
     vectors = [stored.array(name, [n], finite=False) for name in names]
     gain, beta, dt, damping = (stored.settings[name] for name in ("gain", "beta", "dt", "damping"))

@@ -101,11 +101,11 @@ def test_a_tied_log_warns_in_actuator_terms():
     q[:, 2] = q[:, 0]
     x = measured(nominal, q)
     model = HybridForwardModel(nominal, "drop", calibrate="auto")
-    with pytest.warns(UserWarning, match=r"the log never moves \+1 q\[0\] -1 q\[2\] ") as said:
+    with pytest.warns(UserWarning, match=r"log has no motion along \+1 q\[0\] -1 q\[2\] ") as said:
         model.fit(q, x)
     assert len(said) == 1
     q[:, 2] = 0.2
-    with pytest.warns(UserWarning, match=r"the log never moves \+1 q\[2\] \("):
+    with pytest.warns(UserWarning, match=r"the log has no motion along \+1 q\[2\] \("):
         model.fit(q, measured(nominal, q))
 
 

@@ -60,7 +60,7 @@ def test_gains_over_radii_to_their_standard_errors():
     assert len(result.unidentified) == 2
     for sentence, (i, k) in zip(sorted(result.unidentified), [(0, 0), (3, 1)], strict=True):
         found = re.search(
-            r"The data determine gains\[(\d)\] / radii\[(\d)\] = (\S+) \(std. error (\S+)\)\.",
+            r"The data identify gains\[(\d)\] / radii\[(\d)\] = (\S+) \(std. error (\S+)\)\.",
             sentence,
         )
         assert found, sentence
@@ -85,7 +85,7 @@ def test_one_gain_of_all():
 def test_the_sign_of_a_gain_stays_and_bounds_are_those_of_its_size():
     q, x = measured(tendon_robot(), 1)
     bounds = {"gains": (1e-5, 2.6e-5)}
-    with pytest.warns(UserWarning, match="ran into its upper bound"):
+    with pytest.warns(UserWarning, match="is at its upper bound"):
         result = calibrate(tendon_robot(0.9 * TRUE), q, x, ["gains"], bounds=bounds)
     assert (np.sign(result.values["gains"]) == np.sign(TRUE)).all()
     assert np.abs(result.values["gains"]).max() <= 2.6e-5 * (1 + 1e-12)

@@ -281,13 +281,13 @@ def test_inverse_kinematics_keeps_lengths_positive_and_turns_freely(name):
     [
         (
             lambda: ConstantCurvatureChain([0.01] * 2, lengths=[None, 0.1], routing="base"),
-            "`routing` must be 'segment' where tendons would run through",
+            "`routing` must be 'segment' if tendons would run through",
         ),
         (
             lambda: ConstantCurvatureChain(
                 [0.01], n_actuators=2, lengths=[0.1], angles=[0.0, 3.14159265]
             ),
-            "in one plane exactly: psi and psi",
+            "exactly planar ones: psi and psi",
         ),
         (
             lambda: ConstantCurvatureChain([0.01], angles=[1.0, 1.0, 1.0]),
@@ -295,7 +295,7 @@ def test_inverse_kinematics_keeps_lengths_positive_and_turns_freely(name):
         ),
         (
             lambda: ConstantCurvatureChain([0.01] * 2, stage="rotation"),
-            "takes a first segment of one actuator",
+            "needs a first segment with one actuator",
         ),
         (
             lambda: ConstantCurvatureChain(

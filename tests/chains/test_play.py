@@ -156,7 +156,7 @@ def test_bad_rows_and_states_are_named():
     ]:
         with pytest.raises(ValueError, match=message):
             play.apply(q)
-    with pytest.raises(ValueError, match=r"`state` must hold vectors of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"`state` must hold two finite vectors of shape \(2,\)"):
         play.apply(two, PlayOperator(0.1).apply(np.zeros((1, 3)))[1])
     with pytest.raises(ValueError, match="`groups` must have shape"):
         play.apply_by_group(two, np.zeros(2))
@@ -203,10 +203,10 @@ def test_widths_are_doubled_while_the_largest_is_the_best():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the calibrated model leaves")  # what such play hides
+@pytest.mark.filterwarnings("ignore:the calibrated model has a median")  # what such play hides
 def test_no_width_is_wider_than_the_range():
     truth, q, x, groups = log_of(0.01, 1e-4)
-    with pytest.warns(UserWarning, match="calibration left what is physical"):
+    with pytest.warns(UserWarning, match="calibration gave unphysical values"):
         fit = fit_play(truth, q, x, groups, (3e-3,), ("radii",))
     close(fit.widths, np.array([0.0, 3e-3, 6e-3, np.ptp(q, axis=0).max()]))
     assert fit.width == fit.widths[-1]

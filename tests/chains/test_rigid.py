@@ -878,7 +878,7 @@ def test_urdf_of_any_size_takes_bounded_time(tmp_path):
     with pytest.raises(ValueError, match="at most 1000 moving joints, got 2000"):
         RigidChain.from_urdf(written(2_000), "l2000")
     row = written(100, lambda k: f"<mimic joint='j{k + 1}'/>" if k < 99 else "")
-    with pytest.raises(ValueError, match="must mimic through at most 64 others"):
+    with pytest.raises(ValueError, match="must mimic via at most 64 other joints"):
         RigidChain.from_urdf(row, "l100")
     path.write_text("<robot>" + " " * 4_000_000)
     with pytest.raises(ValueError, match="`text_or_path` must be at most 4000000 bytes long"):

@@ -103,7 +103,7 @@ def test_messages_have_an_end(tmp_path):
 def test_paths_that_are_no_text_or_no_file(tmp_path):
     path = tmp_path / "path.csv"
     path.write_bytes(b"t,x,y,z\n0,0,0,\xae\n")
-    with pytest.raises(ValueError, match=r"path\.csv is no text"):
+    with pytest.raises(ValueError, match=r"path\.csv is not text"):
         trajectories.from_csv(path)
     if sys.platform != "win32":
         os.mkfifo(tmp_path / "pipe")

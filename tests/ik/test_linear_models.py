@@ -116,7 +116,7 @@ def test_parts_of_a_task_have_their_own_tolerances():
     assert task.reached(error, (5e-3, 2e-2)).tolist() == [True, False, False]
     assert task.reached(error[:1], 0.5e-2).tolist() == [False]
     assert task.reached(error[:1], 1.2e-2).tolist() == [True]
-    with pytest.raises(ValueError, match="`radian` must be positive metres, got 0"):
+    with pytest.raises(ValueError, match=r"`radian` must be a positive length \[m\], got 0"):
         PoseTask(TENDONS, radian=0)
     with pytest.raises(ValueError, match=r"`weights` must be positive.*for 2 points"):
         PointsTask(TENDONS, [1.0, 2.0], weights=[1.0])

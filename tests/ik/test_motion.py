@@ -325,7 +325,7 @@ def test_solutions_near_targets_out_of_reach_obey_too():
         ((np.eye(2), [1.0, 1.0]), r"of shapes \(k, 3\) and \(k,\)"),
         ((np.eye(3), [1.0, np.nan, 0.0]), "finite"),
         (([[0.0, 0.0, 0.0]], [1.0]), "with a direction in every row"),
-        (([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], [0.0, -1.0]), "have none in common"),
+        (([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], [0.0, -1.0]), "half-spaces have none"),
         (("ab", "c"), "`tip_limits` must be numeric"),
     ],
 )

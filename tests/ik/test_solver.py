@@ -703,7 +703,7 @@ def test_hostile_targets_never_raise(values):
     ("settings", "message"),
     [
         ({"q_min": 0.5}, "`q_min` must not exceed `q_max`"),
-        ({"q_min": [0.1, 0.2]}, "agree in the number of actuators"),
+        ({"q_min": [0.1, 0.2]}, "have the same number of actuators"),
         ({"q_min": float("nan")}, "`q_min` must be a number"),
         ({"q_pref": np.zeros((2, 9))}, "`q_pref` must be a number"),
         ({"q_pref": np.inf}, "`q_pref` must be finite"),
@@ -739,7 +739,7 @@ def test_bad_settings_say_what_was_needed(settings, message):
         (lambda ik: ik.track(np.zeros((2, 3)), [1.0, 1.0]), "increasing"),
         (lambda ik: ik.track(np.zeros((2, 3)), [0.0, 2.0]), "`beta` times the period"),
         (lambda ik: ik.track(np.zeros((2, 3)), feedback="measured"), "needs `plant`"),
-        (lambda ik: ik.track(np.zeros((2, 3)), memory=1.0), "`memory` must be a positive time"),
+        (lambda ik: ik.track(np.zeros((2, 3)), memory=1.0), "`memory` requires feedback"),
         (lambda ik: ik.track(np.zeros((2, 3)), feedback="tip"), "`feedback` must be"),
     ],
 )

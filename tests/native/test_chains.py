@@ -289,7 +289,7 @@ def test_random_chains(counts, routing, tip, rows, seed):
     ids=["arcs", "elastic", "actuators", "joints"],
 )
 def test_chains_that_are_too_large(chain):
-    with pytest.raises(NoKernel, match="the kernels have room for"):
+    with pytest.raises(NoKernel, match="the kernels support at most"):
         Plan(chain.stored())
 
 

@@ -117,7 +117,7 @@ def test_only_files_of_an_export_are_replaced(tmp_path):
 def test_wrong_arguments(tmp_path):
     for options, message in (
         ({"dtype": "float16"}, r"`dtype` must be .* got 'float16'"),
-        ({"name": "3_arm"}, "must be a name in C, as in trunk_3, got '3_arm'"),
+        ({"name": "3_arm"}, "must be a valid name in C, e.g. trunk_3, got '3_arm'"),
     ):
         with pytest.raises(ValueError, match=message):
             export_c(tendon_chain(), tmp_path / "out", **options)

@@ -249,7 +249,7 @@ def test_what_has_no_kernel_says_so():
     assert backend(as_forward_model(lambda q: q)) == "torch: a FunctionModel has no kernel"
     assert backend(ForwardModel()) == "torch: a ForwardModel has no kernel"
     many = ConstantCurvatureChain(np.full(17, 0.01))
-    assert backend(many) == "torch: 17 segments: the kernels have room for 16"
+    assert backend(many) == "torch: 17 segments: the kernels support at most 16"
     with torch.inference_mode():
         frozen = chain()
     for model in (chain().to("meta"), frozen):

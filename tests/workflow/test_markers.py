@@ -54,8 +54,8 @@ def test_a_description_places_the_markers(folder):
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
-        ('"z1"]', '"z1", "u"]', "3 names of columns, or 3 for each of `markers`"),
-        ("markers =", "# markers =", "3 names of columns, or 3 for each of `markers`"),
+        ('"z1"]', '"z1", "u"]', "3 column names, or 3 for each of `markers`"),
+        ("markers =", "# markers =", "3 column names, or 3 for each of `markers`"),
         ("[1, 1.0, 0, 0, 0]", "[2, 1.0, 0, 0, 0]", "segment from 0 to 1"),
         ("[1, 1.0, 0, 0, 0]", "[1, 1.0]", r"lists \[segment, fraction"),
     ],

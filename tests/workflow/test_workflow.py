@@ -140,7 +140,7 @@ def test_turns_of_rings_are_not_identified_apart_from_the_base(log, tmp_path):
 def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace("0.11", "0.05"))
-    with pytest.warns(UserWarning, match="left what is physical: radii") as caught:
+    with pytest.warns(UserWarning, match="gave unphysical values: radii") as caught:
         report, _ = fit(path, robot, tmp_path / "m")
     assert len(caught) == 1
     # The same page does not call them identified, however far the data narrow the prior.

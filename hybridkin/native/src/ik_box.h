@@ -215,7 +215,7 @@ HK_INLINE void ik_box_of(int m, int n, const real *J, const real *v, const real 
             start += newton[i] * residual[i];
             curvature += damping_sq * newton[i] * newton[i];
         }
-        /* A full step that stays on its linear piece has solved it, and with it the problem. */
+        /* A full step that stays on its linear piece has solved the problem. */
         real end = start + curvature, length = R(1.0);
         settled = 1;
         for (int j = 0; j < n; j++) slope[j] = R(0.0);

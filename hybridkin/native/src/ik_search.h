@@ -1,15 +1,15 @@
 /* The search for configurations that reach positions, or poses of rigid arms, one row per target, HK_LANES rows at a time.
 
-   A row is a small machine: it asks for the model at a configuration, and takes what comes. */
+   Every row is a state machine: it requests the model at a configuration and processes the result. */
 
 enum { IK_NULL_STEPS = 30, IK_SLOW_STEPS = 8 };
-#define IK_LAST_DAMPING R(1e8) /* no descent even with this one: as good as it gets */
-#define IK_STATIONARY R(1e-4)  /* sine of the angle between error and what the limits leave free */
-#define IK_NULL_SLIP R(0.3)    /* error per tip-sized motion that the next null-space step mends */
-#define IK_NULL_GAIN R(1e-8)   /* of the square of what is left to go; below it a descent ends */
-#define IK_INSIDE R(0.98)      /* domain distance to go to from outside the domain */
+#define IK_LAST_DAMPING R(1e8) /* no descent even with this damping: stationary */
+#define IK_STATIONARY R(1e-4)  /* sine of the angle between error and the directions left by limits */
+#define IK_NULL_SLIP R(0.3)    /* largest error after a null-space step, per unprojected tip motion */
+#define IK_NULL_GAIN R(1e-8)   /* smallest gain of a step, per square of the remaining step */
+#define IK_INSIDE R(0.98)      /* target domain distance for starts outside the domain */
 
-/* What to do: lower the error; where it is reached, slide into the domain, or to the posture. */
+/* Modes: lower the error; if the target is reached, slide into the domain, or to the posture. */
 enum { IK_LOWERS = 1, IK_TO_DOMAIN = 2, IK_TO_POSTURE = 4 };
 enum { IK_REACHED = 1, IK_AT_REST = 2, IK_HELD = 4 };
 enum { IK_FIRST, IK_LOWER, IK_SLIDE, IK_POLISH, IK_DONE };
@@ -41,7 +41,7 @@ static inline void ik_keep(const ik_settings *ik, ik_point *to, const ik_point *
     to->error = from->error, to->distance = from->distance;
 }
 
-/* Ask for the point after a step. What turns on beyond a limit comes back at the other one. */
+/* Request the point after a step. A turning joint may pass its limit and continue at the other one. */
 static inline void ik_ask(const ik_settings *ik, ik_row *r, int phase) {
     r->phase = phase;
     for (int j = 0; j < ik->n; j++) {
@@ -61,7 +61,7 @@ static inline int ik_reached(const ik_search_t *s, const ik_point *at) {
 }
 
 /* e (3) = the rotation vector of A B^T, for rotations A in a pose (4, 4) and B (3, 3), by the unit
-   quaternion with the largest component first, which no rotation makes small. */
+   quaternion, divided by its largest component, which is never small. */
 static void ik_turn(const real *A, const real *B, real *e) {
     real E[9], w, size;
     int largest = 3;
@@ -162,7 +162,7 @@ static void ik_lower_on(const ik_search_t *s, ik_row *r) {
         ik_settle(s, r);
         return;
     }
-    /* Damping in proportion to the error, so that the last iterations are Gauss-Newton's. */
+    /* Damping proportional to the error: the last iterations are Gauss-Newton steps. */
     const real trust = r->nu * (r->live.error / r->start);
     real moved[IK_ROWS];
     ik_step_bounds(&s->ik, r->live.q, R(0.0), NULL, &r->step);
@@ -186,7 +186,7 @@ static void ik_lowered(const ik_search_t *s, ik_row *r, const ik_point *now) {
     const real quality = gained / (hoped < R(1e-30) ? R(1e-30) : hoped);
     const real u = R(2.0) * quality - R(1.0);
     const int better = now->error < error;
-    /* The damping follows the share of the predicted gain that came true. */
+    /* The damping follows the ratio of actual to predicted gain. */
     r->nu *= better ? ik_clip(R(1.0) - u * u * u, R(1.0) / R(3.0), R(2.0)) : r->growth;
     r->growth = better ? R(2.0) : R(2.0) * r->growth;
     r->slow = better && error - now->error < R(0.01) * s->tol ? r->slow + 1 : 0;
@@ -229,7 +229,7 @@ static void ik_slid(const ik_search_t *s, ik_row *r, const ik_point *now) {
     ik_slide_on(s, r, going && !last ? IK_SLIDE : IK_POLISH);
 }
 
-/* Take the model's answer at what the row asked for. */
+/* Process the model's result at the requested configuration of a row. */
 static void ik_take(const ik_search_t *s, ik_row *r, const ik_point *now) {
     switch (r->phase) {
     case IK_FIRST:

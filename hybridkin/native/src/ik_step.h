@@ -95,7 +95,7 @@ static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, co
     }
 }
 
-/* The largest first step from which steps that shrink by `change` stop within `way`. */
+/* The largest first step for which steps that shrink by `change` stop within `way`. */
 static inline real ik_stopping(real way, real change) {
     if (!(way > R(0.0) && way < R(INFINITY))) return way;
     return way / (R(0.5) + R(0.5) * HK_MATH(sqrt)(R(1.0) + R(2.0) * (way / change)));
@@ -132,7 +132,7 @@ static inline void ik_step_bounds(const ik_settings *ik, const real *q, real sec
     }
 }
 
-/* No faster towards the target, and the posture, than the actuators can brake in time: shorten the
+/* Limit the speed towards target and posture so that the actuators can brake in time: shorten the
    posture step, and return the share of the error e that may be taken back. */
 static inline real ik_brake(const ik_settings *ik, const real *q, const real *J, const real *e,
                             real seconds, ik_step_t *s) {
@@ -223,8 +223,8 @@ static inline void ik_tick(const ik_settings *ik, real *state) {
             apart[i] = used[i] - error[i];
         }
         if (mode & IK_HAS_TIP) {
-            /* Without a reading the model's error counts, moved by the offset that is remembered;
-               without memory no error counts. */
+            /* Without a measurement, use the model's error corrected by the remembered offset;
+               without memory, use no error. */
             const int seen = mode & IK_MUST_SEE || ik_finite(3, apart);
             for (int i = 0; i < 3; i++) {
                 used[i] = seen ? error[i] : used[i] - (memory > R(0.0) ? offset[i] : used[i]);

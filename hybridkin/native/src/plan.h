@@ -36,14 +36,14 @@ typedef int64_t hk_bits;
 #define HK_INLINE static inline __attribute__((always_inline))
 #define HK_NOINLINE __attribute__((noinline))
 
-/* Largest sizes that the kernels have room for on the stack. */
+/* Largest sizes that the kernels support, on the stack. */
 #define HK_MAX_N 64 /* actuators */
 #define HK_MAX_S 16 /* segments */
 #define HK_MAX_M 64 /* outputs of a regressor, or inner coordinates */
 #define HK_MAX_F 2048 /* features whose leverage is taken */
 #define HK_MAX_P 1024 /* powers of the inputs of a polynomial */
 #endif
-#define HK_GROUP 8 /* hidden units, or columns of a leverage, that stand together */
+#define HK_GROUP 8 /* hidden units, or columns of a leverage, stored together */
 #define HK_MAX_Z (3 * HK_MAX_S > HK_MAX_N ? 3 * HK_MAX_S : HK_MAX_N) /* inner coordinates */
 
 /* A node of a plan: code[at] is its kind, then the lengths of its input and output, where its

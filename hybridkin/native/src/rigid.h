@@ -3,7 +3,7 @@
 /* The tip x (3) and its derivative J (3, n) where not NULL. The numbers are the pose of every
    joint's frame in the frame before it, turned so that its axis is z (rotation (3, 3), position
    (3)); of the first one in the measuring frame; then position and rotation of the tip in the last
-   one. `slides` (n) tells which joints are prismatic. Where `frame` is not NULL it becomes the
+   one. `slides` (n): which joints are prismatic. Where `frame` is not NULL it becomes the
    rotation (3, 3) of the tip, and J (6, n) has the rows of its angular velocity. */
 static inline void HK(rigid)(
     int n, const int32_t *slides, const real *numbers, const V *q, V *x, V *J, V *frame) {

@@ -1,4 +1,4 @@
-/* Compares @NAME@ with numbers that hybridkin computed by torch; exit code 0 where all agree. */
+/* Compares @NAME@ with numbers that hybridkin computed with torch; exit code 0 if all agree. */
 #include <math.h>
 #include <stdio.h>
 
@@ -6,7 +6,7 @@
 
 enum { ROWS = @ROWS@, N = @N@, M = @M@ };
 
-/* Rows inside the domain, then further and further out, and one of NaN. */
+/* Rows inside the domain, then rows further and further from it, and one of NaN. */
 static const @REAL@ q[ROWS * N] = {@Q@};
 static const double x[ROWS * M] = {@X@};
 static const double J[ROWS * M * N] = {@J@};

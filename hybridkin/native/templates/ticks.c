@@ -1,8 +1,8 @@
 
 #define STEPS_ARE_CHECKED
-/* Runs of steps: the start, then for every step target, dx, measured tip, and the next command and
-   the square of the smallest singular value that came out. Of those after COMPARED
-   only the limits are checked. */
+/* Runs of steps: the start, then for every step the target, dx, measured tip, and the expected
+   command and square of the smallest singular value. From run COMPARED on only the limits are
+   checked. */
 enum { RUNS = 8, STEPS = @STEPS@, COMPARED = @COMPARED@ };
 static const @REAL@ low[N] = {@LOW@};
 static const @REAL@ high[N] = {@HIGH@};
