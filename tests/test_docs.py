@@ -1,6 +1,8 @@
 """The pages can be reached, their code runs, and every public name says what it takes and gives."""
 
+import csv
 import inspect
+import itertools
 import re
 import textwrap
 from enum import Enum
@@ -8,8 +10,10 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
+import torch
 
 import hybridkin
+from hybridkin import ForwardModel
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
@@ -74,7 +78,9 @@ def test_equations_are_numbered_as_they_come():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["getting_started.md", "your_robot.md", "rigid_arms.md"])
+@pytest.mark.parametrize(
+    "page", ["getting_started.md", "your_robot.md", "rigid_arms.md", "next_rows.md"]
+)
 def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for block in blocks(page, "toml"):
@@ -96,6 +102,86 @@ def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
 def test_code_of_every_page_is_python(page):
     for block in blocks(page, "python"):
         compile(block, page, "exec")
+
+
+@pytest.mark.slow
+def test_models_of_the_page_on_the_inside_run_as_printed(capsys):
+    mechanical, error, kernel = blocks("how_it_works.md", "python")
+    space = {}
+    exec(compile(mechanical, "how_it_works.md", "exec"), space)
+    printed = capsys.readouterr().out
+    assert "boom 1.045 m" in printed
+    assert "[ True  True  True  True  True]" in printed
+    crane = space["chain"]
+    q = torch.tensor([[0.1, 0.5, 0.2], [-0.3, 0.9, 0.3]], dtype=torch.float64)
+    assert torch.autograd.gradcheck(crane, q.requires_grad_())
+    exec(compile(error, "how_it_works.md", "exec"), space)
+    assert float(capsys.readouterr().out.split()[0]) < 12.5
+    waves = space["model"].error_model_.module_
+    q = torch.from_numpy(space["data"].q[:2])
+    x, J = ForwardModel.forward_and_jacobian(waves, q)
+    torch.testing.assert_close(waves.forward_and_jacobian(q), (x, J))
+    assert "WAVES" in kernel
+
+
+def cells_of(page):
+    """Yield the header and one row of every table of a page, cell by cell."""
+    head = None
+    for line in (DOCS / page).read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if not line.startswith("| "):
+            head = None
+        elif head is None:
+            head = cells
+        elif set(line) - {*"| -"}:
+            yield head, cells
+
+
+def test_tables_have_eight_rows_at_most():
+    for page in ("hybrid.md", "next_rows.md", "domain.md", "changes.md", "beyond_the_paper.md"):
+        rows = [len(list(of)) for _, of in itertools.groupby(cells_of(page), lambda pair: pair[0])]
+        assert rows, page
+        assert max(rows) <= 8, page
+
+
+STUDIES = {
+    "25": "few rows",
+    "armlab": "outside the training range",
+    "5 folds": "held-out motions",
+}  # by a word of the header
+CASES = {
+    "trunk 1": "trunk 1, inner 60 %",
+    "trunk 2": "trunk 2, inner 60 %",
+    "armlab": "armlab_3cable, pulls up to 6 mm",
+    "ftdcr_v4, plain": "ftdcr_v4, plain chain",
+    "ftdcr_v4, elastic": "ftdcr_v4, elastic tendons",
+    "asl_trunk_static": "asl_trunk_static",
+}
+
+
+def test_figures_of_the_hybrids_are_those_of_the_stored_table():
+    with open(DOCS / "data" / "hybrids.csv", newline="", encoding="utf-8") as file:
+        stored = [*csv.DictReader(file)]
+    compared = 0
+    for head, (name, *cells) in cells_of("hybrid.md"):
+        study = next((STUDIES[kind] for kind in STUDIES if kind in head), None)
+        if study is None:
+            continue
+        case, _, model = name.rpartition(": ")
+        for column, cell in zip(head[1:], cells, strict=True):
+            own = [e for e in stored if e["study"] == study and e["model"] == model]
+            if study == "few rows":
+                own = [e for e in own if (e["case"], e["rows"]) == (case, column)]
+            elif study == "held-out motions":
+                own = [e for e in own if (e["case"], e["test"]) == (case, column)]
+            else:
+                own = [e for e in own if e["case"] == CASES[column]]
+            (entry,) = own
+            spread, largest = entry["std_mm"], entry["max_mm"]
+            found = entry["mean_mm"] + (f" ± {spread}" if study == "few rows" else f" ({largest})")
+            assert cell == found, (name, column)
+            compared += 1
+    assert compared == 7 * 4 + 4 * 6 + 8 * 3
 
 
 @pytest.mark.slow

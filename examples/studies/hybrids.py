@@ -6,19 +6,23 @@ The tables of the docs page "Choosing coupling and error model"::
 
 About two hours on one core. It needs `hybridkin[sim]`, and the recordings in the folder that
 ``--data`` or HYBRIDKIN_DATA names (`help(hybridkin.datasets.load_ftdcr)` names their sources); an
-absent recording is left out with a warning. The folder gets report.md, report.json and two figures.
-Draw k of the rows and of the noise has the seed k, and so have the networks; fold k of the motions,
-too.
+absent recording is left out with a warning. The folder gets report.md, report.json, hybrids.csv
+with all errors, and two figures. Draw k of the rows and of the noise has the seed k, and so have
+the networks; fold k of the motions, too. The figures of the page, from the stored errors::
+
+    python examples/studies/hybrids.py --draw docs/data/hybrids.csv --out results/hybrids
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from csv_tables import add_csv
 from hybrid_cases import (
     AUTO,
     CALIBRATED,
@@ -228,7 +232,44 @@ def hybrids_report(
         report.table(_CHOICES, [_choice(entry) for entry in entries if "scores" in entry])
     if outside:
         report.figure("hybrid_outside", _outside_figure(outside), "Tip error outside the range.")
+    parts = {"few rows": curves, "outside the training range": outside}
+    parts["held-out motions"] = motions
+    lines = [line for study, entries in parts.items() for line in _lines(study, entries)]
+    add_csv(report, "hybrids.csv", _COLUMNS, lines)
     return report
+
+
+_COLUMNS = ("study", "case", "test", "rows", "model", "mean_mm", "std_mm", "max_mm")
+_COLUMNS += ("cross_validated_mm",)
+
+
+def stored_entries(path: Any) -> dict[str, list[dict[str, Any]]]:
+    """Return by study the entries that the figures need, from a file hybrids.csv."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    with open(path, newline="", encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            entry: dict[str, Any] = {key: line[key] for key in ("case", "model")}
+            mean, largest = (1e-3 * float(line[key] or "nan") for key in ("mean_mm", "max_mm"))
+            entry["errors"] = {line["test"]: {"mean": mean, "max": largest, "n_test": 1}}
+            entry["n"] = int(line["rows"] or 0)
+            found.setdefault(line["study"], []).append(entry)
+    return found
+
+
+def _lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
+    """Return one line for each model, size and test; of auto with its cross-validated error."""
+    lines, by_size = [], study == "few rows"
+    for case, test in _tests(entries):
+        for key, found in _means(entries, case, test, by_size=by_size).items():
+            model, size = key if by_size else (key, None)
+            some = [e for e in entries if (e["case"], e["model"]) == (case, model)]
+            some = [e for e in some if test in e["errors"] and size in (None, e["n"])]
+            scores = [e["scores"][e["chosen"]] for e in some if "scores" in e]
+            rows = "" if size is None and len({e["n"] for e in some}) > 1 else some[0]["n"]
+            errors = [1e3 * float(error) for error in found]
+            held_out = 1e3 * float(np.mean(scores)) if scores else ""
+            lines.append([study, case, test, rows, model, *errors, held_out])
+    return lines
 
 
 _CHOICES = ("case", "draw", "model", "calibrated", "chosen", "cross-validated", "test")
@@ -265,7 +306,7 @@ def _means(
 
 def _curves_figure(curves: list[dict[str, Any]]) -> Any:
     cases = [(case, test) for case, test in _tests(curves) if test != "with noise"]
-    figure, axes = plots.new_figure(3.4 * len(cases), 4.0, 1, len(cases), squeeze=False)
+    figure, axes = plots.new_figure(3.4 * len(cases), 4.2, 1, len(cases), squeeze=False)
     for ax, (case, test) in zip(axes[0], cases, strict=True):
         means = _means(curves, case, test, by_size=True)
         sizes = sorted({n for _, n in means})
@@ -274,7 +315,7 @@ def _curves_figure(curves: list[dict[str, Any]]) -> Any:
         ax.get_legend().remove()
         ax.set(title=f"{case}, {test}", ylabel="mean tip error [mm]" if ax is axes[0, 0] else "")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
@@ -294,14 +335,16 @@ def _outside_figure(outside: list[dict[str, Any]]) -> Any:
             values = [1e3 * means[name][k] for name in shown]
             ax.plot(values, places, mark, color=color, label=label)
             least = min((NOMINAL, CALIBRATED), key=lambda name: means.get(name, [np.inf])[0])
-            ax.axvline(1e3 * means[least][k], color="0.7", linewidth=1.0, linestyle="--")
+            better = f"{label} of nominal or calibrated, the better one"
+            ax.axvline(1e3 * means[least][k], color=color, lw=1.0, ls="--", alpha=0.6, label=better)
         ax.set(xscale="log", xlabel="tip error [mm]")
         ax.set_title(case[0], fontsize="small")
         _plain_ticks(ax.xaxis)
         ax.set_yticks(range(len(names), 0, -1), names)
         ax.grid(alpha=0.3)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    place = {"loc": "outside lower center", "ncols": 2, "fontsize": "small", "frameon": False}
+    figure.legend(handles, labels, **place)
     return figure
 
 
@@ -323,7 +366,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--test-rows", type=int, default=1000, help="default: 1000")
     parser.add_argument("--models", nargs="+", help="names as in the report; default: all")
     parser.add_argument("--jobs", type=int, default=1, help="processes; default: 1")
+    parser.add_argument("--draw", metavar="CSV", help="only draw the figures of a hybrids.csv")
     given = parser.parse_args(arguments)
+    if given.draw is not None:
+        entries = stored_entries(given.draw)
+        report = Report("Hybrid models compared")
+        report.figure("hybrid_curves", _curves_figure(entries["few rows"]), "")
+        report.figure("hybrid_outside", _outside_figure(entries["outside the training range"]), "")
+        print(*report.write(given.out), sep="\n")
+        return
 
     def shown(what: str, done: int, total: int) -> None:
         print(f"{done}/{total} {what}", file=sys.stderr)

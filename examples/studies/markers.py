@@ -22,6 +22,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from csv_tables import add_csv
 from hybrid_cases import _PAIRS, PLANTS, SPOOL, recording
 from joblib import Memory, Parallel, delayed
 from numpy.typing import NDArray
@@ -144,7 +145,7 @@ def study(
 
 def write(entries: list[dict[str, Any]]) -> Report:
     """Return the report of the entries: mean errors of the tip, and their spread over draws."""
-    report = Report("Several markers")
+    report, lines = Report("Several markers"), []
     report.record["entries"] = entries
     for robot in dict.fromkeys(e["robot"] for e in entries):
         own = [e for e in entries if e["robot"] == robot]
@@ -165,13 +166,17 @@ def write(entries: list[dict[str, Any]]) -> Report:
                 both = 1e3 * np.array([[e[m]["mean"] for m in MARKERS] for e in some])
                 one, three = both.mean(0)
                 cells.append(f"{one:.2f} / {three:.2f} ({np.diff(both).std():.2f})")
+                lines.append([robot, n, model, float(one), float(three)])
             rows.append([model, *cells])
         rows.append(["the same chain, other two ends"])
         for n in sizes:
             some = [e for e in own if e["n"] == n and "others" in e["one"]]
             both = 1e3 * np.mean([[e[m]["others"] for m in MARKERS] for e in some], axis=0)
             rows[-1].append(f"{both[0]:.2f} / {both[1]:.2f}")
+            lines.append([robot, n, rows[-1][0], *map(float, both)])
         report.table(["model", *(f"n = {n}" for n in sizes)], rows)
+    header = ("robot", "rows", "model", "tip_alone_mm", "three_markers_mm")
+    add_csv(report, "markers.csv", header, lines)
     return report
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from csv_tables import add_csv
 from hybrid_cases import PLANTS, Case, motion_cases, trunk_cases, without_noise
 from numpy.typing import NDArray
 from scipy.stats import qmc
@@ -290,8 +291,10 @@ def next_report(
     Returns
     -------
     Report
-        Tables in mm; ``report.write(folder)`` writes them with ``report.json``.
+        Tables in mm; ``report.write(folder)`` writes them with ``report.json`` and the same
+        figures in ``next_rows.csv``.
     """
+    lines = []
     report = Report("Which configurations to measure next")
     report.record.update(box=everywhere, path=path, motions=moved)
     for title, entries in (("Range", everywhere), ("Path", path), ("Motions", moved)):
@@ -306,9 +309,26 @@ def next_report(
                 f"{title}: {case}, {model}; mean ± standard deviation (mean of the largest), mm"
             )
             report.table(["way", *map(str, sizes)], rows)
+            lines += _lines(title, some)
             if model == "pose":
                 report.text(*_worths(some, case))
+    add_csv(report, "next_rows.csv", _COLUMNS, lines)
     return report
+
+
+_COLUMNS = ("study", "case", "model", "rows", "way", "mean_mm", "std_mm", "max_mm")
+
+
+def _lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
+    """Return one line for each way and number of rows."""
+    lines = []
+    for way, n in dict.fromkeys((e["way"], e["n"]) for e in entries):
+        some = [e for e in entries if (e["way"], e["n"]) == (way, n)]
+        means = 1e3 * np.array([e["mean"] for e in some])
+        errors = means.mean(), means.std(), 1e3 * np.mean([e["max"] for e in some])
+        known = study.lower(), some[0]["case"], some[0]["model"], n, way
+        lines.append([*known, *map(float, errors)])
+    return lines
 
 
 def _worths(entries: list[dict[str, Any]], case: str) -> list[str]:

@@ -1,10 +1,19 @@
 """The experiments on hybrid models: their rows and splits, what they repeat, what they show."""
 
+from pathlib import Path
+
 import hybrid_cases as cases
 import numpy as np
 import pytest
 import torch
-from hybrids import extrapolation, held_out_motions, hybrids_report, learning_curves
+from hybrids import (
+    extrapolation,
+    held_out_motions,
+    hybrids_report,
+    learning_curves,
+    main,
+    stored_entries,
+)
 
 from hybridkin import ConstantCurvatureChain
 from hybridkin.datasets._recordings import FTDCR_FILES, FTDCR_SERVOS
@@ -194,7 +203,17 @@ def test_report_of_all_three(curves, one_plant, recordings, folder, tmp_path):
     assert [entry["model"] for entry in motions] == names
     report = hybrids_report(curves, outside, motions)
     paths = {path.name for path in report.write(tmp_path / "hybrids")}
-    assert paths == {"report.md", "report.json", "hybrid_curves.png", "hybrid_outside.png"}
+    assert paths == {
+        *("report.md", "report.json", "hybrids.csv"),
+        *("hybrid_curves.png", "hybrid_outside.png"),
+    }
+    stored = stored_entries(tmp_path / "hybrids" / "hybrids.csv")
+    assert [*stored] == ["few rows", "outside the training range", "held-out motions"]
+    for e in stored["few rows"]:
+        test, errors = next(iter(e["errors"].items()))
+        expected = entry(curves, e["model"], e["n"])["errors"][test]
+        assert errors["mean"] == pytest.approx(expected["mean"], abs=5.1e-6)
+        assert errors["max"] == pytest.approx(expected["max"], abs=5.1e-6)
     text = (tmp_path / "hybrids" / "report.md").read_text()
     assert "| rows | 25 | 120 |" in text
     assert "| plain chain | 0 | " in text
@@ -214,3 +233,11 @@ def test_absent_recordings_are_left_out(tmp_path):
         pytest.warns(UserWarning, match="Left out: asl_trunk_static"),
     ):
         assert held_out_motions(data_home=tmp_path) == []
+
+
+def test_figures_of_the_docs_are_drawn_from_their_table(tmp_path):
+    data = Path(__file__).parents[2] / "docs" / "data" / "hybrids.csv"
+    main(["--draw", str(data), "--out", str(tmp_path)])
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        *("hybrid_curves.png", "hybrid_outside.png")
+    }

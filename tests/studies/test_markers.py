@@ -30,7 +30,12 @@ def test_the_study_of_the_simulated_trunks(tmp_path):
     assert [entry["robot"] for entry in entries] == ["trunk 1", "trunk 2"]
     for entry in entries:
         assert 0.0 < entry["three"]["mean"] < 0.1
-    text = write(entries).markdown()
+    report = write(entries)
+    report.write(tmp_path / "out")
+    lines = (tmp_path / "out" / "markers.csv").read_text().splitlines()
+    assert lines[0] == "robot,rows,model,tip_alone_mm,three_markers_mm"
+    assert [line.split(",")[:2] for line in lines[1::2]] == [["trunk 1", "12"], ["trunk 2", "12"]]
+    text = report.markdown()
     assert "## trunk 2" in text
     assert (
         f"{1e3 * entries[0]['one']['mean']:.2f} / {1e3 * entries[0]['three']['mean']:.2f}" in text

@@ -28,7 +28,12 @@ def test_report_has_all_ways_and_sizes(tmp_path):
     assert "| random | 2.00 ± 0.00 (10) | 1.00 ± 0.00 (5) | 0.50 ± 0.00 (2) |" in text
     assert "50 rows, chosen: worth 80 random ones by the mean, 80 by the largest" in text
     assert "Motions: trunk, quadratic" in text
-    assert {p.name for p in report.write(tmp_path / "out")} == {"report.md", "report.json"}
+    names = {p.name for p in report.write(tmp_path / "out")}
+    assert names == {"report.md", "report.json", "next_rows.csv"}
+    lines = (tmp_path / "out" / "next_rows.csv").read_text().splitlines()
+    assert lines[0] == "study,case,model,rows,way,mean_mm,std_mm,max_mm"
+    assert "range,trunk,pose,50,random,2.00,0.00,10.00" in lines
+    assert "motions,trunk,quadratic,5,chosen,4.00,0.00,20.00" in lines
 
 
 @pytest.mark.slow
