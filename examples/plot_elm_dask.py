@@ -1,12 +1,12 @@
 """A night of measurements, learned by two processes
 =================================================
 
-The error of a mechanical model, learned from more rows than one wants to hold. All that an
-`ELMRegressor` keeps of its rows are means and a scatter matrix. So each process reads the chunks of
-its own blocks, adds them by `partial_fit` and forgets them; the models of the blocks are added by
-`merge`. The result is that of one fit to all rows.
+The residual of a mechanical model, learned from more rows than fit in memory. An `ELMRegressor`
+stores only means and a scatter matrix of its rows. Each process reads the chunks of its own blocks
+one by one and adds them by `partial_fit`; `merge` adds the models of the blocks. The result is that
+of one fit to all rows.
 
-It needs dask (``pip install "hybridkin[dask]"``); without it this example says so and stops.
+It needs dask (``pip install "hybridkin[dask]"``); without dask this example stops.
 """
 
 import copy
@@ -24,8 +24,8 @@ except ImportError:
     LocalCluster = None
 
 # %%
-# The robot moves at random all night. A camera sees its tip, 5 mm off in each direction, and the
-# log goes to one file per chunk. Here a chunk is drawn from its number, when it is asked for.
+# The robot moves at random all night. A camera measures its tip with 5 mm noise in each direction,
+# and every chunk of the log is one file. Here a chunk is computed from its number.
 
 NOISE = 0.005  # standard deviation [m]
 BLOCKS = [range(first, first + 5) for first in range(0, 80, 5)]  # numbers of the chunks
@@ -46,10 +46,10 @@ def chunk(number, n_rows, noise=NOISE):
 
 
 # %%
-# What the workers do. All models need the same hidden layer, so the seed is an integer, and the
-# same input scaling, so its bounds are given. The limits of the actuators would do; where they are
-# not known, a first pass finds them. `merge` changes the model on its left, but what a task was
-# handed belongs to dask: hence the copy.
+# The tasks of the workers. All models need the same hidden layer, so the seed is an integer, and
+# the same input scaling, so its bounds are given. The limits of the actuators can be the bounds;
+# here a first pass finds them. `merge` changes the model on its left, and a task must not change
+# its arguments, so it copies this model.
 
 
 def bounds_of(numbers, n_rows):
@@ -79,8 +79,8 @@ def tip_error(model):
 
 
 # %%
-# What the client does: it hands out the blocks and builds the tree. Every model of the tree is
-# ready to use, so a learning curve comes along: the error of each, beside the rows it has seen.
+# The client distributes the blocks and builds the tree. Every model of the tree is complete, so
+# their errors against the number of rows give a learning curve.
 
 
 def bounds_by_dask(client, blocks, n_rows):
@@ -143,9 +143,9 @@ def compare(cluster, client, blocks=BLOCKS, n_rows=N_ROWS):
 
 
 # %%
-# The answers agree to rounding, and a model of the tree is as good as the loop after as many rows.
-# Dashed: what the noise of the camera leaves of a fit without penalty. The penalty helps where rows
-# are few. How much the second worker brings depends on the cores that are free.
+# Tree and loop agree to rounding, also part of the way. Dashed: the error of a fit without penalty
+# from the noise of the camera. The penalty helps if there are few rows. The gain by the second
+# worker depends on the free cores.
 
 
 def draw(tree, curve, seconds):

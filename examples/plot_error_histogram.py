@@ -2,13 +2,14 @@
 Where a model errs, and by how much
 ===================================
 
-The error histogram of the paper (Fig. 2), before and after learning, and the same errors where they
-occur in the workspace. **Simulated** trunk; test rows that had no part in the fit.
+The error histogram of the paper (Fig. 2) before and after learning, and the same errors in the
+workspace. The trunk is **simulated**; the rows are held out.
 """
+
+# sphinx_gallery_thumbnail_number = 2
 
 import matplotlib.pyplot as plt
 import numpy as np
-import torch
 
 from hybridkin import HybridForwardModel, datasets, plots, robots
 
@@ -30,7 +31,7 @@ found = {
 }
 
 # %%
-# Calibration takes away what radii and base explain, learning a good part of the rest.
+# Calibration removes the error of radii and base. Learning removes a good part of the rest.
 
 display = plots.ErrorHistogramDisplay.from_predictions(data.x[test], found)
 for name, errors in display.errors.items():
@@ -40,16 +41,17 @@ display.plot(ax)
 plt.show()
 
 # %%
-# Where they occur, both on one scale: the nominal model errs by centimetres all over the workspace,
-# most on one side, for the trunk is tilted and weighs something; the line joins the worst pair.
+# Both pictures have one colour scale. The nominal model errs by centimetres in the whole workspace,
+# most on one side, because the trunk is tilted and has a weight. The line joins the measured and
+# the predicted tip of the row with the largest error. Each robot ends at the tip that its model
+# predicts.
 
 worst = int(display.errors["mechanical, nominal"].argmax())
-with torch.no_grad():
-    backbone = chain.backbone(torch.from_numpy(data.q[test][worst]))
-figure = plt.figure(figsize=(11, 4.8), layout="constrained")
+figure = plt.figure(figsize=(11, 5.2), layout="constrained")
 for k, name in enumerate(("mechanical, nominal", "hybrid, serial"), 1):
     ax = figure.add_subplot(1, 2, k, projection="3d")
-    plots.WorkspaceDisplay(data.x[test], found[name], backbone, worst).plot(ax)
+    body = plots.BackboneDisplay.from_estimator(models[name], data.q[test][worst])
+    plots.WorkspaceDisplay(data.x[test], found[name], body.points[0], worst).plot(ax)
     ax.collections[0].set_clim(0, 6)
     ax.set_title(name)
 plt.show()

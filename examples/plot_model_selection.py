@@ -3,9 +3,9 @@ Choosing a model with scikit-learn
 ==================================
 
 `HybridForwardModel` is a scikit-learn regressor: cross-validation, grid search, pipelines and
-``clone`` treat it like any other, and its calibration is done anew in every fold. The log of the
-**simulated** trunk holds single postures, no motions; here neighbouring postures make up a group,
-so that a model is examined on postures unlike those it has seen.
+``clone`` accept it, and every fold calibrates anew. The log of the **simulated** trunk holds single
+configurations, no motions. Here neighbouring configurations form a group, so that a model is tested
+on configurations unlike those of its fit.
 """
 
 import matplotlib.pyplot as plt
@@ -15,7 +15,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.metrics import make_scorer
 from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 
-from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots
+from hybridkin import ELMRegressor, HybridForwardModel, datasets, plots, robots
 
 data = datasets.load_trunk()
 rows = np.flatnonzero(data.part == 3)[:300]
@@ -32,7 +32,7 @@ score = make_scorer(mean_distance, greater_is_better=False)
 folds = GroupKFold(3)
 
 # %%
-# Any regressor can be the error model. ``cross_val_score`` with groups judges the sum.
+# Any regressor can be the error model. ``cross_val_score`` with groups tests the sum.
 
 chain = robots.bionic_handling_assistant()
 candidates = {
@@ -45,7 +45,7 @@ for name, model in candidates.items():
     print(f"{name}: {errors.mean():.1f} mm, folds {errors.min():.1f} to {errors.max():.1f}")
 
 # %%
-# A grid over the coupling and over parameters of the network within.
+# A grid over the coupling and over parameters of the network.
 
 model = HybridForwardModel(chain, ELMRegressor(random_state=0), calibrate="default")
 grid = {
@@ -57,14 +57,15 @@ search = GridSearchCV(model, grid, cv=folds, scoring=score).fit(q, x, groups=gro
 print("best:", search.best_params_, f"{-search.best_score_:.1f} mm")
 
 # %%
-# The penalty matters more than the size; where the error acts matters most.
+# The coupling matters most. The penalty matters more than the size of the network.
 
 results = search.cv_results_
 coupling = np.array(results["param_coupling"], dtype=str)
 size = np.array(results["param_error_model__n_hidden"], dtype=int)
 alpha = np.array(results["param_error_model__alpha"], dtype=float)
 figure, ax = plt.subplots(figsize=(8, 4.4), layout="constrained")
-for where, color in (("parallel", "#E69F00"), ("serial", "#0072B2")):
+for where in ("parallel", "serial"):
+    color = plots.model_color(where)
     for n_hidden, style in ((25, "o--"), (100, "s-")):
         some = (coupling == where) & (size == n_hidden)
         mean, spread = -results["mean_test_score"][some], results["std_test_score"][some]

@@ -2,15 +2,15 @@
 Another day
 ===========
 
-A hybrid model was fitted yesterday. Today the robot stands a little elsewhere, and the zeros of its
+A hybrid model was fitted yesterday. Today the base of the robot has moved, and the zeros of its
 actuators have shifted. `HybridForwardModel.adapt` finds both from five rows that are spread over
-the workspace. Compared are the model as it was, `partial_fit`, which learns the new error as an
-affine function of the actuators, and a fit to the five rows alone. Rows of the simulated trunk come
-with the package; the changes are computed from them.
+the workspace. This example compares it with the model as it was, with `partial_fit`, which learns
+the new residual as an affine function of the actuators, and with a fit to the five rows alone. The
+rows are those of the **simulated** trunk; the changes are computed.
 """
 
 # %%
-# Yesterday: a fit to 1600 rows. The other 400 are today's, four of five for tests.
+# Yesterday: a fit to 1600 rows. Of today's 400 rows, 80 are candidates for the fit and 320 test it.
 
 import copy
 import warnings
@@ -39,8 +39,9 @@ def spread(x, n, first):
 
 
 # %%
-# Today: zeros shifted by 6 mm (rms), a base turned by 3 degrees and moved by 2 cm, in ten draws.
-# A shift of the zeros gives other readings for the same tips, a moved base other tips.
+# Today, in ten random draws: the zeros have shifted by 6 mm (rms), the base has turned by 3 degrees
+# and moved by 2 cm. Shifted zeros change the readings at the same tips; a moved base changes the
+# tips.
 
 
 def change(rng, what):
@@ -76,14 +77,14 @@ CHANGES = ("nothing", "zeros", "base", "both")
 table = {what: [errors(what, seed) for seed in range(10)] for what in CHANGES}
 
 # %%
-# `adapt` comes near the error of the fit, and leaves a robot that has not changed as it is.
+# The error after `adapt` is near that of the fit. If nothing has changed, it stays as it was.
 
 figure, axes = plt.subplots(figsize=(7, 3.6))
 colors = {
     "as it was": "0.7",
-    "partial_fit": "#E69F00",
+    "partial_fit": "#56B4E9",
     "adapt": "#0072B2",
-    "fitted anew": "#CC79A7",
+    "fitted anew": "black",
 }
 for k, (name, color) in enumerate(colors.items()):
     means = {what: np.mean([draw[name] for draw in table[what]]) for what in CHANGES}

@@ -2,15 +2,14 @@
 Which configurations to measure next
 ====================================
 
-A measured row costs robot time, and most rows of a random log say what other rows have said.
-`choose_rows` picks those that leave the least expected error, before anything is measured. Here the
-rows of the **simulated** trunk that comes with the package are the pool: 380 postures with all nine
-lengths random. Some of them are "measured", a hybrid model is fitted to these, and 120 other
-postures judge it, by the commanded lengths, without the noise of measured ones.
+A measured row costs robot time, and most rows of a random log repeat what other rows contain.
+`choose_rows` chooses the rows with the least expected error before anything is measured. The pool
+are 380 configurations of the **simulated** trunk with all nine lengths at random. A hybrid model is
+fitted to some of them and tested on 120 others, at the commanded lengths, which have no noise.
 """
 
 # %%
-# The pool, and the order in which to measure it. Only the nominal robot and the lengths are needed.
+# The pool, and the order in which to measure it. It takes the nominal robot and the lengths only.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -48,21 +47,21 @@ for n, (mean, largest), several in zip(sizes, by_choice, by_chance.swapaxes(0, 1
     )
 
 # %%
-# The largest error gains most. The expected error comes from the size of the robot alone: too large
-# for few rows, which also calibrate the robot, and about right for many.
+# The largest error decreases most. The expected error follows from the size of the robot alone. It
+# is too large for few rows, because they also calibrate the robot, and about right for many.
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
 for k, (ax, what) in enumerate(zip(axes, ("mean", "largest"), strict=True)):
     average, spread = by_chance[..., k].mean(0), by_chance[..., k].std(0)
     ax.plot(sizes, by_choice[:, k], "o-", color="#0072B2", label="chosen rows")
-    ax.plot(sizes, average, "s--", color="#D55E00", label="random rows, five draws")
-    ax.fill_between(
-        sizes, average - spread, average + spread, color="#D55E00", alpha=0.2, linewidth=0
-    )
+    ax.plot(sizes, average, "s--", color="0.4", label="random rows, five draws")
+    ax.fill_between(sizes, average - spread, average + spread, color="0.4", alpha=0.2, linewidth=0)
     ax.set(xscale="log", xticks=sizes, xlabel="measured rows", ylabel=f"{what} tip error [mm]")
     ax.set_xticklabels(map(str, sizes))
     ax.minorticks_off()
     ax.set_ylim(bottom=0)
-axes[0].plot(np.arange(24, 200) + 1, 1e3 * expected[24:], ":", color="0.5", label="expected")
+axes[0].plot(
+    np.arange(24, 200) + 1, 1e3 * expected[24:], ":", color="black", label="expected, chosen rows"
+)
 axes[0].legend(frameon=False)
 plt.show()

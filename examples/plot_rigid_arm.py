@@ -2,10 +2,9 @@
 A rigid arm from a URDF
 =======================
 
-Nothing in the way from a log to a tracked path asks for a soft robot. A URDF gives a `RigidChain`,
-with closed-form Jacobian; calibration finds where its base and its tool are, and the hybrid model
-learns what is left, here the sag of a light arm under its own weight. The measurements are
-**simulated**.
+The steps from a log to a tracked path are the same for rigid arms. A URDF gives a `RigidChain` with
+a closed-form Jacobian. Calibration finds the poses of base and tool. The hybrid model learns the
+residual, here the sag of a light arm under its own weight. The measurements are **simulated**.
 """
 
 import matplotlib.pyplot as plt
@@ -41,8 +40,8 @@ URDF = """
 """
 
 # %%
-# The log: 150 postures. The real arm stands 2 cm aside, carries a tool nobody has measured, and its
-# shoulder and elbow give way by up to a degree or two under the weight of what they hold.
+# The log: 150 configurations. The base of the true arm is 2 cm away from the nominal one, its tool
+# is not in the URDF, and shoulder and elbow sag by up to two degrees under the weight.
 
 MASSES = torch.tensor([0.0, 0.0, 1.4, 0.0, 0.9, 0.6], dtype=torch.float64)  # at each joint [kg]
 COMPLIANCE = torch.tensor([0.0, 0.002, 0.003, 0.0, 0.002, 0.0], dtype=torch.float64)  # [rad/Nm]
@@ -54,7 +53,7 @@ real = RigidChain.from_urdf(URDF, "flange", base=base, tool=[0.015, 0.0, 0.11])
 
 
 def settled(q):
-    """Return the joint angles (N, 6) that the arm comes to rest at [rad]."""
+    """Return the joint angles (N, 6) at which the arm comes to rest [rad]."""
     height = torch.func.vmap(torch.func.jacrev(lambda one: nominal.backbone(one)[1:7, 2]))
     torque = -9.81 * (height(q) * MASSES[:, None]).sum(1)
     return q + COMPLIANCE * torque
@@ -66,14 +65,16 @@ with torch.no_grad():
     x = real(settled(torch.from_numpy(q))).numpy() + rng.normal(0.0, 2e-4, (150, 3))
 
 # %%
-# Errors on postures held out, ten folds. Learning at the joints (serial coupling) is what this arm
-# asks for: that is where it gives way.
+# Errors on held-out configurations, ten folds. Serial coupling learns the error at the joints,
+# where this arm sags; it has the least error.
 
 models = {
-    "URDF as it is": HybridForwardModel(nominal, "drop"),
-    "base and tool calibrated": HybridForwardModel(nominal, "drop", calibrate=("base", "tool")),
-    "+ error at the tip": HybridForwardModel(nominal, "quadratic", calibrate=("base", "tool")),
-    "+ error at the joints": HybridForwardModel(
+    "mechanical, nominal: URDF": HybridForwardModel(nominal, "drop"),
+    "mechanical, calibrated": HybridForwardModel(nominal, "drop", calibrate=("base", "tool")),
+    "hybrid, error at the tip": HybridForwardModel(
+        nominal, "quadratic", calibrate=("base", "tool")
+    ),
+    "hybrid, serial: error at the joints": HybridForwardModel(
         nominal, "quadratic", coupling="serial", calibrate=("base", "tool")
     ),
 }
@@ -84,10 +85,9 @@ for name, values in errors.errors.items():
     print(f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.1f} mm")
 
 # %%
-# A circle, drawn with the last model within the limits of the URDF, which are
-# the default.
+# The last model leads the tip along a circle, by default within the limits of the URDF.
 
-model = models["+ error at the joints"].fit(q, x)
+model = models["hybrid, serial: error at the joints"].fit(q, x)
 circle = trajectories.spiral((0.45, 0.0, 0.45), (0.15, 0.15), turns=1.0, dt=0.1)
 ik = InverseKinematics(model, q_pref=[0, 0.3, 0.8, 0, 0.5, 0], dt=0.1)
 track = ik.track(circle)
@@ -99,9 +99,7 @@ print(f"circle on the simulated arm: mean {error.mean():.1f} mm, largest {error.
 
 figure = plt.figure(figsize=(11, 4.6), layout="constrained")
 left, right = figure.subfigures(1, 2, width_ratios=(1.3, 1))
-errors.plot(left.subplots(), unit="mm")
-left.axes[0].set_xscale("log")
-left.axes[0].set_xlim(0.1, 300)
+errors.plot(left.subplots(), unit="mm", log=True)
 ax = right.add_subplot(projection="3d")
 plots.BackboneDisplay(arm).plot(ax)
 ax.plot(*(100 * circle.x.T), color="black", linewidth=1)

@@ -1,11 +1,11 @@
 """Tendons that go slack
 =====================
 
-On a real robot with nine tendons a plain constant-curvature chain is centimetres off wherever
-tendons hang slack. `ElasticTendonChain` knows that a tendon can only pull. Every row is predicted
-by models that have not seen its motion. The recording is not part of the package (its source:
-``help(hybridkin.datasets.load_ftdcr)``); without it this example says so and stops, and the picture
-is that of :doc:`another run </slack_tendons>`.
+On a real robot with nine tendons a plain constant-curvature chain errs by centimetres where tendons
+are slack. `ElasticTendonChain` describes that a tendon can only pull. Every row is predicted by
+models that were fitted without its motion. The recording is not part of the package (its source:
+``help(hybridkin.datasets.load_ftdcr)``). Without it this example stops, and the picture is that of
+:doc:`another run </slack_tendons>`.
 
 .. image:: /images/slack_tendons.png
    :alt: Tip error of every row of held-out motions, before and after
@@ -82,7 +82,7 @@ def with_kernel(chain, q, x, groups):
 
 
 def without_warnings(*args):
-    """Return `predictions`; the plain chain warns of the very slack that is compared here."""
+    """Return `predictions` without warnings: the plain chain warns of slack tendons."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return predictions(*args)

@@ -2,16 +2,16 @@
 Table 1 of the paper
 ====================
 
-Three ways to predict the tip: mechanics alone, data alone, and mechanics plus a learned error, each
-with the learners of Reinhart & Steil (2016). The trunk is **simulated**; the paper's numbers are
-those of the real one, so that the order and the factors can be compared, not the centimetres.
-This is a small version of what ``hybridkin paper`` does: 4 random test sets, 2 hidden layers each.
+Mechanical, data-driven and hybrid models of the tip, with the learners of Reinhart & Steil (2016).
+The trunk is **simulated**, the paper's robot is real: compare the order of the models and the
+factors between them, not the centimetres. ``hybridkin paper`` computes the whole table; this
+example has 4 random test sets and 2 hidden layers for each.
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hybridkin import datasets, paper
+from hybridkin import datasets, paper, plots
 
 table = paper.table1(datasets.load_trunk(), n_splits=4, n_seeds=2, n_jobs=1)
 
@@ -28,14 +28,13 @@ for name, row in zip(names, table, strict=True):
     print(f"{name:28s} train {train:5.2f} cm, test {test:5.2f} cm")
 
 # %%
-# A short line is a model that generalises. The data alone do so worst: most of their curvature is
-# that of the robot's geometry, which the mechanical model knows.
+# A short line shows a model that generalises. The data-driven models generalise worst, because they
+# must also learn the geometry of the robot, which the mechanical model contains.
 
 figure, ax = plt.subplots(figsize=(8.5, 4.6), layout="constrained")
 places = np.arange(len(names))[::-1]
 train, test = (100 * np.array([row[part]["mean"] for row in table]) for part in ("train", "test"))
-colors = {"mechanical": "#E69F00", "data-driven": "#D55E00", "hybrid": "#0072B2"}
-tints = [colors[name.replace(",", " ").split()[0]] for name in names]
+tints = [plots.model_color(name) for name in names]
 ax.hlines(places, train, test, color=tints, linewidth=2.5, alpha=0.5)
 ax.scatter(train, places, facecolor="white", edgecolor=tints, s=45, zorder=3, label="training rows")
 ax.scatter(test, places, color=tints, s=45, zorder=3, label="test rows")

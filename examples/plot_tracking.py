@@ -2,10 +2,12 @@
 Tracking a path on a plant
 ==========================
 
-Figures 3 and 4 of the paper: the tip follows a figure eight feed-forward, with commands computed on
-the mechanical model and on two hybrid models. The plant is the **simulated** trunk (MuJoCo), which
-weighs something, is tilted, and whose base is not quite where it is said to be.
+Figures 3 and 4 of the paper: the tip follows a figure eight without feedback. The commands come
+from the nominal mechanical model and from two hybrid models. The plant is the **simulated** trunk
+(MuJoCo). It has a weight, is tilted, and its base has an error.
 """
+
+# sphinx_gallery_thumbnail_number = 2
 
 import importlib.util
 
@@ -18,8 +20,8 @@ train, _ = datasets.paper_split(data, random_state=0)
 chain = robots.bionic_handling_assistant()
 models = {
     "mechanical, nominal": HybridForwardModel(chain, "drop"),
-    "hybrid, as in the paper": HybridForwardModel(chain, random_state=0),
-    "hybrid, error inside": HybridForwardModel(
+    "hybrid, ELM": HybridForwardModel(chain, random_state=0),
+    "hybrid, serial": HybridForwardModel(
         chain, "quadratic", coupling="serial", calibrate="default"
     ),
 }
@@ -48,16 +50,32 @@ else:
         error = 100 * tracks[name].error
         print(f"{name}: mean {error.mean():.2f} cm, largest {error.max():.2f} cm")
 
-    # Left: the path. Right: the error over time, and what was sent to one segment.
+    # Left: the path. Right: the error over time, and the commands to one segment.
     figure = plt.figure(figsize=(11, 5), layout="constrained")
     left, right = figure.subfigures(1, 2)
     tips = {name: track.x_measured for name, track in tracks.items()}
     plots.TrackingDisplay(path.x, tips, t=path.t).plot(left.subplots())
     axes = right.subplots(2, 1, sharex=True)
-    colors = ("#D55E00", "#0072B2", "#009E73")
-    for (name, track), color in zip(tracks.items(), colors, strict=True):
+    for name, track in tracks.items():
+        color = plots.model_color(name)
         axes[0].plot(path.t, 100 * track.error, color=color, label=name)
         lines = axes[1].plot(path.t, 100 * track.q[:, :3], color=color)
     axes[0].set(ylabel="tip error [cm]", ylim=(0, None))
     axes[1].set(ylabel="chambers, segment 1 [cm]", xlabel="time [s]")
+    plt.show()
+
+# %%
+# The trunk on the commands of the serial hybrid, at six points of the path. Each body ends at the
+# measured tip.
+
+if importlib.util.find_spec("mujoco") is not None:
+    track = tracks["hybrid, serial"]
+    rows = range(0, len(path), len(path) // 6)
+    figure = plt.figure(figsize=(6, 4.6), layout="constrained")
+    ax = figure.add_subplot(projection="3d")
+    ax.plot(*(100 * path.x.T), color="black", linewidth=1)
+    bodies = plots.BackboneDisplay.from_estimator(
+        chain, track.q[rows], tips=tips["hybrid, serial"][rows]
+    )
+    bodies.plot(ax)
     plt.show()

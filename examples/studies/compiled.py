@@ -7,7 +7,7 @@ The table and the figure of the docs pages "Theory" and "Control loops"::
 
 An hour on one core. The parts: "agreement" of models in batches and in single rows; "steps" from
 inside and outside the limits; "solve" of targets in reach and out of reach; "ticks", every one
-timed by itself, clock and ctypes call included.
+timed alone, with clock and ctypes call.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Logs of few lines through actuator space: where a correction is worse than none.
+"""Logs of few lines in actuator space: where a learned correction increases the error.
 
 Figures of the docs page "Choosing coupling and error model"::
 

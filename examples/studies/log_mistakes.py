@@ -1,4 +1,4 @@
-"""Mistakes in logs: which of them are named, and which would pass without a word.
+"""Mistakes in logs: which of them the check names, and which nothing finds.
 
 The figures of the docs page "Your own robot"::
 
@@ -6,7 +6,7 @@ The figures of the docs page "Your own robot"::
 
 About ten minutes on one core. Every robot is drawn at random (seed k for robot k): extensible
 segments, tendons or elastic tendons; 1 to 3 segments of 3 or 4 actuators; 0.1 to 1 m long. Its log
-is simulated: circular arcs, a smooth error that the model does not know, and noise. Every mistake
+is simulated: circular arcs, a smooth error that the model lacks, and noise. Every mistake
 is made in a copy of that log, which is checked (`check_log`), and fitted where the check found
 nothing: geometry and an error model with linear features. A mistake is
 

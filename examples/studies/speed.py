@@ -4,8 +4,8 @@
     python examples/studies/speed.py model.safetensors --robot robot.toml --batches 1,1000
 
 One thread, CPU time, the best of several runs. One line for each kind of work; the last columns are
-the same work in eager torch, and how many times faster the NumPy call is. About a minute. What
-computes the NumPy calls stands in the first line of each model.
+the same work in eager torch, and how many times faster the NumPy call is. About a minute. The first
+line of each model names what computes its NumPy calls.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ The numbers of the docs page "Rigid arms"::
 
 A minute. Every leaf link of every URDF that pinocchio reads is the end of an arm. Poses and
 Jacobians are compared at configurations drawn within one radian or metre. pinocchio gives joints
-that mimic others a coordinate of their own; it is set to what the URDF says.
+that mimic others their own coordinate; it is set as in the URDF.
 """
 
 from __future__ import annotations

@@ -187,6 +187,11 @@ class HybridModule(ForwardModel):
         return self if self.mechanical is None else self.mechanical
 
     @property
+    def corrects_inside(self) -> bool:
+        """Whether a correction acts inside the robot, see `InnerCorrection`."""
+        return any(isinstance(correction, InnerCorrection) for correction in self.corrections)
+
+    @property
     def fitted(self) -> HybridModule:
         """The model of the fit: this one, whose robot has not changed; see `AdaptedModel`."""
         return self
@@ -246,8 +251,8 @@ class HybridModule(ForwardModel):
 
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""
-        inner = any(isinstance(correction, InnerCorrection) for correction in self.corrections)
-        return Inside(self.mechanical, q) if inner and self.mechanical is not None else None
+        mechanical = self.mechanical if self.corrects_inside else None
+        return None if mechanical is None else Inside(mechanical, q)
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         inside = self._inside(q)

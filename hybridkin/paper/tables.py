@@ -17,7 +17,7 @@ from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
-from hybridkin.plots import new_figure
+from hybridkin.plots import model_color, new_figure
 from hybridkin.workflow.report import Progress, Report, linear, quadratic, quiet
 
 PAPER_TABLE_1 = {
@@ -171,7 +171,9 @@ def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
     names = [f"{e['model']}, {e['learner']}".removesuffix(", -") for e in table]
     means, spreads = (100 * np.array([e["test"][key] for e in table]) for key in ("mean", "std"))
     places = np.arange(len(table))[::-1]
-    ax.errorbar(means, places, xerr=[np.minimum(means, spreads), spreads], fmt="o", capsize=3)
+    for name, mean, spread, place in zip(names, means, spreads, places, strict=True):
+        look = {"fmt": "o", "capsize": 3, "color": model_color(name)}
+        ax.errorbar(mean, place, xerr=[[min(mean, spread)], [spread]], **look)
     ax.set_yticks(places, names)
     ax.set(xlabel="test error [cm]", xlim=(0.0, None))
     report.figure("table1", figure, "Mean test error ± standard deviation over configurations.")

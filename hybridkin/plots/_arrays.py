@@ -1,4 +1,4 @@
-"""Arrays checked as they come in."""
+"""Checks of the arrays of a display."""
 
 from __future__ import annotations
 
@@ -54,5 +54,5 @@ def positions(x: ArrayLike) -> NDArray:
 
 
 def distance(a: NDArray, b: NDArray) -> NDArray:
-    """Return the distances of rows, NaN where either is not known."""
-    return np.hypot.reduce(a - b, axis=-1)  # whose squares do not overflow
+    """Return the distances of rows, NaN where one of them is unknown."""
+    return np.hypot.reduce(a - b, axis=-1)  # hypot does not overflow

@@ -1,8 +1,11 @@
-"""What all pictures share: figures, units, colours, and arrays checked as they come in."""
+"""Common parts of all figures: axes, units, colours, legends."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -10,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import ScaledTranslation
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
@@ -19,14 +23,23 @@ from hybridkin._core.arrays import one_of
 LENGTHS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 # Okabe & Ito: colour-blind readers can distinguish them.
 COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
-STYLES = ("--", "-", "-.", ":")
+STYLES = ("-", "--", "-.", ":")
+# Words in the name of a model, its colour and line style; the first that fit count.
+_MODELS = (
+    (r"^(?!mechanic).*\bauto\b", "#009E73", "-"),
+    (r"\bserial\b", "#56B4E9", "-"),
+    (r"\bhybrid\b|\bparallel\b", "#0072B2", "-"),
+    (r"\bdata\b", "#CC79A7", ":"),
+    (r"^mechanic.*\b(calibrated|auto)\b", "#E69F00", "-."),
+    (r"\bmechanical\b|\bnominal\b", "#D55E00", "--"),
+)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def new_figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
 ) -> tuple[Figure, Any]:
-    """Return a figure outside pyplot's list, for files rather than windows, and its axes.
+    """Return a figure to save, which pyplot does not manage, and its axes.
 
     Parameters
     ----------
@@ -35,14 +48,14 @@ def new_figure(
     rows, columns : int, default=1
         Grid of axes.
     **options
-        Handed to ``Figure.subplots``.
+        Arguments of ``Figure.subplots``.
 
     Returns
     -------
     figure : matplotlib Figure
-        To be saved with ``figure.savefig``.
+        Save it with ``figure.savefig``.
     axes : Axes or ndarray of Axes
-        One, or the grid.
+        One axes, or the grid.
 
     Examples
     --------
@@ -56,7 +69,7 @@ def new_figure(
 
 
 class Display:
-    """What all displays share: they remember where they were drawn last."""
+    """Base class of all displays, which remember their last axes."""
 
     def _drawn(self, ax: Axes) -> Self:
         self.ax_, self.figure_ = ax, ax.figure
@@ -80,30 +93,74 @@ def space_or_new(ax: Axes | None) -> Any:
     return ax
 
 
-def look_of(i: int) -> dict[str, Any]:
-    """Return the look of the line of model i: models differ in colour and in style."""
-    return {"color": COLORS[i % 8], "linestyle": STYLES[i % 4], "linewidth": 1.5}
+def model_color(name: str, default: str = "#000000") -> str:
+    """Return the colour of a model in every figure, by the words of its name.
+
+    Parameters
+    ----------
+    name : str
+        Of the model, such as "hybrid, ELM".
+    default : str, default="#000000"
+        Colour of a name without a known word.
+
+    Returns
+    -------
+    str
+        Vermilion of a mechanical model, orange if it is calibrated; pink of a "data-driven" model;
+        blue of a "hybrid" or "parallel" model, light blue of a "serial" one, green of "auto".
+
+    Examples
+    --------
+    >>> from hybridkin import plots
+    >>> plots.model_color("hybrid, ELM") == plots.model_color("hybrid on nominal")
+    True
+    """
+    return next((color for words, color, _ in _MODELS if re.search(words, name)), default)
+
+
+def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
+    """Return the looks of the lines of models, see `model_color`; no two are the same.
+
+    Names without a known word get the colours that are left.
+    """
+    colors = [model_color(name, "") for name in names]
+    left = itertools.cycle([color for color in COLORS if color not in colors] or COLORS)
+    looks, seen = [], Counter[str]()
+    for color in (color or next(left) for color in colors):
+        first = next((style for _, of, style in _MODELS if of == color), "-")
+        style = STYLES[(STYLES.index(first) + seen[color]) % len(STYLES)]
+        looks.append({"color": color, "linestyle": style, "linewidth": 1.5})
+        seen[color] += 1
+    return looks
+
+
+def legend_below(ax: Axes, n_columns: int = 1) -> None:
+    """Put the legend under the axis' name, off the data."""
+    down = ScaledTranslation(0.0, -0.5, ax.figure.dpi_scale_trans)
+    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "borderaxespad": 0.0}
+    place |= {"bbox_transform": ax.transAxes + down, "ncols": n_columns}
+    ax.legend(frameon=False, fontsize="small", **place)
 
 
 def steps_of(t: NDArray | None, n_rows: int) -> tuple[NDArray, str]:
-    """Return the values and the name of a time axis: times [s], or steps where they are absent."""
+    """Return the values and the name of a time axis: times [s], or steps without times."""
     return (np.arange(n_rows), "time step") if t is None else (t, "time [s]")
 
 
 def scale_of(unit: str, known: Mapping[str, float] = LENGTHS) -> float:
-    """Return how many of a unit one metre has, or one radian."""
+    """Return the number of units in a metre or a radian."""
     return known[one_of(unit, "unit", known)]
 
 
 def decimals(values: ArrayLike) -> int:
-    """Return how many decimals show the largest of the values with two digits, 2 to 6."""
+    """Return the decimals, 2 to 6, that show two digits of the largest value."""
     values = np.asarray(values, dtype=float)
     largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
     return 2 if largest == 0.0 else int(np.clip(1 - np.floor(np.log10(largest)), 2, 6))
 
 
 def label_space(ax: Any, unit: str) -> None:
-    """Name the axes of space and scale them equally, none too short, on white panes."""
+    """Label the axes of space and scale them equally, none too short, on white panes."""
     ax.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
     low, high = np.array([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -112,6 +169,6 @@ def label_space(ax: Any, unit: str) -> None:
     for axis, share in zip((ax.xaxis, ax.yaxis, ax.zaxis), half / half.max(), strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_major_locator(MaxNLocator(max(2, round(5 * share))))
-    ax.patch.set_visible(False)  # or it hides the labels of the axes beside it
+    ax.patch.set_visible(False)  # it would hide the labels of the axes beside it
     ax.set_aspect("equal")
-    ax.set_box_aspect(half, zoom=0.92)  # space for the z-axis' name, which layouts do not see
+    ax.set_box_aspect(half, zoom=0.88)  # space for the z label, which layouts ignore

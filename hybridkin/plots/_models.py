@@ -1,8 +1,8 @@
-"""What models predict, and what robots look like in given configurations, as plain arrays."""
+"""Predictions of models, and bodies of robots in given configurations, as plain arrays."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,7 +14,8 @@ from hybridkin.chains.chain import Chain
 from hybridkin.plots._arrays import plain, positions, shaped
 
 _RIM = 1.15  # radius of a drawn disk over that of the actuator circle
-_CORNERS = 25  # points of a disk's rim
+_CORNERS = 17  # points of a disk's rim
+_STEPS = 12  # to the tips that a model predicts
 
 
 @runtime_checkable
@@ -35,8 +36,13 @@ def predicted(model: Model, q: ArrayLike) -> NDArray:
         return positions(model(torch.from_numpy(plain(q, "q"))))
 
 
-def body_of(model: Model, q: ArrayLike, n_points: int) -> dict[str, Any]:
-    """Return the arguments of `BackboneDisplay` for a robot in configurations q (K, n) or (n,)."""
+def body_of(
+    model: Model, q: ArrayLike, n_points: int, tips: ArrayLike | None = None
+) -> dict[str, Any]:
+    """Return the arguments of `BackboneDisplay` for a robot in configurations q (K, n) or (n,).
+
+    Where `tips` (K, 3) are given, or the model corrects its robot inside, the body ends there.
+    """
     chain = getattr(model, "mechanical_model_", model)
     if not isinstance(chain, Chain):
         raise TypeError(
@@ -45,8 +51,9 @@ def body_of(model: Model, q: ArrayLike, n_points: int) -> dict[str, Any]:
             "Give the points along the robot to the display yourself."
         )
     q = shaped(np.atleast_2d(plain(q, "q")), "q", ("K", chain.n_actuators))
-    known = np.isfinite(q).all(axis=1)
-    rows = torch.from_numpy(q[known])
+    ends = None if tips is None else shaped(tips, "tips", "K3", len(q))
+    known = np.isfinite(q).all(axis=1) & (True if ends is None else np.isfinite(ends).all(axis=1))
+    rows, learned = torch.from_numpy(q[known]), None
 
     def spread(values: torch.Tensor | NDArray) -> NDArray:
         """Return rows of known configurations among rows of NaN for the others."""
@@ -54,6 +61,13 @@ def body_of(model: Model, q: ArrayLike, n_points: int) -> dict[str, Any]:
         full[known] = values
         return full
 
+    if ends is None and isinstance(model, Predictor):
+        tip = slice(3) if chain.n_outputs == 3 else slice(-3, None)  # of poses, or of markers
+        learned = plain(model.predict(q[known]), "x")[:, tip] if known.any() else np.empty((0, 3))
+        if cast(Any, model).module_.fitted.corrects_inside:  # of a HybridForwardModel
+            ends, learned = spread(learned), None
+    if ends is not None:
+        rows = _led_to(chain, rows, torch.from_numpy(ends[known]))
     with torch.no_grad():
         body: dict[str, Any] = {"frames": spread(chain.poses(rows))}
         body["tips"] = spread(chain.tip_model(rows))
@@ -65,11 +79,23 @@ def body_of(model: Model, q: ArrayLike, n_points: int) -> dict[str, Any]:
         else:
             points, body["rigid"] = chain.backbone(rows), True
     body["points"] = spread(points)
-    if isinstance(model, Predictor):
-        tip = slice(3) if chain.n_outputs == 3 else slice(-3, None)  # of poses, or of markers
-        learned = plain(model.predict(q[known]), "x")[:, tip] if known.any() else np.empty((0, 3))
+    if learned is not None:
         body["predicted"] = spread(learned)
     return body
+
+
+def _led_to(chain: Chain, q: torch.Tensor, tips: torch.Tensor) -> torch.Tensor:
+    """Return configurations near q (K, n) at which the chain's tips are the given ones (K, 3).
+
+    Damped Gauss-Newton steps, the shortest in q; of tips out of reach as near as they come.
+    """
+    for _ in range(_STEPS):
+        x, J = chain.tip_model.forward_and_jacobian(q)
+        gram = J @ J.mT
+        damping = 1e-6 * gram.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+        gram = gram + torch.diag_embed(damping.expand(-1, 3))
+        q = q + (J.mT @ torch.linalg.solve(gram, (tips - x)[..., None]))[..., 0]
+    return q.detach()
 
 
 def _around_arcs(
@@ -78,7 +104,7 @@ def _around_arcs(
     """Return the actuators, each (K, P_i, 3), and the rims of the disks (K, S + 1, C, 3)."""
     bending, frames, offsets = map(plain, (chain.arcs(q)[1], chain.poses(q), chain.offsets))
     radii, S = plain(chain.radii), chain.n_segments
-    if chain.stage is not None:  # into the frames that turn with it
+    if chain.stage is not None:  # in the frames that turn with the stage
         bending = bending @ (frames[:, 0, :3, :3].swapaxes(1, 2) @ frames[:, 1, :3, :3])[:, :2, :2]
     n_points = (points.shape[1] - 1) // S
     angles = np.split(plain(chain.angles), np.cumsum(chain.actuators_per_segment)[:-1])
@@ -86,7 +112,7 @@ def _around_arcs(
     centres, turns = [], []  # positions and orientations along each segment
     for s in range(S):
         centre = points[:, s * n_points : (s + 1) * n_points + 1].copy()
-        # The backbone ends behind the rigid offset, the actuators before it.
+        # The backbone includes the rigid offset, the actuators do not.
         centre[:, -1] -= offsets[s] * frames[:, s + 1, :3, 2]
         # An arc turns evenly about the normal of its bending direction.
         about = np.stack([-bending[:, s, 1], bending[:, s, 0], 0.0 * bending[:, s, 0]], axis=-1)

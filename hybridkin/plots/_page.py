@@ -1,11 +1,14 @@
-"""A scene as one interactive page: turned with the mouse, played, and scrubbed by a slider."""
+"""A scene as one interactive page, with a mouse to turn it, a play button and a time slider."""
 
 from __future__ import annotations
 
+import base64
+import gzip
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hybridkin.plots._canvas import COLORS, decimals
@@ -14,27 +17,56 @@ from hybridkin.plots._scene import Line, Scene
 _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
 _MARKERS = {"o": ("circle", 5), "x": ("x", 4), ".": ("circle", 3)}
 _FAR = 1.6  # the eye from the scene's middle, in longest sides of the scene
+_FINEST = 2000.0  # steps of a coordinate along the longest side, at least
+# The script of plotly has 5 MB, and its package has no smaller one; compressed it has 1.8 MB.
+_PAGE = """<!DOCTYPE html>
+<html><head><meta charset="utf-8"><title>Track</title>
+<style>body { margin: 0; overflow: hidden; } #track { height: 100vh; }</style></head>
+<body><div id="track" class="plotly-graph-div"></div><script>
+const packed = "PACKED", size = SIZE;
+const order = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz" +
+  "!#$%&()*+-;<=>?@^_`{|}~";
+const values = new Uint8Array(128);
+[...order].forEach((letter, i) => { values[letter.charCodeAt(0)] = i; });
+const words = new DataView(new ArrayBuffer(packed.length / 5 * 4));
+for (let i = 0; i < packed.length; i += 5) {
+  let word = 0;
+  for (let k = i; k < i + 5; k++) word = word * 85 + values[packed.charCodeAt(k)];
+  words.setUint32(i / 5 * 4, word);
+}
+const unpacked = new Blob([words.buffer.slice(0, size)]).stream()
+  .pipeThrough(new DecompressionStream("gzip"));
+new Response(unpacked).text().then(async (text) => {
+  const [code, figure] = text.split("\\0");
+  (0, eval)(code);
+  const {data, layout, frames, config} = JSON.parse(figure);
+  await Plotly.newPlot("track", data, layout, config);
+  await Plotly.addFrames("track", frames);
+});
+</script></body></html>
+"""
 
 
 def page(
     scene: Scene, fps: float, view: tuple[float, float], progress: Callable[[int, int], None] | None
 ) -> str:
-    """Return the page as HTML that holds everything it needs."""
+    """Return the page as HTML that needs no other file."""
     try:
         import plotly.graph_objects as go
         import plotly.io
+        import plotly.offline
     except ImportError as error:
         raise ImportError(
             '`path` ends in .html, which needs plotly: pip install "hybridkin[interactive]", or '
             "save as .gif or .mp4."
         ) from error
-    digits = max(0, 4 - int(np.floor(np.log10((scene.high - scene.low).max()))))
+    digits = max(0, int(np.ceil(np.log10(_FINEST / (scene.high - scene.low).max()))))
     steps, error = _numbers(scene.steps, 4), None
     still = [_path("path reached", scene.x, digits, color=COLORS[0], dash="dash")]
     if scene.target is not None:
         still.insert(0, _path("target", scene.target, digits, color="black"))
     if scene.error is not None:
-        # Rounded by its own size: it is far below the robot's.
+        # Rounded by its own size, which is far below that of the robot.
         error = _numbers(scene.error, decimals(scene.error) + 2)
         curve = {"type": "scatter", "mode": "lines", "line": {"color": COLORS[0], "width": 2}}
         name = f"tip error [{scene.unit}]"
@@ -54,12 +86,12 @@ def page(
         looks.append({**dot, "showlegend": False})
     first = [{**look, **part} for look, part in zip(looks, frames[0]["data"], strict=True)]
     figure = go.Figure(still + first, _layout(scene, fps, view)).to_dict()
-    figure["frames"] = frames  # plain, or each number would be checked at a second per frame
-    config = {"responsive": True, "displaylogo": False}
-    options = {"auto_play": False, "validate": False, "default_height": "100vh"}
-    html = plotly.io.to_html(figure, include_plotlyjs=True, config=config, **options)
-    head = "<head><title>Track</title><style>body { margin: 0; overflow: hidden; }</style>"
-    return html.replace("<head>", head, 1)
+    figure["frames"] = frames  # as plain dicts: plotly's checks take a second per frame
+    figure["config"] = {"responsive": True, "displaylogo": False}
+    text = plotly.io.to_json(figure, validate=False)
+    packed = gzip.compress(f"{plotly.offline.get_plotlyjs()}\0{text}".encode(), mtime=0)
+    letters = base64.b85encode(packed, pad=True).decode()
+    return _PAGE.replace("SIZE", str(len(packed))).replace("PACKED", letters)
 
 
 def _path(name: str, points: NDArray, digits: int, **look: str) -> dict[str, Any]:
@@ -105,13 +137,16 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
     space = {"aspectmode": "manual", "aspectratio": _point(sides), "domain": {"x": [0.0, width]}}
     space["camera"] = {"eye": _point(_FAR * eye), "center": {"x": 0.0, "y": 0.0, "z": -0.05}}
-    for letter, *corners in zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True):
-        space[f"{letter}axis"] = {"title": {"text": f"{letter} [{scene.unit}]"}, "range": corners}
+    for letter, side, *corners in zip("xyz", sides, scene.low, scene.high, strict=True):
+        title = {"text": f"{letter} [{scene.unit}]"}
+        # Fewer ticks on short sides, or their numbers cover each other.
+        ticks = MaxNLocator(max(2, round(5 * side))).tick_values(*corners)
+        space[f"{letter}axis"] = {"title": title, "range": corners, "tickvals": ticks.tolist()}
     layout = {
         **{"template": "plotly_white", "scene": space, "updatemenus": [menu], "sliders": [slider]},
         "margin": {"l": 20, "r": 20, "t": 20, "b": 110, "autoexpand": False},
         "legend": {"x": 0.0, "y": 1.0, "bgcolor": "rgba(255, 255, 255, 0.6)"},
-        "uirevision": "kept",  # the view stays as it was turned
+        "uirevision": "kept",  # frames do not reset the view
     }
     if scene.error is not None:
         error = {"title": {"text": f"tip error [{scene.unit}]"}, "rangemode": "tozero"}
@@ -129,5 +164,5 @@ def _xyz(points: NDArray, digits: int) -> dict[str, list[float | None]]:
 
 
 def _numbers(values: NDArray, digits: int) -> list[float | None]:
-    """Return rounded numbers, None for what is not known."""
+    """Return rounded numbers, None for unknown ones."""
     return [v if np.isfinite(v) else None for v in values.round(digits).tolist()]

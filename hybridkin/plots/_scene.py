@@ -1,4 +1,4 @@
-"""What moves in a film or a page, as plain arrays, and the figure that shows it."""
+"""The moving parts of a film or a page, as plain arrays, and the axes that show them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hybridkin.plots._canvas import COLORS, label_space
 
 
 class Line(NamedTuple):
-    """One part of a picture in all configurations, several strokes with NaN between them."""
+    """One part of a figure in all configurations, strokes with NaN between them."""
 
     label: str
     points: NDArray  # (K, M, 3)
@@ -22,7 +22,7 @@ class Line(NamedTuple):
     style: str = "-"
 
     def look(self) -> dict[str, Any]:
-        """Return the look as matplotlib names it."""
+        """Return the look as arguments of matplotlib."""
         look = {"color": self.color, "linewidth": self.width, "linestyle": self.style}
         return look | {"marker": self.marker, "markersize": 6}
 
@@ -31,14 +31,14 @@ class Scene(NamedTuple):
     """A motion of T rows, K of them frames, in the unit of the axes."""
 
     unit: str
-    low: NDArray  # (3,) corners of the box in which everything happens
+    low: NDArray  # (3,) corners of the box around all points
     high: NDArray
     x: NDArray  # (T, 3) path reached
     target: NDArray | None  # (T, 3)
     error: NDArray | None  # (T,)
     steps: NDArray  # (T,) of the time axis
-    when: str  # its name
-    rows: NDArray  # (K,) that are frames
+    when: str  # name of the time axis
+    rows: NDArray  # (K,) rows that are frames
     moving: list[Line]
     captions: list[str]
 

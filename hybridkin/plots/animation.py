@@ -1,4 +1,4 @@
-"""A track as a film, mp4 or gif, or as an interactive page to turn and scrub."""
+"""A track as a film, mp4 or gif, or as an interactive page."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ class TrackAnimation(Display):
     rows : array-like of shape (K,), optional
         The rows of `x` that become frames, increasing. Default: all.
     name : str, default="tip"
-        What `x` is called in the legend.
+        Name of `x` in the legend.
 
     Attributes
     ----------
     x, target : ndarray of shape (T, 3)
-        Reached and wanted tips [m]; `target` may be None.
+        Tips reached and targets [m]; `target` may be None.
     error : ndarray of shape (T,) or None
         Distance from the target [m].
     rows : ndarray of shape (K,)
@@ -108,6 +108,7 @@ class TrackAnimation(Display):
         target: ArrayLike | None = None,
         t: ArrayLike | None = None,
         x: ArrayLike | None = None,
+        tips: ArrayLike | None = None,
         n_frames: int = 150,
     ) -> Self:
         """Return the film of a robot that runs through given configurations.
@@ -124,6 +125,9 @@ class TrackAnimation(Display):
             Times [s].
         x : array-like of shape (T, 3), optional
             Tips measured at `q` [m]. Default: those that the model predicts.
+        tips : array-like of shape (T, 3), optional
+            Tips that the model predicts [m], where they depend on more than `q`. The body ends
+            there. Default: see `BackboneDisplay.from_estimator`.
         n_frames : int, default=150
             Frames at most, evenly in time.
 
@@ -137,8 +141,9 @@ class TrackAnimation(Display):
         if q.ndim != 2 or len(q) == 0:
             raise ValueError(f"`q` must have shape (T, n) with T >= 1, got {q.shape}.")
         rows = _evenly(times(t, len(q)), len(q), n_frames)
-        body = BackboneDisplay.from_estimator(model, q[rows])
-        name = "tip (model)" if x is None else "tip (measured)"
+        ends = None if tips is None else shaped(tips, "tips", "T3", len(q))[rows]
+        body = BackboneDisplay.from_estimator(model, q[rows], tips=ends)
+        name, x = "tip (model)" if x is None else "tip (measured)", tips if x is None else x
         if x is None:
             known = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
@@ -188,19 +193,20 @@ class TrackAnimation(Display):
         Parameters
         ----------
         path : path-like
-            Its ending chooses: ".mp4" needs ffmpeg; ".gif" is larger and needs nothing else;
-            ".html" is one page that needs no network, to turn the robot, play, and scrub the time.
-            It needs plotly, ``pip install "hybridkin[interactive]"``.
+            Its ending is the format: ".mp4" needs ffmpeg; ".gif" is larger and needs nothing else;
+            ".html" is one page of about 2 MB that needs no network, to turn the robot, play, and
+            scrub the time, in any browser since 2023. To write it needs plotly,
+            ``pip install "hybridkin[interactive]"``.
         unit : {"m", "cm", "mm"}, default="cm"
             Of the axes and of the error.
         speed : float, default=1.0
-            Of the film over that of the motion.
+            Speed of the film over that of the motion.
         view : (float, float), default=(30.0, -60.0)
-            Elevation and azimuth of the eye [deg], of a page at the start.
+            Elevation and azimuth of the view [deg]; of a page at the start.
         dpi : float, optional
             Pixels per inch of a film of 9 x 4.5 inches. Default: 160, of a gif 80.
         progress : callable, optional
-            Handed (done, total), in frames.
+            Called with (done, total), in frames.
 
         Returns
         -------
@@ -233,7 +239,7 @@ class TrackAnimation(Display):
         stage = Stage(scene, ax, None if self.error is None else figure.add_subplot(grid[1]))
         stage.show(0)
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # or the picture would tremble
+        figure.set_layout_engine("none")  # keeps the axes in place
         with writer.saving(figure, str(path), _DPI[kind] if dpi is None else dpi):
             for k in range(len(self.rows)):
                 stage.show(k)
@@ -245,7 +251,7 @@ class TrackAnimation(Display):
     def lines(self) -> list[Line]:
         """Return all strokes that move, as `BackboneDisplay.lines` [m].
 
-        Those of the body, and with a target the error: a line from the tip to where it should be.
+        Those of the body, and with a target the error: a line from the tip to its target.
         """
         x = self.x[self.rows]
         found = [] if self.body is None else self.body.lines(tip=False)
@@ -257,12 +263,12 @@ class TrackAnimation(Display):
         return found
 
     def limits(self) -> tuple[NDArray, NDArray]:
-        """Return the corners (3,) of the box in which everything happens, with a margin [m]."""
+        """Return the corners (3,) of a box around all points, with a margin [m]."""
         parts = [self.x, *(line.points.reshape(-1, 3) for line in self.lines())]
         everything = np.concatenate(parts if self.target is None else [*parts, self.target])
         known = everything[np.isfinite(everything).all(axis=1)]
         if len(known) == 0:
-            raise ValueError("`x` must hold a known tip at least; all rows are NaN.")
+            raise ValueError("`x` must hold at least one known tip; all rows are NaN.")
         low, high = known.min(axis=0), known.max(axis=0)
         margin = 0.04 * float((high - low).max()) or 1e-3
         return low - margin, high + margin

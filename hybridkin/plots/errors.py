@@ -1,4 +1,4 @@
-"""Errors of models: histograms and boxes."""
+"""Histograms and boxes of tip errors."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
 from hybridkin.plots._arrays import distance, named, plain, positions
-from hybridkin.plots._canvas import COLORS, Display, axes_or_new, look_of, scale_of
+from hybridkin.plots._canvas import Display, axes_or_new, legend_below, looks_of, scale_of
 
 
 class _ErrorDisplay(Display):
-    """Tip errors by model, however they are drawn."""
+    """Tip errors by model."""
 
     def __init__(self, errors: Mapping[str, ArrayLike]) -> None:
         self.errors: dict[str, NDArray] = {}
@@ -74,7 +74,7 @@ class ErrorHistogramDisplay(_ErrorDisplay):
     errors : dict of str to ndarray of shape (N,)
         As given [m].
     ax_, figure_ : matplotlib Axes and Figure
-        Where it was drawn.
+        Where it was drawn last.
 
     Examples
     --------
@@ -97,9 +97,9 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         ax : matplotlib Axes, optional
             Default: those of a new figure of pyplot.
         unit : {"m", "cm", "mm"}, default="cm"
-            Of the error's axis.
+            Unit of the error.
         bins : int, default=40
-            From zero to the largest error of all.
+            Bins from zero to the largest error.
 
         Returns
         -------
@@ -109,15 +109,14 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         known, ax, bins = self._known(unit), axes_or_new(ax), whole(bins, "bins", most=10_000)
         top = max(float(values.max()) for values in known.values()) or 1e-3
         edges = np.linspace(0.0, top, bins + 1).tolist()
-        for i, (name, values) in enumerate(known.items()):
-            look = look_of(i)
+        for look, (name, values) in zip(looks_of(known), known.items(), strict=True):
             color = look["color"]
             label = f"{name}: mean {values.mean():.2f}, max {values.max():.1f} {unit}"
             ax.hist(values, edges, histtype="stepfilled", color=color, alpha=0.25)
             ax.hist(values, edges, histtype="step", label=label, **look)
             ax.axvline(values.mean(), color=color, linestyle="--", linewidth=1.0)
         ax.set(xlabel=f"tip error [{unit}]", ylabel="configurations", xlim=(0.0, top))
-        ax.legend(frameon=False)
+        legend_below(ax)
         return self._drawn(ax)
 
 
@@ -134,18 +133,23 @@ class ErrorBoxDisplay(_ErrorDisplay):
     errors : dict of str to ndarray of shape (N,)
         As given [m].
     ax_, figure_ : matplotlib Axes and Figure
-        Where it was drawn.
+        Where it was drawn last.
     """
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm", log: bool = False) -> Self:
         """Draw horizontal boxes with the mean (dot) and the maximum (cross) and return self.
+
+        A linear axis shows most models up to their 95 %. Larger means and maxima are numbers at
+        its end.
 
         Parameters
         ----------
         ax : matplotlib Axes, optional
             Default: those of a new figure of pyplot.
         unit : {"m", "cm", "mm"}, default="cm"
-            Of the error's axis.
+            Unit of the error.
+        log : bool, default=False
+            Whether the error's axis is logarithmic and shows everything.
 
         Returns
         -------
@@ -153,18 +157,33 @@ class ErrorBoxDisplay(_ErrorDisplay):
             Itself, drawn.
         """
         known, ax = self._known(unit), axes_or_new(ax)
-        names = [*known][::-1]
-        values = [known[name] for name in names]
+        places, values = np.arange(len(known), 0, -1), [*known.values()]
         look = {"widths": 0.6, "patch_artist": True, "medianprops": {"color": "black"}}
         options = {"orientation": "horizontal", "whis": (5, 95), "showfliers": False}
-        box = ax.boxplot(values, **options, **look)
-        for i, patch in enumerate(box["boxes"]):
-            patch.set(facecolor=COLORS[(len(names) - 1 - i) % 8], alpha=0.35)
-        places = np.arange(1, len(names) + 1)
-        ax.plot([v.mean() for v in values], places, "o", color="black", label="mean")
-        ax.plot([v.max() for v in values], places, "x", color="black", label="maximum")
-        ax.set_yticks(places, names)
+        box = ax.boxplot(values, positions=places.tolist(), **options, **look)
+        for patch, line in zip(box["boxes"], looks_of(known), strict=True):
+            patch.set(facecolor=line["color"], alpha=0.5)
+        means, most = (np.array([f(v) for v in values]) for f in (np.mean, np.max))
+        ax.plot(means, places, "o", color="black", label="mean")
+        ax.plot(most, places, "x", color="black", label="maximum")
+        ax.set_yticks(places, [*known])
         ax.set(xlabel=f"tip error [{unit}]")
-        ax.set_xlim(left=0.0)
-        ax.legend(frameon=False)
+        if log:
+            low = min(float(np.percentile(v, 5)) for v in values)
+            ax.set(xscale="log", xlim=(0.7 * max(low, 1e-6 * most.max()), 1.5 * most.max()))
+        else:
+            end = self._end(values)
+            ax.set_xlim(0.0, end)
+            for place, mean, largest in zip(places, means, most, strict=True):
+                words = f"mean {mean:.0f}, " * bool(mean > end) + f"max {largest:.0f}"
+                if largest > end:
+                    beside = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+                    ax.annotate(f"▸ {words}", (end, place), **beside, fontsize="small")
+        legend_below(ax, 2)
         return self._drawn(ax)
+
+    @staticmethod
+    def _end(values: list[NDArray]) -> float:
+        """Return the end of a linear axis, which a few bad models do not extend."""
+        upper, largest = (np.array([np.percentile(v, p) for v in values]) for p in (95, 100))
+        return 1.05 * float(min(largest.max(), 3.0 * np.median(upper))) or 1e-3

@@ -1,4 +1,4 @@
-"""Learning curves: the error on held-out motions against the rows learned from."""
+"""Learning curves: error on held-out motions against the number of training rows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sklearn.utils.validation import has_fit_parameter
 from typing_extensions import Self
 
 from hybridkin.plots._arrays import distance, named, plain, positions
-from hybridkin.plots._canvas import COLORS, MARKERS, STYLES, Display, axes_or_new, scale_of
+from hybridkin.plots._canvas import MARKERS, Display, axes_or_new, legend_below, looks_of, scale_of
 from hybridkin.plots._models import Predictor, predicted
 
 _MOST_TICKS = 8
@@ -89,15 +89,15 @@ class LearningCurveDisplay(Display):
             Measured tips [m].
         groups : array-like of shape (N,), optional
             Motion of every row. Whole motions are then held out, and fewer rows are fewer motions
-            (in random order, the last one cut), as in a shorter recording; models that take
-            groups get them. Without groups every model looks too good on a motion log, because
+            (in random order, the last one cut), as in a shorter recording. Models that accept
+            groups get them. Without groups the errors on a log of motions are too small, because
             neighbouring rows are alike. Default: independent rows.
         sizes : iterable of int, optional
-            Training rows. Default: six, from 25 to as many as there are, evenly in logarithms.
+            Training rows. Default: six sizes from 25 to all rows, evenly in logarithms.
         cv : int, splitter or iterable of (train, test), default=5
-            How to hold out; a number means so many random parts of the groups, or else the rows.
+            How to hold out; a number is that of random parts of the groups, or of the rows.
         random_state : int, RandomState or None, default=None
-            Seed of parts and order.
+            Seed of the parts and of the order.
 
         Returns
         -------
@@ -151,7 +151,7 @@ class LearningCurveDisplay(Display):
         ax : matplotlib Axes, optional
             Default: those of a new figure of pyplot. Both its scales become logarithmic.
         unit : {"m", "cm", "mm"}, default="cm"
-            Of the error's axis.
+            Unit of the error.
         styles : mapping of str to (color, format), optional
             Look of some models, as ("#0072B2", "o-").
 
@@ -160,9 +160,9 @@ class LearningCurveDisplay(Display):
         LearningCurveDisplay
             Itself, drawn.
         """
-        scale, ax = scale_of(unit), axes_or_new(ax)
+        scale, ax, looks = scale_of(unit), axes_or_new(ax), looks_of(self.errors)
         for i, (name, errors) in enumerate(self.errors.items()):
-            own = (COLORS[i % 8], MARKERS[i % 8] + STYLES[i % 4])
+            own = (looks[i]["color"], MARKERS[i % 8] + looks[i]["linestyle"])
             color, form = (styles or {}).get(name, own)
             known = np.isfinite(errors).any(axis=1)
             sizes, values = self.sizes[known], scale * errors[known]
@@ -179,7 +179,7 @@ class LearningCurveDisplay(Display):
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
         ax.grid(alpha=0.3)
-        ax.legend(frameon=False)
+        legend_below(ax, 2)
         return self._drawn(ax)
 
 
@@ -203,7 +203,7 @@ def _splits(
 
 
 def _ordered(train: NDArray, groups: NDArray | None, rng: np.random.RandomState) -> NDArray:
-    """Return the training rows in the order in which they are learned: motion by motion."""
+    """Return the training rows in random order, motion by motion."""
     if groups is None:
         return rng.permutation(train)
     own = groups[train]

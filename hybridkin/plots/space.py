@@ -1,4 +1,4 @@
-"""The robot in space: its workspace coloured by error, and its body with all that moves it."""
+"""The robot in space: its workspace coloured by error, and its body with its actuators."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
@@ -18,15 +19,15 @@ from hybridkin.plots._models import Model, body_of
 from hybridkin.plots._scene import Line
 
 _BODY = "#404040"
-# Of the segments' actuators: dark and light take turns, for prints without colour.
+# Of the actuators by segment; dark and light alternate, for prints without colour.
 _SEGMENTS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
 _AXES = ("#D55E00", "#009E73", "#0072B2")
 _AXIS_LENGTH = 0.1  # of the backbone
-_TOP = 0.99  # share of the errors within the colour scale: one outlier would darken the rest
+_TOP = 0.99  # share of the errors within the colour scale, which outliers do not extend
 
 
 class WorkspaceDisplay(Display):
-    """Measured tips coloured by the model's error, with one robot among them (Fig. 2, left).
+    """Measured tips coloured by the model's error, and one robot (Fig. 2, left).
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ class WorkspaceDisplay(Display):
     x, predicted : ndarray of shape (N, 3)
         Measured and predicted tips [m].
     ax_, figure_ : matplotlib Axes and Figure
-        Where it was drawn.
+        Where it was drawn last.
 
     Examples
     --------
@@ -74,7 +75,7 @@ class WorkspaceDisplay(Display):
             whole(row, "row", -len(self.x), len(self.x) - 1)
 
     def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
-        """Draw into a 3-D axes and return self; the colours end where 1 % of the errors is larger.
+        """Draw into a 3-D axes and return self; the colour scale ends at 99 % of the errors.
 
         Parameters
         ----------
@@ -97,18 +98,20 @@ class WorkspaceDisplay(Display):
         look |= {"depthshade": False, "linewidths": 0.0, "alpha": 0.8, "rasterized": True}
         space.computed_zorder = False  # the robot in front of the cloud
         dots = space.scatter(*(scale * self.x[order].T), **look)
-        bar = {"label": f"tip error [{unit}]", "shrink": 0.7, "pad": 0.12, "extend": "max"}
+        bar = {"label": f"tip error [{unit}]", "shrink": 0.75, "pad": 0.1, "extend": "max"}
         space.figure.colorbar(dots, ax=space, **bar)
         if self.backbone is not None:
-            robot = {"color": COLORS[0], "linewidth": 5, "label": "robot (model)"}
+            robot = {"color": _BODY, "linewidth": 4, "label": "robot (model)"}
             space.plot(*(scale * self.backbone.T), **robot)
         if self.row is not None:
             ends = scale * np.stack([self.x[self.row], self.predicted[self.row]])
             space.plot(*ends.T, color="black", linewidth=1.5)
             space.scatter(*ends[:1].T, color="black", s=30, label="measured tip", zorder=3)
-            space.scatter(*ends[1:].T, color=COLORS[0], s=30, label="predicted tip", zorder=3)
+            ring = {"facecolor": "white", "edgecolor": "black", "s": 30, "depthshade": False}
+            space.scatter(*ends[1:].T, **ring, label="predicted tip", zorder=3)
         if self.backbone is not None or self.row is not None:
-            space.legend(frameon=False, loc="upper left")
+            place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.03), "ncols": 3}
+            space.legend(frameon=False, fontsize="small", **place)
         label_space(space, unit)
         return self._drawn(space)
 
@@ -130,9 +133,9 @@ class BackboneDisplay(Display):
     frames : array-like of shape (K, F, 4, 4), optional
         Poses whose axes are shown.
     tips : array-like of shape (K, 3), optional
-        The points that are steered [m]. Default: the ends of the backbones.
+        Tips [m]. Default: the ends of the backbones.
     predicted : array-like of shape (K, 3), optional
-        Where a learned model puts these tips [m]; the learned correction is dotted.
+        Tips that a learned model predicts [m]; the learned correction is dotted.
     rigid : bool, default=False
         Whether the points are joints with straight links between.
 
@@ -141,7 +144,7 @@ class BackboneDisplay(Display):
     points : ndarray of shape (K, P, 3)
         As given [m]; likewise the others.
     ax_, figure_ : matplotlib Axes and Figure
-        Where it was drawn.
+        Where it was drawn last.
 
     Examples
     --------
@@ -186,7 +189,14 @@ class BackboneDisplay(Display):
         self.rigid = rigid
 
     @classmethod
-    def from_estimator(cls, model: Model, q: ArrayLike, *, n_points: int = 12) -> Self:
+    def from_estimator(
+        cls,
+        model: Model,
+        q: ArrayLike,
+        *,
+        n_points: int = 12,
+        tips: ArrayLike | None = None,
+    ) -> Self:
         """Return the body of a chain, or of a fitted hybrid model, in given configurations.
 
         Parameters
@@ -194,23 +204,27 @@ class BackboneDisplay(Display):
         model : chain or HybridForwardModel
             A chain of arcs shows chambers or tendons, at their angles and radii, and disks at the
             ends of its segments; a `RigidChain` its links. A fitted hybrid model shows its
-            mechanical part, calibrated when asked, and where it predicts the tip.
+            mechanical part, calibrated when asked, and where it predicts the tip. With a serial
+            correction the body ends at this tip.
         q : array-like of shape (K, n) or (n,)
             Actuator vectors; of a row with NaN nothing is drawn.
         n_points : int, default=12
             Points per segment.
+        tips : array-like of shape (K, 3), optional
+            Where the body ends [m], in the nearest configuration of the mechanical part that
+            reaches it. Default: see `model`.
 
         Returns
         -------
         BackboneDisplay
             Not drawn yet.
         """
-        return cls(**body_of(model, q, n_points))
+        return cls(**body_of(model, q, n_points, tips))
 
     def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw into a 3-D axes and return self.
 
-        A single configuration shows everything, several their backbones and tips.
+        One configuration is drawn with all parts, several with backbones and tips only.
 
         Parameters
         ----------
@@ -225,11 +239,11 @@ class BackboneDisplay(Display):
             Itself, drawn.
         """
         scale, space = scale_of(unit), space_or_new(ax)
-        single = len(self.points) == 1
+        single, shades = len(self.points) == 1, colormaps["cividis"]
         for k in np.flatnonzero(np.isfinite(self.points).all(axis=(1, 2))):
             for line in self.lines(body=single):
                 look = line.look() | ({"label": line.label or None} if single else {})
-                look["color"] = line.color if single else COLORS[k % 8]
+                look["color"] = line.color if single else shades(k / len(self.points))
                 space.plot(*(scale * line.points[k].T), **look)
             if single and self.disks is not None and self.disks.size:
                 disks = scale * self.disks[k]
@@ -242,7 +256,7 @@ class BackboneDisplay(Display):
         return self._drawn(space)
 
     def lines(self, *, body: bool = True, tip: bool = True) -> list[Line]:
-        """Return all strokes of the robot, to be drawn by any means.
+        """Return all strokes of the robot.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Paths followed: target and tracks in a plane and over time, errors and actuators."""
+"""Tracks: target and tips in a plane and over time, errors and actuators."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from hybridkin.plots._arrays import distance, named, plain, shaped, times
 from hybridkin.plots._canvas import (
     COLORS,
     LENGTHS,
+    STYLES,
     Display,
     axes_or_new,
     decimals,
-    look_of,
+    legend_below,
+    looks_of,
     scale_of,
     steps_of,
 )
@@ -29,7 +31,7 @@ _PLANES = ("xy", "xz", "yx", "yz", "zx", "zy")
 
 
 class TrackingDisplay(Display):
-    """A target path and how each model followed it (Fig. 3).
+    """A target path and the tracks of models (Fig. 3).
 
     Parameters
     ----------
@@ -80,8 +82,7 @@ class TrackingDisplay(Display):
         Parameters
         ----------
         tracks : mapping of str to Track
-            Of the same path. The measured tips are shown where there was a plant, else those of
-            the model.
+            Of the same path. With a plant the measured tips are shown, else those of the model.
 
         Returns
         -------
@@ -109,7 +110,7 @@ class TrackingDisplay(Display):
         unit : {"m", "cm", "mm"}, default="cm"
             Of the axes.
         plane : {"xy", "xz", "yz", "yx", "zx", "zy"}, default="xy"
-            Across, then up.
+            Horizontal, then vertical axis.
 
         Returns
         -------
@@ -119,22 +120,22 @@ class TrackingDisplay(Display):
         one_of(plane, "plane", _PLANES)
         scale, ax = scale_of(unit), axes_or_new(ax)
         i, j = ("xyz".index(letter) for letter in plane)
-        for k, (name, x) in enumerate(self.tracks.items()):
+        for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
             label = self._summary(name, scale, unit)
-            ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look_of(k))
+            ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look)
         target = scale * self.target
         ax.plot(target[:, i], target[:, j], color="black", linewidth=1.0, label="target")
         ax.set(xlabel=f"{plane[0]} [{unit}]", ylabel=f"{plane[1]} [{unit}]")
         ax.set_aspect("equal", adjustable="datalim")
-        ax.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16))
+        legend_below(ax)
         return self._drawn(ax)
 
     def plot_time(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw the three coordinates over time and return self; parameters as of `plot`."""
         scale, ax = scale_of(unit), axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
-        for i, (name, x) in enumerate(self.tracks.items()):
-            lines = ax.plot(steps, scale * x, **{**look_of(i), "linewidth": 1.2})
+        for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
+            lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
             lines[0].set_label(name)
         ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
         for letter, values in zip("xyz", scale * self.target.T, strict=True):
@@ -145,17 +146,50 @@ class TrackingDisplay(Display):
         ax.set(xlabel=when, ylabel=f"tip [{unit}]")
         return self._drawn(ax)
 
-    def plot_error(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
-        """Draw the distances to the target over time and return self; parameters as of `plot`."""
+    def plot_error(
+        self,
+        ax: Axes | None = None,
+        *,
+        unit: str = "cm",
+        expected: Mapping[str, ArrayLike] | None = None,
+    ) -> Self:
+        """Draw the distances to the target over time and return self.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            Default: those of a new figure of pyplot.
+        unit : {"m", "cm", "mm"}, default="cm"
+            Unit of the error.
+        expected : mapping of str to float or array-like of shape (T,), optional
+            Expected errors of the robot [m], such as the error on held-out motions. They make the
+            axis logarithmic, because the error of the solver on a model is far smaller.
+
+        Returns
+        -------
+        TrackingDisplay
+            Itself, drawn.
+        """
         scale, ax = scale_of(unit), axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
-        for i, (name, x) in enumerate(self.tracks.items()):
+        for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
             error = scale * distance(x, self.target)
-            ax.plot(steps, error, label=self._summary(name, scale, unit), **look_of(i))
+            ax.plot(steps, error, label=self._summary(name, scale, unit), **look)
         ax.set(xlabel=when, ylabel=f"tip error [{unit}]")
         ax.set_xlim((steps[0], steps[-1]) if len(steps) > 1 else None)
-        ax.set_ylim(bottom=0.0)
-        ax.legend(frameon=False, fontsize="small")
+        least = []
+        for (label, level), style in zip((expected or {}).items(), STYLES * 2, strict=False):
+            level = np.broadcast_to(scale * plain(level, "expected"), len(steps))
+            if np.isfinite(level).any():
+                least.append(float(np.nanmin(level)))
+                label = f"{label}: {least[-1]:.3g} {unit}"
+            ax.plot(steps, level, color="black", linestyle=style, label=label)
+        if least:
+            ax.set_yscale("log")
+            ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-4 * min(least)))
+        else:
+            ax.set_ylim(bottom=0.0)
+        legend_below(ax)
         return self._drawn(ax)
 
     def _summary(self, name: str, scale: float, unit: str) -> str:
@@ -172,7 +206,7 @@ class ActuatorDisplay:
     paths : mapping of str to array-like of shape (T, n)
         Commanded actuator vectors of each model [m], of revolute joints [rad].
     actuators_per_segment : sequence of int
-        How the n actuators share out over the segments.
+        Number of actuators of each segment.
     t : array-like of shape (T,), optional
         Times [s]. Default: time steps.
     names : sequence of n str, optional
@@ -185,7 +219,7 @@ class ActuatorDisplay:
     paths : dict of str to ndarray of shape (T, n)
         As given.
     axes_, figure_ : ndarray of shape (S,) of Axes, and Figure
-        Where it was drawn.
+        Where it was drawn last.
     """
 
     def __init__(
@@ -248,10 +282,10 @@ class ActuatorDisplay:
         axes : sequence of S matplotlib Axes, optional
             Default: those of a new figure of pyplot.
         unit : {"m", "cm", "mm", "rad", "deg"}, default="cm"
-            Of the actuators.
+            Unit of the actuators.
         per_unit : float or array-like of shape (n,), optional
-            What to divide by in place of the size of `unit`, which is then a name only [m]: -0.001
-            for millimetres of pulled tendons.
+            Divisor in place of the size of `unit`, which is then only a name [m]: -0.001 for
+            millimetres of pulled tendons.
 
         Returns
         -------
@@ -275,10 +309,11 @@ class ActuatorDisplay:
             raise ValueError(f"`axes` must hold {n} axes, got {len(axes)}.")
         steps, when = steps_of(self.t, len(next(iter(self.paths.values()))))
         parts = np.split(np.arange(sum(shares)), np.cumsum(shares)[:-1])
+        looks = looks_of(self.paths)
         for k, (ax, own) in enumerate(zip(axes, parts, strict=True)):
             colors = [COLORS[j % 8] if names else "black" for j in range(len(own))]
             for i, (name, q) in enumerate(self.paths.items()):
-                lines = ax.plot(steps, (scale * q)[:, own], **{**look_of(i), "linewidth": 1.2})
+                lines = ax.plot(steps, (scale * q)[:, own], **{**looks[i], "linewidth": 1.2})
                 lines[0].set_label(name)
                 for j, line in enumerate(lines if names else ()):
                     label = names[own[j]] if i == 0 else line.get_label()
@@ -289,7 +324,8 @@ class ActuatorDisplay:
                 ax.hlines(values, steps[0], steps[-1], label="limits", **look)
             ax.set(ylabel=f"segment {k + 1} [{unit}]")
         beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-        look = beside if names else {"ncols": len(self.paths)}
+        above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(self.paths)}
+        look = beside if names else above
         for ax in axes if names else axes[:1]:
             ax.legend(frameon=False, fontsize="small", **look)
         axes[-1].set(xlabel=when)

@@ -134,7 +134,7 @@ def _add_figures(
 ) -> None:
     errors = distance(predicted, log.x)
     figure, ax = new_figure(6.0, 3.6)
-    ErrorHistogramDisplay({loaded.name: errors}).plot(ax, unit="mm")
+    ErrorHistogramDisplay({loaded.kind: errors}).plot(ax, unit="mm")
     ax.set(ylabel="rows")
     report.figure("error_histogram", figure, "Tip errors of all rows.")
     figure, ax = new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})

@@ -128,10 +128,29 @@ class LoadedModel:
         return fitted | (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
 
     @property
+    def _training(self) -> dict[str, Any]:
+        return (self.header or {}).get("training") or {}
+
+    @property
     def held_out(self) -> dict[str, float] | None:
         """Errors [m] of the fit on held-out motions, where the file has them."""
-        training = (self.header or {}).get("training") or {}
-        return training.get("held_out", {}).get(training.get("saved"))
+        return self._training.get("held_out", {}).get(self._training.get("saved"))
+
+    @property
+    def kind(self) -> str:
+        """What the model is, as the fit calls it: "hybrid, ELM", "mechanical, nominal", ..."""
+        nominal = "data-driven" if self.chain is None else "mechanical, nominal"
+        return self._training.get("saved") or (nominal if self.hybrid is None else "hybrid")
+
+    def expected_errors(self, q: NDArray) -> dict[str, NDArray]:
+        """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""
+        known = self.held_out or {}
+        words = {"mean": "held-out motions, mean", "p95": "held-out motions, 95 %"}
+        found = {words[k]: np.full(len(q), known[k]) for k in words if k in known}
+        if self.hybrid is not None and (radius := self.hybrid.radius_) is not None:
+            name = f"estimated error radius, {100 * radius.coverage:g} %"
+            found[name] = radius.at(self.domain_distance(q) <= 1.0)
+        return found
 
     def log_format(self) -> robots.LogFormat:
         """Return how the robot's logs are written, or plain names in SI units."""

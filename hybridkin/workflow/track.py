@@ -124,9 +124,9 @@ def track_path(
         columns=dict(vars(log_format)),
     )
     _write_summary(report)
-    _add_path(report, track)
+    _add_path(report, loaded, track)
     shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
-    _add_commands(report, domain, whole.t, shown)
+    _add_commands(report, domain, whole.t, shown, n_lead)
     statuses = [*["LEAD_IN"] * n_lead, *names]
     report.file("track.csv", partial(_write_track, whole, shown, statuses, log_format))
     return report, report.write(out)
@@ -282,9 +282,8 @@ def animate_track(
         raise FileNotFoundError(f"`out` must lie in a folder that exists, got {out}.")
     q, target = loaded.effective(log.q), log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
-        loaded.chain, q, target=target, t=log.time, x=loaded.tips(q), n_frames=n_frames
+        loaded.chain, q, target=target, t=log.time, tips=loaded.tips(q), n_frames=n_frames
     )
-    film.name = "tip (model)"
     options = {"unit": unit, "speed": speed, "progress": partial(progress, "drawing frames")}
     try:
         write_file(out, partial(film.save, **options))
@@ -330,18 +329,22 @@ def _text(values: NDArray) -> NDArray:
     return np.char.mod("%.9g", values + 0.0).T  # no -0
 
 
-def _add_path(report: Report, track: Track) -> None:
-    figure, axes = new_figure(11.0, 4.2, 1, 3)
-    display = TrackingDisplay.from_tracks({"model": track})
+def _add_path(report: Report, loaded: LoadedModel, track: Track) -> None:
+    figure, axes = new_figure(11.0, 4.6, 1, 3)
+    display = TrackingDisplay.from_tracks({f"solver on {loaded.kind}": track})
     i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])  # the plane of the largest moves
     display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
     display.plot_time(axes[1], unit="mm")
-    display.plot_error(axes[2], unit="mm")
-    axes[2].get_legend().remove()
-    report.figure("track", figure, "Path, tip by the model, and its error.")
+    errors = loaded.expected_errors(track.q)
+    expected = {f"robot, {name}": values for name, values in errors.items()}
+    display.plot_error(axes[2], unit="mm", expected=expected)
+    caption = "Path and tip by the model; error of the solver"
+    report.figure("track", figure, caption + (", and expected error of the robot." * bool(errors)))
 
 
-def _add_commands(report: Report, domain: Domain, t: NDArray, shown: dict[str, NDArray]) -> None:
+def _add_commands(
+    report: Report, domain: Domain, t: NDArray, shown: dict[str, NDArray], n_lead: int
+) -> None:
     """Add the commands against the limits, in names, unit and sign of the robot's logs."""
     loaded, limits = domain.loaded, domain.limits
     chain, log_format = loaded.chain, loaded.log_format()
@@ -352,7 +355,12 @@ def _add_commands(report: Report, domain: Domain, t: NDArray, shown: dict[str, N
     ends = np.stack([limits.q_min - half_play, limits.q_max + half_play])
     display = ActuatorDisplay(shown, shares, t, names=log_format.q, limits=ends)
     display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
-    report.figure("commands", figure, "Commands as the robot's logs name and count them.")
+    caption = "Commands and their limits, with the names, unit and sign of the robot's logs."
+    if n_lead:
+        for ax in axes[:, 0]:
+            ax.axvline(t[n_lead], color="0.6", linewidth=1.0)
+        caption += " The path begins at the grey line."
+    report.figure("commands", figure, caption)
 
 
 def _write_summary(report: Report) -> None:

@@ -115,7 +115,8 @@ def draw(found: dict[str, list[dict[str, Any]]]) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(11.0, 4.6), layout="constrained")
     for k, (name, points) in enumerate(found.items()):
         done = [p for p in points if "error" not in p]
-        n, style = [p["n"] for p in done], {"marker": "os^vD<>ph*X"[k], "color": f"C{k % 10}"}
+        color = "black" if k == 10 else f"C{k}"
+        n, style = [p["n"] for p in done], {"marker": "os^vD<>ph*X"[k], "color": color}
         axes[0].loglog(n, [p["seconds"] for p in done], label=CLAIMS[name].what, **style)
         axes[1].loglog(n, [max(p["bytes"], 1e6) / 1e6 for p in done], **style)
     axes[0].set(xlabel="rows", ylabel="CPU time [s]", title="Time")

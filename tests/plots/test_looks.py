@@ -1,0 +1,169 @@
+"""What a reader sees: colours that mean the same, legends off the data, bodies that end at tips."""
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.colors import to_hex
+
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, plots
+
+NAMES = (
+    *("mechanical, nominal", "mechanical, calibrated", "data-driven, ELM"),
+    *("hybrid, ELM", "hybrid, serial", "hybrid, auto"),
+)
+TRACK = np.random.default_rng(0).normal(0.0, 0.2, (20, 3))
+
+
+def errors(names):
+    rng = np.random.default_rng(1)
+    return {name: 0.01 * rng.lognormal(size=200) for name in names}
+
+
+def boxes(names, ax):
+    plots.ErrorBoxDisplay(errors(names)).plot(ax)
+    return [to_hex(patch.get_facecolor()).upper() for patch in ax.patches]
+
+
+def outlines(names, ax):
+    plots.ErrorHistogramDisplay(errors(names)).plot(ax)
+    return [to_hex(patch.get_edgecolor()).upper() for patch in ax.patches[1::2]]
+
+
+def paths(names, ax):
+    plots.TrackingDisplay(TRACK, {name: TRACK + 0.01 for name in names}).plot(ax)
+    return [to_hex(line.get_color()).upper() for line in ax.lines[: len(names)]]
+
+
+def curves(names, ax):
+    plots.LearningCurveDisplay([10, 20], {name: [0.2, 0.1] for name in names}).plot(ax)
+    return [to_hex(line.get_color()).upper() for line in ax.lines]
+
+
+@pytest.mark.parametrize("draw", [boxes, outlines, paths, curves])
+def test_a_model_has_the_same_colour_in_every_figure(draw):
+    expected = [plots.model_color(name) for name in NAMES]
+    assert len({*expected}) == len(NAMES)
+    _, axes = plots.new_figure(8, 4, 1, 2)
+    assert draw(NAMES, axes[0]) == expected
+    assert draw(NAMES[::-2], axes[1]) == expected[::-2]  # whatever stands beside it
+
+
+def test_names_of_one_model_in_the_figures_share_its_colour():
+    same = {
+        "hybrid, ELM": ("hybrid on nominal", "parallel, quadratic", "figure eight, hybrid on x"),
+        "hybrid, serial": ("serial on calibrated", "serial, pose"),
+        "mechanical, calibrated": ("mechanical, as auto took it",),
+        "mechanical, nominal": ("nominal model", "spiral, mechanical, nominal"),
+        "data-driven, ELM": ("data alone, kernel ridge",),
+    }
+    for name, others in same.items():
+        assert {plots.model_color(other) for other in others} == {plots.model_color(name)}
+
+
+def test_lines_of_one_figure_differ():
+    names = ["hybrid, linear", "hybrid, ELM", "data-driven, linear", "a", "b", "c"]
+    _, ax = plots.new_figure(4, 3)
+    plots.TrackingDisplay(TRACK, {name: TRACK for name in names}).plot(ax)
+    looks = [(line.get_color(), line.get_linestyle()) for line in ax.lines[: len(names)]]
+    assert len({*looks}) == len(names)
+    assert looks[0][0] == looks[1][0]
+
+
+def track_errors(names, ax):
+    display = plots.TrackingDisplay(TRACK, {name: TRACK + 0.01 for name in names})
+    display.plot_error(ax, expected={"robot": 0.02})
+
+
+@pytest.mark.parametrize("draw", [boxes, outlines, paths, track_errors, curves])
+def test_legends_do_not_cover_data(draw):
+    figure, ax = plots.new_figure(6, 5)
+    draw(NAMES, ax)
+    figure.draw_without_rendering()
+    legend = ax.get_legend().get_window_extent()
+    assert not legend.overlaps(ax.get_window_extent())
+    assert not legend.overlaps(ax.xaxis.get_tightbbox())
+    assert 0 <= legend.y0
+    assert legend.y1 < ax.xaxis.get_tightbbox().y0
+
+
+@pytest.mark.parametrize("names", [None, ["a", "b"]])
+def test_the_legend_of_actuators_stands_beside_them(names):
+    figure, axes = plots.new_figure(6, 4, 2, 1)
+    paths = {name: np.arange(6.0).reshape(3, 2) for name in NAMES[:2]}
+    plots.ActuatorDisplay(paths, (1, 1), names=names).plot(axes)
+    figure.draw_without_rendering()
+    assert not axes[0].get_legend().get_window_extent().overlaps(axes[0].get_window_extent())
+
+
+def test_errors_behind_the_end_of_the_axis_are_numbers():
+    shown = {"hybrid, ELM": [0.001, 0.002, 0.003], "hybrid, auto": [0.001, 0.001, 0.002]}
+    shown["data-driven, ELM"] = [0.0021, 0.004, 1.2]
+    _, ax = plots.new_figure(6, 3)
+    plots.ErrorBoxDisplay(shown).plot(ax, unit="mm")
+    end = ax.get_xlim()[1]
+    assert 4 < end < 402
+    (number,) = ax.texts
+    assert number.get_text().endswith("mean 402, max 1200")
+    assert number.xy == (end, 1)  # in the row of its model
+    assert [text.get_text() for text in ax.get_yticklabels()] == [*shown]
+    _, ax = plots.new_figure(6, 3)
+    plots.ErrorBoxDisplay(shown).plot(ax, unit="mm", log=True)
+    assert (ax.get_xscale(), len(ax.texts)) == ("log", 0)
+    assert ax.get_xlim()[1] > 1200
+
+
+def test_a_track_shows_what_to_expect_of_the_robot():
+    display = plots.TrackingDisplay(TRACK, {"solver on hybrid": TRACK + 1e-6})
+    _, ax = plots.new_figure(4, 3)
+    radius = np.where(np.arange(20) < 5, np.inf, 0.03)
+    display.plot_error(ax, unit="mm", expected={"mean": 0.02, "radius": radius})
+    lines = {line.get_label(): line.get_ydata() for line in ax.lines}
+    np.testing.assert_allclose(lines["mean: 20 mm"], 20.0)
+    np.testing.assert_allclose(lines["radius: 30 mm"][5:], 30.0)
+    assert any(label.startswith("solver on hybrid: mean error 0.0017 mm") for label in lines)
+    assert ax.get_yscale() == "log"
+
+
+# Bodies
+
+
+@pytest.fixture(scope="module")
+def bent_inside():
+    """Return a chain whose error acts inside, rows of it, and its fitted serial hybrid."""
+    chain = ConstantCurvatureChain([0.02, 0.018], lengths=[0.1, 0.1], routing="base")
+    q = np.random.default_rng(0).uniform(-0.006, 0.006, (80, 2, 3))
+    q = (q - q.mean(axis=2, keepdims=True)).reshape(80, 6)
+    with torch.no_grad():
+        x = chain(torch.from_numpy(1.5 * q)).numpy()
+    model = HybridForwardModel(chain, "quadratic", coupling="serial", guard=None).fit(q, x)
+    return chain, q, model
+
+
+def test_a_serial_body_ends_where_the_model_puts_the_tip(bent_inside):
+    chain, q, model = bent_inside
+    predicted = model.predict(q[:5])
+    with torch.no_grad():
+        away = np.linalg.norm(chain(torch.from_numpy(q[:5])).numpy() - predicted, axis=1)
+    assert away.max() > 5e-3
+    body = plots.BackboneDisplay.from_estimator(model, q[:5])
+    np.testing.assert_allclose(body.points[:, -1], predicted, atol=1e-7)
+    np.testing.assert_allclose(body.tips, predicted, atol=1e-7)
+    assert "learned correction" not in [line.label for line in body.lines()]
+    film = plots.TrackAnimation.from_estimator(model, q[:5])
+    (backbone,) = [line for line in film.lines() if line.label == "backbone"]
+    np.testing.assert_allclose(backbone.points[:, -1], film.x, atol=1e-7)
+
+
+def test_a_body_is_led_to_given_tips(bent_inside):
+    chain, q, model = bent_inside
+    tips = model.predict(q[:4])
+    tips[1] = np.nan
+    body = plots.BackboneDisplay.from_estimator(chain, q[:4], tips=tips)
+    np.testing.assert_allclose(body.points[:, -1], tips, atol=1e-7)
+    film = plots.TrackAnimation.from_estimator(chain, q[:4], tips=tips)
+    assert film.name == "tip (model)"
+    np.testing.assert_array_equal(film.x, tips)
+    far = plots.BackboneDisplay.from_estimator(chain, q[0], tips=[[0.0, 0.0, 9.0]])
+    assert np.isfinite(far.points).all()
+    with pytest.raises(ValueError, match="`tips`"):
+        plots.BackboneDisplay.from_estimator(chain, q[:4], tips=tips[:3])
