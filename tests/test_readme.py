@@ -108,7 +108,7 @@ def test_commands_for_a_log_of_ones_own_run(tmp_path, monkeypatch):
         compile(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], "your_robot.md", "exec"), {}
     )
     more = [command for command in commands(page) if command[1] not in ("fit", "track")]
-    assert {command[1] for command in more} == {"describe", "evaluate", "animate", "next"}
+    assert {command[1] for command in more} == {"init", "describe", "evaluate", "animate", "next"}
     for command in [*OWN_LOG, *more]:
         assert hybridkin(command + (QUICK if command[1] == "fit" else []), tmp_path)
         if "--out" in command:

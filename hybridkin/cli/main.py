@@ -5,33 +5,37 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import re
+import shlex
 import signal
 import sys
+import tempfile
 import threading
-import time
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 import hybridkin  # its folders are opened when used: help comes at once
+from hybridkin._core.files import write_file
 from hybridkin._core.units import METRES
+from hybridkin.cli import _demo as demo
+from hybridkin.cli._init import answered, description
 from hybridkin.cli._parser import failed, parser
+from hybridkin.cli._terminal import Stages, shown
 
 if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.robots import LogFormat
+    from hybridkin.datasets import LogReport
     from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits
 
 _DT = 0.02
 # What the user can correct is printed without a traceback.
 _OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
-_PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
 
 
 class _Outcome(NamedTuple):
@@ -46,11 +50,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     before = _stamps(arguments)
     try:
-        with contextlib.closing(_Bars()) as bars, warnings.catch_warnings(), _terminable():
+        stages = Stages(arguments.quiet)
+        with contextlib.closing(stages), warnings.catch_warnings(), _terminable():
             warnings.filterwarnings("default", category=UserWarning)
-            warnings.showwarning = bars.warn
-            outcome = _RUN[arguments.command](arguments, bars)
-    except KeyboardInterrupt as stop:
+            warnings.showwarning = stages.warn
+            outcome = _RUN[arguments.command](arguments, stages)
+    except (KeyboardInterrupt, EOFError) as stop:  # EOFError: no answer to a question
         fate = "nothing was written" if _stamps(arguments) == before else "all was written"
         code = 143 if isinstance(stop, _Terminated) else 130
         return failed(f"interrupted; {fate}", code, arguments.json)
@@ -97,71 +102,37 @@ def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:
     return {file: (file.stat().st_ino, file.stat().st_mtime_ns) for file in files}
 
 
-class _Bars:
-    """Progress bars on standard error, one for each kind of work, and warnings between them."""
-
-    def __init__(self) -> None:
-        self._bar: Any = None
-        self._what: str | None = None
-        self._seen: set[str] = set()
-        self._said = time.monotonic()
-
-    def __call__(self, what: str, done: int, total: int) -> None:
-        if self._what != what:
-            self.close()
-            self._what = what
-            # None: no bars in files and pipes
-            self._bar = tqdm(total=total, desc=what, file=sys.stderr, disable=None)
-        self._bar.update(done - self._bar.n)
-        if self._bar.disable and time.monotonic() > self._said + _PATIENCE:
-            self._said = time.monotonic()
-            print(f"hybridkin: {what}: {done} of {total}", file=sys.stderr)
-
-    def warn(self, message: Any, *_: Any) -> None:
-        """Print a warning, of those that differ in numbers only the first."""
-        text = str(message)
-        kind = re.sub(r"[\d.]+", "", text)
-        if kind not in self._seen:
-            self._seen.add(kind)
-            tqdm.write(f"hybridkin: warning: {text}", file=sys.stderr)
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-        self._bar = self._what = None
-
-
-def _paper(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _paper(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     report, paths = hybridkin.paper.run_paper(
         arguments.out,
         n_splits=arguments.splits,
         n_seeds=arguments.n_seeds,
         n_points=arguments.points,
         n_jobs=arguments.jobs,
-        progress=bars,
+        progress=stages,
     )
-    return _Outcome(report.record, report.plain(), paths)
+    return _Outcome(report.record, shown(report), paths)
 
 
-def _next(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _next(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
     measured = path = None
     if arguments.log is not None:
         known = None if loaded.description is None else loaded.description.log
         log_format = _log_format(arguments, known, arguments.model)
-        measured = _read(arguments, log_format, loaded.chain, False)
+        measured = _read(arguments, log_format, loaded.chain, False, stages)
         measured.check(arguments.force)
     if arguments.path is not None:
         unit = arguments.unit or loaded.log_format().x_unit
         path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
-    options = {"n": arguments.n, "measured": measured, "path": path, "progress": bars}
+    options = {"n": arguments.n, "measured": measured, "path": path, "progress": stages}
     limits = _limits(arguments, loaded, within_fit=False)
     report, paths = workflow.next_rows(loaded, arguments.out, limits=limits, **options)
-    return _Outcome(report.record, report.plain(), paths)
+    return _Outcome(report.record, shown(report), paths)
 
 
-def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
     play = arguments.play
@@ -171,8 +142,8 @@ def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
     )
-    log = _read(arguments, log_format, robot.chain, robot.base_is_free)
-    print(f"{log.report}\n", file=sys.stderr)
+    log = _read(arguments, log_format, robot.chain, robot.base_is_free, stages)
+    _note(log.report, stages)
     report, paths = hybridkin.workflow.fit_log(
         log,
         robot,
@@ -180,18 +151,18 @@ def _fit(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         settings=settings,
         force=arguments.force,
         n_jobs=arguments.jobs,
-        progress=bars,
+        progress=stages,
     )
-    return _Outcome(report.record, report.plain(), paths)
+    return _Outcome(report.record, shown(report), paths)
 
 
-def _evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
     known = None if loaded.description is None else loaded.description.log
     nominal = loaded.chain if loaded.header is None else None
     log_format = _log_format(arguments, known, arguments.model)
-    log = _read(arguments, log_format, nominal, False)
-    print(f"{log.report}\n", file=sys.stderr)
+    log = _read(arguments, log_format, nominal, False, stages)
+    _note(log.report, stages)
     report, paths = hybridkin.workflow.evaluate_log(
         loaded, log, arguments.out, force=arguments.force
     )
@@ -199,10 +170,10 @@ def _evaluate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
     judged = next(filter(None, map(report.record.get, ("new", "held_out", "all"))))
     limit = arguments.fail_above
     code = 1 if limit is not None and 1000 * judged["mean"] > limit else 0
-    return _Outcome(report.record, report.plain(), paths, code)
+    return _Outcome(report.record, shown(report), paths, code)
 
 
-def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
     log_format = loaded.log_format()
@@ -235,13 +206,13 @@ def _track(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         start=start if isinstance(start, str) else np.multiply(start, log_format.q_factor),
         tol=1e-3 * arguments.tol,
         force=arguments.force,
-        progress=bars,
+        progress=stages,
     )
     code = 0 if report.record["reached"] == report.record["n"] else 1
-    return _Outcome(report.record, report.plain(), paths, code)
+    return _Outcome(report.record, shown(report), paths, code)
 
 
-def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     record = hybridkin.workflow.animate_track(
         hybridkin.workflow.open_model(arguments.model, arguments.robot),
         arguments.track,
@@ -249,13 +220,13 @@ def _animate(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         unit=arguments.unit,
         speed=arguments.speed,
         n_frames=arguments.frames,
-        progress=bars,
+        progress=stages,
     )
     speed, size = f"{record['fps']:.3g} a second", f"{record['bytes'] / 1e6:.2f} MB"
     return _Outcome(record, f"{record['frames']} frames, {speed}, {size}", [arguments.out])
 
 
-def _export(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _export(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
     report, paths = hybridkin.workflow.export_model(
         loaded,
@@ -265,23 +236,74 @@ def _export(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
         dt=arguments.dt,
         limits=None if arguments.dt is None else _limits(arguments, loaded),
     )
-    return _Outcome(report.record, report.plain(), paths)
+    return _Outcome(report.record, shown(report), paths)
 
 
-def _describe(arguments: argparse.Namespace, bars: _Bars) -> _Outcome:
+def _describe(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     if arguments.log.suffix.lower() not in hybridkin.workflow.LOG_SUFFIXES:
         loaded = hybridkin.workflow.open_model(arguments.log, arguments.robot)
         report = hybridkin.workflow.describe(loaded)
-        return _Outcome(report.record, report.plain())
+        return _Outcome(report.record, shown(report))
     if arguments.robot is None:
         raise ValueError(f"{arguments.log} is a log; name its robot: --robot ROBOT.toml.")
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
-    found = _read(arguments, log_format, robot.chain, robot.base_is_free).report
+    found = _read(arguments, log_format, robot.chain, robot.base_is_free, stages).report
     return _Outcome(found.to_dict(), str(found), code=0 if found.ok else 1)
 
 
-_COMMANDS = (_paper, _next, _fit, _evaluate, _track, _animate, _export, _describe)
+def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+    out, given = arguments.out, vars(arguments)
+    if out.exists() and not arguments.force:
+        raise FileExistsError(f"{out} exists; name another file, or replace it with --force.")
+    answers, missing = answered(given, ask=False)
+    if missing and sys.stdin.isatty() and not arguments.json:
+        answers, missing = answered(given, ask=True)
+    if missing:
+        need = f"`init` needs {', '.join(missing)} where it cannot ask on a terminal"
+        raise ValueError(f"{need}; see `hybridkin init --help`.")
+    text, log, code = description(answers, out.stem), answers["log"], 0
+    with tempfile.TemporaryDirectory() as folder:  # errors leave no file
+        draft = Path(folder) / "robot.toml"
+        draft.write_text(text, encoding="utf-8")
+        try:
+            robot = hybridkin.robots.read_description(draft)
+        except ValueError as error:
+            raise ValueError(str(error).removeprefix(f"{draft}: ")) from error
+    log_format: Any = robot.log
+    report = hybridkin.workflow.Report(f"{robot.name}: {robot.n_actuators} actuators")
+    report.record.update(columns=vars(log_format), log_check=None)
+    q, x = ", ".join(log_format.q), ", ".join(log_format.x)
+    report.text(f"Columns: actuators {q}; tip {x}; motion {log_format.groups or '(none)'}.")
+    if log is not None:
+        options = {"base_is_free": robot.base_is_free, "delimiter": arguments.delimiter}
+        read = hybridkin.workflow.read_log(log, log_format, chain=robot.chain, **options)
+        _note(read.report, stages)
+        report.record["log_check"], code = read.report.to_dict(), 0 if read.report.ok else 1
+    fit = f"hybridkin fit {log or 'log.csv'} --robot {out} --out model"
+    report.text(f"Read through {out}, then fit a model:\n$ {fit}")
+    write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
+    return _Outcome(report.record, shown(report), [out], code)
+
+
+def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+    out, done = arguments.out, {}
+    if out.exists() and not (out.is_dir() and not [*out.iterdir()]):
+        raise FileExistsError(f"{out} is not an empty folder; name another one by --out.")
+    out.mkdir(parents=True, exist_ok=True)
+    stages.note("The data of this demo are simulated; no robot was measured.")
+    demo.write_log(out / "log.csv")
+    for command, what in demo.steps(out).items():
+        stages.note(f"\n{what}\n$ hybridkin {command}")
+        parsed = parser().parse_args(shlex.split(command))
+        done[parsed.command] = _RUN[parsed.command](parsed, stages)
+    report = demo.summary(out, {name: outcome.record for name, outcome in done.items()})
+    paths = [path for outcome in done.values() for path in outcome.paths]
+    code = max(outcome.code for outcome in done.values())
+    return _Outcome(report.record, shown(report), [out / "log.csv", *paths], code)
+
+
+_COMMANDS = (_paper, _next, _fit, _evaluate, _track, _animate, _export, _describe, _init, _demo)
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 
@@ -292,10 +314,20 @@ def _limits(arguments: argparse.Namespace, loaded: LoadedModel, **options: bool)
     return hybridkin.workflow.path_limits(loaded, **vars(scaled), **options)
 
 
+def _note(found: LogReport, stages: Stages) -> None:
+    """Print what the check of a log found."""
+    stages.note(f"{found}\n", important=bool(found.errors or found.warnings))
+
+
 def _read(
-    arguments: argparse.Namespace, log_format: LogFormat, chain: Chain | None, base_is_free: bool
+    arguments: argparse.Namespace,
+    log_format: LogFormat,
+    chain: Chain | None,
+    base_is_free: bool,
+    stages: Stages,
 ) -> MeasuredLog:
     """Return the log of the arguments, read and checked."""
+    stages("reading and checking the log", 0, 1)
     names = ("exclude", "drop_invalid", "drop_frozen", "delimiter")
     options = {name: vars(arguments)[name] for name in names}
     return hybridkin.workflow.read_log(

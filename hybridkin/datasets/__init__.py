@@ -1,7 +1,7 @@
 """Measured and simulated data: pairs of actuator vectors and tip positions, in SI units."""
 
 from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
-from hybridkin.datasets._logs import Log, load_log
+from hybridkin.datasets._logs import Log, load_log, log_columns
 from hybridkin.datasets._protocol import paper_protocol, paper_split
 from hybridkin.datasets._recordings import load_armlab, load_asl_trunk, load_ftdcr
 from hybridkin.datasets._trunk import load_trunk, make_trunk
@@ -16,6 +16,7 @@ __all__ = [
     "load_ftdcr",
     "load_log",
     "load_trunk",
+    "log_columns",
     "make_trunk",
     "paper_protocol",
     "paper_split",

@@ -172,12 +172,7 @@ def load_log(
     >>> log.x, log.q_names
     (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
-    path = as_path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
-    read = {".npz": _read_npz, ".parquet": _read_parquet, ".pq": _read_parquet}
-    suffix = path.suffix.lower()
-    table = read[suffix](path) if suffix in read else _read_text(path, delimiter)
+    table = _read(as_path(path), delimiter)
     q, x = table.names("q", q), table.names("x", x)
     if len(x) % 3:
         raise ValueError(
@@ -223,6 +218,30 @@ def load_log(
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )
+
+
+def log_columns(path: str | os.PathLike[str], delimiter: str | None = None) -> list[str]:
+    """Return the names of the columns of a log file.
+
+    Parameters
+    ----------
+    path, delimiter
+        As for `load_log`.
+
+    Returns
+    -------
+    list of str
+        In the order of the file.
+    """
+    return _read(as_path(path), delimiter).header
+
+
+def _read(path: Path, delimiter: str | None) -> _Table:
+    if not path.is_file():
+        raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
+    read = {".npz": _read_npz, ".parquet": _read_parquet, ".pq": _read_parquet}
+    suffix = path.suffix.lower()
+    return read[suffix](path) if suffix in read else _read_text(path, delimiter)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -26,7 +27,12 @@ _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with their cube
 
 
-def select(spec: Spec, rows: Rows, given: Rows) -> tuple[Spec, dict[str, Any]]:
+def select(
+    spec: Spec,
+    rows: Rows,
+    given: Rows,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Spec, dict[str, Any]]:
     """Return the specification with the error model of least error on new motions, or a blend.
 
     Every candidate is fitted to all rows, which settles its penalties; then to all but one fold,
@@ -40,6 +46,8 @@ def select(spec: Spec, rows: Rows, given: Rows) -> tuple[Spec, dict[str, Any]]:
         With the geometry chosen and not yet calibrated.
     rows, given : Rows
         The different rows, and all as they were given.
+    progress : callable, optional
+        Called with (done, total) before every candidate.
 
     Returns
     -------
@@ -66,6 +74,8 @@ def select(spec: Spec, rows: Rows, given: Rows) -> tuple[Spec, dict[str, Any]]:
     tests = np.concatenate([test for _, test in splits])
     predicted = np.empty((len(candidates), len(tests), y.shape[1]))
     for i, (coupling, error_model) in enumerate(candidates.values()):
+        if progress is not None:
+            progress(i, len(candidates))
         fitted = fit_hybrid(replace(spec, parts=(Part(1.0, coupling, error_model),)), by_fold)
         part = Part(1.0, coupling, _settled(error_model, fitted.error_model))
         settled.append(part)

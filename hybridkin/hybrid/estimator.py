@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -243,10 +243,11 @@ class HybridForwardModel(HybridPredictor):
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
         geometry: GeometryChoice | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> list[str]:
         """Fit as `fit` does and return the messages of its warnings; none is issued.
 
-        `geometry`, chosen before, replaces the choice of what to calibrate.
+        `geometry` replaces the choice of what to calibrate. `progress` gets (done, total).
         """
         check_settings(self)
         given = self._checked_rows(X, y, sample_weight, groups)
@@ -260,9 +261,8 @@ class HybridForwardModel(HybridPredictor):
         if self.play_ is not None:
             given = given._replace(X=self._effective(given.X, given.groups))
             rows = given.distinct()[0]
-        self.cv_results_ = None
-        if not asked.parts:
-            spec, self.cv_results_ = select(spec, rows, given)
+        found = (spec, None) if asked.parts else select(spec, rows, given, progress)
+        spec, self.cv_results_ = found
         fitted = fit_hybrid(spec, given)
         self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
         self.error_model_, self.module_ = fitted.error_model, fitted.module

@@ -216,7 +216,7 @@ class Domain:
         configuration where nothing guards the domain.
         """
         hybrid, module, limits = self.loaded.hybrid, self.loaded.module, self.limits
-        if hybrid is None or hybrid.guard is None:
+        if hybrid is None or hybrid.guard is None or hybrid.error_model_ is None:
             return self.preferred
         home, bending = torch.from_numpy(self.preferred), torch.from_numpy(self.bending)
         squares = torch.from_numpy((limits.q_max - limits.q_min) ** 2)

@@ -226,6 +226,7 @@ def compare_by_group(
     # Else torch and BLAS start threads in every process, and these wait for each other.
     workers = Parallel(n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator")
     results: Any = workers(jobs)
+    progress("cross-validation by motion", 0, len(parts))
     for i, ((_, test), (errors, chosen)) in enumerate(zip(parts, results, strict=True)):
         for name, values in errors.items():
             empty = np.empty((len(log.q), values.shape[1]))
@@ -288,6 +289,7 @@ def fit_log(
     complete = checked(log, robot.chain, robot.base_is_free)
     _check(complete, settings, force)
     data = complete.thinned(settings.max_rows)
+    progress("calibration", 0, 1)
     rows = _Rows(data.q, data.x, data.motions, robot, settings).with_geometry_chosen()
     start, result, messages = rows.calibrated()
     messages += [] if result is None else complete.misread(result.chain)
@@ -297,13 +299,15 @@ def fit_log(
     savable = _SAVED if robot.chain is not None else (_DATA_LINEAR, ELM, AUTO)
     errors = {name: values.mean() for name, values in compared.errors.items() if name in savable}
     saved = min(errors, key=lambda name: (errors[name], name))
-    progress(f"fitting {saved} to all motions", 0, 1)
+    report_fit = partial(progress, f"fitting {saved} to all motions")
+    report_fit(0, 1)
     mechanical = rows.mechanical() if result is None else result.chain
     # The linear model of a robot without segments is what stands for its mechanical one.
     model = _models(CALIBRATED if saved == _DATA_LINEAR else saved, rows, mechanical)[0]
     model.set_params(coverage=settings.coverage)
-    model.fit_with_messages(rows.q, rows.x, groups=rows.groups, geometry=rows.geometry)
-    progress(f"fitting {saved} to all motions", 1, 1)
+    given = {"groups": rows.groups, "geometry": rows.geometry, "progress": report_fit}
+    model.fit_with_messages(rows.q, rows.x, **given)
+    progress("writing the report", 0, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
     report.record.update(
         n=len(data.q),

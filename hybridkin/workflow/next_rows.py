@@ -83,6 +83,7 @@ def next_rows(
         far = distance(loaded.tips(target), path.x).max()
         where = f"along the path, which the model misses by {1e3 * far:.3g} mm at most"
     known = None if measured is None else loaded.effective(measured.q, measured.motions)
+    progress("choosing configurations", 0, 1)
     rows, errors = choose_rows(loaded.model, candidates, n, measured=known, target=target)
     sent = candidates[rows] if loaded.play is None else loaded.play.command(candidates[rows])[0]
     report = Report(f"{loaded.name}: {n} configurations to measure next")

@@ -148,7 +148,8 @@ class Report:
 
     def __init__(self, title: str) -> None:
         self.record: dict[str, Any] = {"title": title, "versions": versions()}
-        self._blocks: list[tuple[str, str]] = []  # as Markdown, and for a terminal
+        # As Markdown, and text or header and rows of a table.
+        self._blocks: list[tuple[str, str | tuple[Sequence[str], Sequence[Sequence[str]]]]] = []
         self._files: dict[str, Callable[[Path], Any]] = {}
         self.text(f"# {title}")
 
@@ -159,13 +160,8 @@ class Report:
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Add a table."""
         ruled = [header, ["---"] * len(header), *rows]
-        widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-        plain = (  # the first column to the left, the others to the right
-            [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]
-            for line in [header, *rows]
-        )
         markdown = "\n".join("| " + " | ".join(line) + " |" for line in ruled)
-        self._blocks.append((markdown, "\n".join("  " + "  ".join(line) for line in plain)))
+        self._blocks.append((markdown, (header, rows)))
 
     def errors(self, record: dict[str, dict[str, Any]], columns: Sequence[str]) -> None:
         """Add a table of tip errors [mm] by name, with some of their `statistics`."""
@@ -200,9 +196,11 @@ class Report:
         """Return the report as it is written."""
         return "\n\n".join(markdown for markdown, _ in self._blocks) + "\n"
 
-    def plain(self) -> str:
-        """Return the text and the tables for a terminal."""
-        return "\n\n".join(plain for _, plain in self._blocks if plain)
+    def plain(self, table: Callable[..., str] | None = None) -> str:
+        """Return the report as text; `table` makes text of header and rows, by default aligned."""
+        table = _aligned if table is None else table
+        blocks = (block if isinstance(block, str) else table(*block) for _, block in self._blocks)
+        return "\n\n".join(filter(None, blocks))
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Add a file that `write` makes when handed its path."""
@@ -218,6 +216,16 @@ class Report:
         written = {name: partial(_write_text, text=text) for name, text in texts.items()}
         write_files(out, {**self._files, **written})
         return [out / name for name in [*self._files, *texts]]
+
+
+def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table as text, the first column aligned to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = (
+        [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]
+        for line in [header, *rows]
+    )
+    return "\n".join("  " + "  ".join(line) for line in lines)
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -16,7 +16,7 @@ from sklearn.kernel_ridge import KernelRidge
 
 import hybridkin
 from hybridkin import PlayOperator, datasets, load_model, robots, save_model, workflow
-from hybridkin.cli.main import _Bars, main
+from hybridkin.cli.main import main
 
 COLUMNS = ["t1", "t2", "t3", "t4", "t5", "t6"]
 ROBOT = """
@@ -837,16 +837,34 @@ def test_first_track_of_a_kernel_model_stays_where_the_model_is_at_home(tmp_path
     np.testing.assert_allclose(record["limits"]["q_max"], high)
 
 
+@pytest.mark.slow
+def test_track_of_a_calibrated_model_without_a_learned_part(tmp_path, capsys):
+    table = rows()
+    chain = hybridkin.ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
+    model = hybridkin.HybridForwardModel(chain, "drop", calibrate=("radii",))
+    model.fit(-1e-3 * table[:, 1:7], 1e-3 * table[:, 7:10])
+    save_model(model, tmp_path / "drop.safetensors")
+    shape = ["--shape", "figure-eight", "--size", "10,5", "--unit", "mm", "--dt", "1"]
+    code, record = document(
+        capsys, "track", tmp_path / "drop.safetensors", *shape, "--out", tmp_path / "t"
+    )
+    assert code == 0
+    assert record["reached"] == record["n"]
+
+
 # the command line itself
 
 
-@pytest.mark.parametrize("command", ["fit", "evaluate", "track", "animate", "describe", "paper"])
+@pytest.mark.parametrize(
+    "command", ["init", "fit", "evaluate", "track", "animate", "describe", "paper", "demo"]
+)
 def test_every_command_has_help_with_exit_codes(command, capsys):
     with pytest.raises(SystemExit) as left:
         main([command, "--help"])
     assert left.value.code == 0
     text = capsys.readouterr().out
     assert "--json" in text
+    assert "--quiet" in text
     assert "exit codes: 0" in text
     if command != "paper":
         assert f"hybridkin {command} " in text.split("examples:")[1]
@@ -890,13 +908,6 @@ def test_a_reader_that_stops_early_is_no_error(fitted):
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 0
-
-
-def test_long_work_says_so_where_there_is_no_terminal(capsys, monkeypatch):
-    monkeypatch.setattr("hybridkin.cli.main._PATIENCE", -1.0)
-    with contextlib.closing(_Bars()) as bars:
-        bars("tracking", 3, 7)
-    assert capsys.readouterr().err == "hybridkin: tracking: 3 of 7\n"
 
 
 def test_groups_of_the_description_can_be_left_out(log, robot, capsys):

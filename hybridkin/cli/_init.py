@@ -1,0 +1,151 @@
+"""A robot description from answers: the options of `init`, its questions, and the file."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import hybridkin
+from hybridkin._core.units import METRES
+from hybridkin.cli._values import count, existing, in_millimetres, names, one_of
+
+_NEEDED = object()  # the default of what must be given
+_Answers = dict[str, Any]
+_MODELS = {
+    "tendons": {"model": "constant-curvature", "routing": "base"},
+    "elastic-tendons": {"model": "elastic-tendon", "routing": "base"},
+    "chambers": {"model": "constant-curvature", "routing": "segment"},
+}
+
+
+class _Question(NamedTuple):
+    name: str
+    text: str
+    parse: Callable[[str], Any]
+    default: Any = _NEEDED
+
+
+_KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length)"
+_EACH = "[mm]; one value, or one for each segment"
+_SIGN = "-1: a pulled tendon counts as positive in the log; 1: as negative"
+QUESTIONS = (
+    _Question("log", "log file: CSV, npz or parquet", existing, None),
+    _Question("kind", _KINDS, one_of(*_MODELS)),
+    _Question("segments", "number of segments", count),
+    _Question("actuators", "number of actuators in each segment", count, 3),
+    _Question("radius", f"radius of the circle on which the actuators lie {_EACH}", in_millimetres),
+    _Question("length", f"length of the backbone of a segment {_EACH}", in_millimetres),
+    _Question("q_unit", f"unit of the actuators: {', '.join(METRES)}", one_of(*METRES), "mm"),
+    _Question("x_unit", "unit of the tip, one of the same", one_of(*METRES), "mm"),
+    _Question("q_sign", _SIGN, one_of(1, -1)),
+    _Question("q", "columns of the actuators from base to tip, as A,B,...", names),
+    _Question("x", "columns of the tip, as X,Y,Z", names),
+    _Question("groups", "column that names the motion of a row, or none", str, None),
+    _Question("time", "column of the time [s], or none", str, None),
+)
+_WORDS = {  # how names of columns begin
+    "groups": "motion|pattern|group|run|trial|episode|traj|trajectory|sequence",
+    "time": "t|time|times|timestamp|stamp|seconds",
+}
+
+
+def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
+    """Return the answers to all questions, and the options that are missing.
+
+    An answer is that of an option, else that of the user if `ask` is set, else the default. The
+    defaults of columns come from the header of the log.
+    """
+    answers, missing, columns = {"length": (None,), "q_sign": 1}, [], {}
+    for question in QUESTIONS:
+        name = question.name
+        if name in ("length", "q_sign") and answers["kind"] == "chambers":
+            continue
+        if name == "q":
+            columns = {"q": (), "x": ()} if missing else _proposed(answers, given["delimiter"])
+        question = question._replace(default=columns.get(name, question.default))
+        value = given[name]
+        if value is None:
+            value = _asked(question) if ask else question.default
+        if value is _NEEDED:
+            missing.append(f"--{name.replace('_', '-')}")
+        answers[name] = None if value == "none" else value
+    return answers, missing
+
+
+def _asked(question: _Question) -> Any:
+    """Return what the user answers to a question on standard error; empty: the default."""
+    name, text, parse, default = question
+    known = ",".join(default) if isinstance(default, tuple | list) else default
+    hint = "" if default is _NEEDED else f" [{known or 'none'}]"
+    while True:
+        print(f"{name}: {text}{hint}: ", end="", file=sys.stderr, flush=True)
+        answer = input().strip()
+        if not answer and default is not _NEEDED:
+            return default
+        try:
+            return parse(answer)
+        except (ValueError, argparse.ArgumentTypeError) as error:
+            clear = isinstance(error, argparse.ArgumentTypeError)
+            print(f"  {error if clear else 'must be a number'}", file=sys.stderr)
+
+
+def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
+    """Return the columns whose names look like actuators, tip, motion and time."""
+    n = answers["segments"] * answers["actuators"]
+    if answers["log"] is None:
+        return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
+    header = hybridkin.datasets.log_columns(answers["log"], delimiter)
+    tips = [three for three in zip(header, header[1:], header[2:], strict=False) if _is_tip(three)]
+    found: _Answers = {"x": max(tips, key=lambda three: "tip" in three[0].lower())} if tips else {}
+    families: dict[str, list[str]] = {}  # names that differ in numbers only
+    for name in header:
+        if name not in found.get("x", ()) and re.search(r"\d", name):
+            families.setdefault(re.sub(r"\d+", "", name), []).append(name)
+    every = [*itertools.chain(*families.values())]
+    fitting = [family for family in (*families.values(), every) if len(family) == n]
+    found |= {"q": fitting[0]} if fitting else {}
+    for key, words in _WORDS.items():
+        named = [name for name in header if re.match(rf"({words})(?![a-z\d])", name.lower())]
+        found |= {key: named[0]} if named else {}
+    return found
+
+
+def _is_tip(three: Sequence[str]) -> bool:
+    """Return whether three names differ only in their last x, y and z."""
+    axes = zip(three, "xyz", strict=True)
+    return len({"#".join(name.lower().rsplit(axis, 1)) for name, axis in axes}) == 1
+
+
+def description(answers: _Answers, name: str) -> str:
+    """Return the robot description of the answers, every key with a comment."""
+    template = (files("hybridkin.cli") / "robot.toml").read_text(encoding="utf-8")
+    head, segment, tail = re.split(r"(?=\[\[segment|# The logs)", template)
+    sizes = [_of_segments(answers, key) for key in ("radius", "length")]
+    segments = [
+        _filled(segment, {**answers, "radius": radius, "length": length, "repeat": len([*alike])})
+        for (radius, length), alike in itertools.groupby(zip(*sizes, strict=True))
+    ]
+    values = {**answers, **_MODELS[answers["kind"]], "name": name}
+    return "".join([_filled(head, values), *segments, _filled(tail, values)])
+
+
+def _of_segments(answers: _Answers, key: str) -> Sequence[float | None]:
+    """Return a size of every segment."""
+    values, n = answers[key], answers["segments"]
+    if len(values) not in (1, n):
+        raise ValueError(f"--{key} must be one value, or one for each segment, got {len(values)}.")
+    return [*values] * (n // len(values))
+
+
+def _filled(block: str, values: _Answers) -> str:
+    """Return a part of the template with its values; keys without one become comments."""
+    dumps = partial(json.dumps, ensure_ascii=False)
+    block = re.sub(r"\$(\w+)", lambda name: dumps(values[name[1]]), block)
+    return re.sub(r"^(\w+ =) null$", r"# \1", block, flags=re.MULTILINE)

@@ -1,0 +1,122 @@
+"""What a user sees while a command runs: stages, notes and warnings; and tables of results."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Column, Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from hybridkin.workflow import Report
+
+_PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
+_LONG = 30.0  # seconds of a stage from which on the remaining time is of interest
+
+
+class Stages:
+    """Progress on standard error, stage by stage, with notes and warnings between the stages.
+
+    A terminal shows a bar for each stage. Files and pipes get a line when a stage begins, one
+    with its time when it ends, and of a long stage lines with what is done and the time left.
+
+    Parameters
+    ----------
+    quiet : bool, default=False
+        Print warnings only.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        self.quiet = quiet
+        self._console = Console(stderr=True)
+        self._bar: Progress | None = None
+        self._what: str | None = None
+        self._seen: set[str] = set()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Report a stage, and how much of it is done."""
+        if self.quiet:
+            return
+        now = time.monotonic()
+        if self._what != what:
+            self._end()
+            self._what, self._began, self._said = what, now, now
+            if self._console.is_terminal:
+                text = TextColumn("{task.description}", markup=False)
+                columns = text, BarColumn(), TimeElapsedColumn()
+                self._bar = Progress(*columns, console=self._console)
+                self._task = self._bar.add_task(what, total=None)
+                self._bar.start()
+            else:
+                self._line(f"{what} ...")
+        spent = now - self._began
+        left = spent * (total - done) / done if done else 0.0
+        state = f"{what}: {done} of {total}" if total > 1 else what
+        state += f", about {_in_words(left)} left" if spent + left > _LONG else ""
+        if self._bar is not None:
+            whole = total if total > 1 else None
+            self._bar.update(self._task, total=whole, completed=done, description=state)
+        elif 0 < done < total and now > self._said + _PATIENCE:
+            self._said = now
+            self._line(state)
+        if done >= total:
+            self._end()
+
+    def note(self, text: str, *, important: bool = False) -> None:
+        """Print text, unless only what is important is asked for."""
+        self._end()
+        if important or not self.quiet:
+            print(text, file=sys.stderr)
+
+    def warn(self, message: Any, *_: Any) -> None:
+        """Print a warning, of those that differ in numbers only the first."""
+        text = str(message)
+        kind = re.sub(r"[\d.]+", "", text)
+        if kind not in self._seen:
+            self._seen.add(kind)
+            self._line(f"warning: {text}")
+
+    def close(self) -> None:
+        """End the bar of a stage that was not completed."""
+        if self._bar is not None:
+            self._bar.stop()
+        self._bar = self._what = None
+
+    def _end(self) -> None:
+        if self._bar is not None:
+            self._bar.update(self._task, total=1, completed=1, description=self._what)
+        elif self._what is not None:
+            self._line(f"{self._what}: {_in_words(time.monotonic() - self._began)}")
+        self.close()
+
+    def _line(self, text: str) -> None:
+        self._console.print(Text(f"hybridkin: {text}"), soft_wrap=True)
+
+
+def _in_words(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < 60.0 else f"{seconds / 60.0:.1f} min"
+
+
+def shown(report: Report) -> str:
+    """Return a report as text, with ruled tables on a terminal and plain ones elsewhere."""
+    console = Console()
+    return report.plain(partial(_ruled, console)) if console.is_terminal else report.plain()
+
+
+def _ruled(console: Console, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    first, *others = map(Text, header)
+    columns = [Column(first), *(Column(title, justify="right") for title in others)]
+    table = Table(*columns, box=box.SIMPLE_HEAD)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    with console.capture() as caught:
+        console.print(table)
+    return caught.get().strip("\n")

@@ -1,0 +1,239 @@
+"""`init` and `demo`: the first commands of a new user."""
+
+import io
+import itertools
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import ConstantCurvatureChain, load_model, robots
+from hybridkin.cli import _demo
+from hybridkin.cli._init import _proposed
+from hybridkin.cli.main import main
+
+TENDONS = ["--kind", "tendons", "--segments", "2", "--radius", "5", "--length", "100"]
+
+
+def run(capsys, *arguments):
+    """Return exit code, standard output and standard error of a command."""
+    code = main([str(argument) for argument in arguments])
+    return code, *capsys.readouterr()
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A log [mm] of two segments of three tendons, pulled counted as positive."""
+    rng = np.random.default_rng(0)
+    bends = np.cumsum(rng.uniform(-0.3, 0.3, (60, 2, 2)), axis=0).clip(-1, 1)
+    angles = 2 * np.pi / 3 * np.arange(3)
+    ring = np.stack([np.cos(angles), np.sin(angles)])
+    chain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], routing="base")
+    q = -0.005 * (np.cumsum(bends, axis=1) @ ring).reshape(-1, 6)
+    with torch.no_grad():
+        x = chain(torch.from_numpy(q)).numpy() + 1e-4 * rng.standard_normal((60, 3))
+    table = np.column_stack([np.arange(60), -1e3 * q, 1e3 * x, np.arange(60) // 10])
+    header = "timestamp [s],servo_1,servo_2,servo_3,servo_4,servo_5,servo_6,tip_x,tip_y,tip_z,run"
+    np.savetxt(tmp_path / "log.csv", table, "%.6g", ",", header=header, comments="")
+    return tmp_path / "log.csv"
+
+
+def test_init_from_options(tmp_path, capsys):
+    path = tmp_path / "arm.toml"
+    options = ["--radius", "8,8,7", "--q-sign", "-1", "--segments", "3", "--time", "t"]
+    code, out, _ = run(capsys, "init", path, *TENDONS, *options)
+    assert code == 0
+    assert f"hybridkin fit log.csv --robot {path} --out model" in re.sub(r"\s+", " ", out)
+    robot = robots.read_description(path)
+    assert robot.name == "arm"
+    assert robot.calibrate == "auto"
+    assert robot.chain.routing == "base"
+    assert robot.chain.radii.tolist() == [0.008, 0.008, 0.007]
+    assert robot.chain.lengths.tolist() == [0.1] * 3
+    assert robot.log == robots.LogFormat(
+        tuple(f"q{i}" for i in range(1, 10)), ("x", "y", "z"), "mm", "mm", -1, time="t"
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "found"), [("chambers", "ConstantCurvature"), ("elastic-tendons", "ElasticTendon")]
+)
+def test_init_of_other_kinds(tmp_path, capsys, kind, found):
+    sign = [] if kind == "chambers" else ["--q-sign", "1"]
+    options = [*TENDONS, *sign, "--kind", kind, "--actuators", "4", "--q-unit", "cm"]
+    assert run(capsys, "init", tmp_path / "r.toml", *options)[0] == 0
+    robot = robots.read_description(tmp_path / "r.toml")
+    assert type(robot.chain).__name__ == f"{found}Chain"
+    assert robot.chain.n_actuators == 8
+    assert all(robot.chain.extensible) == (kind == "chambers")
+    assert (robot.log.q_unit, robot.log.q_sign) == ("cm", 1)
+
+
+def test_every_key_of_the_file_has_a_comment(tmp_path, capsys):
+    run(capsys, "init", tmp_path / "r.toml", *TENDONS, "--q-sign", "1")
+    lines = (tmp_path / "r.toml").read_text().splitlines()
+    for before, line in itertools.pairwise(lines):
+        if " = " in line and not line.startswith("#"):
+            assert before.startswith("# ") or line.startswith("x_unit"), line
+
+
+def test_init_reads_the_header_of_a_log_and_checks_it(log, tmp_path, capsys):
+    path = tmp_path / "robot.toml"
+    code, out, err = run(capsys, "init", path, *TENDONS, "--q-sign", "-1", "--log", log)
+    assert code == 0
+    found = robots.read_description(path).log
+    assert found.q == tuple(f"servo_{i}" for i in range(1, 7))
+    assert found.x == ("tip_x", "tip_y", "tip_z")
+    assert (found.groups, found.time) == ("run", "timestamp [s]")
+    assert "60 rows, 6 motions, 6 actuators" in err
+    assert "motion run" in out
+    options = ["--q-unit", "m", "--x-unit", "m", "--force", "--json"]
+    code, out, err = run(capsys, "init", path, *TENDONS, "--q-sign", "-1", "--log", log, *options)
+    assert code == 1  # as of `describe`, whose check this is
+    assert "these look like millimetres" in re.sub(r"\s+", " ", err)
+    assert not json.loads(out)["log_check"]["ok"]
+
+
+@pytest.mark.parametrize(
+    ("header", "q", "x"),
+    [
+        ("l1 l2 l3 pos_x pos_y pos_z", "l1 l2 l3", "pos_x pos_y pos_z"),
+        ("X Y Z a_1 b_1 a_2 b_2 a_3 b_3", "a_1 a_2 a_3", "X Y Z"),
+        ("vx vy vz tip[x] tip[y] tip[z] p1 p2 v1", "p1 p2 v1", "tip[x] tip[y] tip[z]"),
+        ("t1 t2 t3 max_x max_y max_z", "t1 t2 t3", "max_x max_y max_z"),
+        ("left right up x y z", None, "x y z"),
+        ("c1 c2 c3 east north high", "c1 c2 c3", None),
+    ],
+)
+def test_columns_are_proposed_by_their_names(tmp_path, header, q, x):
+    path = tmp_path / "log.csv"
+    path.write_text(header.replace(" ", ",") + "\n")
+    found = _proposed({"log": path, "segments": 1, "actuators": 3}, None)
+    for key, names in {"q": q, "x": x}.items():
+        assert list(found.get(key, ())) == (names or "").split()
+    assert not {"groups", "time"} & {*found}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "needs --kind, --segments, --radius, --length, --q-sign where it cannot ask"),
+        (TENDONS, "needs --q-sign where"),
+        ([*TENDONS, "--q-sign", "1", "--q", "a,b"], "error: `q` in [log] must name 6 columns"),
+        ([*TENDONS, "--q-sign", "1", "--radius", "1,2,3"], "--radius must be one value, or one"),
+    ],
+)
+def test_init_without_what_it_needs_writes_nothing(tmp_path, capsys, options, message):
+    code, _, err = run(capsys, "init", tmp_path / "robot.toml", *options)
+    assert code == 2
+    assert message in err
+    assert not [*tmp_path.iterdir()]
+
+
+def test_init_names_columns_that_it_does_not_find(tmp_path, capsys):
+    (tmp_path / "log.csv").write_text("left,right,up,x,y,z\n1,2,3,4,5,6\n")
+    options = [*TENDONS, "--q-sign", "1", "--segments", "1", "--log", tmp_path / "log.csv"]
+    code, _, err = run(capsys, "init", tmp_path / "robot.toml", *options)
+    assert code == 2
+    assert "needs --q where" in err
+
+
+def test_init_replaces_a_file_only_by_force(tmp_path, capsys):
+    path = tmp_path / "robot.toml"
+    path.write_text("mine")
+    options = [*TENDONS, "--q-sign", "1"]
+    code, _, err = run(capsys, "init", path, *options)
+    assert code == 2
+    assert "--force" in err
+    assert path.read_text() == "mine"
+    assert run(capsys, "init", path, *options, "--force")[0] == 0
+    assert robots.from_toml(path).n_actuators == 6
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_init_asks_on_a_terminal(log, tmp_path, capsys, monkeypatch):
+    path = tmp_path / "robot.toml"
+    answers = [
+        log,
+        "cables",
+        "tendons",
+        "two",
+        "2",
+        "",
+        "5",
+        "100",
+        "",
+        "",
+        "-1",
+        "",
+        "",
+        "none",
+        "",
+    ]
+    monkeypatch.setattr(sys, "stdin", Terminal("\n".join(map(str, answers)) + "\n"))
+    code, out, err = run(capsys, "init", path)
+    assert code == 0
+    assert "must be one of tendons, elastic-tendons, chambers, got 'cables'" in err
+    assert "must be a number" in err
+    assert "[servo_1,servo_2,servo_3,servo_4,servo_5,servo_6]: " in err
+    assert "[run]: " in err
+    assert out.startswith("robot: 6 actuators")
+    found = robots.read_description(path).log
+    assert (found.q_sign, found.q[0], found.groups) == (-1, "servo_1", None)
+    assert found.time == "timestamp [s]"
+
+
+def test_an_answer_that_never_comes_is_an_interrupt(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", Terminal("\ntendons\n"))
+    code, _, err = run(capsys, "init", tmp_path / "robot.toml")
+    assert code == 130
+    assert err.endswith("interrupted; nothing was written\n")
+
+
+def test_demo_keeps_out_of_folders_with_files(tmp_path, capsys):
+    (tmp_path / "robot.toml").write_text("mine")
+    code, _, err = run(capsys, "demo", "--out", tmp_path)
+    assert code == 2
+    assert "is not an empty folder" in err
+
+
+@pytest.mark.slow
+def test_demo_goes_from_a_log_to_a_film(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(_demo, "_ROWS", 60)  # for speed, as what follows
+    steps = _demo.steps
+    fast = {"--seeds 1": "--seeds 1 --no-auto", "--frames 24": "--frames 3", "--dt 0.1": "--dt 0.5"}
+
+    def quick(out):
+        commands = {}
+        for command, what in steps(out).items():
+            for slow, option in fast.items():
+                command = command.replace(slow, option)
+            commands[command] = what
+        return commands
+
+    monkeypatch.setattr(_demo, "steps", quick)
+    out = tmp_path / "first try"
+    code, printed, err = run(capsys, "demo", "--out", out)
+    assert code == 0
+    assert "SIMULATED" in printed
+    assert "simulated" in err
+    words = re.sub(r"\s+", " ", printed)
+    for command in ("init", "fit", "track", "animate"):
+        assert f"$ hybridkin {command} '{out.as_posix()}'/" in words
+    held_out = json.loads((out / "model" / "report.json").read_text())["held_out"]
+    shown = re.findall(
+        r"^ +(mechanical|data-driven|hybrid), (\w+) +([\d.]+)", printed, re.MULTILINE
+    )
+    assert len(shown) >= 3
+    for part, learner, mean in shown:
+        assert float(mean) == pytest.approx(1e3 * held_out[f"{part}, {learner}"]["mean"], abs=0.006)
+    assert load_model(out / "model" / "model.safetensors").predict(np.full((1, 9), 0.25)).shape
+    assert (out / "track.gif").stat().st_size > 5_000
+    assert robots.read_description(out / "robot.toml").log.groups == "group"

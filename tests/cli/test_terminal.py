@@ -1,0 +1,132 @@
+"""Progress, notes and warnings on standard error; tables on a terminal and elsewhere."""
+
+import io
+import re
+import time
+
+import pytest
+from rich.console import Console
+
+from hybridkin.cli import _terminal
+from hybridkin.cli._terminal import Stages, shown
+from hybridkin.cli.main import main
+from hybridkin.workflow import Report
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that a test sets."""
+    now = [100.0]
+    monkeypatch.setattr(_terminal.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_pipe_gets_a_line_when_a_stage_begins_and_one_with_its_time(clock, capsys):
+    stages = Stages()
+    stages("calibration", 0, 1)
+    clock[0] += 3.0
+    stages("tracking", 0, 4)
+    clock[0] += 90.0
+    stages("tracking", 4, 4)
+    stages.close()
+    assert capsys.readouterr().err.splitlines() == [
+        "hybridkin: calibration ...",
+        "hybridkin: calibration: 3.0 s",
+        "hybridkin: tracking ...",
+        "hybridkin: tracking: 1.5 min",
+    ]
+
+
+def test_a_long_stage_says_how_much_time_is_left(clock, capsys):
+    stages = Stages()
+    stages("tracking", 0, 10)
+    for done in range(1, 5):  # a line after 20 and after 40 seconds
+        clock[0] += 10.0
+        stages("tracking", done, 10)
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        "hybridkin: tracking: 2 of 10, about 1.3 min left",
+        "hybridkin: tracking: 4 of 10, about 1.0 min left",
+    ]
+
+
+def test_a_stage_that_fails_gets_no_time(clock, capsys):
+    stages = Stages()
+    stages("tracking", 1, 4)
+    stages.close()
+    assert capsys.readouterr().err == "hybridkin: tracking ...\n"
+
+
+def test_quiet_leaves_warnings_and_what_is_important(clock, capsys):
+    stages = Stages(quiet=True)
+    stages("tracking", 0, 4)
+    clock[0] += 90.0
+    stages("tracking", 1, 4)
+    stages.note("a note")
+    stages.note("errors in the log", important=True)
+    stages.warn("bent by 3.1 [mm]")
+    stages.warn("bent by 3.2 [mm]")
+    stages.close()
+    assert capsys.readouterr().err.splitlines() == [
+        "errors in the log",
+        "hybridkin: warning: bent by 3.1 [mm]",
+    ]
+
+
+def test_a_terminal_shows_a_bar_and_the_time_left(monkeypatch):
+    text = io.StringIO()
+    stages = Stages()
+    stages._console = Console(file=text, force_terminal=True, width=100)
+    started = time.monotonic()
+    stages("tracking", 0, 4)
+    monkeypatch.setattr(_terminal.time, "monotonic", lambda: started + 40.0)
+    stages("tracking", 1, 4)
+    stages._bar.refresh()
+    stages.warn("far [mm]")
+    stages("drawing", 0, 1)
+    stages.close()
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text.getvalue())
+    assert "tracking: 1 of 4, about 2.0 min left" in plain
+    assert "hybridkin: warning: far [mm]" in plain
+    assert "drawing" in plain
+
+
+@pytest.fixture
+def report():
+    report = Report("A table")
+    report.table(["tip error [mm]", "mean"], [["hybrid, auto", "1.50"], ["[/nominal]", "22.75"]])
+    return report
+
+
+def test_tables_are_plain_in_a_pipe(report, capsys):
+    aligned = "  tip error [mm]   mean\n  hybrid, auto     1.50\n  [/nominal]      22.75"
+    assert shown(report) == f"A table\n\n{aligned}"
+
+
+def test_tables_are_ruled_on_a_terminal_and_colours_can_be_off(report, monkeypatch):
+    settings = {"FORCE_COLOR": "1", "NO_COLOR": "1", "TERM": "xterm", "COLUMNS": "80"}
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    text = shown(report)
+    assert "───" in text
+    for cell in ("tip error [mm]", "hybrid, auto", "[/nominal]", "22.75"):
+        assert cell in text
+    assert "\x1b[" in text  # a bold header
+    assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", text)
+    assert "| --- | --- |" in report.markdown()
+
+
+def test_a_quiet_command_prints_its_result_only(tmp_path, capsys):
+    robot, log = tmp_path / "robot.toml", tmp_path / "log.csv"
+    robot.write_text('[log]\nq = ["a", "b"]\nx = ["x", "y", "z"]\n')
+    rows = [
+        f"{0.01 * i},{0.02 * (i % 7)},{0.01 * i},{0.02 * (i % 7)},{0.1 + 1e-4 * i**2}"
+        for i in range(40)
+    ]
+    log.write_text("a,b,x,y,z\n" + "\n".join(rows) + "\n")
+    arguments = ["describe", str(log), "--robot", str(robot)]
+    assert main(arguments) == 0
+    loud = capsys.readouterr()
+    assert main([*arguments, "--quiet"]) == 0
+    quiet = capsys.readouterr()
+    assert "reading and checking the log ..." in loud.err
+    assert (quiet.err, quiet.out) == ("", loud.out)
