@@ -1,4 +1,4 @@
-"""Checks of a log before a fit: what is wrong with it, where, and what to do."""
+"""Checks of a log before a fit: findings with their rows and advice."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from hybridkin.datasets._log_report import MISREAD, SEVERITIES, LogFinding, LogR
 from hybridkin.datasets._log_residual import residual_findings
 from hybridkin.datasets._logs import Log, column_names
 
-_FROZEN_ROWS = 3  # fewer may be chance
-_FROZEN_WAY = 0.1  # of an actuator's range: the tip must have moved
-_JUMP = 3.0  # times what nine steps in ten stay below
-_GAP = 10.0  # median steps in time
+_FROZEN_ROWS = 3  # fewer rows may be chance
+_FROZEN_WAY = 0.1  # share of an actuator's range over which the tip must have moved
+_JUMP = 3.0  # relative to the 90 % quantile of the steps
+_GAP = 10.0  # relative to the median time step
 _FEW_MOTIONS = 5
 _FEW_ROWS = 30
 
@@ -31,35 +31,34 @@ def check_log(
     base_is_free: bool = True,
     drop_invalid: bool = True,
 ) -> LogReport:
-    """Return what may be wrong with a log: sensors, rows, times, motions, units and signs.
+    """Return possible errors of a log: sensors, rows, times, motions, units and signs.
 
-    The check looks for NaN and infinite rows, a tip or an actuator sensor that is frozen while the
-    rest moves, columns that never change, rows that occur twice, jumps of the tip, gaps in time and
-    times that run backwards, columns that hold the same, a tip that comes late or drifts, and too
-    few motions to hold some out. With a chain it also looks for wrong units, columns of q in
-    another order or of another sign, actuators numbered the other way round, axes of the tip that
-    are turned or left-handed, radii that are far off, and an offset or a drift of one actuator.
-    Rows must be in order of time. Of several markers the last one, the tip, is checked, where it
-    was measured.
+    The check looks for NaN and infinite rows, a frozen sensor of the tip or of an actuator while
+    the rest moves, columns that never change, rows that occur twice, jumps of the tip, gaps in time
+    and decreasing times, columns with the same values, a tip that lags or drifts, and too few
+    motions for held-out errors. With a chain it also looks for wrong units, a wrong order or sign
+    of the columns of q, actuators numbered in the other direction, rotated or left-handed axes of
+    the tip, radii that are far off, and an offset or a drift of one actuator. Rows must be in order
+    of time. With several markers, the last one, the tip, is checked in the rows that have it.
 
     Parameters
     ----------
     log : Log
-        As from `load_log`; of arrays ``Log(q, x, groups)``.
+        As from `load_log`; from arrays ``Log(q, x, groups)``.
     chain : ConstantCurvatureChain or ElasticTendonChain, optional
-        Nominal kinematics, or a calibrated chain (``calibrate(...).chain``), which tells orders of
-        the columns apart more sharply. None: units, order, signs and axes are not checked.
+        Nominal kinematics, or a calibrated chain (``calibrate(...).chain``), which distinguishes
+        orders of the columns better. None: units, order, signs and axes are not checked.
     base_is_free : bool, default=True
-        Whether the pose of the base will be fitted. With tendons on a backbone that does not
-        stretch, a wrong sign of q then is a half turn of the base, which is named where the base
-        is turned by more than 120 degrees about its axis.
+        Whether the pose of the base will be fitted. For tendons on a backbone of fixed length, a
+        wrong sign of q then looks like a half turn of the base. It is reported if the base must
+        rotate by more than 120 degrees about its axis.
     drop_invalid : bool, default=True
-        Whether the reader was asked to leave out invalid rows (a warning) or not (an error).
+        Whether invalid rows are left out (a warning) or not (an error).
 
     Returns
     -------
     LogReport
-        ``print(report)`` shows it; ``report.ok`` is False where a fit would be worthless.
+        ``print(report)`` shows it; ``report.ok`` is False if a fit would be worthless.
 
     Examples
     --------
@@ -76,7 +75,8 @@ def check_log(
     n_actuators = log.q.shape[1]
     if chain is not None and n_actuators != chain.n_actuators:
         raise ValueError(
-            f"`log` must have {chain.n_actuators} actuators, as `chain` has, got {n_actuators}."
+            f"`log` must have {chain.n_actuators} actuators, as many as `chain`, got "
+            f"{n_actuators}; check the columns of q."
         )
     several = log.x.shape[1] > 3
     if several:
@@ -111,20 +111,20 @@ def check_log(
 
 
 class _Rows(NamedTuple):
-    """The valid rows of a log, and their numbers in the whole of it."""
+    """The valid rows of a log, and their row numbers in the whole log."""
 
     log: Log
     numbers: NDArray
 
     def named(self, rows: ArrayLike) -> str:
-        """Return rows in words."""
+        """Return rows as text."""
         kind, places = _places(self.log, self.numbers)
         return named_rows(places[np.asarray(rows)], kind)
 
     def finding(
         self, kind: str, message: str, advice: str, rows: ArrayLike = (), severity: str = "warning"
     ) -> LogFinding:
-        """Return a finding about some rows, or all of them."""
+        """Return a finding about some rows, or all rows."""
         numbers = self.numbers[np.asarray(rows, dtype=int)]
         return LogFinding(kind, severity, message, advice, numbers)
 
@@ -133,13 +133,13 @@ class _Rows(NamedTuple):
         return [*zip(column_names(self.log, which), vars(self.log)[which].T, strict=True)]
 
     def same_motion(self) -> NDArray:
-        """Return whether each row and the next belong to one motion, shape (N - 1,)."""
+        """Return whether each row and the next belong to the same motion, shape (N - 1,)."""
         groups = np.zeros(len(self.log.q)) if self.log.groups is None else self.log.groups
         return groups[1:] == groups[:-1]
 
 
 def _places(log: Log, numbers: NDArray) -> tuple[str, NDArray]:
-    """Return where a log's rows stand: "line" of a file, or "row" with the given numbers."""
+    """Return the places of a log's rows: "line" of a file, or "row" with the given numbers."""
     return ("row", numbers) if log.line is None else ("line", log.line)
 
 
@@ -152,7 +152,7 @@ def _invalid(log: Log, valid: NDArray, drop_invalid: bool) -> Iterator[LogFindin
     what = f"{len(lines)} of {n} rows have a missing, NaN or infinite value"
     what = f"{what} ({named_rows(lines, kind)})"
     if drop_invalid and valid.all():
-        advice = "find out why: a marker that hides in some poses leaves a hole in the data there."
+        advice = "find out why: a marker that is hidden in some poses leaves a gap in the data."
         yield LogFinding("invalid", "warning", f"{what}; they were left out.", advice)
     else:
         advice = "correct them, or leave them out with --drop-invalid (drop_invalid=True)."
@@ -160,7 +160,7 @@ def _invalid(log: Log, valid: NDArray, drop_invalid: bool) -> Iterator[LogFindin
 
 
 def _runs(still: NDArray) -> list[tuple[int, int]]:
-    """Return first and last row of stretches whose steps (N - 1,) are all still."""
+    """Return first and last row of each run in which all steps (N - 1,) are still."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
@@ -175,7 +175,7 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
         found = np.setdiff1d(_frozen_rows(q, still), tips)
         if len(found) and still.mean() < most:
             message = (
-                f"{what} stays exactly the same in {len(found)} rows while the actuators move "
+                f"{what} does not change at all in {len(found)} rows while the actuators move "
                 f"({rows.named(found)}): the sensor was frozen or lost the marker."
             )
             advice = "leave these rows out with --drop-frozen, or delete them from the log."
@@ -185,7 +185,7 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
     for name, column in rows.columns("q"):
         still = np.diff(column) == 0
         runs = [run for run in _runs(still) if run[1] - run[0] >= _FROZEN_ROWS]
-        if len(runs) != 1:  # commands rest often, a sensor that is measured never
+        if len(runs) != 1:  # commands are often constant, measured values never
             continue
         first, last = runs[0]
         others = still.sum() - (last - first)
@@ -195,15 +195,15 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
         if others < 0.05 * len(still) and share < 0.5 and alone and way > _FROZEN_WAY * moved:
             found = np.arange(first, last + 1)
             message = (
-                f"actuator {name!r}, which changes from row to row elsewhere, stays exactly the "
-                f"same in {len(found)} rows ({rows.named(found)}) while the tip moves."
+                f"actuator {name!r}, which changes from row to row elsewhere, does not change at "
+                f"all in {len(found)} rows ({rows.named(found)}) while the tip moves."
             )
-            advice = "if its sensor hung, leave these rows out; if it was at rest, all is well."
+            advice = "if its sensor was frozen, leave these rows out; if it was at rest, keep them."
             yield rows.finding("frozen actuator", message, advice, found)
 
 
 def _frozen_rows(q: NDArray, still: NDArray) -> NDArray:
-    """Return rows in which something stands still while an actuator moves considerably."""
+    """Return the still rows during which an actuator moves considerably."""
     spans = np.ptp(q, axis=0)
     spans[spans == 0] = np.inf
     found = np.zeros(len(q), dtype=bool)
@@ -216,11 +216,11 @@ def _frozen_rows(q: NDArray, still: NDArray) -> NDArray:
 _CONSTANT = {
     "q": (
         "actuators that never move",
-        "nothing can be learned about them: record motions of each, or keep them at rest in use.",
+        "their effect is not identified: record motions of each, or do not move them in use.",
     ),
     "x": (
         "tip columns that never change",
-        "check the names of the columns; motion in one plane is fitted in that plane only.",
+        "check the names of the columns; a motion in one plane is fitted in that plane only.",
     ),
 }
 
@@ -240,12 +240,12 @@ def _same(rows: _Rows) -> Iterator[LogFinding]:
     for (one, a), (other, b) in itertools.combinations(columns, 2):
         if np.ptp(a) > 0 and (a == b).all():
             message = f"columns {one!r} and {other!r} hold the same values in all rows."
-            advice = "check the names of the columns; two actuators that always agree are one."
+            advice = "check the names of the columns; equal actuators cannot be distinguished."
             yield rows.finding("same column", message, advice)
 
 
 def _first_alike(columns: NDArray) -> NDArray:
-    """Return for each row the first row that is exactly the same."""
+    """Return for each row the first row that is equal to it."""
     _, first, inverse = np.unique(columns, axis=0, return_index=True, return_inverse=True)
     return first[inverse.ravel()]
 
@@ -258,24 +258,24 @@ def _duplicates(rows: _Rows) -> Iterator[LogFinding]:
         n = 0 if groups is None else int((groups[copies] != groups[original[copies]]).sum())
         across = f", {n} of them in another motion" if n else ""
         message = f"{len(copies)} rows are exact copies of earlier ones{across}"
-        advice = "delete them: copies in training and test part make errors look too small."
+        advice = "delete them: copies in training and test rows make held-out errors too small."
         yield rows.finding("duplicates", f"{message} ({rows.named(copies)}).", advice, copies)
     keep = np.setdiff1d(np.arange(len(q)), copies)
     command = _first_alike(q[keep])
     counts = np.bincount(command)
     again = counts[command] > 1
     if again.sum() >= 10:
-        # Spread of the tips about the mean of their command, pooled over all repeated commands.
+        # Standard deviation of the tips about the mean of their command, over repeated commands.
         sums = np.stack([np.bincount(command, c) for c in x[keep].T], axis=1)
         errors = x[keep] - (sums[command] / counts[command, None])
         spread = np.sqrt((errors[again] ** 2).sum() / (again.sum() - (counts > 1).sum()))
         message = (
-            f"{again.sum()} rows share their command with another row, as on a way out and "
-            f"back; there the tip scatters by {1e3 * spread:.3g} mm rms."
+            f"{again.sum()} rows have the same command as another row, as in a motion out and "
+            f"back; their tips differ by {1e3 * spread:.3g} mm rms."
         )
         advice = (
-            "this is noise, or backlash (also called play) where the robot came from another side, "
-            "which --play auto (play=) can learn; no model of the command alone errs less."
+            "this is noise, or backlash (also called play) if the robot came from another side, "
+            "which --play auto (play=) can fit; other models cannot have a smaller error."
         )
         yield rows.finding("same command", message, advice, keep[again], "note")
 
@@ -295,7 +295,7 @@ def _jumps(rows: _Rows) -> Iterator[LogFinding]:
         )
         advice = (
             "look at these rows: a swapped or lost marker, or a robot that snaps; --loss soft_l1 "
-            "bounds what outliers do to the calibration."
+            "limits the effect of outliers on the calibration."
         )
         yield rows.finding("jumps", message, advice, steps + 1)
 
@@ -307,36 +307,36 @@ def _times(rows: _Rows) -> Iterator[LogFinding]:
     late = np.flatnonzero(step <= 0) + 1
     if len(late):
         message = f"times do not increase at {len(late)} rows ({rows.named(late)})."
-        advice = "sort the rows by time within each motion; play and lag are judged by the order."
+        advice = "sort the rows by time in each motion; backlash and lag depend on the order."
         yield rows.finding("time", message, advice, late)
     inside = step[same & (step > 0)]
     usual = float(np.median(inside)) if len(inside) >= 10 else np.inf
     gaps = np.flatnonzero(same & (step > _GAP * usual)) + 1
     if len(gaps):
         message = (
-            f"{len(gaps)} gaps in time within a motion, up to {step[gaps - 1].max():.4g} s "
-            f"where {usual:.4g} s is usual ({rows.named(gaps)})."
+            f"{len(gaps)} gaps in time within a motion, up to {step[gaps - 1].max():.4g} s; the "
+            f"usual step is {usual:.4g} s ({rows.named(gaps)})."
         )
-        advice = "rows were lost or the robot waited; if it was touched, name the parts apart."
+        advice = "rows were lost or the robot waited; if it was touched, name two motions."
         yield rows.finding("time", message, advice, gaps)
 
 
 def _motions(rows: _Rows) -> Iterator[LogFinding]:
     n_rows, groups = len(rows.log.q), rows.log.groups
     if n_rows < _FEW_ROWS:
-        advice = "record some hundreds, spread over the whole workspace."
-        yield rows.finding("rows", f"{n_rows} rows are few.", advice)
+        advice = "record some hundred rows, spread over the whole workspace."
+        yield rows.finding("rows", f"the log has only {n_rows} rows.", advice)
     n = 0 if groups is None else len(np.unique(groups))
     if groups is None:
-        message = "no column names the motion of a row: stretches of the log are held out instead."
+        message = "no column names the motion of a row: ten parts of the log are held out instead."
         advice = "give `groups` (--groups COLUMN, or groups = in [log])."
     elif n > max(0.5 * n_rows, _FEW_MOTIONS):
-        message = f"{n} motions in {n_rows} rows: nearly every row is its own, a random split."
-        advice = "name rows of one sweep alike; for poses taken one by one at random this is right."
+        message = f"{n} motions in {n_rows} rows: nearly every row is a motion, a random split."
+        advice = "give rows of one motion the same name; for poses taken at random this is right."
     elif n < _FEW_MOTIONS:
-        few = f"{n} motion{'s are' if n > 1 else ' is'} few"
+        few = f"the log has only {n} motion{'s' if n > 1 else ''}"
         message = f"{few}: errors on held-out motions are uncertain."
-        advice = "record more motions, or cut long ones into parts that differ."
+        advice = "record more motions, or cut long motions into different parts."
     else:
         return
     yield rows.finding("motions", message, advice)

@@ -1,4 +1,4 @@
-"""Does a log fit the robot? Units, sign and numbering of the actuators, by the nominal chain."""
+"""Checks of a log against the nominal chain: units, signs and numbering of the actuators."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from hybridkin.datasets._log_report import LogFinding
 from hybridkin.datasets._logs import Log, column_names
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
-_ROWS, _FEW = 500, 150  # enough to tell one robot from its mirror image; of many changes
+_ROWS, _FEW = 500, 150  # enough to distinguish a robot from its mirror image; for many changes
 _CONVERT = (
     "set `spool_radius` (of motors) or `gain` (of pressures or steps: metres per unit) in every "
     "[[segment]] of the robot description (`gains` of a chain)"
 )
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
-# Of the tip's spread over the robot's reach: what cannot be, what is usual. Of strokes over radii
-# (a bend, in rad) and of chamber lengths over radii: what is too small, usual and too large.
+# Range of the tip over the reach of the robot: impossible, usual. Strokes over radii (a bend, in
+# rad) and chamber lengths over radii: too small, usual, too large.
 _REACH, _USUAL_REACH = 5.0, 0.7
 _BEND, _LONG = (0.02, 1.0, 15.0), (0.05, 3.0, 100.0)
-_SMALL_SHARE = 0.04  # of the way that the model predicts
-_FAR_BETTER, _GOOD = 0.6, 0.55  # of the motion missed: another reading's over the declared one's
-_ENOUGH = 0.85  # of the variance explained
-_TWIST, _TILT = 120.0, 45.0  # [deg] of a base that is turned about its axis, and upright
+_SMALL_SHARE = 0.04  # range of the tip relative to that of the model
+_FAR_BETTER, _GOOD = 0.6, 0.55  # missed motion of another reading: relative to declared; absolute
+_ENOUGH = 0.85  # explained share of the variance
+_TWIST, _TILT = 120.0, 45.0  # [deg] least rotation of a base about its axis; its largest tilt
 _BENDS = (0.25, 0.4, 0.5, 0.65, 1.5, 2.0, 2.5, 4.0)  # factors on all bends that are tried
 _SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # offsets, in standard deviations
-_SHIFTED = 0.87  # of the motion missed; clean logs of robots, simulated and real, stayed above 0.89
-_SIMPLE = 1.1  # an earlier change in the list is taken where it is about as good
+_SHIFTED = 0.87  # relative missed motion; for clean logs, simulated and real, it was above 0.89
+_SIMPLE = 1.1  # an earlier change in the list is chosen if it is nearly as good
 _ADVICE = {
     "axes": "check order and signs of the columns of x, which must be right-handed, and [base] of "
     'the description; or list "base" in `calibrate`.',
@@ -43,18 +43,18 @@ _ADVICE = {
     'actuators lie, and the unit of q; or list "radii" in `calibrate`.',
     "offset": "correct its zero, or list the zeros (`actuator_zeros` or `tendon_zeros`) in "
     "`calibrate`.",
-    "drift": "look for a slipping spool or sensor; fit the parts of the log apart.",
+    "drift": "look for a slipping spool or sensor; fit the parts of the log separately.",
     "geometry": "check which columns are q and x, their order, the zero of each actuator, the "
-    "angles, the routing, the lengths and, where it is not fitted, [base].",
+    "angles, the routing, the lengths and, if it is not fitted, [base].",
     "whole": "subtract from each column its value at the straight robot; or, for chambers that "
-    "stretch, leave `length` out of every [[segment]].",
-    "changes": "if the log holds changes of length, add the length at rest to each, or, for a "
+    "stretch, remove `length` from every [[segment]].",
+    "changes": "if the log holds changes of length, add the length at rest to each; or, for a "
     "robot with tendons on a backbone of fixed length, give `length` in every [[segment]].",
 }
 
 
 class _Robot:
-    """The numbers of a nominal chain that a log is compared with."""
+    """The numbers of a nominal chain, for the comparison with a log."""
 
     def __init__(self, chain: Any) -> None:
         self.chain = chain
@@ -72,9 +72,9 @@ class _Robot:
             return self.chain(torch.from_numpy(np.ascontiguousarray(q, dtype=float))).cpu().numpy()
 
     def changed(self, q: NDArray) -> dict[tuple[str, float, float], NDArray]:
-        """Return rows q after each change of their values that is tried.
+        """Return rows q after each tried change of their values.
 
-        All bends by a factor, as radii that are off make them; an offset or a drift of one
+        The changes are a factor on all bends, as from wrong radii, and an offset or a drift of one
         actuator, in standard deviations.
         """
         found, t, parts = {}, np.linspace(0.0, 1.0, len(q)), np.split(q, self.ends, axis=1)
@@ -90,7 +90,7 @@ class _Robot:
 
 
 def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
-    """Return the log and the chain with q in metres, where the chain has gains."""
+    """Return the log and the chain with q in metres, if the chain has gains."""
     if chain is None or chain.in_metres:
         return log, chain
     q = chain.metres(torch.from_numpy(log.q.astype(float))).detach().cpu().numpy()
@@ -100,14 +100,14 @@ def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
 
 
 def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFinding]:
-    """Return what contradicts the chain; units first, since all else rests on them."""
+    """Return contradictions to the chain; units first, because the other checks need them."""
     robot = _Robot(chain)
     found = [*_kind_findings(log, robot)] or [*_unit_findings(log, robot)]
     return found or [*_orientation_findings(log, robot, base_is_free)]
 
 
 def _kind_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
-    """Yield a finding where q holds no lengths, or whole ones for changes or the reverse."""
+    """Yield a finding if q holds no lengths, lengths instead of changes, or the reverse."""
     low, high = log.q.min(axis=0), log.q.max(axis=0)
     if log.units["q"] != "m":
         message = f"the actuators of the robot are lengths, but q is in {log.file_units['q']}."
@@ -131,10 +131,10 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
     length = robot.length + sum(part.mean() for part in np.split(own * q, robot.ends, axis=1))
     if robot.extensible:
         size, radius, (low, usual, high) = float(np.median(q[:, own])), radii.mean(), _LONG
-        # As long as q says; in which unit is asked next.
+        # The length is that of q; its unit is checked next.
         length /= 1.0 if low <= size / radius <= high else _factor(size / radius, usual)
     else:
-        # A tendon bends its own segment, with routing "base" all before it too.
+        # A tendon bends its own segment and, with routing "base", all segments before it.
         spans = np.cumsum(radii) if robot.chain.routing == "base" else radii
         pulls, spans = np.abs(q).max(axis=0), np.repeat(spans, robot.chain.actuators_per_segment)
         pairs = zip(pulls[robot.pulled], spans[robot.pulled], strict=True)
@@ -163,11 +163,11 @@ def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
     where = f"in [log] of the robot description or --{name}-unit"
     remedy = f'set {name}_unit = "{true}" {where} {true}'
     if true is None:
-        q_remedy = f"where these are no lengths, {_CONVERT}"
+        q_remedy = f"if these are not lengths, {_CONVERT}"
         remedy = q_remedy if name == "q" else f"check `{name}_unit` {where}"
     looks = f"these look like {_NAMES[true]}" if true else f"they are off by about {factor:g}"
     message = f"columns of {name} are declared as {unit}, but {what}; {looks}."
-    advice = f"{remedy}; or correct the radii and lengths of the description, which are metres."
+    advice = f"{remedy}; or correct the radii and lengths of the description, in metres."
     return LogFinding("units", "error", message, advice)
 
 
@@ -176,7 +176,7 @@ def _signs(sign: NDArray) -> Way:
 
 
 def _sign_advice(log: Log, way: Way) -> str:
-    """Return how to write the signs of a way of reading the columns."""
+    """Return the advice to set the signs of a way of reading the columns."""
     sign = np.array(way.sign) * np.broadcast_to(log.q_sign, len(way.sign))[list(way.order)]
     value = sign[0] if np.ptp(sign) == 0 else sign.tolist()
     option = f", or --q-sign={value}" if np.ptp(sign) == 0 else ""
@@ -187,7 +187,7 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
     chain, flip = robot.chain, _sign_advice(log, _signs(np.where(robot.pulled, -1, 1)))
     pulls = log.q[:, robot.pulled]
     if not robot.extensible and pulls.max() > 20 * max(-pulls.min(), 0.0):
-        message = "the tendons are only ever lengthened; shortening must be negative."
+        message = "the tendons are only lengthened, never shortened; shortening must be negative."
         yield LogFinding("sign", "warning", message, flip)
         return
     rows = np.linspace(0, len(log.q) - 1, min(len(log.q), _ROWS)).astype(int)
@@ -201,7 +201,7 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
     way, least = better_way(chain, q, x, base_is_free)
     reread = float(misses(chain, way.of(q)[None], x, True)[0])
     if not base_is_free and turned < min(good, _FAR_BETTER * reread):
-        how = "turned, and one of them mirrored" if image < free else "turned"
+        how = "rotated, and one of them mirrored" if image < free else "rotated"
         message = f"{compared}{_share(turned)} with the axes of the tip {how}."
         yield LogFinding("axes", "warning", message, _ADVICE["axes"])
         return
@@ -221,10 +221,10 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
         yield _way_finding(log, robot, way, f"{compared}{_share(least)} with ")
     elif base_is_free and not robot.extensible and abs(twist) > _TWIST and tilt < _TILT:
         message = (
-            f"the base must be turned by {twist:.0f} degrees about its axis to fit the tips, but "
-            f"by {twist - np.copysign(180, twist):.0f} degrees with the sign of q flipped."
+            f"the base must be rotated by {twist:.0f} degrees about its axis to fit the tips, but "
+            f"only by {twist - np.copysign(180, twist):.0f} degrees with the sign of q flipped."
         )
-        mounted = "Or, if the robot is mounted so, give the turn in [base] (`base` of a chain)."
+        mounted = "Or, if the robot is mounted so, give the rotation in [base] (`base` of a chain)."
         yield LogFinding("sign", "warning", message, f"{flip} {mounted}")
     elif share < (_FAR_BETTER if kind == "size" else _SHIFTED):
         what = f"its bends are {i:g} times as large"
@@ -232,7 +232,7 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
             name, far = column_names(log, "q")[int(i)], 1e3 * abs(by) * q.std(axis=0)[int(i)]
             does = "is off" if kind == "offset" else "drifts"
             what = f"actuator {name!r} {does} by about {far:.1g} mm"
-        message = f"the nominal model misses {100 * share:.0f} % as much of the motion if {what}."
+        message = f"the error of the nominal model falls to {100 * share:.0f} % if {what}."
         yield LogFinding(kind, "warning", message, _ADVICE[kind])
     elif 1 - missed**2 < _ENOUGH:
         explained = f"{_share(missed)} of the tip's motion, in any order and sign of q"
@@ -241,7 +241,7 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
 
 
 def _exchanged(chain: Any, q: NDArray, x: NDArray) -> tuple[float, int, int]:
-    """Return what is missed after the best exchange of a column of q with one of x, and which."""
+    """Return the error after the best exchange of a column of q with one of x, and the columns."""
     found = []
     for i, j in itertools.product(range(q.shape[1]), range(3)):
         a, b = q.copy(), x.copy()
@@ -251,13 +251,13 @@ def _exchanged(chain: Any, q: NDArray, x: NDArray) -> tuple[float, int, int]:
 
 
 def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding:
-    """Return a finding that names a better way to read the columns of q."""
+    """Return a finding with a better way to read the columns of q."""
     declared = column_names(log, "q")
     names = [declared[i] for i in way.order]
     clockwise = next(changes(robot.chain.actuators_per_segment, False)).order
     kind, what, advice = "sign", [], []
     if names != declared and way.order == clockwise:
-        kind, what = "numbering", ["the actuators numbered the other way round"]
+        kind, what = "numbering", ["the actuators numbered in the other direction"]
         first, second = robot.chain.angles[:2].tolist()
         counted = f"set clockwise = {str(np.sin(second - first) > 0).lower()} in every [[segment]]"
         advice = [f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."]
@@ -273,7 +273,7 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
 
 
 def _factor(ratio: float, usual: float) -> float:
-    """Return how many times too large (small) a value is, as a power of ten."""
+    """Return the factor by which a value is too large or too small, as a power of ten."""
     return min(_FACTORS, key=lambda f: abs(np.log(max(ratio, 1e-300) / f / usual)))
 
 

@@ -1,4 +1,4 @@
-"""Order and signs of the actuator columns: which of them explain the tips best."""
+"""Search for the order and signs of the actuator columns that explain the tips best."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-_ROWS = 60  # of the search; enough to tell two orders apart
-_MANY = 5  # of more actuators in a segment, and of more segments, only pairs of columns are swapped
-_ROUNDS, _KEPT = 12, 10  # changes one after the other; orders that each round starts from
-_GAIN = 0.97  # the error of a further change over that before
-_SIMPLE = 1.1  # an earlier change in the list is taken where it is about as good
+_ROWS = 60  # rows of the search; enough to distinguish two orders
+_MANY = 5  # for more actuators in a segment, or more segments, only pairs of columns are swapped
+_ROUNDS, _KEPT = 12, 10  # successive changes; orders from which each round starts
+_GAIN = 0.97  # largest ratio of errors after and before a further change
+_SIMPLE = 1.1  # an earlier change in the list is chosen if it is nearly as good
 
 
 class Way(NamedTuple):
@@ -25,7 +25,7 @@ class Way(NamedTuple):
     sign: tuple[int, ...]
 
     def then(self, other: Way) -> Way:
-        """Return this way, and of its result the other."""
+        """Return this way followed by another one."""
         order = tuple(self.order[i] for i in other.order)
         sign = (self.sign[i] * s for i, s in zip(other.order, other.sign, strict=True))
         return Way(order, tuple(sign))
@@ -36,15 +36,15 @@ class Way(NamedTuple):
 
 
 def as_declared(n: int) -> Way:
-    """Return the columns as they are."""
+    """Return the way that does not change n columns."""
     return Way((*range(n),), (1,) * n)
 
 
 def changes(counts: list[int], signed: bool) -> Iterator[Way]:
     """Yield the single changes that are tried, common mistakes first.
 
-    The numbering of all segments reversed; all signs, or one; two columns swapped; the columns of
-    one segment in another order; the segments in another order.
+    They are: reversed numbering of all segments; all signs, or one; two columns swapped; another
+    order of the columns of one segment; another order of the segments.
     """
     n = sum(counts)
     start, same = as_declared(n)
@@ -68,10 +68,10 @@ def _blocks(counts: list[int]) -> list[list[int]]:
 
 
 def misses(chain: Any, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
-    """Return for each q (N, n) of qs (K, N, n) the share of the tips' motion that a chain misses.
+    """Return for each q (N, n) of qs (K, N, n) the relative error of the chain's tips.
 
-    The rms distance of the tips x (N, 3) from the chain's, after the best shift and, of a free
-    base, turn and scale, over the rms distance of x from its mean.
+    This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for
+    a free base also rotation and scale), divided by the rms distance of x from its mean.
     """
     a, b = _clouds(chain, qs, x)
     if base_is_free:
@@ -81,7 +81,7 @@ def misses(chain: Any, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
 
 
 def base_turn(chain: Any, q: NDArray, x: NDArray) -> tuple[float, float]:
-    """Return by how much the base turns about its own axis to fit the tips, and tilts [deg]."""
+    """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     base = chain.base[:3, :3].double()
     turn = (base.mT @ _turn(*_clouds(chain, q[None], x))[0][0] @ base).numpy()
     twist = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
@@ -89,7 +89,7 @@ def base_turn(chain: Any, q: NDArray, x: NDArray) -> tuple[float, float]:
 
 
 def _clouds(chain: Any, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
-    """Return the tips (K, N, 3) of the chain and those measured, each about their mean."""
+    """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
         a = chain(rows.flatten(0, 1)).double().reshape(*rows.shape[:2], 3)
@@ -102,7 +102,7 @@ def _turn(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
     References
     ----------
-    Umeyama, IEEE PAMI 13 (1991): least squares over turns that are none of mirror images.
+    Umeyama, IEEE PAMI 13 (1991): least squares over rotations without mirror images.
     """
     u, s, vh = torch.linalg.svd(b.mT @ a)
     flip = torch.ones_like(s)
@@ -112,9 +112,9 @@ def _turn(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def better_way(chain: Any, q: NDArray, x: NDArray, base_is_free: bool) -> tuple[Way, float]:
-    """Return the best way to read the columns that was found, and what it misses (see `misses`).
+    """Return the best found way to read the columns, and its relative error (see `misses`).
 
-    Changes are tried one after the other, from the best few of the round before.
+    Each round tries all changes on the best ways of the previous round.
     """
     counts, signed = chain.actuators_per_segment, not any(chain.extensible)
     rows = np.linspace(0, len(q) - 1, min(len(q), _ROWS)).astype(int)

@@ -1,4 +1,4 @@
-"""What a check of a log found: findings with their severity, their rows and advice."""
+"""The report of a check of a log: findings with severity, rows and advice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _WIDTH, _ARROW = 96, " " * 11 + "-> "
 
 @dataclass(frozen=True, eq=False)
 class LogFinding:
-    """One thing that a check of a log found.
+    """One finding of a check of a log.
 
     Attributes
     ----------
@@ -25,13 +25,13 @@ class LogFinding:
         "jumps", "time", "motions", "rows", "same column", "drift", "lag", "offset", "units",
         "order", "sign", "numbering", "axes", "size" or "geometry".
     severity : {"error", "warning", "note"}
-        "error": a fit would be worthless; "warning": look at it; "note": good to know.
+        "error": a fit would be worthless; "warning": check it; "note": information.
     message : str
         What was found.
     advice : str
         What to do.
     rows : ndarray of shape (k,)
-        The rows it is about, from 0; empty where it is about all of them.
+        The rows of the finding, from 0; empty: all rows.
     """
 
     kind: str
@@ -43,7 +43,7 @@ class LogFinding:
 
 @dataclass(frozen=True, eq=False)
 class LogReport:
-    """The findings of `check_log`, and what the log holds.
+    """The findings of `check_log`, and the size and ranges of the log.
 
     Attributes
     ----------
@@ -52,15 +52,15 @@ class LogReport:
     n_rows, n_actuators : int
         Size of the log.
     n_motions : int or None
-        How many motions its groups name.
+        Number of motions in its groups; None without groups.
     q_range : ndarray of shape (n_actuators, 2)
         Least and largest value of every actuator [m].
     x_range : ndarray of shape (3, 2)
-        The same of the tip [m].
+        Least and largest coordinates of the tip [m].
     duration : float or None
-        From the first to the last time stamp [s].
+        Time from the first to the last time stamp [s].
     source : str
-        Where the log came from.
+        Source of the log, for example its path.
     q_unit : str
         Unit of q, "m", "rad" or "1".
     """
@@ -82,12 +82,12 @@ class LogReport:
 
     @property
     def warnings(self) -> tuple[LogFinding, ...]:
-        """The findings to look at."""
+        """The findings to check."""
         return tuple(f for f in self.findings if f.severity == "warning")
 
     @property
     def misread(self) -> tuple[LogFinding, ...]:
-        """The findings on how columns should be read: units, order, signs, axes, radii."""
+        """The findings about reading the columns: units, order, signs, axes, radii."""
         return tuple(f for f in self.findings if f.kind in MISREAD)
 
     @property
@@ -96,7 +96,7 @@ class LogReport:
         return not self.errors
 
     def accepting(self, kind: str) -> LogReport:
-        """Return the report with findings of a kind, whose rows were left out, as notes."""
+        """Return the report with findings of a kind as notes, because their rows are left out."""
         others = [f for f in self.findings if f.kind != kind]
         for f in self.findings:
             if f.kind == kind:
@@ -105,7 +105,7 @@ class LogReport:
         return replace(self, findings=tuple(others))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything as numbers, text and lists, for JSON."""
+        """Return the report as numbers, text and lists, for JSON."""
         record = {**vars(self), "ok": self.ok, "duration_s": self.duration}
         del record["duration"]
         for name in ("q_range", "x_range"):
@@ -116,7 +116,7 @@ class LogReport:
         return record
 
     def summary(self) -> str:
-        """Return one sentence: how many errors and warnings."""
+        """Return the numbers of errors and warnings as text."""
         counts = {"error": len(self.errors), "warning": len(self.warnings)}
         found = [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
         return " and ".join(found) or "no errors and no warnings"
@@ -147,7 +147,7 @@ def _filled(head: str, text: str) -> str:
 
 
 def named_rows(places: NDArray, kind: str) -> str:
-    """Return places in words, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
+    """Return places as text, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
     found = np.sort(places)
     runs = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
     words = [f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:4]]

@@ -1,4 +1,4 @@
-"""What the residual of a rough model shows: a drift of the tip, or a lag behind q."""
+"""Checks of the residual of a rough model: a drift of the tip, or a lag behind q."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hybridkin.datasets._log_report import LogFinding
 from hybridkin.datasets._logs import Log
 
-_LAGS = 10  # rows that the tip may be late, or early
-# The rms residual with a drift of the tip, and with a lag, over that without. Without any it stayed
-# above 0.89 on simulated logs and on recordings of real robots.
+_LAGS = 10  # largest lag of the tip in rows, in both directions
+# Limits of the rms residual of a model with a drift, and with a lag, relative to that without. For
+# simulated logs and recordings of real robots without drift or lag it was above 0.89.
 _DRIFT, _LAG = 0.8, 0.6
 
 
@@ -26,9 +26,9 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
     log : Log
         Valid rows in order of time.
     chain : Chain or None
-        Nominal model, as a part of the rough one.
+        Nominal model, a part of the rough model.
     same : ndarray of shape (N - 1,)
-        Whether each row and the next belong to one motion.
+        Whether each row and the next belong to the same motion.
     """
     features, x = _features(log.q, chain), log.x
     if len(x) < 3 * features.shape[1] or not np.ptp(x, axis=0).any():
@@ -37,12 +37,12 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
     left, drifted = _left(features, x), _left(np.hstack([features, t, t**2]), x)
     if drifted < _DRIFT * left:
         message = (
-            f"the tip drifts or steps in the course of the log: of {size * left:.3g} mm rms that a "
-            f"rough model of q leaves, {size * drifted:.3g} mm remain with a trend in time."
+            f"the tip drifts or steps during the log: the residual of a rough model falls from "
+            f"{size * left:.3g} to {size * drifted:.3g} mm rms with a trend in time."
         )
         advice = (
-            "find out whether the camera or the base was moved, or the robot warmed up; fit the "
-            "parts apart, or leave the moved part out."
+            "find out if the camera or the base was moved, or if the robot became warm; fit the "
+            "parts separately, or leave the moved part out."
         )
         yield LogFinding("drift", "warning", message, advice)
     run, lagged = np.concatenate([[0], np.cumsum(~same)]), {0: left}
@@ -54,15 +54,15 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
     best = min(lagged, key=lambda k: lagged[k])
     if lagged[best] < _LAG * left:
         message = (
-            f"the tip comes {abs(best)} rows {'after' if best > 0 else 'before'} q: a rough model "
-            f"leaves {size * lagged[best]:.3g} mm rms so shifted, {size * left:.3g} mm as it is."
+            f"the tip is {abs(best)} rows {'behind' if best > 0 else 'ahead of'} q: the rms "
+            f"residual is {size * lagged[best]:.3g} mm with this lag, {size * left:.3g} mm without."
         )
-        advice = "match the clocks of the two recordings, or move slowly and wait for rest."
+        advice = "synchronise the clocks of the two recordings, or move slowly and wait for rest."
         yield LogFinding("lag", "warning", message, advice)
 
 
 def _features(q: NDArray, chain: Any) -> NDArray:
-    """Return what a rough model of the tip is linear in: q, its squares and the chain's tips."""
+    """Return the features of a rough linear model of the tip: q, squares and the chain's tips."""
     spans = np.ptp(q, axis=0)
     z = (q - q.mean(axis=0)) / np.where(spans > 0, spans, 1.0)
     columns = [np.ones((len(q), 1)), z, z**2]
@@ -73,6 +73,6 @@ def _features(q: NDArray, chain: Any) -> NDArray:
 
 
 def _left(features: NDArray, x: NDArray) -> float:
-    """Return the rms of what least squares leave of x over that of x about its mean."""
+    """Return the rms residual of x by least squares over the rms of x about its mean."""
     residual = x - features @ np.linalg.lstsq(features, x, rcond=None)[0]
     return float(np.sqrt((residual**2).sum() / ((x - x.mean(axis=0)) ** 2).sum()))

@@ -1,4 +1,4 @@
-"""Logs that a user brings: columns of a CSV, npz or parquet file, in SI units."""
+"""Logs of a user's robot: columns of a CSV, npz or parquet file, converted to SI units."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
 
 _DELIMITERS = (",", ";", "\t")
-_MOST_COLUMNS, _LONGEST = 10_000, 256  # of a file; characters of the name of a motion
+_MOST_COLUMNS, _LONGEST = 10_000, 256  # columns of a file; characters of a motion's name
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,26 +32,26 @@ class Log:
     Attributes
     ----------
     q : ndarray of shape (N, n)
-        Actuator vectors [m], or in the unit that `units` says.
+        Actuator vectors [m], or in the unit given by `units`.
     x : ndarray of shape (N, 3) or (N, 3 K)
-        Tip positions [m], or those of K markers, the last of which is the tip; NaN where a marker
+        Tip positions [m], or positions of K markers, the last of which is the tip. NaN if a marker
         was not measured.
     groups : ndarray of shape (N,) or None
         Motion, run or day of each row.
     time : ndarray of shape (N,) or None
         Time stamps [s].
     line : ndarray of shape (N,) of int or None
-        Line of each row in a text file, its number from 0 in other files.
+        Line of each row in a text file; in other files the row number from 0.
     invalid_lines : ndarray of shape (k,) of int
-        The lines that were left out because a value is missing, NaN or infinite.
+        Lines that were left out because a value is missing, NaN or infinite.
     q_names, x_names : tuple of str
         Names of the columns.
     q_sign : int or sequence of int
-        Factor of the actuator columns of the file.
+        Factor on the actuator columns of the file.
     units, file_units : mapping of str to str
-        Units of "q" and "x" here and in the file.
+        Units of "q" and "x" in this object and in the file.
     source : str
-        Where the log comes from.
+        Source of the log, for example its path.
     """
 
     q: NDArray
@@ -90,7 +90,7 @@ class Log:
 
 
 def column_names(log: Log, which: str) -> list[str]:
-    """Return the names of the columns of "q" or "x", by their numbers where they have none."""
+    """Return the names of the columns of "q" or "x"; without names, their numbers."""
     n = vars(log)[which].shape[1]
     return [*(vars(log)[f"{which}_names"] or (f"{which}[{i}]" for i in range(n)))]
 
@@ -117,31 +117,31 @@ def load_log(
         fastparquet, anything else as text with a header line.
     q : sequence of str
         Columns of the actuator vector, in the order of the robot model. In an npz file an array
-        (N,) is a column; ``"name[2]"`` is column 2 of an array (N, k), ``"name"`` all of them.
+        (N,) is a column; ``"name[2]"`` is column 2 of an array (N, k), ``"name"`` all its columns.
     x : sequence of 3 str, or of 3 K
         Columns of the tip position, or of the positions of K markers, the last of which is the tip.
-        A row that lacks some markers is kept, with NaN for these.
+        A row without some markers is kept, with NaN for these.
     groups : str or None, default=None
-        Column that names the motion, run or day of a row, for splitting by groups.
+        Column that names the motion, run or day of a row, for splits by groups.
     time : str or None, default=None
         Column of the time stamp [s].
     q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
-        left as it is: counts or pressures, of a chain with `gains`.
+        not converted: counts or pressures, for a chain with `gains`.
     x_unit : {"m", "cm", "mm", "um", "in"}, default="m"
         Unit of the tip columns in the file.
     q_sign : 1, -1 or sequence of them, default=1
-        Factor of the actuator columns: -1 where the file counts a pulled tendon as positive, since
-        length changes here are negative for shortening.
+        Factor on the actuator columns: -1 if the file counts a pulled tendon as positive, because
+        here a shortening is negative.
     delimiter : str or None, default=None
-        Separator of a text file. None: comma, semicolon or tab, whichever the header has most of.
+        Separator of a text file. None: the most frequent in the header of comma, semicolon and tab.
     drop_invalid : bool, default=False
-        Leave out rows with a missing, NaN or infinite value instead of raising.
+        Leave out rows with a missing, NaN or infinite value instead of raising an error.
 
     Returns
     -------
     Log
-        In SI units; ``groups`` are strings, None like ``time`` if not asked for.
+        In SI units; ``groups`` are strings. ``groups`` and ``time`` are None if not requested.
 
     Raises
     ------
@@ -150,16 +150,16 @@ def load_log(
     ImportError
         If a parquet file is given and pandas cannot read it.
     ValueError
-        If a column is unknown, a cell is not a number, rows are invalid or none is left.
+        If a column is unknown, a cell is not a number, rows are invalid, or no row is left.
 
     Warns
     -----
     UserWarning
-        If values look like millimetres where metres were declared.
+        If metres are declared but values look like millimetres.
 
     See Also
     --------
-    check_log : What may be wrong with a log, and what to do.
+    check_log : Possible errors of a log, with advice.
 
     Examples
     --------
@@ -176,7 +176,7 @@ def load_log(
     q, x = table.names("q", q), table.names("x", x)
     if len(x) % 3:
         raise ValueError(
-            f"`x` must name 3 columns, got {len(x)}: {x}; of several markers 3 for each."
+            f"`x` must name 3 columns, or 3 for each of several markers, got {len(x)}: {x}."
         )
     factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
     values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
@@ -190,7 +190,7 @@ def load_log(
         where = named_rows(places[~valid], "row" if table.lines is None else "line")
         raise ValueError(
             f"{(~valid).sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
-            f"infinite value ({where}); correct them, or leave them out by drop_invalid=True where "
+            f"infinite value ({where}); correct them, or leave them out with drop_invalid=True if "
             "others are left."
         )
     values = values[valid]
@@ -246,7 +246,7 @@ def _read(path: Path, delimiter: str | None) -> _Table:
 
 @dataclass(frozen=True)
 class _Cells:
-    """The columns of a text, with empty cells where rows are short; made when they are read."""
+    """The columns of a text, with empty cells if rows are short; made on access."""
 
     by_row: list[list[str]]
 
@@ -255,7 +255,7 @@ class _Cells:
 
 
 class _Table(NamedTuple):
-    """The columns of a file as they stand in it; of text also the line of every row."""
+    """The unconverted columns of a file; for text also the line of every row."""
 
     path: Path
     header: list[str]
@@ -263,7 +263,7 @@ class _Table(NamedTuple):
     lines: NDArray | None = None
 
     def names(self, argument: str, asked: Sequence[str]) -> list[str]:
-        """Return the names of columns, with that of an array (N, k) replaced by its columns'."""
+        """Return names of columns; the name of an array (N, k) becomes those of its columns."""
         asked = [asked] if isinstance(asked, str) or asked is None else list(asked)
         if not asked or not all(isinstance(name, str) for name in asked):
             raise ValueError(f"`{argument}` must be column names, got {asked!r}.")
@@ -290,7 +290,7 @@ class _Table(NamedTuple):
         close = close or difflib.get_close_matches(name, self.header, n=3, cutoff=0.4)
         hint = f"did you mean {', '.join(map(repr, close))}? Its" if close else "its"
         if len(self.header) == 1:
-            hint = "it has one column only, check `delimiter`. Its"
+            hint = "it has only one column, check `delimiter`. Its"
         raise ValueError(
             f"There is no column {name!r} in {path!r}; {hint:.400} columns: {self.header!s:.1000}."
         )
@@ -303,7 +303,7 @@ class _Table(NamedTuple):
             return np.array([_number(str(cell), name, line, self.path) for cell, line in cells])
         kind = np.asarray(column).dtype
         try:
-            if kind.kind in "cV":  # their real part would be taken
+            if kind.kind in "cV":  # astype would use only their real part
                 raise TypeError(kind)
             return np.asarray(column).astype(float)
         except (TypeError, ValueError, OverflowError) as error:
@@ -312,7 +312,7 @@ class _Table(NamedTuple):
             ) from error
 
     def rows(self, names: list[str], groups: str | None) -> tuple[NDArray, NDArray | None]:
-        """Return columns of numbers (N, k), and the group of every row."""
+        """Return columns as numbers (N, k), and the group of every row."""
         found, labels = {name: self.numbers(name) for name in names}, None
         sizes = {name: len(column) for name, column in found.items()}
         if groups is not None:
@@ -335,8 +335,8 @@ class _Table(NamedTuple):
 
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
-    """Return the factor of the n columns of q, once units and sign are known to be such."""
-    other = "; of other units give '1' and the chain `gains` [m per unit]"
+    """Return the factor on the n columns of q, after a check of units and sign."""
+    other = "; for other units give '1', and `gains` [m per unit] of the chain"
     one_of(q_unit, "q_unit", UNITS, other)
     one_of(x_unit, "x_unit", METRES)
     sign = real_array(q_sign, "q_sign")
@@ -376,14 +376,14 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
 
 
 def _read_npz(path: Path) -> _Table:
-    """Return the arrays (N,) of a file, columns of arrays (N, k) as ``name[i]``."""
+    """Return the arrays (N,) of a file; columns of arrays (N, k) are named ``name[i]``."""
     arrays = arrays_of(path)
     columns = {name: array for name, array in arrays.items() if array.ndim == 1}
     for name, array in arrays.items():
         if array.ndim == 2 and array.shape[1] > _MOST_COLUMNS:
             raise ValueError(
                 f"{name!r} of {str(path)!r} must have at most {_MOST_COLUMNS} columns, got "
-                f"{array.shape[1]}; transpose it where rows and columns are swapped."
+                f"{array.shape[1]}; transpose it if rows and columns are swapped."
             )
         if array.ndim == 2:
             columns |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
@@ -398,19 +398,19 @@ def _read_parquet(path: Path) -> _Table:
         frame = pd.read_parquet(path)
     except ImportError as error:
         raise ImportError(
-            f"{str(path)!r} needs pandas and pyarrow to be read (pip install pandas pyarrow); or "
+            f"Reading {str(path)!r} needs pandas and pyarrow (pip install pandas pyarrow); or "
             "save the log as CSV or npz."
         ) from error
-    except Exception as error:  # of its metadata, pyarrow and pandas have many
+    except Exception as error:  # pyarrow and pandas have many kinds of them
         raise ValueError(f"{str(path)!r} is not a parquet file: {error!s:.200}.") from error
     return _Table(path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns])
 
 
 def _check_rows(path: Path) -> None:
-    """Raise where a parquet file has more rows than fit its size, as of one value repeated."""
+    """Raise if a parquet file has too many rows for its size, e.g. one value repeated."""
     try:
         from pyarrow.parquet import read_metadata
-    except ImportError:  # read by fastparquet
+    except ImportError:  # fastparquet reads it
         return
     found = read_metadata(path)
     check_expansion(path, 8 * found.num_rows * found.num_columns)
@@ -425,6 +425,6 @@ def _number(cell: str, name: str, line: int, path: Path) -> float:
     except ValueError:
         raise ValueError(
             f"Line {line} of {str(path)!r}, column {name!r}: a number is needed, got {text!r:.60}; "
-            "correct the cell (an empty one counts as missing, see `drop_invalid`; decimals take "
-            "a point)."
+            "correct the cell (an empty cell is a missing value, see `drop_invalid`; decimals "
+            "need a point)."
         ) from None

@@ -1,4 +1,4 @@
-"""Arrays of npz files that others wrote: what is no such file costs little and runs no code."""
+"""Safe reading of npz files from others: a bad file costs little memory and runs no code."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-_MOST, _RATIO = 2**28, 100  # bytes of the content, where it is more than so many times the file
+_MOST, _RATIO = 2**28, 100  # bytes of content allowed in any file; or ratio to the file's size
 
 
 def check_expansion(path: Path, size: int) -> None:
-    """Raise where the content [bytes] is out of proportion to the file."""
+    """Raise if the content [bytes] is far larger than the file."""
     if size > max(_MOST, _RATIO * path.stat().st_size):
         raise ValueError(f"it expands to {size / 1e6:.0f} MB, over {_RATIO} times its size")
 
@@ -25,8 +25,8 @@ def arrays_of(path: Path) -> dict[str, NDArray]:
             arrays = {name: file[name] for name in file.files}
         for name, array in arrays.items():
             if not isinstance(array, np.ndarray) or max(array.shape, default=0) > size:
-                raise ValueError(f"{name!r:.60} is no array, or has a shape without numbers")
-    except Exception as error:  # of numpy, zipfile, zlib, tokenize and struct, each with its own
+                raise ValueError(f"{name!r:.60} is not an array, or has a shape without numbers")
+    except Exception as error:  # numpy, zipfile, zlib, tokenize and struct raise their own
         raise ValueError(
             f"{str(path)!r} is not an npz file of plain arrays: {error!s:.200}."
         ) from error

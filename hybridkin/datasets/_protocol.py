@@ -12,7 +12,7 @@ from hybridkin._core.arrays import shaped, whole
 
 MOST = 10**9  # rows; 72 GB
 RANGE = {"low": 0.19, "high": 0.31, "hold": 0.20, "jitter": 0.005}
-"""Working range, held length and half the spread about it [m]."""
+"""Working range of lengths, held length and half the range about it [m]."""
 
 
 def paper_protocol(
@@ -23,25 +23,24 @@ def paper_protocol(
 ) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
     """Return the commanded lengths of the paper's sampling protocol and the part of each row.
 
-    First each segment in turn moves alone, its three lengths uniform from 0.19 to 0.31 m while the
-    other segments are held at 0.20 m, give or take 5 mm; then all nine lengths are uniform in that
-    range.
+    First each segment moves alone: its three lengths are uniform from 0.19 to 0.31 m, and the other
+    segments are held at 0.20 m +- 5 mm. Then all nine lengths are uniform from 0.19 to 0.31 m.
 
     Parameters
     ----------
     random_state : int, Generator or None, default=None
-        Source of the draws.
+        Source of the random lengths.
     n_segment : int, default=500
-        Rows per segment that moves alone.
+        Number of rows for each segment that moves alone.
     n_random : int, default=500
-        Rows in which all lengths are random.
+        Number of rows in which all lengths are random.
 
     Returns
     -------
     q_target : ndarray of shape (3 * n_segment + n_random, 9)
         Commanded chamber lengths [m].
     part : ndarray of shape (3 * n_segment + n_random,)
-        0, 1 or 2: the segment that moves alone; 3: all of them.
+        0, 1 or 2: the segment that moves alone; 3: all segments move.
 
     References
     ----------
@@ -88,14 +87,14 @@ def paper_split(
     data : Bunch or array-like of shape (n_samples,)
         Data with ``part``, or that array itself.
     random_state : int, Generator or None, default=None
-        Which of the fully random rows are kept for the test.
+        Seed that selects the test rows among the fully random ones.
     n_test : int, default=100
-        Rows of the test set.
+        Number of rows of the test set.
 
     Returns
     -------
     train_idx : ndarray of shape (n_samples - n_test,)
-        Training rows: every row of a segment moving alone and the other fully random ones.
+        Training rows: all rows in which one segment moves alone, and the other random rows.
     test_idx : ndarray of shape (n_test,)
         Test rows.
 
@@ -112,7 +111,7 @@ def paper_split(
     """
     part = getattr(data, "part", data)
     if part is None:
-        raise ValueError("`data` has no parts: it was not drawn by the paper's protocol.")
+        raise ValueError("`data` has no parts of the paper's protocol; give data of `load_trunk`.")
     part = shaped(part, "data", ["n_samples"])
     random_rows = np.flatnonzero(part == 3)
     n_test = whole(n_test, "n_test", 1, len(random_rows))

@@ -1,4 +1,4 @@
-"""Recordings of real robots: three published sets that a user brings."""
+"""Recordings of real robots: readers for three published data sets, which the user provides."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ SOURCES = {
 def load_ftdcr(data_home: str | os.PathLike[str] | None = None, *, subset: str = "train") -> Bunch:
     """Return motion-capture data of a real robot with three segments and nine tendons.
 
-    Nominal: segments of 60, 62.5 and 64 mm, tendon circle 4.5 mm; the tendons of the far segments
-    run through the near ones and can go slack. The rows are slow motions, not rest, and neighbours
-    belong to one motion: split by groups. The single-tendon pulls are in both subsets.
+    Nominal: segments of 60, 62.5 and 64 mm, tendon circle 4.5 mm. Tendons of distal segments run
+    through the proximal ones and can become slack. The rows are slow motions, not rest, and
+    neighbours belong to one motion: split by groups. Both subsets hold the single-tendon pulls.
 
     Parameters
     ----------
     data_home : path-like or None, default=None
         Folder that holds ``ftdcr_v4``; None takes the environment variable HYBRIDKIN_DATA.
     subset : {"train", "tendon_pull"}, default="train"
-        All motions, or those that pull one tendon at a time (which are among them).
+        All motions, or only those that pull one tendon at a time.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def load_ftdcr(data_home: str | os.PathLike[str] | None = None, *, subset: str =
     Raises
     ------
     FileNotFoundError
-        If the files are not there; the message names their source.
+        If the files do not exist; the message names their source.
     """
     if subset not in FTDCR_FILES:
         raise ValueError(f"`subset` must be one of {list(FTDCR_FILES)}, got {subset!r}.")
@@ -89,10 +89,10 @@ def load_ftdcr(data_home: str | os.PathLike[str] | None = None, *, subset: str =
 def load_armlab(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     """Return data of a real robot with one segment and three cables.
 
-    A raster in steps of 0.1 mm. While the first cable is at rest, a grid line has one position of
-    the second (groups 0 to 100, in tenths of a millimetre); afterwards a line has one position of
-    the first (groups 100 plus tenths of a millimetre). Some lines are absent. Neighbouring lines
-    are 0.1 mm apart: hold out blocks of them to see extrapolation.
+    The rows are a grid in steps of 0.1 mm. While the first cable is at rest, each grid line has one
+    position of the second cable (groups 0 to 100, in tenths of a millimetre). Afterwards each line
+    has one position of the first cable (groups 100 plus tenths of a millimetre). Some lines are
+    missing. Neighbouring lines are 0.1 mm apart: hold out blocks of lines to test extrapolation.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def load_armlab(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     Raises
     ------
     FileNotFoundError
-        If the file is not there; the message names its source.
+        If the file does not exist; the message names its source.
     """
     path, origin = _locate(data_home, "armlab_3cable", "armlab_3cable.npz")
     file = _arrays(path, {"cable_shortening_mm": (3,), "tip_mm": (3,), "row": ()})
@@ -132,7 +132,7 @@ def load_armlab(data_home: str | os.PathLike[str] | None = None) -> Bunch:
 def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     """Return data of a real trunk with three segments, six motors and strong friction.
 
-    Hysteresis dominates: the command alone does not determine the tip. Split by groups.
+    Hysteresis is strong: the command does not determine the tip. Split by groups.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     Raises
     ------
     FileNotFoundError
-        If the file is not there; the message names its source.
+        If the file does not exist; the message names its source.
     """
     path, origin = _locate(data_home, "asl_trunk_static", "asl_trunk_static.npz")
     shapes = {"u": (6,), "disk_pos_m": (3, 3), "run_id": (), "kind": ()}
@@ -170,7 +170,7 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
 
 
 def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str) -> dict[str, NDArray]:
-    """Return the arrays of a recording, whose rows have these shapes, or say that it is damaged."""
+    """Return the arrays of a recording; raise if their rows do not have these shapes."""
     file = arrays_of(path)
     n = {len(array) for name, array in file.items() if name in shapes and array.ndim}
     for name in (*shapes, *names):
@@ -187,7 +187,7 @@ def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str) -> d
 def _locate(
     data_home: str | os.PathLike[str] | None, folder: str, name: str
 ) -> tuple[Path, dict[str, str]]:
-    """Return the path of a recording, and where it comes from."""
+    """Return the path of a recording, and its source and citation."""
     source, citation = SOURCES[folder]
     home = os.environ.get(DATA_HOME) if data_home is None else data_home
     path = None if not home else Path(home) / folder / name
@@ -195,7 +195,7 @@ def _locate(
         looked = "no data_home was given" if path is None else f"there is no {str(path)!r}"
         raise FileNotFoundError(
             f"{folder}/{name} is not part of hybridkin, and {looked}. Its source: {source}. Put "
-            f"the file into a folder {folder!r} and give the folder above as `data_home` or as the "
-            f"environment variable {DATA_HOME}."
+            f"the file into a folder {folder!r} and give its parent folder as `data_home` or as "
+            f"the environment variable {DATA_HOME}."
         )
     return path, {"source": source, "citation": citation}

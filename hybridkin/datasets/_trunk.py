@@ -1,4 +1,4 @@
-"""Data of the simulated trunk, by default under the paper's sampling protocol."""
+"""Data of the simulated trunk, by default with the paper's sampling protocol."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ PAPER = (
     "R. F. Reinhart and J. J. Steil, Hybrid Mechanical and Data-driven Modeling Improves Inverse "
     "Kinematic Control of a Soft Robot, Procedia Technology 26, 12-19, 2016."
 )
-OWN = -1  # part of a row whose command was given
+OWN = -1  # part of a row with a given command
 PARTS = ("segment 0", "segment 1", "segment 2", "all segments")
-CHUNK = 25  # rows a process does at a time, and loses when it is interrupted
+CHUNK = 25  # rows that a process computes at once, and loses if it is interrupted
 MAX_REDRAWS = 20
-# Random streams apart from the protocol's own: measurement noise (row), redraws (row, attempt).
+# Random streams besides that of the protocol: measurement noise (row), redraws (row, attempt).
 NOISE, REDRAW = 1, 2
 
 
@@ -49,19 +49,19 @@ def make_trunk(
     return_X_y: bool = False,
     **plant_parameters: Any,
 ) -> Any:
-    """Return simulated data of a pneumatic trunk, by default under the paper's protocol.
+    """Return simulated data of a pneumatic trunk, by default with the paper's protocol.
 
-    Chamber lengths and tip positions of `hybridkin.simulation.TrunkPlant`, a MuJoCo model in the
-    manner of Festo's Bionic Handling Assistant, sampled by the protocol of Reinhart and Steil
-    (2016). Everything here is simulated; nothing was measured on a robot. Row i again::
+    The rows are chamber lengths and tip positions of `hybridkin.simulation.TrunkPlant`, a MuJoCo
+    model similar to Festo's Bionic Handling Assistant, sampled by the protocol of Reinhart and
+    Steil (2016). All data are simulated, not measured on a robot. To repeat row i::
 
         plant = TrunkPlant(**data.parameters["plant"])
         seed = data.parameters["random_state"]
         q, pose = plant.settle(data.q_target[i], random_state=[seed, 1, data.row[i]])
 
-    The result depends on the seed and the parameters alone, not on `n_jobs` nor on interruptions.
-    A row of the protocol that does not settle is drawn again, so that every part keeps its size;
-    rows of a given `q_target` that do not settle are left out. Both are reported in ``failed``
+    The result depends only on the seed and the parameters, not on `n_jobs` or on interruptions.
+    A row of the protocol that does not settle is drawn again, so that every part keeps its size.
+    Rows of a given `q_target` that do not settle are left out. Both are reported in ``failed``
     and by a warning.
 
     Parameters
@@ -69,30 +69,30 @@ def make_trunk(
     q_target : array-like of shape (n_samples, 9) or None, default=None
         Commanded chamber lengths [m]; None draws them by `paper_protocol`.
     n_segment, n_random : int, default=500
-        Size of the protocol's parts, when `q_target` is None.
+        Sizes of the parts of the protocol, if `q_target` is None.
     random_state : int or None, default=None
-        Seed of sampling and noise; None takes a fresh one, kept in ``parameters``.
+        Seed of sampling and noise; None: a new one, which is stored in ``parameters``.
     cable_noise : float, default=1e-3
         Standard deviation of the measured lengths [m].
     mocap_noise : float, default=5e-4
         Standard deviation of each coordinate of the measured tip position [m].
     n_jobs : int or None, default=None
-        Processes, as in joblib.
+        Number of processes, as in joblib.
     checkpoint : path-like or None, default=None
-        Folder that keeps rows as they are made, in npz files. Rows that it has from the same seed
-        and parameters are not made again, after an interruption for example.
+        Folder for finished rows, in npz files. Rows in it with the same seed and parameters are
+        not computed again, for example after an interruption.
     return_X_y : bool, default=False
         If True, return ``(q, x)`` only.
     **plant_parameters
-        Handed to `hybridkin.simulation.TrunkPlant`.
+        Arguments of `hybridkin.simulation.TrunkPlant`.
 
     Returns
     -------
     data : :class:`~sklearn.utils.Bunch`
         ``q`` (n_samples, 9), measured chamber lengths [m], three per segment from base to tip;
         ``x`` (n_samples, 3), measured tip position in the motion-capture frame [m]; ``q_target``
-        (n_samples, 9), commanded chamber lengths [m]; ``part`` (n_samples,), 0, 1, 2 where that
-        segment alone moves, 3 where all lengths are random, None for a given `q_target`; ``row``
+        (n_samples, 9), commanded chamber lengths [m]; ``part`` (n_samples,), 0, 1 or 2 if only that
+        segment moves, 3 if all lengths are random, None for a given `q_target`; ``row``
         (n_samples,), row of the sampling protocol; ``groups`` (None); ``failed``, rows that did not
         settle, as (row, q_target, message); ``parameters``, seed, noise, sampling and plant
         parameters; ``units``, ``source``, ``citation``, ``DESCR``.
@@ -146,7 +146,7 @@ def make_trunk(
 def _targets(
     q_target: ArrayLike | None, seed: int, n_segment: int, n_random: int
 ) -> tuple[NDArray, NDArray, dict[str, Any]]:
-    """Return the commanded lengths (N, 9), the part of each row, and what they are made from."""
+    """Return the commanded lengths (N, 9), the part of each row, and the protocol's settings."""
     if q_target is None:
         targets, part = paper_protocol(seed, n_segment=n_segment, n_random=n_random)
         sizes = {"n_segment": int(n_segment), "n_random": int(n_random)}
@@ -156,8 +156,8 @@ def _targets(
     bad = np.flatnonzero(~((targets >= low) & (targets <= high)).all(axis=1))
     if len(bad):
         raise ValueError(
-            f"`q_target` must be chamber lengths of {low} to {high} m, {len(bad)} rows are "
-            f"not, the first row {bad[0]}: {targets[bad[0]]}; clip them or convert to metres."
+            f"`q_target` must be chamber lengths of {low} to {high} m, but {len(bad)} rows are "
+            f"not, first row {bad[0]}: {targets[bad[0]]}; clip them or convert them to metres."
         )
     return targets, np.full(len(targets), OWN, np.int8), {}
 
@@ -165,8 +165,8 @@ def _targets(
 def load_trunk(*, return_X_y: bool = False) -> Any:
     """Return the shipped simulated data of a pneumatic trunk: 2000 rows of the paper's protocol.
 
-    Made by ``make_trunk(random_state=0)``: simulated, 3 x 500 + 500 rows with 1 mm cable noise and
-    0.5 mm motion-capture noise. Loading needs no MuJoCo.
+    They were made by ``make_trunk(random_state=0)``: simulated, 3 x 500 + 500 rows with 1 mm cable
+    noise and 0.5 mm motion-capture noise. Loading does not need MuJoCo.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
     Returns
     -------
     data : :class:`~sklearn.utils.Bunch`
-        As `make_trunk` returns it.
+        As from `make_trunk`.
 
     Examples
     --------
@@ -192,7 +192,7 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
 
 
 def _kept(checkpoint, rows, targets, part, made):
-    """Return what `_measure` does, from a file of the checkpoint where it has a whole one."""
+    """Return the result of `_measure`, from a file of the checkpoint if it has a valid one."""
     if checkpoint is None:
         return _measure(rows, targets, part, made)
     text = json.dumps([rows.tolist(), targets.tolist(), part.tolist(), made], sort_keys=True)
@@ -203,7 +203,7 @@ def _kept(checkpoint, rows, targets, part, made):
         if str(key) == text and np.hstack([q, x, reached]).shape == (len(rows), 21):
             found = zip(json.loads(str(failed)), tried, strict=True)
             return q, x, reached, [(row, target, why) for (row, why), target in found]
-    except (ValueError, LookupError, TypeError):  # absent or damaged: made again
+    except (ValueError, LookupError, TypeError):  # missing or damaged: computed again
         pass
     q, x, reached, failed = _measure(rows, targets, part, made)
     said = json.dumps([[row, why] for row, _, why in failed])
@@ -214,7 +214,7 @@ def _kept(checkpoint, rows, targets, part, made):
 
 
 def _measure(rows, targets, part, made):
-    """Settle a chunk of rows; the noise of a row is seeded by (seed, row) whoever makes it."""
+    """Settle a chunk of rows; the noise of a row depends on (seed, row), not on the process."""
     seed, plant = made["random_state"], TrunkPlant(**made["plant"])
     failed, targets = [], targets.copy()
     q, x = np.full((len(rows), 9), np.nan), np.full((len(rows), 3), np.nan)
@@ -243,12 +243,12 @@ def _plant_parameters(given):
     """Return all arguments of the plant, as plain numbers and lists."""
     merged = {k: v.default for k, v in inspect.signature(TrunkPlant).parameters.items()} | given
     del merged["random_state"]  # every row has its own seed
-    TrunkPlant(**merged)  # complains here, not in a process
+    TrunkPlant(**merged)  # raises errors here, not in a process
     return {name: np.asarray(value).tolist() for name, value in merged.items()}
 
 
 def _bunch(columns, parameters, failed, return_X_y):
-    """Return rows and where they come from; `columns` are q, x, q_target, part and row."""
+    """Return rows with their source; `columns` are q, x, q_target, part and row."""
     if return_X_y:
         return columns["q"], columns["x"]
     own = (columns["part"] == OWN).any()

@@ -1,4 +1,4 @@
-"""How a robot has changed since the fit, from a few new rows: its base and its zeros."""
+"""The change of a robot since the fit, base and actuator zeros, from a few new rows."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from hybridkin.native.library import evaluate
 
 PARAMETERS = ("base", "actuator_zeros")
 _SCALES = 10.0 ** np.arange(-3.0, 0.6, 0.5)  # prior standard deviations, in natural units
-_COMMON = 0.5  # share of the variance of a row that is common to its group
-_ROUNDS, _CHOOSING = 30, 6  # of Gauss-Newton; the first ones choose the scales
+_COMMON = 0.5  # share of the variance of a row that its whole group shares
+_ROUNDS, _CHOOSING = 30, 6  # Gauss-Newton rounds; the first ones also choose the scales
 _SETTLED = 1e-9
-_LARGE = 3.0  # remaining errors over those of the fit
-_MEAN_LENGTH = 1.596  # of a normal vector of three coordinates
-_MOST = 2000  # rows whose errors are computed for that
+_LARGE = 3.0  # ratio of remaining errors to those of the fit that gives a warning
+_MEAN_LENGTH = 1.596  # mean length of a standard normal vector with three coordinates
+_MOST = 2000  # rows whose errors give the noise of a fit without held-out errors
 _SINGULAR = np.linalg.LinAlgError, torch.linalg.LinAlgError  # pyright: ignore
-_LEAST = 0.2  # share of the errors before learning that remain at least
+_LEAST = 0.2  # assumed lower limit of training errors, as a share of the errors before learning
 
 
 def adapted(
@@ -43,25 +43,25 @@ def adapted(
     scale: NDArray,
     parameters: Sequence[str],
 ) -> tuple[HybridModule | AdaptedModel, str | None]:
-    """Return the model after the change that new rows make most probable, and a warning about it.
+    """Return the model after the most probable change, given new rows, and a warning or None.
 
-    The change theta = (turn, way, shift) is in natural units: a turn about the base in radians, a
-    way of the base in reaches of the robot, a shift of an actuator in half its range in the log.
-    It has a normal prior about zero. The three standard deviations are those of the largest
-    evidence, and base and zeros stay as they were unless the evidence for a change is clear.
+    The change theta = (rotation, translation, shift) is in natural units: a rotation about the base
+    in radians, a translation of the base in reaches of the robot, a shift of an actuator zero in
+    half its range in the log. Its prior is normal about zero, with the three standard deviations of
+    largest evidence. Base and zeros do not change unless the evidence for a change is clear.
 
     Parameters
     ----------
     fitted : HybridModule
         The model of the fit.
     rows : Rows
-        New rows; the rows of a group share a part of their errors.
+        New rows. The errors of the rows of a group have a common part.
     noise : float
-        Standard deviation of a coordinate of a tip about the model of the fit [m].
+        Standard deviation of one tip coordinate about the fitted model [m].
     scale : ndarray of shape (n,)
         Half the range of every actuator in the log of the fit [unit of q].
     parameters : sequence of str
-        What may have changed, out of `PARAMETERS`.
+        What may have changed, from `PARAMETERS`.
 
     References
     ----------
@@ -82,7 +82,7 @@ def adapted(
 def _likeliest_change(
     problem: _Problem, groups: NDArray | None, noise: float, parameters: Sequence[str]
 ) -> tuple[NDArray, NDArray]:
-    """Return the most probable change theta, and the residual that it leaves, relative to noise."""
+    """Return the most probable change theta, and the residual after it, relative to the noise."""
     theta = std = np.zeros(6 + len(problem.scale))
     misfit, residual = 1.0, np.zeros(0)
     if "base" in parameters:
@@ -101,18 +101,18 @@ def _likeliest_change(
 
 
 def _misfit(rms: float, noise: float) -> str | None:
-    """Return a warning where errors remain that the fit does not have; `rms` relative to them."""
+    """Return a warning if the errors are far larger than those of the fit; `rms` is the ratio."""
     if rms <= _LARGE:
         return None
     return (
-        f"`y` differs from the adapted model by {1e3 * 3**0.5 * rms * noise:.3g} mm (rms), the fit "
-        f"from held-out rows by {1e3 * 3**0.5 * noise:.3g} mm: the robot has changed in another "
-        "way than `parameters` allow, for example by a payload. Record a new log and `fit`."
+        f"`y` differs from the adapted model by {1e3 * 3**0.5 * rms * noise:.3g} mm (rms); the "
+        f"held-out error of the fit is {1e3 * 3**0.5 * noise:.3g} mm. The robot has changed in a "
+        "way that `parameters` do not cover, for example by a payload. Record a new log and `fit`."
     )
 
 
 def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
-    """Raise where a change cannot be found."""
+    """Raise if `parameters` are not allowed; `in_space`: outputs are tips in space or poses."""
     if isinstance(parameters, str) or not parameters or not {*parameters} <= {*PARAMETERS}:
         raise ValueError(
             f"`parameters` must be one or both of {PARAMETERS} in a list, got {parameters!r}."
@@ -120,14 +120,14 @@ def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
     if "base" in parameters and not in_space:
         raise ValueError(
             f"`parameters` must be ['actuator_zeros'] for this `y`, got {parameters!r}: 'base' "
-            "moves tips of three coordinates, or poses."
+            "needs tips with three coordinates, or poses."
         )
 
 
 def held_out_noise(error: Any, cv_results: dict[str, Any] | None) -> float:
-    """Return the standard deviation of a coordinate of the error on held-out rows [m].
+    """Return the standard deviation of one error coordinate on held-out rows [m].
 
-    NaN where neither the fitted error model nor the scores of candidates give it.
+    NaN if neither the fitted error model nor the scores of candidates give it.
     """
     if cv_results is not None:
         return float(np.min(cv_results["mean_distance"])) / _MEAN_LENGTH
@@ -140,10 +140,10 @@ def held_out_noise(error: Any, cv_results: dict[str, Any] | None) -> float:
 
 
 def training_noise(fitted: FittedHybrid, rows: Rows, output: str) -> float:
-    """Return the standard deviation of a coordinate of the error on training rows [m].
+    """Return the standard deviation of one error coordinate on training rows [m].
 
-    Of an ELMRegressor they are held out, one by one. Other regressors may have learned the rows by
-    heart: their errors count as no less than a share of the errors before learning.
+    For an ELMRegressor these are leave-one-out errors. Other regressors may overfit the rows, so
+    their errors count as at least a share of the errors before learning.
     """
     error, rows = fitted.error_model, rows.take(np.arange(0, len(rows.X), 1 + len(rows.X) // _MOST))
     before = residuals(fitted.mechanical, rows.q, rows.y, output).reshape(rows.tips.shape)
@@ -152,7 +152,7 @@ def training_noise(fitted: FittedHybrid, rows: Rows, output: str) -> float:
         if isinstance(error, ELMRegressor):
             own = rows.counts * error.module_.leverage(rows.q).numpy()
             after /= np.maximum(1.0 - own, 1e-3)[:, None]
-    squares = np.ma.masked_invalid(after**2)  # without those of missing markers
+    squares = np.ma.masked_invalid(after**2)  # without missing markers
     mean_squares = [np.ma.average(squares, axis=0, weights=rows.counts).mean()]
     if error is not None and not isinstance(error, ELMRegressor):
         mean_squares.append(_LEAST**2 * np.nanvar(before, axis=0).mean())
@@ -160,7 +160,7 @@ def training_noise(fitted: FittedHybrid, rows: Rows, output: str) -> float:
 
 
 class _Problem:
-    """New rows, and the model after a change of the robot."""
+    """The new rows, and the model as a function of the change of the robot."""
 
     def __init__(self, fitted: HybridModule, rows: Rows, scale: NDArray) -> None:
         self.fitted, self.q, self.y = fitted, rows.q, torch.from_numpy(rows.tips)
@@ -179,9 +179,9 @@ class _Problem:
         return kind(self.fitted, self.scale * change[6:], motion)
 
     def registered(self, noise: float) -> NDArray:
-        """Return the change of the base alone that fits best, where to start.
+        """Return the best change of the base alone, as a start.
 
-        Arun, Huang & Blostein (1987); the turn stays small about axes of which the rows say little.
+        Arun, Huang & Blostein (1987); the rotation stays small about axes that are not identified.
         """
         x = torch.from_numpy(evaluate(self.fitted, self.q.numpy())[0])
         y, theta = self.y[:, : x.shape[1]].reshape(-1, 3), self.q.new_zeros(6 + len(self.scale))
@@ -197,7 +197,7 @@ class _Problem:
     def linearised(self, theta: NDArray) -> tuple[NDArray, NDArray]:
         """Return the residual (k, m) at a change, and the derivative (k, m, 6 + n) of the model.
 
-        Of poses the errors of orientation are in metres, a radian as the reach of the robot.
+        Orientation errors of poses are in metres: one radian counts as the reach of the robot.
         """
         model = self.model(theta).rows()
         x, J = map(torch.from_numpy, evaluate(model, self.q.numpy(), jacobian=True))
@@ -218,9 +218,9 @@ class _Problem:
 
 
 def _whitened(values: NDArray, groups: NDArray | None) -> NDArray:
-    """Return rows (k, ...) as independent ones: errors of the rows of a group have a common part.
+    """Return rows (k, ...) whitened for errors with a part that is common to their group.
 
-    The mean of a group is known less well by that part, what differs from it better.
+    The common part makes the mean of a group less certain, and differences from it more certain.
     """
     if groups is None:
         return values
@@ -240,8 +240,8 @@ def _likeliest_scales(
 ) -> tuple[NDArray, float]:
     """Return the prior standard deviations (6 + n,) and the misfit of largest evidence.
 
-    A standard deviation of zero stands for no change, a misfit for the variance of what no change
-    explains, over that of the fit. For rows A theta = target of unit variance.
+    The rows are A theta = target with unit variance. A standard deviation of zero means no change.
+    The misfit is the variance that no change explains, relative to that of the fit.
     """
     base, zeros = (name in parameters for name in PARAMETERS)
     scales = _SCALES.tolist()

@@ -1,4 +1,4 @@
-"""A fitted hybrid on a robot that has changed: its base has moved, its actuators have new zeros."""
+"""A fitted hybrid for a robot that has changed: the base has moved, actuators have new zeros."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from hybridkin.hybrid._pose import PoseHybridModule
 class AdaptedModel(ForwardModel):
     """The model x = T f(q + shift) of a fitted hybrid f, with a rigid motion T of its outputs.
 
-    Everything that was learned belongs to the configuration q + shift and to the frame before T.
+    The learned residual is evaluated at q + shift, in the frame before T.
 
     Parameters
     ----------
     fitted : HybridModule
-        f, as it was fitted. Where T is not the identity its outputs are tips or poses in space.
+        f, as it was fitted. If T is not the identity, its outputs are tips or poses in space.
     shift : Tensor of shape (n,)
-        How far the zeros of the actuators have moved [unit of q].
+        Shift of the actuator zeros [unit of q].
     motion : Tensor of shape (4, 4)
-        T, how the base has moved in the measuring frame.
+        T, the motion of the base in the measuring frame.
     """
 
     layout = Layout("adapted_model", {"shift": "n", "motion": "44"}, parts=("fitted",))
@@ -44,17 +44,17 @@ class AdaptedModel(ForwardModel):
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
-        """Return the model of a description, whose arrays must fit its robot."""
+        """Return the model from its description; the arrays must fit the robot."""
         model = super().from_stored(stored, restore)
         try:
             _ = model.mechanical
-        except RuntimeError as error:  # of torch, of other sizes and types
+        except RuntimeError as error:  # torch raises it for wrong sizes and types
             raise ValueError("`shift` and `motion` do not fit the robot") from error
         return model
 
     @property
     def mechanical(self) -> ForwardModel | None:
-        """The mechanical part after the change: a chain where a chain can have such zeros."""
+        """The mechanical model after the change: a chain if chains can have such zeros."""
         f, shift = self.fitted.mechanical, self.shift
         if f is None:
             return None
@@ -67,12 +67,12 @@ class AdaptedModel(ForwardModel):
 
     @property
     def robot(self) -> ForwardModel:
-        """The mechanical part after the change, or the module itself without one."""
+        """The mechanical model after the change, or the module itself without one."""
         return self.mechanical or self
 
     @property
     def tip_model(self) -> ForwardModel:
-        """The model of the tip alone after the change."""
+        """The model of the tip alone, after the change."""
         return self.of(cast(HybridModule, self.fitted.tip_model))
 
     def of(self, fitted: HybridModule) -> Self:
@@ -80,7 +80,7 @@ class AdaptedModel(ForwardModel):
         return type(self)(fitted, self.shift, self.motion)
 
     def rows(self) -> Self:
-        """Return the module whose outputs are the columns of measured y: for tips the same."""
+        """Return the module whose outputs are the columns of measured y; for tips this module."""
         return self.of(self.fitted.rows())
 
     def before(self, q: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,7 +102,7 @@ class AdaptedModel(ForwardModel):
         return x if self.fitted.mechanical is None else self._moved(x, self.motion)
 
     def error_part(self, q: Tensor) -> Tensor:
-        """Return what is added to the mechanical part, shape (..., m) [m]."""
+        """Return the learned part that is added to the mechanical one, shape (..., m) [m]."""
         error = self.fitted.error_part(self._then(q))
         move = self._moved if self.fitted.mechanical is None else self._turned
         return move(error, self.motion)
@@ -120,9 +120,9 @@ class AdaptedModel(ForwardModel):
         return q + self.shift.to(q)
 
     def _turned(self, v: Tensor, motion: Tensor) -> Tensor:
-        """Return vectors (..., 3), or several of them in (..., m), turned as a motion turns."""
+        """Return vectors (..., 3), or several of them in (..., m), rotated by a motion."""
         if v.shape[-1] % 3:
-            return v  # not in space: of such models only the zeros are adapted
+            return v  # not in space: for such models only the zeros are adapted
         return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
 
     def _moved(self, x: Tensor, motion: Tensor) -> Tensor:

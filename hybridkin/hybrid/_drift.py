@@ -1,4 +1,4 @@
-"""A change of the robot since the fit: an affine correction, learned measurement by measurement."""
+"""Drift: a change of the robot since the fit, as an affine correction learned row by row."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.regressor_modules import AffineModule
 
 _ALPHAS = np.append(inf, 10.0 ** np.arange(3.0, -6.1, -0.5))  # penalties to choose from
-# Evidence for a change of a robot: the gain in its logarithm that a part of a change must bring,
-# and the variances of what the change does not explain to choose from, over that of the fit; every
-# doubling must bring a gain of one.
+# Evidence for a change of a robot: the gain in log evidence that each part of a change needs, and
+# the candidates for the variance that no change explains, relative to that of the fit. Each
+# doubling of this variance needs a gain of one.
 SWITCH, MISFITS = 2.0, 2.0 ** np.arange(5)
 
 
 def too_far() -> ValueError:
-    """Return the error for rows of which the models say nothing finite."""
+    """Return the error for rows at which the models are not finite."""
     way = "leave these rows out, or check their unit"
     return ValueError(f"`X` or `y` holds numbers too large for the model; {way}.")
 
 
 class Drift(NamedTuple):
-    """Statistics of the residuals of a fitted model; earlier ones fade.
+    """Statistics of the residuals of a fitted model, in which earlier residuals fade.
 
     The correction B [1, u], ``u = (q - center) / scale``, is the ridge regression of the residuals
-    with penalty `alpha`. It starts at zero and returns to zero where nothing is measured for long.
+    with penalty `alpha`. It starts at zero and returns to zero in directions without new data.
 
     Parameters
     ----------
     center, scale : ndarray of shape (n,)
-        Map of the range of the fit to [-1, 1] [unit of q].
+        Map of the training range to [-1, 1] [unit of q].
     gram : ndarray of shape (n + 1, n + 1)
         Weighted products of [1, u].
     moment : ndarray of shape (n + 1, m)
@@ -51,7 +51,7 @@ class Drift(NamedTuple):
 
     @classmethod
     def of_range(cls, q: Tensor, n_outputs: int) -> Drift:
-        """Return the drift before any measurement, for a fit to rows q (N, n)."""
+        """Return the drift before any measurement, for training rows q (N, n)."""
         center, scale = center_and_scale(q)
         n = len(scale) + 1
         none = np.zeros((n, n)), np.zeros((n, n_outputs)), np.zeros(())
@@ -60,7 +60,7 @@ class Drift(NamedTuple):
     def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.
 
-        Each row multiplies the weight of all before it by `decay`, once for each repetition.
+        Each row multiplies the weights of all earlier rows by `decay`, once per repetition.
         """
         if not np.isfinite(residual).all():
             raise too_far()
@@ -78,13 +78,13 @@ class Drift(NamedTuple):
         return Drift(*self[:2], *(0.0 * part for part in self[2:]))
 
     def likeliest_alpha(self, noise: float) -> float:
-        """Return the penalty of largest evidence, infinite where no correction is as likely.
+        """Return the penalty of largest evidence, infinite if no correction is as likely.
 
         Parameters
         ----------
         noise : float
-            Standard deviation of a coordinate of a residual without a change [m]. NaN: unknown,
-            then the penalty is 1.
+            Standard deviation of one residual coordinate without a change [m]. NaN: unknown, the
+            penalty is then 1.
         """
         if np.isnan(noise):
             return 1.0

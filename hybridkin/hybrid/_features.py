@@ -1,4 +1,4 @@
-"""Features phi(q) of the actuators, linear ones first, and readouts W phi(q) of them."""
+"""Features phi(q) of the actuators, linear ones first, and their readouts W phi(q)."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _BLOCK = 2**18  # numbers in the features of a block of rows, which stay in the 
 
 
 def center_and_scale(q: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the map of the range of rows q (N, n) to [-1, 1]; of constant columns the scale is 1.
+    """Return center and scale that map the range of rows q (N, n) to [-1, 1].
 
-    A column that is constant up to rounding has no range either.
+    Columns that are constant, up to rounding, get the scale 1.
     """
     low, high = q.amin(0), q.amax(0)
     scale = 0.5 * (high - low)
@@ -33,7 +33,7 @@ def center_and_scale(q: Tensor) -> tuple[Tensor, Tensor]:
 class Features(PortableModule):
     """Features phi(q) = [1, u], with u = (q - center) / scale.
 
-    Kinds with more features append them, so that the two parts can be penalised apart.
+    Subclasses append more features. The two parts have separate penalties.
 
     Parameters
     ----------
@@ -50,12 +50,12 @@ class Features(PortableModule):
 
     @classmethod
     def of_range(cls, q: Tensor, *args: Any, **options: Any) -> Self:
-        """Return the features for the range of rows q (N, n); constant columns stay."""
+        """Return the features for the range of rows q (N, n); constant columns get scale 1."""
         return cls(*center_and_scale(q), *args, **options)
 
     @property
     def n_linear(self) -> int:
-        """How many features come first and are linear: the constant, then u."""
+        """Number of linear features, which come first: the constant, then u."""
         return 1 + len(self.center)
 
     def forward(self, q: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ class Features(PortableModule):
         return torch.cat([torch.ones_like(u[..., :1]), u, *self._bent(u)], dim=-1)
 
     def readout(self, q: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Return W phi(q) (..., C) for weights W (C, P), and its slope by q (..., C, n)."""
+        """Return W phi(q) (..., C) for weights W (C, P), and its derivative by q (..., C, n)."""
         u = self._scaled(q)
         linear, bent = weights.tensor_split([self.n_linear], dim=1)
         value = u @ linear[:, 1:].mT + linear[:, 0]
@@ -83,14 +83,14 @@ class Features(PortableModule):
         return ()
 
     def _bent_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Return W phi(u) of the features after the linear ones, and its slope by u."""
+        """Return W phi(u) for the features after the linear ones, and its derivative by u."""
         raise NotImplementedError
 
 
 class QuadraticFeatures(Features):
     """The linear features, then u_i u_j for i < j and (3 u_i^2 - 1) / 2.
 
-    The squares have no mean over the range, so their penalty leaves the constant alone.
+    The squares have zero mean over the range, so their penalty does not act on the constant.
     """
 
     layout = Layout("quadratic_features", {"center": "n", "scale": "n"})
@@ -146,7 +146,7 @@ class HiddenFeatures(Features):
         self.register_buffer("input_bias", input_bias)
 
     def seen_through(self, mean: Tensor, M: Tensor) -> HiddenFeatures:
-        """Return the features whose hidden layer sees ``mean + (q - mean) @ M`` in place of q."""
+        """Return the features whose hidden layer gets ``mean + (q - mean) @ M`` instead of q."""
         layer = self.input_weights, self.input_bias, self.center, self.scale
         W, b = seen_through(*layer, mean, M)
         return HiddenFeatures(self.center, self.scale, W, b, self.activation)
@@ -168,27 +168,27 @@ class HiddenFeatures(Features):
 class PoseFeatures(Features):
     """The linear features, then axes of the segments and moments of loads about the segments.
 
-    What bends a soft robot besides its actuators are mostly loads: its weight and what it carries.
-    A load of direction g at the robot's end turns the frame after segment s with the moment d x g,
-    d being the lever from that frame to the end. Seen in the frame itself, whose axes are a_i, it
-    has the components a_i . (d x g) = g . (a_i x d), and the load the components g . a_i. So the
-    features are, for S segments and with all vectors in the base frame,
+    Besides its actuators, mostly loads bend a soft robot: its own weight and a payload. A load of
+    direction g at the robot's end acts on the frame after segment s with the moment d x g, where d
+    is the lever from that frame to the end. In the axes a_i of this frame, the moment has the
+    components a_i . (d x g) = g . (a_i x d), and the load has the components g . a_i. For S
+    segments, with all vectors in the base frame, the features are
 
-    - the lever from the base to the end: 3 numbers, which stand for the moments at the base;
-    - segment by segment the axes a_i of the frame after it, 9 numbers, and but for the last
+    - the lever from the base to the end, 3 numbers, for the moments at the base;
+    - for each segment the axes a_i of the frame after it, 9 numbers, and except for the last
       segment the moments a_i x d about that frame, 9 numbers; a frame includes the rigid offset.
 
-    These are 18 S - 6 features. Levers are divided by the reach of the chain, so all are numbers
-    without unit and of the order of one. They need no direction of gravity: the weights learn it.
-    The pose of the base changes nothing here. Levers reach to the robot's end also where another
-    point is steered.
+    These are 18 S - 6 features. Levers are divided by the reach of the chain, so all features are
+    unitless and of order one. The direction of gravity is not needed: the weights learn it. The
+    pose of the base has no effect. Levers end at the robot's end, also if the model's tip is
+    another point.
 
     Parameters
     ----------
     center, scale : Tensor of shape (n,)
         Map of the training range to [-1, 1] [unit of q].
     chain : ArcChain
-        The robot; its parameters and buffers are those of the features, too.
+        The robot. The features share its parameters and buffers.
     """
 
     layout = Layout("pose_features", {"center": "n", "scale": "n"}, parts=("chain",))
@@ -209,15 +209,15 @@ class PoseFeatures(Features):
         return (torch.cat([lever, *vectors]).mT,)
 
     def _rows_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        # Virtual work: the weights are forces on vectors. Those of a frame turn as one with every
-        # segment before them; every segment after them moves the end of their lever.
+        # Virtual work: the weights are forces on vectors. Each segment before a frame rotates all
+        # vectors of that frame; each segment after it moves the end of its lever.
         vectors, lever, frames = self._vectors(u)
         moves, spins, slope = frames.moves / self.chain.reach.to(u), frames.spins, frames.slope
         C = len(weights)
         at_base, *forces = weights.split([3, *(len(part) for part in vectors)], dim=1)
         value = at_base @ lever
-        pulls = [at_base[:, :, None]]  # on the end, by the frames before a segment
-        turns = []  # by the frames after a segment
+        pulls = [at_base[:, :, None]]  # forces on the end, from the frames before a segment
+        turns = []  # moments, from the frames after a segment
         for force, part in zip(forces, vectors, strict=True):
             value = value + force @ part
             turning = _turning(force)
@@ -231,7 +231,7 @@ class PoseFeatures(Features):
             own = pulls[k][:, 0, None] * moves[0, :, k]
             for axis in (1, 2):
                 own.addcmul_(pulls[k][:, axis, None], moves[axis, :, k])
-            for axis in (0, 1, 2):  # a length turns nothing
+            for axis in (0, 1, 2):  # a length rotates nothing
                 own[:, 1:].addcmul_(turns[k][:, axis, None], spins[axis, 1:, k])
             work.append(own)
         by_arcs = torch.stack(work[::-1], 2).flatten(1, 2)  # (C, 3 S, N)
@@ -244,8 +244,8 @@ class PoseFeatures(Features):
     def _vectors(self, u: Tensor) -> tuple[list[Tensor], Tensor, Frames]:
         """Return the features of every frame, the lever from the base, and the frames.
 
-        The features are axes and moments (18, N) of every frame, the last without moments (9, N);
-        the lever is (3, N), over the reach.
+        The features are axes and moments (18, N) of every frame, for the last one axes only (9, N).
+        The lever is (3, N), relative to the reach.
         """
         frames = self.chain.frames_and_moves(u * self.scale.to(u) + self.center.to(u))
         reach = self.chain.reach.to(u)
@@ -260,7 +260,7 @@ def _turning(forces: Tensor) -> Tensor:
     """Return the map (3 C, 3 Y) of vectors y to the moments sum y x f of forces f (C, 3 Y)."""
     fx, fy, fz = forces.unflatten(1, (-1, 3)).unbind(2)
     zero = torch.zeros_like(fx)
-    rows = [zero, fz, -fy, -fz, zero, fx, fy, -fx, zero]  # y x f, by the components of y
+    rows = [zero, fz, -fy, -fz, zero, fx, fy, -fx, zero]  # derivative of y x f by y
     return torch.stack(rows, -1).unflatten(-1, (3, 3)).permute(0, 2, 1, 3).reshape(3 * len(fx), -1)
 
 
@@ -270,7 +270,7 @@ class Readout(ForwardModel):
     Parameters
     ----------
     features : Features
-        phi, with its slope.
+        phi, with its derivative.
     weights : Tensor of shape (C, P)
         W [unit of the outputs].
     """
@@ -284,7 +284,7 @@ class Readout(ForwardModel):
         self.n_actuators, self.n_outputs = len(features.center), len(weights)
 
     def up_to(self, chain: ArcChain) -> Readout:
-        """Return the readout of the arcs up to the tip of a chain, from that of all arcs."""
+        """Return the readout for the arcs up to the tip of a chain, from that for all arcs."""
         return Readout(self.features, chain.up_to_tip(self.weights))
 
     def forward(self, q: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""One pure fit of a hybrid: from a specification and measured rows to models and a module."""
+"""The fit of a hybrid as a pure function of a specification and measured rows."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import error_module
 
-_COUNTS = 1e12  # weights farther apart count in no sum of float64
+_COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
 
 
 class Rows(NamedTuple):
-    """Measured rows as an estimator gets them."""
+    """Measured rows in the form that an estimator gets."""
 
     X: NDArray  # (N, n) actuator vectors, float64 or float32
     y: NDArray  # (N, m) or (N,) [m]
-    weights: NDArray | None = None  # (N,), how many times each row counts
+    weights: NDArray | None = None  # (N,), number of times each row counts
     groups: NDArray | None = None  # (N,), motion of every row
 
     @property
@@ -64,7 +64,7 @@ class Rows(NamedTuple):
 
     @property
     def counts(self) -> NDArray:
-        """How many times each row counts, (N,)."""
+        """Number of times each row counts, (N,)."""
         return np.ones(len(self.X)) if self.weights is None else self.weights
 
     def take(self, rows: NDArray) -> Rows:
@@ -72,21 +72,21 @@ class Rows(NamedTuple):
         return Rows(*(None if part is None else part[rows] for part in self))  # pyright: ignore
 
     def marker(self, k: int) -> Rows:
-        """Return the rows in which marker k was measured, with its tips alone."""
+        """Return the rows in which marker k was measured, with only its positions as tips."""
         tips = self.tips[:, 3 * k : 3 * k + 3]
         measured = np.flatnonzero(~np.isnan(tips[:, 0]))
         if len(measured) < 2:
-            raise ValueError(f"`y` must hold marker {k} in at least 2 rows; leave that marker out.")
+            raise ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")
         return self._replace(y=tips).take(measured)
 
     def distinct(self, runs: bool = False) -> tuple[Rows, NDArray]:
-        """Return the different rows, and the place of every row, see `distinct_rows`."""
+        """Return the different rows, and the place of every row in them, see `distinct_rows`."""
         first, weights, place = distinct_rows(self.X, self.y, self.weights, self.groups, runs)
         return self.take(first)._replace(weights=weights), place
 
 
 class NamedFeatures(NamedTuple):
-    """An error model by the name of its features, with its penalties where they are chosen."""
+    """An error model by the name of its features, with its penalties if they are chosen."""
 
     kind: str  # "linear", "quadratic" or "pose"
     alphas: Pair | None = None
@@ -94,17 +94,17 @@ class NamedFeatures(NamedTuple):
 
 
 class Part(NamedTuple):
-    """One error model of a hybrid, where it acts, and its share."""
+    """One error model of a hybrid, its coupling and its weight."""
 
     weight: float
     coupling: str  # "parallel" or "serial"
-    # "drop" and "kernel" are names. A fitted readout is used as it is; of several markers outside
-    # the robot there may be one error model for each.
+    # Names are "drop" and "kernel". A fitted readout is used unchanged. With several markers and
+    # parallel coupling, a tuple holds one error model per marker.
     error_model: NamedFeatures | BaseEstimator | str | ReadoutFit | tuple[Any, ...]
 
 
 class Blend(NamedTuple):
-    """Several fitted error models, whose hybrids are averaged."""
+    """Several fitted error models; the result is the weighted mean of their hybrids."""
 
     weights: tuple[float, ...]
     error_models: tuple[Any, ...]
@@ -112,22 +112,22 @@ class Blend(NamedTuple):
 
 @dataclass(frozen=True)
 class Spec:
-    """What to fit: the settings of a HybridForwardModel, resolved."""
+    """Specification of a fit: the resolved settings of a HybridForwardModel."""
 
     mechanical: ForwardModel | None
     parts: tuple[Part, ...]  # empty: not chosen yet, see `select`
-    calibrate: tuple[str, ...] | str = ()  # geometry that is still to be calibrated, or "auto"
+    calibrate: tuple[str, ...] | str = ()  # geometry to calibrate, or "auto"
     guard: str | None = "leverage"
     output: str = "position"
     random_state: int | np.random.RandomState | None = None
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
-    left_out: bool = True  # whether more than predictions is wanted, as residuals of rows left out
+    left_out: bool = True  # whether held-out residuals are computed as well
 
 
 class FittedHybrid(NamedTuple):
-    """What a fit found; nothing was issued, its warnings are `messages`."""
+    """Result of a fit; its warnings are in `messages` and were not issued."""
 
     mechanical: ForwardModel | None
     calibration: CalibrationResult | None
@@ -142,9 +142,9 @@ class FittedHybrid(NamedTuple):
 
 
 def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
-    """Return the hybrid: calibrate the mechanical model, fit every error model to its residuals.
+    """Return the hybrid: the calibrated mechanical model and error models of its residuals.
 
-    A pure function: it changes none of its arguments and issues no warning.
+    A pure function: it does not change its arguments and issues no warning.
     """
     spec = calibrated(spec, rows, rows.groups)
     distinct, place = rows.distinct()
@@ -169,9 +169,9 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
 
 
 def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], rows: Rows) -> FittedHybrid:
-    """Return the hybrid of several markers, each on the rows in which it was measured.
+    """Return the hybrid of several markers, each fitted to the rows in which it was measured.
 
-    What acts inside the robot is learned once, from all of them; what acts outside it one by one.
+    A serial error model is learned once from all markers, a parallel one for each marker.
     """
     joint: list[Part] = []
     for part in spec.parts:
@@ -192,16 +192,16 @@ def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], rows: Rows) -> Fit
 
 
 def _of_marker(error_model: Any, k: int, tip: ArcChain | None = None) -> Any:
-    """Return the error model of marker k; of one inside the robot what its chain sees of it."""
+    """Return the error model of marker k; a serial one is cut to the arcs of the marker's chain."""
     if isinstance(error_model, ReadoutFit) and tip is not None:
         return error_model._replace(readout=error_model.readout.up_to(tip))
     return error_model[k] if type(error_model) is tuple else error_model
 
 
 def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
-    """Return a warning where the different rows are few to learn from; raise below one or two.
+    """Return a warning for too few different rows; raise an error below the least number.
 
-    From 20 held-out errors on, their rms is known to a sixth.
+    The rms of 20 held-out errors has a relative standard error of about one sixth.
     """
     n_rows, n = rows.X.shape
     learned = not spec.parts or spec.parts[0].error_model != "drop"
@@ -214,22 +214,23 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
     low, high = rows.counts.min(), rows.counts.max()
     if not (low > high / _COUNTS and 1.0 / _COUNTS < high < _COUNTS):
         raise ValueError(
-            f"`sample_weight` must lie within a factor of {_COUNTS:g} of each other and of 1 where "
-            f"rows count at all, got {low:g} to {high:g}; 0 leaves a row out."
+            f"`sample_weight` must lie within a factor of {_COUNTS:g} of the other weights and "
+            f"of 1, or be 0 (row not used), got {low:g} to {high:g}; scale the weights."
         )
     if not learned or n_rows >= max(20, 2 * (n + 1)):
         return []
     return [
-        f"`X` holds {n_rows} different rows of {n} actuators, few to learn from: an affine "
+        f"`X` holds {n_rows} different rows of {n} actuators, too few to rely on: an affine "
         f"function alone has {n + 1} coefficients for each output, and held-out errors of so few "
-        f"rows say little about new ones. Record at least {10 * (n + 1)}, in several motions."
+        f"rows do not predict the error on new ones. Record at least {10 * (n + 1)}, in several "
+        "motions."
     ]
 
 
 def with_geometry_chosen(spec: Spec, rows: Rows, geometry: GeometryChoice | None = None) -> Spec:
-    """Return the specification with what to calibrate chosen on the rows, or before.
+    """Return the specification with the parameters to calibrate, chosen on the rows or given.
 
-    Of a list the choice is between a plain chain and elastic tendons, for error_model="auto".
+    For a list and error_model="auto", the choice is between a plain chain and elastic tendons.
     """
     if not spec.calibrate or (spec.parts and spec.calibrate != "auto"):
         return spec
@@ -253,7 +254,7 @@ def with_geometry_chosen(spec: Spec, rows: Rows, geometry: GeometryChoice | None
 
 
 def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
-    """Return the specification with the calibrated mechanical model; `groups` for its `cv_rmse`."""
+    """Return the specification with the model calibrated; its `cv_rmse` holds out `groups`."""
     if not spec.calibrate:
         return spec
     if spec.calibrate == "auto":
@@ -279,12 +280,12 @@ def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
 
 
 def _positions(spec: Spec, rows: Rows) -> Tensor:
-    """Return the tip positions (N, 3) of rows that may be poses [m]."""
+    """Return the tip positions (N, 3) of rows, which may be poses [m]."""
     return torch.from_numpy(rows.tips[:, :3] if spec.output == "pose" else rows.tips)
 
 
 def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str) -> NDArray:
-    """Return measured minus mechanical model, in the rows that an error model learns [m]."""
+    """Return the residual, measured minus mechanical model, in the form that is learned [m]."""
     if mechanical is None:
         return y
     if output == "pose":
@@ -319,13 +320,13 @@ def _fit_part(
         if not isinstance(model, (ELMRegressor, ELMRegressorCV)) or M is None:
             fitted = _fit_regressor(model, rows, errors, place)
             module = error_module(fitted, q)
-        else:  # or random weights would give it a slope where the rows say nothing
+        else:  # else random weights give it a slope in directions without data
             seen = (mean + (errors.X - mean) @ M).astype(errors.X.dtype)
             fitted = _fit_regressor(model, rows, errors._replace(X=seen), place)
             module = cast(ELM, fitted.module_).seen_through(*map(torch.from_numpy, (mean, M)))
         correction = TipCorrection(module)
     if mechanical is None:
-        return fitted, correction  # without a mechanical model there is nothing to fall back on
+        return fitted, correction  # no guard: no mechanical model remains where eps fades out
     alone = HybridModule(mechanical, [correction], q.new_ones(1))
     with torch.no_grad():
         own = correction.module if isinstance(correction, TipCorrection) else None
@@ -335,10 +336,10 @@ def _fit_part(
 
 
 def _fit_regressor(model: Any, given_rows: Rows, rows: Rows, place: NDArray) -> Any:
-    """Return the regressor fitted to the errors of the different rows."""
+    """Return the regressor fitted to the residuals of the different rows."""
     if isinstance(model, str):  # "kernel"
         model = tuned_kernel(rows.X, rows.y, rows.counts, rows.groups)
-    elif not isinstance(model, (ELMRegressor, ELMRegressorCV)):  # gets the rows as they were given
+    elif not isinstance(model, (ELMRegressor, ELMRegressorCV)):  # is fitted to the given rows
         kept = np.flatnonzero(given_rows.counts)
         rows = rows.take(place[kept])._replace(weights=given_rows.take(kept).weights)
     given = {} if rows.weights is None else {"sample_weight": rows.weights}
@@ -357,8 +358,7 @@ def _fit_features(
 ) -> ReadoutFit:
     """Return the readout of named features, or of the hidden layer of an ELM.
 
-    An ELMRegressor brings its `alpha` as the penalty; of an ELMRegressorCV the penalties are
-    chosen.
+    The `alpha` of an ELMRegressor is the penalty; for an ELMRegressorCV the penalties are chosen.
     """
     model = part.error_model
     if isinstance(model, NamedFeatures):
@@ -393,8 +393,8 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
         params = ELMRegressor(n_hidden, activation=model.activation, random_state=seed)
     elif np.ndim(model.alpha):
         raise ValueError(
-            "`alpha` of the error model must be one number where it acts inside the robot, got "
-            f"{model.alpha!r}: no output of its own belongs to a coordinate there."
+            "`alpha` of the error model must be one number with coupling='serial', got "
+            f"{model.alpha!r}: coordinates inside the robot do not correspond to single outputs."
         )
     else:
         alphas = float(model.alpha), float(model.alpha)
@@ -407,14 +407,14 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
 
 
 def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:
-    """Return measured tips (N, m), where one is missing the chain's, and the chain's [m]."""
+    """Return tips (N, m), measured (if missing: of the chain), and those of the chain [m]."""
     found = chain(rows.q).detach()
     tips = torch.from_numpy(rows.tips[:, : chain.n_outputs])
     return torch.where(tips.isnan(), found, tips), found
 
 
 def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
-    """Return the warnings of a fit: of its calibration, or of the rows of an uncalibrated chain."""
+    """Return the warnings of a fit: of its calibration, or of rows for an uncalibrated chain."""
     chain = fitted.mechanical
     if fitted.calibration is not None or not isinstance(chain, Chain):
         return fitted.messages

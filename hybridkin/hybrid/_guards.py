@@ -1,4 +1,4 @@
-"""Where a learned correction is trusted: smooth weights from a leverage or from a box."""
+"""Guards: smooth weights, from a leverage or a box, that fade a learned correction out."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.network import LeverageModule
 
 GUARDS = ("leverage", "box", None)
-_STILL = 1e-3  # of the largest spread: the log does not move in such a direction
-_AS_IF = 0.1  # of the range: the spread that is assumed in such a direction
-_ROWS = 128  # that stand for the training rows
-_BLOCK = 4096  # training rows whose distances are computed at a time
-_TESTED = 0.98  # share of these rows, whose distances from other groups count as tested
-_STEP = 0.2  # the least distance to be tested, where the range of an actuator is 2
+_STILL = 1e-3  # relative to the largest spread: below it, the log does not move in a direction
+_AS_IF = 0.1  # relative to the range: the spread that is assumed in such a direction
+_ROWS = 128  # number of rows that represent the training rows
+_BLOCK = 4096  # training rows whose distances are computed at once
+_TESTED = 0.98  # share of these rows whose distances from other groups count as tested
+_STEP = 0.2  # least tested distance; the range of an actuator is 2
 
 
 class Guard(PortableModule):
-    """Trust in a correction: a weight g(q), and a length that no correction exceeds by far.
+    """Limits of a correction: a weight g(q), and a largest length.
 
-    The weight is 1 where `domain_distance` is at most `FULL`, and fades outside. Weight and
-    shortening are twice continuously differentiable, so the full Jacobian is continuous.
+    The weight is 1 where `domain_distance` is at most `FULL`, and decreases to 0 outside. Weight
+    and shortening are twice continuously differentiable, so the full Jacobian is continuous.
 
     Parameters
     ----------
     largest : Tensor of shape ()
         The longest correction of a training row [m]. Longer ones are shortened to less than
-        `MOST` times this: nowhere is the hybrid farther than that from the mechanical model.
+        `MOST` times this length, which limits the distance from the mechanical model everywhere.
     """
 
     MOST = 1.5
@@ -44,7 +44,7 @@ class Guard(PortableModule):
         self.register_buffer("largest", largest)
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return how far q is from the training rows, at most 1 among them, shape (...)."""
+        """Return the distance of q from the training rows, at most 1 in the domain, (...)."""
         raise NotImplementedError
 
     def forward(self, q: Tensor) -> Tensor:
@@ -57,36 +57,36 @@ class Guard(PortableModule):
         return reverse_jacobian(self, q)
 
     def shortened(self, correction: Tensor) -> Tensor:
-        """Return corrections (..., m), those longer than the largest shortened [m]."""
+        """Return corrections (..., m); those longer than `largest` are shortened [m]."""
         relative = self._relative(correction)
         return correction * (self._kept(relative)[0] / relative)
 
     def shortened_with_jacobian(self, correction: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `shortened` of corrections (N, m), and the Jacobians (N, m, n) of the result."""
+        """Return the `shortened` corrections (N, m), and their Jacobians (N, m, n)."""
         long = self.is_long(correction).nonzero()[:, 0]
         if not len(long):
             return correction, J
         own, J_own = correction[long], J[long]
         relative = self._relative(own)
         kept, slope = self._kept(relative)
-        # Along the correction its length changes by the slope, across it by the factor.
+        # Derivative along the correction: the slope; across it: the factor.
         factor, along = kept / relative, (own / own.norm(dim=-1, keepdim=True))[..., None]
         change = (slope - factor)[..., None] * along @ (along.mT @ J_own)
         J_own = factor[..., None] * J_own + change
         return correction.index_copy(0, long, factor * own), J.index_copy(0, long, J_own)
 
     def is_long(self, correction: Tensor) -> Tensor:
-        """Return which corrections (..., m) are longer than the largest, shape (...)."""
+        """Return which corrections (..., m) are longer than `largest`, shape (...)."""
         return self._relative(correction)[..., 0] > 1.0
 
     def _relative(self, correction: Tensor) -> Tensor:
-        # Lengths up to the largest count as one: the root stays smooth, and nothing changes.
+        # Lengths up to `largest` count as one. They are not shortened, and the root stays smooth.
         unit = self.largest.to(correction).clamp(min=torch.finfo(correction.dtype).tiny ** 0.25)
         squares = (correction / unit).square().sum(-1, keepdim=True)
         return squares.clamp(min=1.0).sqrt()
 
     def _kept(self, relative: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the length kept of a relative length of at least 1, and its derivative."""
+        """Return the shortened value of a relative length of at least 1, and its derivative."""
         margin = self.MOST - 1.0
         bent = torch.tanh((relative - 1.0) / margin)
         return 1.0 + margin * bent, 1.0 - bent * bent
@@ -95,14 +95,14 @@ class Guard(PortableModule):
 class LeverageGuard(Guard):
     """Distance from the training rows by the leverage phi^T (G + lambda 1)^-1 phi of a model.
 
-    Errors outside the domain are not known, but up to `FULL` times its limit a correction still
-    removes more error than it adds: the radius ends at the domain, the correction later.
+    The domain ends at distance 1. Errors outside it are not known, but up to distance `FULL` a
+    correction still removes more error than it adds, so it fades out only from there.
 
     Parameters
     ----------
     model : LeverageModule
-        Gives the leverage: the error model itself where it is a network at the tip, else a
-        `QuadraticLeverage`, which does not know the features of the error model.
+        Gives the leverage: the error model itself if it is a network at the tip, else a
+        `QuadraticLeverage`, which does not depend on the features of the error model.
     limit : Tensor of shape ()
         The leverage at distance 1.
     largest : Tensor of shape ()
@@ -123,18 +123,18 @@ class LeverageGuard(Guard):
     ) -> LeverageGuard:
         """Return the guard whose limit is the largest leave-one-out leverage of the rows q (N, n).
 
-        That is h / (1 - c h), with h the leverage of a row that took part in the fit c times.
+        That is h / (1 - c h), with h the leverage of a row that counts c times in the fit.
         """
         h = in_blocks(lambda rows: (model.leverage(rows)[:, None],), q)[0][:, 0]
         return cls(model, (h / (1.0 - counts * h).clamp(min=1e-9)).max(), largest)
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return the leverage of q over the limit, shape (...)."""
+        """Return the leverage of q divided by the limit, shape (...)."""
         return self.model.leverage(q) / self.limit.to(q)
 
 
 class BoxGuard(Guard):
-    """Distance from the training rows by how far q is outside a box, in tenths of its width.
+    """Distance from the training rows: how far q is outside a box, in tenths of its width.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ class BoxGuard(Guard):
 
 
 class QuadraticLeverage(LeverageModule):
-    """Leverage in linear and squared inputs, for error models that have none of their own.
+    """Leverage in linear and squared inputs, for error models without their own leverage.
 
     Parameters
     ----------
@@ -212,13 +212,13 @@ def fit_guard(
     kind : {"leverage", "box", None}
         The guard.
     corrections : Tensor of shape (N, m)
-        What the error model gives for these rows [m].
+        Output of the error model for these rows [m].
     model : nn.Module or None
-        The error model, which may have a leverage of its own.
+        The error model, which may have its own leverage.
     q : Tensor of shape (N, n)
         The training rows.
     counts : ndarray of shape (N,)
-        How many times each counts.
+        Number of times each row counts.
     """
     if kind is None:
         return None
@@ -228,26 +228,26 @@ def fit_guard(
     times = torch.from_numpy(counts)
     with torch.no_grad():
         if not isinstance(model, LeverageModule) or _unexcited(q).numel():
-            # Every configuration counts once, however often the log returns to it.
+            # Every configuration counts once, even if the log repeats it.
             model, times = QuadraticLeverage.fit(torch.unique(q, dim=0)), torch.ones_like(times)
         return LeverageGuard.fit(model, q, largest, times)
 
 
 class GroupDistance(PortableModule):
-    """Distance from the training rows, at most 1 as far as held-out groups have tested it.
+    """Distance from the training rows, at most 1 in the part that held-out groups have tested.
 
-    Errors on held-out groups hold for rows that are no farther from the training rows than these
-    are from the rows of other groups. A leverage does not know this: single actuators span all of
-    its features [1, u, u^2], but no row shows how their motions act together.
+    Held-out errors are valid for rows that are no farther from the training rows than these are
+    from the rows of other groups. A leverage cannot check this: motions of single actuators excite
+    all of its features [1, u, u^2], but show nothing about combined motions.
 
     Parameters
     ----------
     rows : Tensor of shape (R, n)
-        Training rows that stand for all of them.
+        Training rows that represent all of them.
     axes : Tensor of shape (n, k)
         Directions in which the rows move, per range of each actuator.
     farthest : Tensor of shape ()
-        How far all but a few training rows are from the rows of other groups, along these axes.
+        Largest distance of a training row from the rows of other groups, except for a few rows.
     """
 
     layout = Layout("group_distance", {"rows": "rn", "axes": "nk", "farthest": ""})
@@ -260,15 +260,15 @@ class GroupDistance(PortableModule):
 
     @classmethod
     def fit(cls, q: Tensor, groups: NDArray) -> GroupDistance | None:
-        """Return the distance of training rows q (N, n) in groups (N,), None of a single one."""
+        """Return the distance for training rows q (N, n) in groups (N,), None for one group."""
         of = torch.from_numpy(np.unique(groups, return_inverse=True)[1])
         if not of.any():
             return None
         axes = _directions(q)[0] / center_and_scale(q)[1][:, None]
         y = (q - q.mean(0)) @ axes
-        # Each row that is added is the farthest from those before.
+        # Each added row is the farthest from the rows before.
         picked, gap = [y.square().sum(1).argmax()], y.new_full((len(y),), torch.inf)
-        step = torch.empty_like(y)  # a new one for each would cost more than the sums
+        step = torch.empty_like(y)  # reused: allocating it each time costs more than the sums
         while True:
             torch.sub(y, y[picked[-1]], out=step)
             gap = torch.minimum(gap, step.square_().sum(1))
@@ -280,12 +280,12 @@ class GroupDistance(PortableModule):
         for some, theirs in zip(y.split(_BLOCK), of.split(_BLOCK), strict=True):
             far = torch.cdist(y[rows], some).masked_fill(own == theirs, torch.inf)
             apart = torch.minimum(apart, far.amin(1))
-        # All training rows are within a gap of the picked ones, and so are their distances.
-        # Where every motion was repeated, the step keeps the domain from being empty.
+        # All training rows are within the gap of a picked row, so distances differ by at most it.
+        # If every motion was repeated, the clamp keeps the domain from being empty.
         return cls(q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP))
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        """Return the squared distance of rows q (N, n) from the nearest row, relative, (N,)."""
+        """Return the squared relative distance of rows q (N, n) from the nearest row, (N,)."""
         rows, axes = self.rows.to(q), self.axes.to(q) / self.farthest.to(q)
         with torch.no_grad():
             nearest = torch.cdist(q @ axes, rows @ axes).argmin(1)
@@ -295,9 +295,9 @@ class GroupDistance(PortableModule):
 def _unexcited(q: Tensor) -> Tensor:
     """Return the directions (n, k) of q, over its range, in which rows (N, n) do not move.
 
-    Balanced tendons never change the common pull of a segment, for example. The data say nothing
-    about it, but the mechanical model does. If every small step along it left the domain, inverse
-    kinematics could use the fading of the error model as a way to move the tip.
+    For example, balanced tendons never change the common pull of a segment. The log does not
+    identify its effect, but the mechanical model predicts one. If small steps in this direction
+    left the domain, inverse kinematics could move the tip by fading the error model out.
     """
     return _directions(q)[1]
 

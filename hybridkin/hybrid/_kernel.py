@@ -1,4 +1,4 @@
-"""Folds by the size of a log, and kernel ridge regression with parameters tuned on them."""
+"""Cross-validation folds, and kernel ridge regression with parameters tuned on them."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from sklearn.metrics.pairwise import euclidean_distances
 from hybridkin._core.turns import TURNS
 from hybridkin.calibration.measured import distance, folds
 
-_MOST = 10_000  # rows, for which the matrices take 3 GB
+_MOST = 10_000  # rows; the matrices then take 3 GB
 _FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
-_GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # over the mean variance of the inputs
+_GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # divided by the mean variance of the inputs
 
 
 def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
-    """Return training and held-out rows of 5 folds of groups, or of rows; 10 of a small log."""
+    """Return training and held-out rows of 5 folds of groups, or rows; 10 folds for small logs."""
     return folds(X, groups, _FOLDS if len(X) >= _FEW else _FOLDS_OF_FEW, shuffle=True)
 
 
 def tuned_kernel(
     X: NDArray, error: NDArray, weights: NDArray, groups: NDArray | None
 ) -> KernelRidge:
-    """Return Gaussian kernel ridge with the width and the penalty of least held-out distance.
+    """Return Gaussian kernel ridge with the width and the penalty of least held-out error.
 
-    The search starts on a coarse grid and walks to the best neighbour until none is better.
+    The search starts on a coarse grid and moves to the best neighbour until none is better.
     """
     if len(X) > _MOST:
         raise ValueError(
             f"`X` must hold at most {_MOST} different rows with error_model='kernel', whose memory "
-            f"grows with the square of their number, got {len(X)}; leave rows out, or use "
+            f"grows with the square of their number, got {len(X)}; use fewer rows, or "
             "error_model=ELMRegressorCV()."
         )
     splits = folds_of(X, groups)

@@ -1,4 +1,4 @@
-"""Ridge regression on features times Jacobians: optimum, leave-out residuals, penalties."""
+"""Ridge regression on features times Jacobians: optimum, held-out residuals, penalties."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Pair = tuple[float, float]
 _GRID = (inf, 4.0, 0.0, -4.0)  # penalties to start with, in half decades
 _LOW, _HIGH = (-6.0, -12.0), 8.0
 _EQUAL = 1e-3
-_RANK = 1e-8  # of the features' sum of squares
-_FOLDS = 10  # groups at most whose Gram matrices are kept even where they hold few rows
-_BLOCK = 2**22  # numbers of products that are kept: 32 MB
+_RANK = 1e-8  # least share of the features' sum of squares for an axis to be kept
+_FOLDS = 10  # up to this number of groups, Gram matrices are kept even for groups of few rows
+_BLOCK = 2**22  # numbers in the products that are kept: 32 MB
 
 
 class Products:
     """The products phi_k phi_l, l <= k, of the features of every row.
 
-    Sums over rows and over such products are one matrix product with these. Those of few rows are
-    kept; of more rows they are computed at every use, block by block.
+    A sum over rows of these products is one matrix product. For few rows the products are kept;
+    for many rows they are computed at every use, block by block.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Products:
         self._kept = [*self._blocks()] if len(phi) <= self._rows else None
 
     def __iter__(self) -> Iterator[tuple[slice, NDArray]]:
-        """Yield some rows, and their products (K (K + 1) / 2, n)."""
+        """Yield blocks of n rows, and their products (K (K + 1) / 2, n)."""
         return self._blocks() if self._kept is None else iter(self._kept)
 
     def _blocks(self) -> Iterator[tuple[slice, NDArray]]:
@@ -56,7 +56,7 @@ class Products:
 class Linearised:
     """The problem sum_n |y_n - J_n W phi_n|^2 + sum_ck penalty_k W_ck^2.
 
-    A feature whose penalty is infinite takes no part.
+    Features with an infinite penalty are not used.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Linearised:
     y : Tensor of shape (N, m)
         Targets.
     products : Products, optional
-        Those of the features. Default: they are computed.
+        Products of the features. Default: they are computed.
     """
 
     def __init__(self, J: Tensor, phi: Tensor, y: Tensor, products: Products | None = None) -> None:
@@ -78,9 +78,9 @@ class Linearised:
         self._apart: dict[int, Tensor] = {}  # the Gram matrices of large groups
 
     def factor(self, penalty: Tensor, less: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return which features take part (K,), and the Cholesky factor (D, D) of their system.
+        """Return which features are used (K,), and the Cholesky factor (D, D) of their system.
 
-        `less` is the Gram matrix of rows that do not count.
+        `less` is the Gram matrix of rows to subtract.
         """
         kept, gram = torch.isfinite(penalty), self.gram if less is None else self.gram - less
         system = gram[:, kept][..., kept].flatten(2).flatten(0, 1)
@@ -92,7 +92,7 @@ class Linearised:
         return self.y - (self.J @ (self.phi @ readout.mT)[..., None])[..., 0]
 
     def left_out(self, penalty: Tensor, members: list[Tensor] | None = None) -> Tensor:
-        """Return the residual (N, m) of every row from a fit without it, or without its group.
+        """Return the residual (N, m) of every row from a fit without that row, or its group.
 
         Exact: (1 - H_SS)^-1 r_S, with H the hat matrix and S the rows of a group. Groups with
         more rows than there are weights are subtracted from the system instead.
@@ -102,7 +102,7 @@ class Linearised:
         penalty : Tensor of shape (K,)
             Penalty of every feature.
         members : list of Tensor, optional
-            Rows of every group, the same ones at every call. None: every row by itself.
+            Rows of every group, the same at every call. None: single rows.
         """
         kept, L = self.factor(penalty)
         own = self.residual(solve_kept(self.moment, kept, L))
@@ -155,7 +155,7 @@ def _pairs(n: Any) -> Any:
 
 
 def _places(n: int) -> NDArray:
-    """Return where the pairs of n things (n, n) stand among those in order of the larger one."""
+    """Return the places (n, n) of the pairs of n items in the list ordered by the larger item."""
     i, j = np.indices((n, n))
     return _pairs(np.maximum(i, j)) + np.minimum(i, j)
 
@@ -166,7 +166,7 @@ def moment(J: Tensor, y: Tensor, phi: Tensor) -> Tensor:
 
 
 def solve_kept(right: Tensor, kept: Tensor, L: Tensor) -> Tensor:
-    """Return the solution (C, K) for a right-hand side (C, K), zero for features left out."""
+    """Return the solution (C, K) for a right-hand side (C, K), zero for unused features."""
     solution = torch.zeros_like(right)
     found = torch.cholesky_solve(right[:, kept].reshape(-1, 1), L)
     solution[:, kept] = found.reshape(len(right), -1)
@@ -174,7 +174,7 @@ def solve_kept(right: Tensor, kept: Tensor, L: Tensor) -> Tensor:
 
 
 def design(J: Tensor, phi: Tensor) -> Tensor:
-    """Return the rows (..., m, C P) that take all of W to J W phi."""
+    """Return the matrix (..., m, C P) that maps the entries of W to J W phi."""
     return (J[..., None] * phi[..., None, None, :]).flatten(-2)
 
 
@@ -186,11 +186,11 @@ def members_of(groups: ArrayLike) -> list[Tensor]:
 
 
 def basis(phi: Tensor, n_linear: int, most: int) -> Tensor:
-    """Return the basis (P, K) of features (N, P): the linear ones, and what the others add.
+    """Return the basis (P, K) of features (N, P): linear ones, then the rest of the others.
 
-    What the first `n_linear` features explain of the others over the rows is taken off them, so
-    that their penalty does not touch it. The rest is turned to its principal axes, which leaves a
-    penalty on it as it is; axes without rows to speak of are dropped, and the weakest of too many.
+    The part of the other features that the first `n_linear` explain over the rows is subtracted,
+    so that their penalty does not act on it. The rest is rotated to its principal axes, which does
+    not change the penalty. Axes with almost no data are dropped, and the weakest above `most`.
     """
     linear, bent = phi.tensor_split([n_linear], dim=1)
     explained = torch.linalg.pinv(linear, rtol=1e-6) @ bent
@@ -204,16 +204,16 @@ def basis(phi: Tensor, n_linear: int, most: int) -> Tensor:
 def choose(
     score: Callable[[Pair], float], start: Pair | None = None
 ) -> tuple[Pair, dict[Pair, float]]:
-    """Return the pair of penalties with the least score, and the scores of all that were tried.
+    """Return the pair of penalties with the least score, and the scores of all tried pairs.
 
-    Of those that are as good but for a thousandth it is the largest, which conditions best.
+    Of pairs whose scores differ by less than a thousandth, the largest is best conditioned.
 
     Parameters
     ----------
     score : callable
-        The score of a pair; a penalty may be infinite.
+        Score of a pair; a penalty may be infinite.
     start : tuple of two floats, optional
-        Where to look, besides at no correction. Default: everywhere.
+        Start of the search, besides no correction. Default: a coarse grid.
     """
     scores: dict[Pair, float] = {}  # by half decades
 
@@ -251,7 +251,7 @@ def _penalties(half_decades: Pair) -> Pair:
 def quasi_newton(
     slope: Tensor, pairs: list[tuple[Tensor, Tensor]], factor: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """Return the inverse Hessian of L-BFGS times a slope, from changes of readout and slope."""
+    """Return the L-BFGS inverse Hessian times a slope, from changes of readout and slope."""
     shares = []
     for moved, turned in reversed(pairs):
         shares.append((moved * slope).sum() / (moved * turned).sum())

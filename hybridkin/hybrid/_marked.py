@@ -18,7 +18,7 @@ from hybridkin.learning.regressor_modules import AffineModule
 class MarkedHybridModule(HybridModule):
     """The hybrids of all markers of a chain as one torch module q (..., n) -> x (..., 3 K).
 
-    A row is in the domain where it is in those of all markers. The error weight is the least one.
+    A row is in the domain if it is in the domains of all markers. The error weight is the least.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class MarkedHybridModule(HybridModule):
         return cast(HybridModule, self.tips[-1])
 
     def with_drift(self, drift: AffineModule | None) -> Self:
-        """Return the same model with another drift; this one stays as it is."""
+        """Return the same model with another drift; this model does not change."""
         moved = []
         for k, tip in enumerate(self.tips):
             rows = slice(3 * k, 3 * k + 3)
@@ -49,7 +49,7 @@ class MarkedHybridModule(HybridModule):
         return type(self)(self.mechanical, moved)
 
     def _each(self, name: str, *given: object) -> list:
-        """Return what a method of the module of every marker gives."""
+        """Return the result of a method for the module of every marker."""
         return [getattr(tip, name)(*given) for tip in self.tips]
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:

@@ -20,7 +20,7 @@ from hybridkin.native.plan import ROUNDING
 
 
 class Inside:
-    """The mechanical model at rows q (N, n): inner coordinates z (N, C) and their slope dz/dq."""
+    """The mechanical model at rows q (N, n): inner coordinates z (N, C) and dz/dq."""
 
     def __init__(self, mechanical: ForwardModel, q: Tensor) -> None:
         self.mechanical = mechanical
@@ -37,22 +37,22 @@ class Inside:
         return self.mechanical.from_coordinates_and_jacobian(self.z)[1] @ self.slope
 
 
-# The weight g(q) of a correction (N, 1), where it may be less than one, and dg/dq (N, 1, n).
+# The weight g(q) of a correction (N, 1), if it is less than one anywhere, and dg/dq (N, 1, n).
 Fading = tuple[Tensor, Tensor]
-Guarded = tuple[Tensor, Tensor, Fading | None]  # a correction, its derivative, how it fades
+Guarded = tuple[Tensor, Tensor, Fading | None]  # a correction, its derivative, its fading
 
 
 class TipCorrection(PortableModule):
     """A learned correction at the tip, c(q) = eps(q).
 
-    s(q) is c(q), faded by the weight g(q) of the guard, and shortened where it is too long.
+    s(q) is c(q) times the weight g(q) of the guard, shortened if it is too long.
 
     Parameters
     ----------
     module : ForwardModel
         eps, q (..., n) -> (..., m) [m]: the torch module of a regressor, or a `Readout`.
     guard : Guard or None
-        Where it is trusted. None: everywhere.
+        Its weight and largest length. None: no limits.
     """
 
     layout = Layout("tip_correction", {}, parts=("module", "guard"))
@@ -67,7 +67,7 @@ class TipCorrection(PortableModule):
         return self.module(q)
 
     def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
-        """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and how it fades."""
+        """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and the fading."""
         guard = self.guard
         if guard is None:
             return *self.module.forward_and_jacobian(q), None
@@ -94,7 +94,7 @@ class InnerCorrection(PortableModule):
     readout : Readout
         W phi(q), the change of the inner coordinates [unit of z].
     guard : Guard or None
-        Where it is trusted. None: everywhere.
+        Its weight and largest length. None: no limits.
     """
 
     layout = Layout("inner_correction", {}, parts=("mechanical", "readout", "guard"))
@@ -113,9 +113,9 @@ class InnerCorrection(PortableModule):
         return self.mechanical.from_coordinates(inside.z + self.readout(q)) - inside.x
 
     def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
-        """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and how it fades.
+        """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and the fading.
 
-        It is F(z + W phi) where no row fades or is too long: only these need df/dq.
+        If no row fades or is too long, f + s = F(z + W phi) and df/dq is not needed.
         """
         assert inside is not None
         delta, turn = self.readout.forward_and_jacobian(q)
@@ -139,12 +139,12 @@ Correction = TipCorrection | InnerCorrection
 class HybridModule(ForwardModel):
     """The sum x = f(q) + sum_k w_k s_k(q) + t(q) d(q) as a torch module q (..., n) -> x (..., m).
 
-    f is the mechanical model. s_k is a learned correction c_k, faded by the weight g_k of its
-    guard and shortened where it is too long. d is a drift, weighed by the error weight
+    f is the mechanical model. s_k is a learned correction c_k times the weight g_k of its guard,
+    shortened if it is too long. d is a drift, weighted by the error weight
     t(q) = 1 - sum_k w_k (1 - g_k(q)). f is evaluated once for any number of corrections.
 
-    A plain hybrid has one correction of weight 1, a blend has several; their weights sum to less
-    than 1 where the mechanical model alone has a share in the blend.
+    A plain hybrid has one correction of weight 1, a blend has several. Their weights sum to less
+    than 1 if the mechanical model alone is part of the blend.
 
     Parameters
     ----------
@@ -155,9 +155,9 @@ class HybridModule(ForwardModel):
     weights : Tensor of shape (K,)
         w_k.
     drift : AffineModule or None
-        d, how the robot has changed since the fit.
+        d, the change of the robot since the fit.
     tested : GroupDistance or None
-        How far held-out groups have tested the corrections, where the rows have groups.
+        Distance up to which held-out groups have tested the corrections, if the rows have groups.
     """
 
     layout = Layout(
@@ -193,12 +193,12 @@ class HybridModule(ForwardModel):
 
     @property
     def fitted(self) -> HybridModule:
-        """The model of the fit: this one, whose robot has not changed; see `AdaptedModel`."""
+        """The model of the fit: this one, since the robot has not changed; see `AdaptedModel`."""
         return self
 
     @property
     def shift(self) -> Tensor:
-        """How far the zeros of the actuators have moved since the fit [unit of q]."""
+        """Shift of the actuator zeros since the fit [unit of q]."""
         return self.weights.new_zeros(())
 
     def of(self, fitted: HybridModule) -> HybridModule:
@@ -210,12 +210,12 @@ class HybridModule(ForwardModel):
         return q, y
 
     def with_drift(self, drift: AffineModule | None) -> Self:
-        """Return the same model with another drift; this one stays as it is."""
+        """Return the same model with another drift; this model does not change."""
         corrections = [c for _, c in self._parts()]
         return type(self)(self.mechanical, corrections, self.weights, drift, self.tested)
 
     def rows(self) -> HybridModule:
-        """Return the module whose outputs are the columns of measured y: for tips the same."""
+        """Return the module whose outputs are the columns of measured y; for tips this module."""
         return self
 
     def forward(self, q: Tensor) -> Tensor:
@@ -232,7 +232,7 @@ class HybridModule(ForwardModel):
         return 0.0 * self.error_part(q) if self.mechanical is None else self.mechanical(q)
 
     def error_part(self, q: Tensor) -> Tensor:
-        """Return what is added to f(q): corrections and drift, shape (..., m) [m]."""
+        """Return the sum of corrections and drift, which is added to f(q), (..., m) [m]."""
         return in_blocks(lambda rows: (self._learned(rows, self._inside(rows)),), q)[0]
 
     def error_weight(self, q: Tensor) -> Tensor:
@@ -244,7 +244,7 @@ class HybridModule(ForwardModel):
         return in_blocks(lambda rows: (self._distance(rows),), q)[0][..., 0]
 
     def _parts(self) -> list[tuple[float, Correction]]:
-        """Return weight and correction, one by one."""
+        """Return pairs of weight and correction."""
         corrections = cast("list[Correction]", [*self.corrections])
         # Not tolist: before torch 2.5 it does not work in functional transforms.
         return [*zip(map(float, self.weights), corrections, strict=True)]
@@ -293,7 +293,7 @@ class HybridModule(ForwardModel):
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         inside, total = self._inside(q), None
         if inside is not None:
-            # Inner corrections bring f along. df/dq is needed where their weights leave a share.
+            # Inner corrections include f. df/dq is needed only if their weights sum to less than 1.
             inner = (weight for weight, c in self._parts() if isinstance(c, InnerCorrection))
             share = 1.0 - sum(inner)
             if share > ROUNDING:
@@ -305,7 +305,7 @@ class HybridModule(ForwardModel):
     def _added(
         self, total: tuple[Tensor, Tensor] | None, q: Tensor, inside: Inside | None
     ) -> tuple[Tensor, Tensor]:
-        """Return a sum and its derivative at rows q, with all corrections and the drift added."""
+        """Return `total`, a value and its derivative, plus all corrections and the drift."""
         fadings: list[tuple[float, Fading]] = []
         for weight, correction in self._parts():
             x, J, fading = correction.guarded_and_jacobian(q, inside)
@@ -324,8 +324,8 @@ class HybridModule(ForwardModel):
 
 
 def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
-    """Return how a correction fades at rows q (N, n), None where all count in full."""
-    rows = (~(distance <= guard.FULL)).nonzero()[:, 0]  # the others, where NaN is one
+    """Return the weights of a correction and their slopes at rows q (N, n), None if all are 1."""
+    rows = (~(distance <= guard.FULL)).nonzero()[:, 0]  # written so that NaN is included
     if not len(rows):
         return None
     weight, slope = guard.weight_and_jacobian(q[rows])
@@ -336,7 +336,7 @@ def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
 def _plus(
     total: tuple[Tensor, Tensor] | None, weight: float, x: Tensor, J: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return a sum with the weighed x and J added."""
+    """Return a sum plus the weighted x and J."""
     if total is None:
         return (x, J) if weight == 1.0 else (weight * x, weight * J)
     return torch.add(total[0], x, alpha=weight), torch.add(total[1], J, alpha=weight)

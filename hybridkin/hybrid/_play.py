@@ -1,4 +1,4 @@
-"""How much play (backlash) the actuators have, from a log."""
+"""The backlash (also called play) of the actuators, from a log."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._fit import Rows, Spec, calibrated, residuals
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
-_LEAST = 0.0025  # of the stroke: the first width tried
-_CLOSE = 0.02  # to the best width
+_LEAST = 0.0025  # first width, relative to the stroke
+_CLOSE = 0.02  # tolerance of the best width, relative to it
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
 
 
 def play_of(
     play: ArrayLike | str | None, spec: Spec, rows: Rows
 ) -> tuple[PlayOperator | None, list[str]]:
-    """Return the play that a HybridForwardModel asks for, and warnings about it.
+    """Return the backlash for the setting `play` of a HybridForwardModel, and warnings about it.
 
     Parameters
     ----------
     play : None, "auto", float or array-like of shape (n,)
-        Its setting.
+        The setting.
     spec : Spec
-        Its mechanical model, and what to calibrate of that first.
+        The mechanical model, and its parameters to calibrate first.
     rows : Rows
-        The log, the rows of one motion in the order of time.
+        The log, with the rows of each motion in order of time.
     """
     if play is None:
         return None, []
@@ -41,7 +41,7 @@ def play_of(
         if found is None or found.width < 0.95 * ranges.max():
             return found, []
         return found, [
-            f"`play`='auto' found backlash of {found.width:.3g}, as wide as the range of `X`: the "
+            f"play='auto' found a backlash of {found.width:.3g}, as wide as the range of `X`: the "
             "log gives no upper limit. Record larger motions, or give the width as `play`."
         ]
     operator = PlayOperator(play)
@@ -50,32 +50,32 @@ def play_of(
     if not np.any(operator.width >= ranges):
         return operator, []
     return operator, [
-        f"`play` {play!r} is no less than the range of `X`, {ranges}: such an actuator never "
-        "moves. Its unit is that of `X`, metres."
+        f"`play` {play!r} must be less than the range of `X`, {ranges}: else an actuator never "
+        "moves. Give `play` in the unit of `X`, for lengths metres."
     ]
 
 
 def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
-    """Return the play with the least held-out error of an ELM; None where none helps.
+    """Return the backlash with the least held-out error of an ELM; None if none helps.
 
-    Widths up to the range of the actuators are tried. As in `fit_play`, the best is kept only where
-    it lowers the error of a motion by more than the standard error of that over the motions.
+    Widths up to the range of the actuators are tried. As in `fit_play`, the best width is kept only
+    if its mean gain over the motions is larger than the standard error of this gain.
 
     Parameters
     ----------
     spec : Spec
-        Its mechanical model, calibrated without play.
+        The mechanical model, calibrated without backlash.
     rows : Rows
-        The log, the rows of one motion in the order of time.
+        The log, with the rows of each motion in order of time.
     """
     X, y, weights, groups = rows
     motions = np.zeros(len(X)) if groups is None else groups
     strokes = np.subtract(*np.percentile(X, (95, 5), axis=0))
     least = _LEAST * float(np.median(strokes[strokes > 0.0])) if strokes.any() else 0.0
-    # The error may have several minima over the width, so widths of all sizes are tried.
+    # The error can have several minima over the width, so widths of all sizes are tried.
     doubled, widest = least * 2.0 ** np.arange(20), float(np.ptp(X, axis=0).max())
     widths = [0.0, *doubled[(doubled > 0.0) & (doubled < widest)].tolist(), widest]
-    # A motion is one sample: its rows err alike. Where there is one only, stretches of it serve.
+    # A motion is one sample, as its rows have similar errors. A single motion is cut into ten.
     parts = motions if len(np.unique(motions)) > 1 else np.arange(len(X)) * 10 // len(X)
     counted = rows.counts > 0
     names = np.unique(parts[counted])

@@ -1,4 +1,4 @@
-"""Hybrid models of the whole pose: position and orientation errors of the tip, learned together."""
+"""Hybrid models of the pose: position and orientation errors of the tip, learned together."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ class PoseHybridModule(HybridModule, PoseModel):
     """Position and frame of the tip, p = p_mech + e_p and R = exp(e_r / reach) R_mech.
 
     As a torch module it maps q (..., n) to tip positions (..., 3), like any other. (e_p, e_r) is
-    the sum of corrections and drift of `HybridModule`, six numbers in metres; a radian counts as
-    the `reach` of the chain, as 1 m for other models. The guards weigh and shorten all six
-    together. All vectors are in the measuring frame.
+    the sum of corrections and drift of `HybridModule`, six numbers in metres. One radian counts as
+    the `reach` of the chain, or as 1 m for other models. The guards weight and shorten the six
+    numbers together. All vectors are in the measuring frame.
 
     Parameters
     ----------
     mechanical : PoseModel
         p_mech and R_mech.
     corrections : sequence of TipCorrection
-        Their modules map q (..., n) to (..., 6) [m].
+        Corrections whose modules map q (..., n) to (..., 6) [m].
     weights, drift, tested
         As for `HybridModule`.
     """
@@ -93,7 +93,7 @@ class PoseRows(PoseHybridModule):
         return _rows(self.mechanical.pose(q))
 
     def error_part(self, q: Tensor) -> Tensor:
-        """Return the way [m] and the rotation vector [rad] from there to the hybrid's pose."""
+        """Return translation [m] and rotation vector [rad] from the mechanical to this pose."""
         error = super().error_part(q)
         return torch.cat([error[..., :3], error[..., 3:] / reach_of(self.mechanical)], dim=-1)
 
@@ -106,7 +106,7 @@ class PoseRows(PoseHybridModule):
 
 
 def pose_errors(mechanical: PoseModel, q: Tensor, y: NDArray) -> NDArray:
-    """Return the residual of poses y (N, 6) of a mechanical model: (e_p, e_r), (N, 6) [m]."""
+    """Return the residuals (e_p, e_r) of poses y for a mechanical model, (N, 6) [m]."""
     if y.ndim != 2 or y.shape[1] != 6:
         raise ValueError(
             "`y` must have shape (N, 6) with output='pose', tip position [m] and rotation vector "
@@ -129,7 +129,7 @@ def reach_of(mechanical: PoseModel) -> Tensor | float:
 
 
 def _moved(T: Tensor, way: Tensor, turn: Tensor) -> Tensor:
-    """Return poses (N, 4, 4) moved by ways (N, 3), their frames turned where they are."""
+    """Return poses (N, 4, 4) translated by ways (N, 3), with their frames rotated in place."""
     tip = T[:, :3, 3:] + way[..., None]
     return torch.cat([torch.cat([turn @ T[:, :3, :3], tip], -1), T[:, 3:]], -2)
 

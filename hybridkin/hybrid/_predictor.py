@@ -1,4 +1,4 @@
-"""What a fitted hybrid model answers: tips, Jacobians, their parts and their domain."""
+"""The predictions of a fitted hybrid model: tips, Jacobians, their parts and the domain."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hybridkin.native.library import evaluate
 
 
 class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
-    """The methods of a `HybridForwardModel` that answer from what `fit` found."""
+    """The prediction methods of a `HybridForwardModel`; they use only the results of `fit`."""
 
     output: str
     module_: HybridModule | AdaptedModel
@@ -42,19 +42,19 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (N, n)
-            Actuator vectors; with `play` those of a motion in the order of time.
+            Actuator vectors; with `play`, the rows of each motion in order of time.
         return_radius : bool, default=False
-            Whether to return the estimated error radius as well; needs `coverage`.
+            Whether to return the estimated error radius as well; requires `coverage`.
         groups : array-like of shape (N,), optional
-            Motion of every row; only `play` depends on it. Default: one motion.
+            Motion of every row, only used with `play`. Default: one motion.
 
         Returns
         -------
         x : ndarray of shape (N, m), or (N,) as in `fit`
-            Tips [m]; of poses also rotation vectors up to pi long [rad].
+            Tips [m]; for poses also rotation vectors with a length of at most pi [rad].
         radius : ndarray of shape (N,)
-            Only if `return_radius`: a share `coverage` of the tips lies within [m], if the groups
-            of the fit and the new ones are exchangeable. Infinite where no radius is known: outside
+            Only if `return_radius`: estimated error radius [m]. It covers a share `coverage` of
+            the tips if the groups of the fit and the new ones are exchangeable. Infinite outside
             the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
         if not return_radius:
@@ -63,7 +63,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
-                "HybridForwardModel(..., coverage=0.9)."
+                "HybridForwardModel(..., coverage=0.9); this one was fitted without."
             )
         x, inside = self._evaluated(_with_domain, X, groups)
         return x, self.radius_.at(inside).astype(x.dtype)
@@ -76,11 +76,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._evaluated(lambda m, q: evaluate(chain, q), X, groups)[0]
 
     def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
-        """Return the learned part w(q) eps(q), shaped like `predict` [m], of turns [rad]."""
+        """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
         return self._evaluated(_method("error_part"), X, groups, warn=False)[0]
 
     def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
-        """Return R^2 of `predict`, the mean over the columns of y, each without missing markers."""
+        """Return R^2 of `predict`, averaged over the columns of y, without missing markers."""
         x, n = self.predict(X), len(np.asarray(y))
         weights = np.ones(n) if sample_weight is None else np.asarray(sample_weight)
         both = (np.asarray(values, dtype=float).reshape(n, -1).T for values in (y, x))
@@ -90,7 +90,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
-        Of poses the last three rows give the angular velocity in the measuring frame.
+        For poses, the last three rows give the angular velocity in the measuring frame.
         """
         return self._evaluated(partial(evaluate, jacobian=True), X, groups)[1]
 
@@ -102,23 +102,23 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return x, J
 
     def in_domain(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
-        """Return whether each row lies in the domain, as close to the training rows as these are.
+        """Return whether each row lies in the domain, close to the training rows (see `guard`).
 
-        After a fit with groups also: no farther from the nearest training row than 98 % of these
-        are from the rows of other groups, because held-out groups have tested no more. Errors of
-        rows outside are not known, even where eps still counts in full.
+        After a fit with groups, a row must also be as close to the nearest training row as 98 % of
+        these are to rows of other groups: held-out groups have tested the model only so far. The
+        errors of rows outside the domain are not known, even where eps has its full weight.
 
         Parameters
         ----------
         X : array-like of shape (N, n)
             Actuator vectors.
         groups : array-like of shape (N,), optional
-            Motion of every row; only `play` depends on it.
+            Motion of every row, only used with `play`.
 
         Returns
         -------
         inside : ndarray of bool of shape (N,)
-            True everywhere where nothing guards the error model.
+            Without a guard and groups all True.
         """
         return self._evaluated(partial(_with_domain, value=False), X, groups, warn=False)[0]
 
@@ -127,7 +127,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
 
     def _warn_of_units(self, rows: Rows) -> None:
-        """Warn where measured tips span so much more than the robot that they are not in metres."""
+        """Warn if measured tips span far more than the robot, so they cannot be in metres."""
         if not isinstance(chain := self.mechanical_model_, Chain):
             return
         known, tips = known_tips(chain, rows)
@@ -136,7 +136,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             warnings.warn(message, stacklevel=3)
 
     def _effective(self, X: NDArray, groups: ArrayLike | None) -> NDArray:
-        """Return the motion of the actuators, where there is play."""
+        """Return the motion of the actuators: with backlash, not the commands X themselves."""
         if self.play_ is None or not len(X):
             return X
         return self.play_.apply_by_group(X, np.zeros(len(X)) if groups is None else groups)
@@ -148,29 +148,29 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         groups: ArrayLike | None,
         warn: bool = True,
     ) -> list[NDArray]:
-        """Return what a function of the module gives for the rows of X, in the dtype of X."""
+        """Return the results of a function of the module for the rows of X, in the dtype of X."""
         check_is_fitted(self, "module_")
         X = check_inputs(self, X)
         q = self._effective(X, groups).astype(np.float64)
         if warn and isinstance(chain := self.mechanical_model_, Chain):
-            rows = torch.from_numpy(q)  # finite; lengths below zero are extrapolation
+            rows = torch.from_numpy(q)  # finite; negative lengths are extrapolation, no error
             for message in (*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")):
                 if message is not None:
                     warnings.warn(message, stacklevel=3)
         arrays = function(self.module_.rows(), q)
-        with np.errstate(over="ignore"):  # beyond float32
+        with np.errstate(over="ignore"):  # too large for float32
             arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
 def _method(name: str) -> Callable[[HybridModule | AdaptedModel, NDArray], Sequence[NDArray]]:
-    """Return what computes a method of a module for rows q."""
+    """Return a function that evaluates a method of a module at rows q."""
     return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
 
 
 def _with_domain(
     module: HybridModule | AdaptedModel, q: NDArray, value: bool = True
 ) -> list[NDArray]:
-    """Return x of rows q where asked for, and whether they lie within the domain."""
+    """Return x of rows q if `value`, and whether they lie in the domain."""
     *x, distance = evaluate(module, q, value, distance=True)
     return [*x, distance <= 1.0]

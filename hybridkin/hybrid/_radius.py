@@ -1,4 +1,4 @@
-"""How far off a tip may be: a radius confirmed by held-out motions."""
+"""The estimated error radius of a tip, computed from held-out motions."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid, with_geometry_chosen
 from hybridkin.hybrid._selection import select
 
-_ROUNDING = 1e-9  # of shares
+_ROUNDING = 1e-9  # rounding error of shares
 
 
 class Radius(NamedTuple):
-    """Radius about a predicted tip [m]; infinite where no radius holds."""
+    """Estimated error radius about a predicted tip [m]; infinite if the log supports none."""
 
-    inside: float  # the domain of the error model; infinite: too few groups for the coverage
-    outside: float  # infinite: the log says nothing of errors outside the domain
+    inside: float  # in the domain of the error model; infinite: too few groups for the coverage
+    outside: float  # infinite: the log has no errors outside the domain
     coverage: float  # share of held-out tips within the radius
     n_rows: int
 
     def at(self, in_domain: NDArray) -> NDArray:
-        """Return the radius (N,) of rows inside or outside the domain (N,)."""
+        """Return the radius (N,) of rows that are inside or outside the domain (N,)."""
         return np.where(in_domain, self.inside, self.outside)
 
     @property
     def least_groups(self) -> int:
-        """The least number of groups with which the radius is finite."""
+        """The least number of groups that gives a finite radius."""
         return ceil(self.coverage / (1.0 - self.coverage) - _ROUNDING)
 
 
 def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, str | None]:
-    """Return the radius that covers a share `coverage` of held-out tips, and a warning about it.
+    """Return the radius that covers a share `coverage` of held-out tips, and a warning or None.
 
-    Whole groups are held out, in five folds, and everything is fitted anew without them,
-    calibration included. Without groups every row is one. The errors inside the domain of these
-    fits give the radius; of several markers the largest of a row counts.
+    Whole groups are held out in five folds, and everything, calibration included, is fitted again
+    without them. Without groups every row is a group. The errors in the domain of these fits give
+    the radius; with several markers the largest error of a row counts.
 
     References
     ----------
@@ -78,10 +78,10 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
 
 
 def _quantile(values: NDArray, groups: NDArray, weights: NDArray, coverage: float) -> float:
-    """Return the smallest value that covers the share; infinity where no value does.
+    """Return the smallest value that covers the share; infinity if no value does.
 
-    Each of the K groups (N,), numbered from 0, has the mass 1 / (K + 1), divided among its values
-    (N,) by their weights (N,). The rest belongs to a new group, whose errors are not known.
+    Each of the K groups, numbered from 0 (N,), has the mass 1 / (K + 1), divided among its values
+    (N,) by their weights (N,). The rest is the mass of a new group, whose errors are not known.
     """
     totals = np.bincount(groups, weights)
     order = np.argsort(values)

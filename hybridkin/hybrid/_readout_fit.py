@@ -1,4 +1,4 @@
-"""The readout W phi(q) from data: its optimum, its penalties, its leave-out residuals."""
+"""The readout W phi(q) from data: its optimum, its penalties and its held-out residuals."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from hybridkin.hybrid._linearised import Linearised, Pair
 from hybridkin.native.library import Program, program_of
 from hybridkin.native.plan import Plan
 
-_LARGEST = 1000  # weights at most; of wide features the strongest directions are kept
-_ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # of descent; the first, and every tenth, factorise
-_SETTLED = 1e-9  # of the gradient without a correction
-_RATIOS = torch.from_numpy(np.logspace(-2, 4, 25))  # of noise, over the mean of dx/dq squared
+_LARGEST = 1000  # most weights; of more features only the strongest directions are kept
+_ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # steps; the first ones and every tenth factorise
+_SETTLED = 1e-9  # relative to the gradient without a correction
+_RATIOS = torch.from_numpy(np.logspace(-2, 4, 25))  # noise ratios, over the mean of dx/dq squared
 
 
 class ReadoutFit(NamedTuple):
-    """A fitted readout, and how it was found."""
+    """A fitted readout, with its penalties and held-out residuals."""
 
     readout: Readout
-    alphas: Pair  # of the linear and of the other features; infinity: none of them
-    residual: NDArray  # (N, m) [m], of every row from a fit without it, or without its group
-    scores: dict[Pair, float]  # mean squared leave-out distance [m^2], by alphas
+    alphas: Pair  # of the linear and of the other features; infinity: features not used
+    residual: NDArray  # (N, m) [m], of every row from a fit without that row, or its group
+    scores: dict[Pair, float]  # mean squared held-out distance [m^2], by alphas
     gradient: float  # of the objective at the optimum, relative to that without a correction
-    noise_ratio: float = inf  # variance of tips over that of actuators; infinity: of tips alone
-    rmse: float = nan  # root mean square length of `residual`, by weight [m]
+    noise_ratio: float = inf  # variance of tips over that of actuators; infinity: tips only
+    rmse: float = nan  # weighted root mean square length of `residual` [m]
 
     def stored(self) -> Stored:
-        """Return how the fit describes itself; JSON has no infinity, so penalties are strings."""
+        """Return the description of the fit; JSON has no infinity, so penalties are strings."""
         return Stored.of(
             "readout_fit",
             {"residual": self.residual},
@@ -57,7 +57,7 @@ class ReadoutFit(NamedTuple):
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> ReadoutFit:
-        """Return the fit of a description; `restore` returns its readout."""
+        """Return the fit from its description; `restore` returns its readout."""
         first, second = map(float, stored.list_of(str, "alphas"))
         return cls(
             restore(stored.part("readout")),
@@ -74,14 +74,14 @@ _Tips = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def _tips(model: ForwardModel) -> _Tips:
-    """Return `from_coordinates_and_jacobian`, of arcs by the compiled core where it is there."""
+    """Return `from_coordinates_and_jacobian`, for arcs from the compiled core if available."""
     if not isinstance(model, ArcChain) or program_of(model) is None:
         return model.from_coordinates_and_jacobian
     m = ceil(model.tip_at)
     offsets = model.offsets[:m].numpy(force=True).copy()
     offsets[-1] *= model.tip_at == m
     arrays = {"base": model.base.numpy(force=True), "offsets": offsets, "radii": np.ones(m)}
-    derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}  # of q that are arcs
+    derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}  # q are the arcs
     place = {"tip_at": float(m), "markers": [[float(m), *model.markers[-1][1:]]]}
     plan = Plan(Stored("constant_curvature", place, arrays, derived=derived))
     program = Program(plan)
@@ -94,7 +94,7 @@ def _tips(model: ForwardModel) -> _Tips:
 
 
 def _at_tip(z: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what `_tips` gives where the inner coordinates are the tip."""
+    """Return the result of `_tips` if the inner coordinates are the tip."""
     return z, identity(z.shape[1], z).expand(len(z), -1, -1)
 
 
@@ -110,47 +110,47 @@ def fit_readout(
     noise_ratio: float = inf,
     left_out: bool = True,
 ) -> ReadoutFit:
-    """Return the readout that minimises the error of the tip plus a penalty on its weights.
+    """Return the readout that minimises the tip error plus a penalty on its weights.
 
     The objective sum_n w_n |x_n - F(z_n + D W phi_n)|^2 + alpha_1 |W_lin|^2 + alpha_2 |W_bent|^2 is
-    brought to its exact minimum by damped Gauss-Newton rounds, then by quasi-Newton ones.
-    D scales the coordinates such that one unit of each moves the tip by 1 m (rms over the rows):
-    a penalty is the variance of the noise over that of a weight.
+    minimised exactly, by damped Gauss-Newton and then by quasi-Newton steps. D scales the
+    coordinates so that one unit of each moves the tip by 1 m (rms over the rows). A penalty is
+    therefore the variance of the noise over that of a weight.
 
-    Noise of the actuators moves the tip by dx/dq: far in some directions, little in others, and
-    differently in every posture. Where the leave-out residuals look like that, |.| is measured in
-    units of such noise (generalised least squares), if that lowers their mean distance.
+    Noise of the actuators moves the tip by dx/dq, which depends on the direction and on the
+    posture. If the held-out residuals have such a distribution, |.| is measured in units of this
+    noise (generalised least squares), provided that this lowers the mean held-out distance.
 
     Parameters
     ----------
     mechanical : ForwardModel
         f, with inner coordinates z and F(z(q)) = f(q).
     features : Features
-        phi; what its linear features explain of the others is subtracted from those.
+        phi; the part of its other features that the linear ones explain is subtracted.
     q : Tensor of shape (N, n)
         Actuator vectors.
     x : Tensor of shape (N, m)
-        Measured tips [m], NaN where a marker is missing; its residual is zero.
+        Measured tips [m], NaN for missing markers, whose residual is zero.
     coupling : {"serial", "parallel"}, default="serial"
         Whether W phi(q) is added to the inner coordinates, or to the tip.
     sample_weight : Tensor of shape (N,), optional
-        How many times each row counts; equal rows are left out together. The residual of a row of
-        weight 0 is NaN.
+        Number of times each row counts; equal rows are held out together. The residual of a row
+        of weight 0 is NaN.
     groups : array-like of shape (N,), optional
-        Motion of every row, which is left out as a whole. Default: single rows.
+        Motion of every row; whole motions are held out. Default: single rows.
     alphas : tuple of two floats, optional
-        The penalties; infinity: without these features. Default: those with the least leave-out
+        The penalties; infinity: without these features. Default: those with the least held-out
         error, which the linearised problem gives exactly without another fit.
     noise_ratio : float, default=inf
-        With `alphas`: the variance of a tip's coordinate over that of an actuator, without the
-        noise of this one [m^2 over the squared unit of q]. Infinity: the actuators are exact.
+        With `alphas`: the variance of a tip coordinate, without actuator noise, over that of an
+        actuator [m^2 over the squared unit of q]. Infinity: the actuators are exact.
     left_out : bool, default=True
-        With `alphas`: whether the leave-out residuals are computed; else they are NaN.
+        With `alphas`: whether the held-out residuals are computed; else they are NaN.
 
     Returns
     -------
     ReadoutFit
-        The readout, and how it was found.
+        The readout with its penalties and held-out residuals.
     """
     q, x = q.detach().double(), x.detach().double()
     first, counts, place = distinct_rows(q, x, sample_weight, groups)
@@ -175,10 +175,10 @@ def fit_readout(
 def _chosen(
     problem: _Problem, members: list[Tensor] | None, start: Pair | None = None
 ) -> ReadoutFit:
-    """Return the fit with the penalties of least leave-out error."""
+    """Return the fit with the penalties of least held-out error."""
     weights, alphas, scores = problem.nothing, start, {}
     for _ in range(2):
-        # Linearised without a correction first, then about the one found.
+        # Linearised first without a correction, then about the one found.
         score = partial(problem.score, problem.linearised(weights), members)
         alphas, scores = _linearised.choose(score, alphas)
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
@@ -186,7 +186,7 @@ def _chosen(
     found = _fitted(problem, members, alphas, weights)._replace(scores=scores)
     without = problem.mean_distance(problem.rest.numpy(force=True), 2)
     if problem.mean_distance(found.residual, 2) > without:
-        # The linearised problem predicted an improvement that the exact one does not show.
+        # The improvement of the linearised problem is not there in the exact one.
         return _fitted(problem, members, (inf, inf))._replace(scores=scores)
     return found
 
@@ -194,7 +194,7 @@ def _chosen(
 def _fitted(
     problem: _Problem, members: list[Tensor] | None, alphas: Pair, start: Tensor | None = None
 ) -> ReadoutFit:
-    """Return the fit with given penalties, from weights to start at; residuals of `members`."""
+    """Return the fit with given penalties, from weights `start`; residuals hold out `members`."""
     penalty = problem.penalty(alphas)
     weights, gradient = problem.minimum(problem.nothing if start is None else start, penalty)
     left_out = problem.x * nan
@@ -205,7 +205,7 @@ def _fitted(
 
 
 class _Problem:
-    """The rows of a fit, in scaled coordinates and in a basis of the features without idle ones."""
+    """The rows of a fit, in scaled coordinates and a basis of the features with data."""
 
     def __init__(
         self,
@@ -235,14 +235,14 @@ class _Problem:
         self.nothing = phi.new_zeros(len(self.units), self.phi.shape[1])
 
     def in_noise(self, ratio: float) -> _Problem:
-        """Return the problem for noise of covariance dx/dq dx/dq' + ratio, but for a factor."""
+        """Return the problem for noise of covariance dx/dq dx/dq' + ratio, up to a factor."""
         if ratio == inf:
             return self
         problem = copy.copy(self)
         problem._last = None
         spread, axes = self._principal_noise
         variance = spread + ratio
-        # The mean square of whitened residuals is that of residuals in metres, were they all noise.
+        # If residuals are only noise, the factor keeps their mean square the same as in metres.
         weights = self.root.square()
         variance /= (weights * variance).sum() / (weights.sum() * variance.shape[1])
         problem.noise_ratio = ratio
@@ -250,7 +250,7 @@ class _Problem:
         return problem
 
     def likeliest_ratio(self, residual: Tensor) -> float:
-        """Return the ratio that makes residuals (N, m) [m] likeliest as normal noise."""
+        """Return the ratio with the largest likelihood of residuals (N, m) [m] as normal noise."""
         spread, axes = self._principal_noise
         squares = (axes.mT @ residual[..., None])[..., 0].square()
         weights = self.root.square() * self.seen.all(1, keepdim=True) * torch.ones_like(squares)
@@ -265,19 +265,19 @@ class _Problem:
 
     @cached_property
     def _principal_noise(self) -> tuple[Tensor, Tensor]:
-        """Return variances (N, m) and axes (N, m, m) of what noise of the actuators does to x."""
+        """Return variances (N, m) and axes (N, m, m) of x for unit noise of the actuators."""
         J = self.mechanical.forward_and_jacobian(self.q)[1] * self.seen[..., None]
         spread, axes = torch.linalg.eigh(J @ J.mT)
         return spread.clamp(min=0.0), axes
 
     def in_metres(self, residual: Tensor) -> Tensor:
-        """Return weighted and whitened residuals (N, m) as they were [m]."""
+        """Return residuals (N, m) [m] from weighted and whitened ones."""
         if self.whitening is not None:
             residual = torch.linalg.solve(self.whitening, residual)
         return residual / self.root
 
     def mean_distance(self, residual: NDArray, power: int = 1) -> float:
-        """Return the weighed mean length of residuals (N, m) of markers [m], or of its `power`."""
+        """Return the weighted mean of the marker lengths of residuals (N, m) to a `power` [m]."""
         weights = self.root.square().numpy() * points(self.seen.numpy())[..., 0]
         far = np.linalg.norm(points(residual), axis=2)
         return float((weights * far**power).sum() / weights.sum())
@@ -288,7 +288,7 @@ class _Problem:
         return self.phi.new_tensor([alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n))
 
     def linearised(self, readout: Tensor) -> Linearised:
-        """Return the ridge problem about a readout (C, K); the last one is kept."""
+        """Return the ridge problem linearised about a readout (C, K); the last one is cached."""
         if self._last is None or not torch.equal(self._last[0], readout):
             rest, J = self._about(readout)
             J = self._whitened(J * self.units)
@@ -297,17 +297,17 @@ class _Problem:
         return self._last[1]
 
     def score(self, linear: Linearised, members: list[Tensor] | None, alphas: Pair) -> float:
-        """Return the mean squared leave-out distance [m^2]."""
+        """Return the mean squared held-out distance [m^2]."""
         left = linear.left_out(self.penalty(alphas), members)
         return float(left.square().sum() / self.root.square().sum())
 
     def minimum(
         self, readout: Tensor, penalty: Tensor, rounds: int = _ROUNDS
     ) -> tuple[Tensor, float]:
-        """Return the best readout, from one to start at, and the relative gradient left there.
+        """Return the best readout, from a start `readout`, and its relative gradient.
 
-        The first steps solve a Gauss-Newton system each. The later ones keep the last of these and
-        correct it by how the gradient has changed (L-BFGS): they cost no factorisation.
+        Each of the first steps solves a Gauss-Newton system. Later steps reuse the last system and
+        correct it by changes of the gradient (L-BFGS), without a factorisation.
         """
         taking_part = torch.isfinite(penalty)
         readout = torch.where(taking_part, readout, 0.0)
@@ -323,7 +323,7 @@ class _Problem:
                 factor, pairs = self.linearised(readout).factor(penalty), []
             step = -_linearised.quasi_newton(slope, pairs, factor)
             share, descent = 1.0, float((slope * step).sum())
-            while share > 1e-6:  # a full step may overshoot where the tip curves away
+            while share > 1e-6:  # a full step may overshoot, as the tip is nonlinear
                 tried = readout + share * step
                 new, new_slope = self._value_and_slope(tried, weight, taking_part)
                 if new <= (1.0 + 1e-14) * value + 1e-4 * share * descent:
@@ -338,21 +338,21 @@ class _Problem:
         return readout, float(slope.norm()) / scale
 
     def readout(self, weights: Tensor) -> Readout:
-        """Return the readout of the features themselves, in the units of the coordinates."""
+        """Return the readout of the original features, in the units of the coordinates."""
         return Readout(self.features, self.units[:, None] * (weights @ self.basis.mT))
 
     def _about(self, readout: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals (N, m) [m] and Jacobians (N, m, C) by the coordinates."""
+        """Return residuals (N, m) [m] and Jacobians (N, m, C) by the coordinates, at a readout."""
         return self._rest(self.z + self.units * (self.phi @ readout.mT))
 
     def _rest(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals (N, m) [m] and Jacobians (N, m, C) at coordinates, of no marker zero."""
+        """Return residuals (N, m) [m] and Jacobians (N, m, C) at z, zero for missing markers."""
         tip, J = self._tips(z)
         seen = self.seen
         return torch.where(seen, self.x - tip, 0.0), torch.where(seen[..., None], J, 0.0)
 
     def _whitened(self, values: Tensor) -> Tensor:
-        """Return values (N, m) or (N, m, C) in units of the noise, times the roots of weights."""
+        """Return values (N, m) or (N, m, C) in units of noise, times the roots of the weights."""
         flat = values.reshape(*self.x.shape, -1)
         if self.whitening is not None:
             flat = self.whitening @ flat

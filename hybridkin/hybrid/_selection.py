@@ -1,4 +1,4 @@
-"""Which error models: chosen by errors on held-out motions, and outside the fitted rows."""
+"""Choice of the error model by errors on held-out motions, and on rows outside the fitted ones."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
-_PICKS = 10  # of a blend
-_EQUAL = 1e-8  # of scores: readouts end at 1e-9 of their gradient
+_PICKS = 10  # picks of a blend; each is a weight of 0.1
+_EQUAL = 1e-8  # scores this close are equal: readouts end at 1e-9 of their gradient
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
-_MOST = 2000  # rows for kernel ridge, whose cost grows with their cube
+_MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their number
 
 
 def select(
@@ -33,17 +33,17 @@ def select(
     given: Rows,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Spec, dict[str, Any]]:
-    """Return the specification with the error model of least error on new motions, or a blend.
+    """Return the specification with the error model of least held-out error, or a blend.
 
-    Every candidate is fitted to all rows, which settles its penalties; then to all but one fold,
-    and to the inner rows, each time on the mechanical model calibrated on the same rows. The
-    predictions for the held-out and the outer rows give the weights of the blend, which may be a
+    Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
+    but one, and to the inner rows, each time with the mechanical model calibrated on the same rows.
+    The predictions for the held-out and the outer rows give the weights of the blend. It can be a
     single candidate.
 
     Parameters
     ----------
     spec : Spec
-        With the geometry chosen and not yet calibrated.
+        With the geometry chosen, but not yet calibrated.
     rows, given : Rows
         The different rows, and all as they were given.
     progress : callable, optional
@@ -54,19 +54,19 @@ def select(
     spec : Spec
         Calibrated, with its parts.
     results : dict
-        The errors of all candidates, see `HybridForwardModel.cv_results_`.
+        Errors of all candidates, see `HybridForwardModel.cv_results_`.
     """
     y, counts, folds = rows.tips, rows.counts, folds_of(rows.X, rows.groups)
     fold_of = np.empty(len(y), dtype=int)
     for k, (_, test) in enumerate(folds):
         fold_of[test] = k
     weighed = rows._replace(weights=counts, groups=None)
-    # A single held-out motion has similar ones in training; folds of motions judge more strictly.
+    # A single held-out motion has similar ones in training; folds of motions are a harder test.
     by_fold = weighed._replace(groups=None if rows.groups is None else fold_of)
     splits = [*folds, inner_and_outer(rows.X)]
     parts = [weighed.take(train) for train, _ in splits]
     alone = [calibrated(replace(spec, left_out=False), part) for part in parts]
-    geometry, spec = spec.geometry, calibrated(spec, given)  # its warnings count the rows given
+    geometry, spec = spec.geometry, calibrated(spec, given)  # its warnings count the given rows
     candidates = _candidates(spec)
     if len(y) > _MOST:
         del candidates["parallel kernel"]
@@ -98,7 +98,7 @@ def select(
 
 
 class _HeldOut(NamedTuple):
-    """Predictions for the N held-out rows, then for the outer ones, of all candidates."""
+    """Predictions of all candidates for the N held-out rows, then for the outer rows."""
 
     predicted: NDArray  # (K, N + M, m)
     y: NDArray  # (N + M, m)
@@ -109,7 +109,7 @@ class _HeldOut(NamedTuple):
 
     @classmethod
     def of(cls, predicted: NDArray, rows: Rows, fold_of: NDArray, outer: NDArray) -> _HeldOut:
-        """Weigh both kinds of rows, relative to the first candidate, the mechanical model."""
+        """Return both kinds of rows, weighted by the errors of the first candidate, f_mech."""
         n, at = len(rows.X), np.concatenate([np.arange(len(rows.X)), outer])
         y, counts = rows.tips[at], rows.counts[at]
         weights = counts.copy()
@@ -119,9 +119,9 @@ class _HeldOut(NamedTuple):
         return cls(predicted, y, weights, counts, fold_of[at], n)
 
     def shares(self, rows: NDArray) -> NDArray:
-        """Return the weights (K,) of the candidates, multiples of a tenth that sum to one.
+        """Return the weights (K,) of the candidates, multiples of 0.1 that sum to one.
 
-        Ten times the candidate that lowers the score most is added, the same one again too.
+        Ten times, the candidate that lowers the score most is added; repetition is allowed.
 
         References
         ----------
@@ -138,13 +138,13 @@ class _HeldOut(NamedTuple):
 
 
 def _chosen(names: list[str], found: _HeldOut, rows: Rows) -> tuple[NDArray, dict[str, Any]]:
-    """Return the weights of the candidates, and the errors of all and of their blend.
+    """Return the weights of the candidates, and the errors of all candidates and their blend.
 
-    A blend whose gain over the mechanical model, paired by motion or fold, is within its standard
-    error is not taken.
+    If the gain of the blend over the mechanical model, paired by motion or fold, is within its
+    standard error, the mechanical model is chosen.
     """
     n, counts = found.n, found.counts
-    # The blend is judged by weights that were chosen without the fold.
+    # On each fold the blend is scored with weights chosen without that fold.
     blend = np.empty_like(found.y)
     for fold in np.unique(found.fold):
         test = found.fold == fold
@@ -171,13 +171,13 @@ def _chosen(names: list[str], found: _HeldOut, rows: Rows) -> tuple[NDArray, dic
 
 
 def _means_by(labels: NDArray, distances: NDArray, counts: NDArray) -> NDArray:
-    """Return the mean distances (K, L) of K models for each of L labels of the rows."""
+    """Return the mean distances (K, L) of K models for each of L row labels."""
     parts = [labels == label for label in np.unique(labels)]
     return np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in parts]).T
 
 
 def _candidates(spec: Spec) -> dict[str, tuple[str, Any]]:
-    """Return coupling and error model by name, the simplest first: of equals it is chosen."""
+    """Return coupling and error model by name; of equal candidates the first, simplest one wins."""
     inside = ("linear", "quadratic", *(("pose",) if isinstance(spec.mechanical, ArcChain) else ()))
     network = ELMRegressorCV(250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state))
     candidates: dict[str, tuple[str, Any]] = {
@@ -192,7 +192,7 @@ def _candidates(spec: Spec) -> dict[str, tuple[str, Any]]:
 
 
 def _settled(error_model: Any, fitted: Any) -> Any:
-    """Return the error model with the choices that its fit to all rows made."""
+    """Return the error model with the settings that were chosen in its fit to all rows."""
     if type(fitted) is tuple:  # one for each marker
         return tuple(_settled(error_model, one) for one in fitted)
     if isinstance(fitted, ReadoutFit):

@@ -36,7 +36,7 @@ def resolved_error_model(error_model: Any, seed: int | np.random.RandomState | N
 
 
 def missing_markers(estimator: BaseEstimator, y: Any) -> NDArray[np.bool_]:
-    """Return which entries of y (N, 3 K) belong to markers that are missing; rows keep one."""
+    """Return which entries of y (N, 3 K) are missing markers; every row must keep one marker."""
     model = SimpleNamespace(**estimator.get_params(deep=False))
     allowed = model.mechanical_model is None or isinstance(model.mechanical_model, MarkedChain)
     if not allowed or model.output == "pose" or np.ndim(y) != 2 or y.shape[1] % 3:
@@ -45,7 +45,7 @@ def missing_markers(estimator: BaseEstimator, y: Any) -> NDArray[np.bool_]:
 
 
 def check_settings(estimator: BaseEstimator) -> None:
-    """Raise where the settings of a HybridForwardModel are not allowed."""
+    """Raise if a setting of a HybridForwardModel is not allowed."""
     model = SimpleNamespace(**estimator.get_params(deep=False))
     error_model, mechanical = model.error_model, model.mechanical_model
     names = ("auto", "drop", *_REGRESSORS, *FEATURES)
@@ -71,16 +71,16 @@ def check_settings(estimator: BaseEstimator) -> None:
     serial = model.coupling == "serial" and error_model != "drop"
     if serial and (not isinstance(error_model, _INSIDE) or error_model == "kernel"):
         raise TypeError(
-            f"`error_model` must give features that can act inside the robot with "
-            f"coupling='serial': None, one of {['elm', *FEATURES]}, an ELMRegressor or an "
-            f"ELMRegressorCV, got {error_model!r}; use coupling='parallel'."
+            f"`error_model` must be None, one of {['elm', *FEATURES]}, an ELMRegressor or an "
+            f"ELMRegressorCV with coupling='serial', because its features act inside the robot, "
+            f"got {error_model!r}; use coupling='parallel'."
         )
     if mechanical is None:
         if serial or (isinstance(error_model, str) and error_model not in _REGRESSORS):
             raise ValueError(
                 f"`mechanical_model` must be given with coupling={model.coupling!r} and "
-                f"error_model={error_model!r}: the error is that of a mechanical model. "
-                "For the data alone give an estimator as `error_model`."
+                f"error_model={error_model!r}, which correct a mechanical model. "
+                "To learn without one, give an estimator as `error_model`."
             )
     elif not isinstance(mechanical, nn.Module):
         raise TypeError(
@@ -89,16 +89,16 @@ def check_settings(estimator: BaseEstimator) -> None:
         )
     elif not isinstance(mechanical, Chain) and not by_word and [*(wanted or ())]:
         raise TypeError(
-            f"`mechanical_model` must be a chain, with a geometry, to `calibrate` {wanted!r}, got "
-            f"{type(mechanical).__name__}."
+            f"`mechanical_model` must be a chain to `calibrate` {wanted!r}, got "
+            f"{type(mechanical).__name__}, which has no geometry."
         )
 
 
 def _check_pose_settings(model: SimpleNamespace) -> None:
     if not isinstance(model.mechanical_model, PoseModel):
         raise TypeError(
-            "`mechanical_model` must be a PoseModel, with pose_and_jacobian(q), for output='pose', "
-            f"as all chains are, got {type(model.mechanical_model).__name__}; for positions use "
+            "`mechanical_model` must be a PoseModel with pose_and_jacobian(q) for output='pose'; "
+            f"all chains are. Got {type(model.mechanical_model).__name__}; for positions use "
             "output='position'."
         )
     named = isinstance(model.error_model, str) and model.error_model not in _REGRESSORS
@@ -106,10 +106,10 @@ def _check_pose_settings(model: SimpleNamespace) -> None:
         raise ValueError(
             "`coupling` must be 'parallel' and `error_model` a regressor, None, 'elm', 'kernel' or "
             f"'drop' with output='pose', got {model.coupling!r} and {model.error_model!r}; "
-            "ELMRegressorCV() chooses its penalties, or use output='position'."
+            "use ELMRegressorCV(), which chooses its penalties, or output='position'."
         )
     if model.coverage is not None:
         raise ValueError(
-            f"`coverage` must be None with output='pose', got {model.coverage!r}; its radius is "
-            "for tip positions: fit a model with output='position' to y[:, :3]."
+            f"`coverage` must be None with output='pose', got {model.coverage!r}: the radius is "
+            "for tip positions. Fit a model with output='position' to y[:, :3]."
         )

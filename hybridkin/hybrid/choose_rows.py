@@ -1,4 +1,4 @@
-"""Which configurations to measure next: those that leave the least expected error of the tip."""
+"""Choice of the configurations to measure next: those that leave the least expected tip error."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import PoseFeatures, QuadraticFeatures
 from hybridkin.hybrid.estimator import HybridForwardModel
 
-# Prior standard deviations at the tip, in reaches of the robot: of a weight of linear features, of
-# one of other features, of a shift of the base; of its turn [rad]. Noise of a measured tip.
+# Standard deviations at the tip, in reaches of the robot. Priors: weights of linear features and of
+# other features, translation of the base, its rotation [rad]. Last: noise of a measured tip.
 _LINEAR, _OTHER, _SHIFT, _TURN, _NOISE = 0.055, 0.0165, 0.033, 0.1, 0.0055
-_LARGEST, _MOST = 1000, 5000  # parameters: directions of features are kept up to; ever
-_BLOCK = 1000  # rows whose design is held at once
-_ROWS, _WORTH = 8, 2.0  # rows that stand for a motion; how many independent ones they are worth
+_LARGEST, _MOST = 1000, 5000  # parameters: above the first, features are reduced; hard limit
+_BLOCK = 1000  # rows whose design matrix is in memory at once
+_ROWS, _WORTH = 8, 2.0  # rows that represent a motion; they count as so many independent rows
 
 
 def choose_rows(
@@ -39,51 +39,51 @@ def choose_rows(
 ) -> tuple[NDArray, NDArray]:
     """Return which candidates to measure next, in order, and the error expected after each.
 
-    Greedy Bayesian I-optimality: every row is the one that takes most off the expected error over
-    the target. The error of the mechanical model is taken as linear in unknown parameters, the
-    weights of pose features (of models other than chains of arcs: quadratic ones) that act inside
-    the robot, and a small move of its base. What matters is where the rows lie, not what was
-    measured there, so all can be chosen before the first measurement.
+    Greedy Bayesian I-optimality: each chosen row reduces the expected error over the target most.
+    The error of the mechanical model is assumed linear in unknown parameters: weights of pose
+    features that act inside the robot (quadratic features if the model is not a chain of arcs), and
+    a small motion of the base. The choice depends on the actuator vectors, not on measured tips, so
+    all rows can be chosen before the first measurement.
 
-    Rows chosen for learning make a calibration without learning worse, because they lie where the
-    mechanical model errs most.
+    Do not use rows chosen for learning for a calibration without learning. They lie where the
+    mechanical model has its largest errors, and make such a calibration worse.
 
     Parameters
     ----------
     model : ForwardModel, HybridForwardModel or callable
-        A chain, any other model as for `as_forward_model`, or a fitted hybrid, whose mechanical
-        part is used.
+        A chain, any other model that `as_forward_model` accepts, or a fitted hybrid. Of a hybrid,
+        the mechanical model is used.
     candidates : array-like of shape (N, n_actuators)
-        Actuator vectors that can be measured, a few thousand from all over the range for example
-        [unit of q]. With play those of the actuators, not the commands.
+        Actuator vectors that can be measured, for example a few thousand over the whole range
+        [unit of q]. With backlash: the motion of the actuators, not the commands.
     n : int
         How many to choose.
     measured : array-like of shape (M, n_actuators), optional
-        Actuator vectors measured already [unit of q]; of a fitted hybrid those of its fit.
+        Actuator vectors that are already measured [unit of q], e.g. those of a hybrid's fit.
     target : array-like of shape (K, n_actuators), optional
-        Where the error is to be small, along a path for example [unit of q]. Default: all
+        Where the error must be small, for example along a path [unit of q]. Default: all
         candidates.
     groups : array-like of shape (N,), optional
-        Motion of every candidate. Whole motions are chosen, of which 8 rows from the first to the
-        last stand for all and are worth two independent ones.
+        Motion of every candidate. Whole motions are chosen. Eight rows from the first to the last
+        represent each motion and count as two independent rows.
 
     Returns
     -------
     indices : ndarray of int or labels, of shape (n,)
-        Rows of `candidates`, or labels of the motions where there are `groups`, in the order
-        chosen: the first k are the choice for k.
+        Rows of `candidates`, or labels of motions with `groups`, in the order of the choice: the
+        first k are the choice for n=k.
     expected_error : ndarray of shape (n,)
-        Root mean square error of the tip over the target that is expected to be left after each
-        row [m]. Where it falls slowly more rows pay little. It comes from the size of the robot,
-        not from data: compare rows by it, do not promise it.
+        Expected root mean square tip error over the target after each row [m]. If it falls slowly,
+        more rows bring little. It is computed from the size of the robot, not from data: use it to
+        compare rows, not as an accuracy.
 
     Raises
     ------
     TypeError
-        If `model` is no model.
+        If `model` is not a model.
     ValueError
-        For a wrong shape, NaN, more rows than candidates, or a robot with too many parameters:
-        matrices of float64 are kept below 200 MB.
+        For a wrong shape, NaN, more rows than candidates, or a robot with too many parameters
+        (float64 matrices stay below 200 MB).
 
     Warns
     -----
@@ -92,8 +92,8 @@ def choose_rows(
 
     Notes
     -----
-    On three segments, one core: 100 of 2000 candidates take a second and 80 MB, of 20,000 six
-    seconds and 350 MB.
+    For three segments on one core, 100 of 2000 candidates take a second and 80 MB, 100 of 20,000
+    six seconds and 350 MB.
 
     References
     ----------
@@ -110,8 +110,8 @@ def choose_rows(
     """
     if isinstance(model, HybridForwardModel) and model.error_model == "drop":
         warnings.warn(
-            "`model` has error_model='drop' and learns nothing: rows chosen for learning make its "
-            "calibration worse than random ones; choose an error model, or measure random rows.",
+            "`model` has error_model='drop' and learns nothing: for its calibration, rows chosen "
+            "for learning are worse than random rows. Set an error model, or measure random rows.",
             stacklevel=2,
         )
     robot = as_forward_model(model).robot
@@ -129,7 +129,7 @@ def choose_rows(
 
 
 def _few_rows_of(groups: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the labels of all motions (G,), and rows of each (G, R) from its first to its last."""
+    """Return the labels of all motions (G,), and R rows of each, from first to last, (G, R)."""
     names, of_row, counts = np.unique(groups, return_inverse=True, return_counts=True)
     order, ends = np.argsort(of_row, kind="stable"), np.cumsum(counts)
     return names, order[np.rint(np.linspace(ends - counts, ends - 1, _ROWS).T).astype(int)]
@@ -148,17 +148,17 @@ def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
 
 
 class _TipErrors:
-    """The tip's error as A theta, with theta ~ N(0, 1): what a serial hybrid can learn.
+    """The tip error as A theta, with theta ~ N(0, 1): the part that a serial hybrid can learn.
 
-    The rows of A are [J_z D (x) phi | base]: weights of the features phi(q) act on the coordinates
-    z inside the robot, in units D that move the tip by 1 m (rms); the base shifts and turns.
+    The rows of A are [J_z D (x) phi | base]. Weights of the features phi(q) act on the coordinates
+    z inside the robot, in units D that move the tip by 1 m (rms); the base moves and rotates.
 
     Parameters
     ----------
     robot : ForwardModel
         The mechanical model.
     q : Tensor of shape (N, n)
-        Rows that give features and coordinates their units.
+        Rows that set the units of features and coordinates.
     """
 
     def __init__(self, robot: ForwardModel, q: Tensor) -> None:
@@ -193,7 +193,7 @@ class _TipErrors:
         return J * self.units, self.features(q) @ self.basis, base
 
     def design(self, q: Tensor) -> Tensor:
-        """Return A of rows q (N, n), shape (N, m, P)."""
+        """Return A for rows q (N, n), shape (N, m, P)."""
         J, phi, base = self.parts(q)
         return torch.cat([_linearised.design(J, phi), base], dim=2)
 
@@ -206,11 +206,11 @@ class _TipErrors:
 def _greedy(
     errors: _TipErrors, q: Tensor, n: int, known: Tensor, aim: Tensor
 ) -> tuple[list[int], NDArray]:
-    """Return n of the motions q (G, R, n), each the best after those before, and the errors left.
+    """Return n of the motions q (G, R, n), each the best given those before, and the errors.
 
-    With S the covariance of theta, M the mean of A' A over the aim and s^2 the noise, a motion with
-    the rows A takes tr[(A S A' + s^2)^-1 A S M S A'] off the mean squared error tr(M S). Both
-    products are updated for all motions by what a chosen one, of low rank, takes off S.
+    With S the covariance of theta, M the mean of A' A over the target and s^2 the noise, a motion
+    with rows A reduces the mean squared error tr(M S) by tr[(A S A' + s^2)^-1 A S M S A']. A chosen
+    motion changes S by a matrix of low rank, with which both products are updated for all motions.
     """
     size = q.shape[1]
     J, phi, base = errors.parts(q.flatten(0, 1))
@@ -223,7 +223,7 @@ def _greedy(
     designs = (A.flatten(0, 1).unflatten(0, (-1, size * m)) for A in blocks)
     about = [(A @ S @ A.mT, A @ SMS @ A.mT) for A in designs]
     spread, worth = (torch.cat(part) for part in zip(*about, strict=True))
-    # Rows of a motion err alike.
+    # Rows of a motion have similar errors.
     noise = max(1.0, size / _WORTH) * errors.variance * identity(size * m, q)
     left, chosen, squares = (M * S).sum(), [], []
     free = torch.ones_like(spread[:, 0, 0], dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""How a fitted HybridForwardModel describes itself: its settings, and what its fit found."""
+"""The description of a fitted HybridForwardModel: its settings and the results of its fit."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _MODULES: dict[str, type[PortableModule]] = {
         *(AdaptedModel, AdaptedPoseModel),
     )
 }
-# Fitted error models that describe themselves, and others that a hybrid may be given.
+# Fitted error models with their own description, and other regressors that a hybrid accepts.
 _FITS = {"elm_regressor": ELMRegressor.from_stored, "readout_fit": ReadoutFit.from_stored}
 _REGRESSORS = {
     cls.__name__: cls for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
@@ -57,7 +57,7 @@ _REGRESSORS = {
 
 
 def restorer() -> Restore:
-    """Return a function from descriptions to models, to one model from one description."""
+    """Return a function from descriptions to models; one description always gives one object."""
     found: dict[int, Any] = {}
 
     def restore(stored: Stored) -> Any:
@@ -73,7 +73,7 @@ def restorer() -> Restore:
 
 
 def stored_hybrid(model: HybridForwardModel) -> Stored:
-    """Return how a fitted hybrid describes itself."""
+    """Return the description of a fitted hybrid."""
     if "module_" not in vars(model):
         raise TypeError("`model` must be fitted before it is saved; call `fit` first.")
     nominal = model.mechanical_model
@@ -102,7 +102,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
 
 
 def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
-    """Return the fitted hybrid of a description and of what `training_of` returned."""
+    """Return the fitted hybrid from its description and the result of `training_of`."""
     n, restore = stored.value("n_features_in", int), restorer()
     model = estimator_of(HybridForwardModel, stored.value("params", dict))
     if isinstance(model.calibrate, list):
@@ -127,7 +127,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
-    stored.arrays.setdefault("drift_squares", np.zeros(()))  # older files do not have it
+    stored.arrays.setdefault("drift_squares", np.zeros(()))  # not in files of earlier versions
     shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]), ())
     names = [f"drift_{name}" for name in Drift._fields]
     model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
@@ -141,9 +141,9 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         inside, _, coverage, n_rows = map(float, stored.array("radius", (4,), finite=False))
         if not (inside >= 0.0 and 0.0 < coverage < 1.0 and n_rows < inf):
             raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
-        # Earlier files hold a finite radius outside the domain, which no log supports.
+        # Files of earlier versions hold a finite radius outside the domain; no log supports it.
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
-    known = "fitted_rows" in stored.arrays  # older files do not have it
+    known = "fitted_rows" in stored.arrays  # not in files of earlier versions
     model._fitted_rows = stored.array("fitted_rows", "N") if known else None
     results = training.get("cv_results") if isinstance(training, dict) else None
     model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
@@ -154,7 +154,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
 
 
 def training_of(model: HybridForwardModel) -> dict[str, Any]:
-    """Return what a fitted hybrid knows about its training as JSON values, errors in metres."""
+    """Return the results of the training of a fitted hybrid as JSON values, errors in metres."""
     known: dict[str, Any] = {}
     error = model.error_model_
     error = error.error_models[0] if isinstance(error, Blend) else error
@@ -171,7 +171,7 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
 
 
 def _setting(asked: Any, fitted: Any) -> Any:
-    """Return `error_model` as JSON: as it was asked for, else as what the fit led to."""
+    """Return the setting `error_model` as JSON, or the fitted error model if that is not JSON."""
     if asked is None or isinstance(asked, str):
         return asked
     if type(asked).__name__ in _REGRESSORS:
@@ -190,7 +190,7 @@ def _setting(asked: Any, fitted: Any) -> Any:
 
 
 def _described(estimator: Any) -> dict[str, Any]:
-    """Return class and parameters of an estimator."""
+    """Return the class and the parameters of an estimator."""
     return {"class": type(estimator).__name__, "params": params_of(estimator)}
 
 
@@ -206,7 +206,7 @@ def _estimator(setting: dict[str, Any]) -> Any:
 
 
 def _stored_error(error: Any) -> Stored | None:
-    """Return how a fitted error model describes itself; None where there is none."""
+    """Return the description of a fitted error model, None if there is none."""
     if error is None or isinstance(error, (ReadoutFit, ELMRegressor, ELMRegressorCV)):
         return None if error is None else error.stored()
     if type(error) is tuple:  # one for each marker
@@ -220,7 +220,7 @@ def _stored_error(error: Any) -> Stored | None:
 
 
 def _restored_error(stored: Stored | None, restore: Restore, n: int) -> Any:
-    """Return the fitted error model of a description, for n actuators."""
+    """Return the fitted error model from its description, for n actuators."""
     if stored is None:
         return None
     if stored.kind == "list":
@@ -239,7 +239,7 @@ def _restored_error(stored: Stored | None, restore: Restore, n: int) -> Any:
 
 
 def _array(value: Any) -> Any:
-    """Return a list of numbers, null for NaN, or of such lists, as an array; others as they are."""
+    """Return a (nested) list of numbers, null for NaN, as an array; other values unchanged."""
     if not isinstance(value, list) or any(isinstance(entry, str) for entry in value):
         return value
     array = np.array(value)

@@ -1,4 +1,4 @@
-"""A mechanical model plus a learned model of its error, trusted only where it was learned."""
+"""The hybrid model as a scikit-learn regressor: a mechanical model plus its learned residual."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from hybridkin.learning.hidden_layer import check_rows
 
 
 class HybridForwardModel(HybridPredictor):
-    """Forward kinematics f_hyb(q) = f_mech(q) + eps(q), with eps learned on the model's errors.
+    """Forward kinematics f_hyb(q) = f_mech(q) + eps(q), with eps learned from the residual.
 
     A scikit-learn regressor from actuator vectors to tip positions, or poses. The fitted `module_`
     is a torch module with a closed-form Jacobian, ready for `InverseKinematics`.
@@ -56,87 +56,87 @@ class HybridForwardModel(HybridPredictor):
     Parameters
     ----------
     mechanical_model : nn.Module, optional
-        Maps q (..., n) to x (..., m), a `ConstantCurvatureChain` for example. It is copied, never
-        changed. None: no mechanical part, the data alone decide (f^dat of the paper).
+        Maps q (..., n) to x (..., m), for example a `ConstantCurvatureChain`. It is copied, never
+        changed. None: no mechanical model, everything is learned (f^dat of the paper).
     error_model : estimator, str or None, default=None
         Any scikit-learn regressor with as many outputs as x has, or a name:
 
-        - "elm", which None means too: ``ELMRegressor(random_state=random_state)``;
-        - "linear" or "quadratic" features of all actuators, or "pose", features of a chain's shape
-          that loads act on. Linear and other features have separate penalties, which are chosen
-          by the leave-out error of rows, or groups; they may reject any correction;
+        - "elm", the same as None: ``ELMRegressor(random_state=random_state)``;
+        - "linear" or "quadratic": features of all actuators; "pose": features of a chain's shape
+          on which loads act. Linear and other features have separate penalties, chosen by the
+          leave-one-out error of rows, or of groups; an infinite penalty means no correction;
         - "kernel": Gaussian kernel ridge tuned on 5 folds, for up to 10 000 rows;
         - "drop": the mechanical model alone;
-        - "auto": the blend of these, with linear and other features in both couplings, that has
-          the least error on held-out groups, or rows, and a little on rows outside those of the
-          fit; kernel ridge up to 2000 rows. No correction where its gain over the mechanical model
-          is within its standard error. Group rows by what will be new in use.
+        - "auto": the blend of these models, features in both couplings, with the least error on
+          held-out groups, or rows; rows outside the fitted ones have a small weight in it. Kernel
+          ridge takes part up to 2000 rows. If the gain over the mechanical model is within its
+          standard error, nothing is added. Group rows by what will be new in use.
     coupling : {"parallel", "serial"}, default="parallel"
-        Where the error acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial": inside
-        the robot, f_mech(z(q) + delta(q)), with z the lengths and bendings of a chain's segments, q
-        itself for other mechanical models; delta is linear in features of q, so a regressor must
-        be an ELMRegressor (its hidden layer and `alpha` are used) or an ELMRegressorCV. It needs
-        less data where the error has a simple cause inside the robot.
+        Where the correction acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial":
+        inside the robot, f_mech(z(q) + delta(q)). z holds the lengths and bendings of a chain's
+        segments; for other mechanical models it is q. delta is linear in features of q, so a
+        regressor must be an ELMRegressor (its hidden layer and `alpha` are used) or an
+        ELMRegressorCV. Serial needs less data if the error has a simple cause inside the robot.
     calibrate : sequence of str, "auto", "default" or None, default=None
-        Geometry of the mechanical model to fit first, see `hybridkin.calibrate`; it is refitted
-        in every fold of a cross-validation. "auto" chooses among sets of parameters, from nothing
+        Parameters of the mechanical model to calibrate first, see `hybridkin.calibrate`. Every
+        fold of a cross-validation repeats this. "auto" chooses among sets of parameters, from none
         to the whole geometry, by the errors on held-out groups, or rows, and on the outer rows
-        after a fit to the inner ones (for error_model="drop" by the first alone); where tendons of
-        a `ConstantCurvatureChain` contradict each other it tries an `ElasticTendonChain`, too. So
-        does error_model="auto" with a list. "default": the chain's own list. None means "auto" of a
+        after a fit to the inner ones (for error_model="drop" by the first errors only). If tendons
+        of a `ConstantCurvatureChain` contradict each other, it also tries an `ElasticTendonChain`.
+        So does error_model="auto" with a list. "default": the chain's own list. None: "auto" for a
         chain with error_model="auto", else nothing.
     guard : {"leverage", "box", None}, default="leverage"
-        Where eps is trusted. "leverage": the domain is where the inputs are as close to the
-        training rows as these are to each other, in the hidden features of a network at the tip,
-        for other error models in the inputs and their squares; eps fades out from three times this
-        distance on, and f_mech remains. "box": the domain is the training range, and eps fades out
-        from its edge on. None: everywhere. With `groups` the domain (`in_domain`) ends as well
-        where no held-out group has tested the model. With a guard f_hyb is nowhere farther from
-        f_mech than 1.5 times the longest correction of a training row.
+        Where eps is used. "leverage": the domain is where inputs are as close to the training rows
+        as these are to each other, in the hidden features of a network at the tip, or in the inputs
+        and their squares for other error models. From three times this distance eps fades out and
+        f_mech remains. "box": the domain is the training range, and eps fades out outside it.
+        None: everywhere. With `groups`, the domain (`in_domain`) also excludes rows where no
+        held-out group has tested the model. With a guard, f_hyb differs from f_mech by at most 1.5
+        times the longest correction of a training row.
     play : float, array-like of shape (n,) or "auto", optional
-        Play (backlash) of the actuators [unit of q]: rows are commands in the order of time, and
-        the model maps the motion of the actuators, see `PlayOperator`. "auto" takes the width with
-        the least held-out error of an `ELMRegressorCV`, or none. Each group starts without a past.
-        Inverse kinematics finds the motion of the actuators, ``play_.command`` the commands for
-        it. Default: no play, rows in any order.
+        Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
+        time, and the model maps the motion of the actuators, see `PlayOperator`. "auto" takes the
+        width with the least held-out error of an `ELMRegressorCV`, or none. Each group starts anew.
+        Inverse kinematics finds the motion of the actuators; ``play_.command`` gives the commands
+        for it. Default: no backlash, rows in any order.
     coverage : float, optional
         Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``, if
         new groups are like those of the log. It needs ``coverage / (1 - coverage)`` groups, 9 for
         0.9, and five more fits, each with a fifth of them held out. Default: no radius.
     output : {"position", "pose"}, default="position"
-        What y holds. "pose": rows of tip position [m] and rotation vector [rad] of the tip's frame
-        in the measuring frame. The errors of both are learned as six numbers [m], a radian as the
-        reach of the chain, and set p = p_mech + eps_p and R = exp(eps_r / reach) R_mech. For a
-        ``PoseModel`` and regressors, parallel, no `coverage`; a calibration uses the positions.
+        What y holds. "pose": rows of tip position [m] and rotation vector [rad] of the tip frame
+        in the measuring frame. The errors of both are learned as six numbers [m]: one radian counts
+        as the reach of the chain, p = p_mech + eps_p and R = exp(eps_r / reach) R_mech. It needs a
+        ``PoseModel``, a regressor, parallel coupling and no `coverage`. Positions calibrate it.
     random_state : int, RandomState or None, default=None
         Seed of the named error models; a given regressor has its own.
 
     Attributes
     ----------
     module_ : nn.Module
-        q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``; of poses q
-        -> tip position, with ``pose``, ``pose_jacobian`` and ``tip_transform`` as well.
+        q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``. For poses:
+        q -> tip position, also with ``pose``, ``pose_jacobian`` and ``tip_transform``.
     mechanical_model_ : ForwardModel or None
-        The mechanical part, calibrated when asked; `adapt` moves its base and its zeros.
+        The mechanical model, calibrated if asked; `adapt` moves its base and its actuator zeros.
     error_model_ : estimator, ReadoutFit, Blend or None
-        The fitted error model; of a blend its ``weights`` and ``error_models``. Of serial coupling
-        and of named features it holds the ``alphas`` chosen and the ``residual`` of every row from
-        a fit without it or its group [m].
+        The fitted error model. A blend has ``weights`` and ``error_models``. With serial coupling
+        or named features it holds the chosen ``alphas`` and the ``residual`` of every row from a
+        fit without that row or its group [m].
     cv_results_ : dict or None
-        Of error_model="auto": by candidate, the last of which is the blend, the mean distance on
-        held-out rows and its spread over the folds [m]; ``io_distance``, that on the outer 35 % of
-        the rows after a fit to the inner 40 % [m]; the ``weights`` of the blend, and what is
-        ``chosen`` ("blend", or the only candidate with a weight). ``parameters`` is the set that
-        was calibrated, ``mechanical_model`` holds the same two errors of every set, "cv" and "io",
-        without play [m]. The blend is judged by weights chosen without the fold. New motions unlike
-        all in the log are harder than held-out ones.
+        For error_model="auto". By candidate, the last of which is the blend: the mean distance on
+        held-out rows and its standard deviation over the folds [m], and ``io_distance``, the mean
+        distance on the outer 35 % of the rows after a fit to the inner 40 % [m]. ``weights`` of the
+        blend; ``chosen``: "blend", or the only candidate with a weight. ``parameters``: the set
+        that was calibrated; ``mechanical_model``: the same two errors of every set, "cv" and "io",
+        without backlash [m]. On each fold the blend has weights chosen without that fold. New
+        motions unlike all in the log have larger errors than held-out ones.
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator or None
-        The play; None where there is none, and where "auto" found no significant gain.
+        The backlash; None if there is none, or if "auto" found no significant gain.
     radius_ : Radius or None
-        Where a coverage was asked for: the radius ``inside`` the domain [m], infinite where the
-        groups are too few, and ``outside`` it, always infinite; that of the fit, whatever follows.
+        With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups, and
+        ``outside`` it, always infinite. `adapt` and `partial_fit` do not change it.
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)
@@ -195,19 +195,19 @@ class HybridForwardModel(HybridPredictor):
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
     ) -> HybridForwardModel:
-        """Calibrate the mechanical model when asked, and learn its error.
+        """Calibrate the mechanical model if asked, learn its residual, and return this estimator.
 
         Parameters
         ----------
         X : array-like of shape (N, n)
-            Actuator vectors q [m], of revolute joints [rad].
+            Actuator vectors q [m]; for revolute joints [rad].
         y : array-like of shape (N, m) or (N,)
-            Measured tip positions x [m]; of poses (N, 6); of K markers (N, 3 K), NaN: missing.
+            Measured tip positions x [m]; poses (N, 6); K markers (N, 3 K), NaN if missing.
         sample_weight : array-like of shape (N,), optional
             How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
-            Equal rows are held out together. With `play` weight 0 still moves actuators.
+            Equal rows are held out together. With `play`, rows of weight 0 still move actuators.
         groups : array-like of shape (N,), optional
-            Motion of every row, which is held out as a whole: by the calibration
+            Motion of every row. Whole motions are held out by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
             Rows farther from the log than its groups are from each other are not `in_domain`.
 
@@ -219,18 +219,18 @@ class HybridForwardModel(HybridPredictor):
         Raises
         ------
         ValueError
-            For parameters out of their set, shapes that do not fit the mechanical model, data that
-            are not finite, or that a scaler has turned into numbers without a unit, and fewer than
-            two different rows to learn from, three with `coverage`.
+            For settings that are not allowed, shapes that do not fit the mechanical model, data
+            that are not finite or that a scaler has made unitless, and fewer than two different
+            rows to learn from (three with `coverage`).
 
         Warns
         -----
         UserWarning
-            Where the different rows are fewer than 20, or than twice the coefficients of an affine
-            function of q. Where tendons of a ConstantCurvatureChain contradict each other, as slack
-            tendons do (so do `predict` and the Jacobians), where calibrate="auto" finds directions
-            of X that move the tip and that the log does not, where numbers look like millimetres,
-            where the groups are too few for `coverage`, and the warnings of `calibrate`.
+            If there are fewer different rows than 20, or than twice the coefficients of an affine
+            function of q; if tendons of a ConstantCurvatureChain contradict each other, as slack
+            tendons do (`predict` and the Jacobians warn too); if calibrate="auto" finds directions
+            of X that move the tip but do not vary in the log; if numbers look like millimetres; if
+            there are too few groups for `coverage`; and the warnings of `calibrate`.
         """
         for message in self.fit_with_messages(X, y, sample_weight, groups):
             warnings.warn(message, stacklevel=2)
@@ -245,7 +245,7 @@ class HybridForwardModel(HybridPredictor):
         geometry: GeometryChoice | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> list[str]:
-        """Fit as `fit` does and return the messages of its warnings; none is issued.
+        """Fit as `fit` does and return the messages of its warnings without issuing them.
 
         `geometry` replaces the choice of what to calibrate. `progress` gets (done, total).
         """
@@ -287,32 +287,32 @@ class HybridForwardModel(HybridPredictor):
         decay: float = 0.98,
         alpha: float | None = None,
     ) -> HybridForwardModel:
-        """Follow a change of the robot, a payload or wear, by new measurements in order of time.
+        """Update the model with new measurements in order of time, after a payload or wear.
 
-        Mechanical model and error model stay as they were fitted. The new residual is learned as
-        an affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``. It follows
-        one motion; `adapt` is for a robot whose base or actuator zeros are not those of the fit.
+        The mechanical model and the error model do not change. The new residual is learned as an
+        affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``. This follows
+        one motion. If the base or the actuator zeros have changed since the fit, use `adapt`.
 
         Parameters
         ----------
         X : array-like of shape (N, n)
-            Actuator vectors, a single row too.
+            Actuator vectors; a single row is allowed.
         y : array-like of shape (N, m) or (N,)
             Measured tips [m].
         sample_weight : array-like of shape (N,), optional
             How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
         decay : float, default=0.98
-            Factor in (0, 1] on the weight of all earlier rows with every row: 0.98 forgets within
-            about fifty measurements.
+            Factor in (0, 1] by which every new row multiplies the weights of all earlier rows. 0.98
+            forgets within about fifty measurements.
         alpha : float, optional
-            Penalty on B, in measurements: a small one follows single measurements. Default: the one
-            of largest evidence, for errors as large as those of the fit on held-out rows; B stays
-            zero unless the evidence for a change is clear.
+            Penalty on B, in measurements; with a small one B follows single measurements. Default:
+            the one of largest evidence, given the held-out errors of the fit; B stays zero unless
+            the evidence for a change is clear.
 
         Returns
         -------
         HybridForwardModel
-            This estimator; fitted by `fit`, if it was not yet.
+            This estimator. If it was not fitted, `fit` fits it.
         """
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
@@ -334,7 +334,7 @@ class HybridForwardModel(HybridPredictor):
         self._drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
             alpha = self._drift.likeliest_alpha(self._noise)
-        # What was handed out before stays as it was.
+        # A module that a caller already holds does not change.
         drifted = fitted.with_drift(self._drift.correction(alpha))
         self.module_ = self.module_.of(drifted)
         return self
@@ -347,43 +347,43 @@ class HybridForwardModel(HybridPredictor):
         parameters: Sequence[str] = PARAMETERS,
         groups: ArrayLike | None = None,
     ) -> HybridForwardModel:
-        """Adapt the model to a robot that has changed since the fit, from a few rows.
+        """Adapt the model to a robot that has changed since the fit, from a few new rows.
 
-        On another day the base stands elsewhere and the zeros of the actuators have shifted. Five
-        rows spread over the workspace are enough to find both: ``x = T f_hyb(q + shift)``, with a
-        rigid motion T. What the fit has learned stays. A robot that has not changed stays as it is.
+        On another day the base may have moved and the actuator zeros may have shifted. Five rows
+        spread over the workspace identify both: ``x = T f_hyb(q + shift)``, with a rigid motion T.
+        The learned residual is kept. If the robot has not changed, the model does not change.
 
-        The change is always one since the fit: `adapt` replaces an earlier one, and what
-        `partial_fit` has learned. A payload or softer segments are another kind of change; for
-        these record a new log.
+        The change always counts from the fit: `adapt` replaces an earlier `adapt` and all that
+        `partial_fit` has learned. A payload or softer segments are another kind of change; record
+        a new log for these.
 
         Parameters
         ----------
         X : array-like of shape (k, n)
-            New actuator vectors, a single one too; with `play` the rows of a group in their order.
+            New actuator vectors, one or more; with `play`, the rows of a group in order of time.
         y : array-like of shape (k, m) or (k,)
-            Measured tips [m]; of poses (k, 6), see `output`.
+            Measured tips [m]; poses (k, 6), see `output`.
         parameters : sequence of str, default=("base", "actuator_zeros")
             What may have changed.
         groups : array-like of shape (k,), optional
-            Motion of every row. The rows of one motion err alike, and count as fewer.
+            Motion of every row. Rows of one motion have similar errors and count as fewer rows.
 
         Returns
         -------
         HybridForwardModel
-            This estimator. `mechanical_model_` has changed as well, `calibration_` and `radius_`
-            are those of the fit.
+            This estimator. `mechanical_model_` changes as well; `calibration_` and `radius_` stay
+            those of the fit.
 
         Raises
         ------
         ValueError
-            For other `parameters`, and for "base" where the outputs are neither tips in space nor
+            For other `parameters`, and for "base" if the outputs are neither tips in space nor
             poses.
 
         Warns
         -----
         UserWarning
-            Where the errors on the new rows stay far larger than those of the fit on held-out rows.
+            If the errors on the new rows stay far larger than the held-out errors of the fit.
 
         Examples
         --------
@@ -399,8 +399,8 @@ class HybridForwardModel(HybridPredictor):
         fitted = self.module_.fitted.with_drift(None)
         if np.isnan(self._noise):
             raise ValueError(
-                "`adapt` needs the held-out errors of the fit, which a file of an earlier version "
-                "does not hold; fit the model again and save it."
+                "`adapt` needs the held-out errors of the fit; files of earlier versions do not "
+                "hold them. Fit the model again and save it."
             )
         rows = self._checked_rows(X, y, None, groups, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
@@ -428,7 +428,7 @@ class HybridForwardModel(HybridPredictor):
         return Rows(X, y, cast("NDArray | None", weights), groups)
 
     def _spec(self, rows: Rows) -> Spec:
-        """Return what the settings ask for, with a copy of the mechanical model."""
+        """Return the settings as a specification, with a copy of the mechanical model."""
         mechanical, names = copy.deepcopy(self.mechanical_model), ()
         if mechanical is not None:
             mechanical = as_forward_model(mechanical)

@@ -1,4 +1,4 @@
-"""The tables and figures of the paper, on the simulated trunk."""
+"""The tables and figures of the paper, computed for the simulated trunk."""
 
 from hybridkin.paper.report import run_paper
 from hybridkin.paper.tables import PAPER_ELM, table1

@@ -1,4 +1,4 @@
-"""Which geometry of the simulated trunk the paper's sampling protocol identifies."""
+"""The geometry of the simulated trunk that the paper's sampling protocol identifies."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from hybridkin.datasets import paper_split
 from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries
 
 ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
-"""The geometry that `identifiability` asks for at once."""
+"""All parameters that `identifiability` calibrates at once."""
 
 IDENTIFIABLE = ("radii", "rest_bends", "tool", "base")
-"""What remains of it where parameters with the same effect on the samples are asked for once."""
+"""The same without parameters that have the same effect on the data as others."""
 
 
 def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
-    """Return which geometry of the trunk the training rows of the paper's protocol identify.
+    """Return which parameters of the trunk the training rows of the paper's protocol identify.
 
     Parameters
     ----------
     data : Bunch
         As for `table1`.
     split : int, default=0
-        Which of the fully random rows are kept for the test.
+        Seed that selects the test rows among the fully random ones.
 
     Returns
     -------
     dict
-        "n_train", "n_single" (rows in which one segment moves) and "n_random"; then by "asked",
+        "n_train", "n_single" (rows in which one segment moves) and "n_random". For "asked",
         "identifiable" and "default" (radii and base) a dict of "parameters", "entries" (one for
         each free parameter, see `geometry_entries`), "unidentified" (a sentence for each direction
-        that is not identified), and "rmse", "test" and "test_max", tip errors on the training rows
-        and on the test rows [m].
+        that is not identified), and tip errors [m]: "rmse" on the training rows, "test" and
+        "test_max" on the test rows.
     """
     train, test = paper_split(data, split)
     chain = robots.bionic_handling_assistant()
@@ -59,21 +59,21 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
 
 
 def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) -> None:
-    """Add what `identifiability` found to a report."""
+    """Add the results of `identifiability` to a report."""
     report.record["identifiability"] = found
     asked, fewer, default = (found[label] for label in ("asked", "identifiable", "default"))
     n = sum(entry["identified"] for entry in asked["entries"])
     report.text(
-        "## Which geometry the samples identify",
-        f"All of {', '.join(ASKED)} at once, from the {found['n_train']} training rows of one "
-        f"split of the **simulated** data: {found['n_single']} rows of one segment moving alone "
-        f"and {found['n_random']} fully random ones. Identified means that the rows narrow the "
-        f"prior at least {IDENTIFIED:.0f} times: {n} of "
-        f"{len(asked['entries'])} parameters. The others stay near the published geometry. The "
+        "## Geometry that the data identify",
+        f"Parameters {', '.join(ASKED)} are calibrated at once to the {found['n_train']} training "
+        f"rows of one split of the **simulated** data. In {found['n_single']} rows one segment "
+        f"moves alone, and {found['n_random']} rows are fully random. A parameter is identified if "
+        f"the rows narrow its prior at least {IDENTIFIED:.0f} times. This holds for {n} of "
+        f"{len(asked['entries'])} parameters; the others stay near the published geometry. The "
         "base is given by its rotation from the start and its position.",
     )
     report.geometry(asked["entries"])
-    report.text("What the samples do not identify, and which measurement would:")
+    report.text("Not identified by the data, and the measurement that would identify it:")
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
     n = sum(entry["identified"] for entry in fewer["entries"])
     report.text(f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:")
@@ -85,10 +85,10 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
     found["base_position_error"] = list(away.values())
     report.text(
         f"The tip error on the 100 test rows hardly changes: {100 * asked['test']:.2f} cm with "
-        f"everything fitted, {100 * fewer['test']:.2f} cm without turns and actuator zeros, "
-        f"{100 * default['test']:.2f} cm with radii and base alone. Standard errors measure noise, "
-        "not the error of a wrong model: the simulated trunk sags and is no chain of arcs "
-        f"({100 * fewer['rmse']:.2f} cm rms remain), and the position of its base, known in the "
-        f"simulation, is off by {', '.join(f'{value:+.1f}' for value in away.values())} mm, up to "
+        f"all parameters, {100 * fewer['test']:.2f} cm without turns and actuator zeros, "
+        f"{100 * default['test']:.2f} cm with only radii and base. Standard errors measure noise, "
+        "not the error of a wrong model. The simulated trunk sags and is not a chain of arcs "
+        f"({100 * fewer['rmse']:.2f} cm rms remain). The calibrated position of its base differs "
+        f"from ground truth by {', '.join(f'{value:+.1f}' for value in away.values())} mm, up to "
         f"{far:.0f} standard errors."
     )

@@ -1,4 +1,4 @@
-"""The paper's result as one report."""
+"""The report that reproduces the paper."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ def run_paper(
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> tuple[Report, list[Path]]:
-    """Reproduce the paper on the simulated trunk and write report.md, report.json and figures.
+    """Reproduce the paper on the simulated trunk; write and return a report with figures.
 
     Parameters
     ----------
     out : str or Path
-        Folder to write into; it is made when absent.
+        Folder to write into; it is created if needed.
     n_splits, n_seeds, n_jobs, progress
         As in `table1`.
     n_points : int, default=151
-        Time steps of each tracked path.
+        Number of time steps of each tracked path.
 
     Returns
     -------
     report : Report
         Its ``record`` holds every number.
     paths : list of Path
-        What was written.
+        The written files.
     """
     check_out(out)
-    TrunkPlant()  # fails at once, with advice, where MuJoCo is missing
+    TrunkPlant()  # fails at once, with advice, if MuJoCo is missing
     data = load_trunk()
     table = tables.table1(data, n_splits, n_seeds, n_jobs=n_jobs, progress=progress)
     train, _ = paper_split(data, 0)
@@ -62,10 +62,10 @@ def run_paper(
     report.record.update(n_splits=n_splits, n_seeds=n_seeds, n_points=n_points)
     report.text(
         "Reinhart & Steil (2016) learn the error of a constant-curvature model of Festo's Bionic "
-        "Handling Assistant and invert the sum to steer its tip. Here the robot is **simulated** "
-        "(MuJoCo; 1 mm noise on the chamber lengths, 0.5 mm on the tip). The paper's own numbers, "
-        "from the real robot, stand beside ours: compare the order of the models and the factors "
-        "between them, not the centimetres.",
+        "Handling Assistant and invert the sum to control its tip. Here the robot is **simulated** "
+        "(MuJoCo; 1 mm noise on the chamber lengths, 0.5 mm on the tip). The numbers of the paper "
+        "are from the real robot. Compare the order of the models and the ratios of their errors, "
+        "not the centimetres.",
     )
     tables.write_table1(report, table)
     _write_errors(report, data, models)
@@ -84,8 +84,8 @@ def _write_errors(report: Report, data: Bunch, models: dict[str, HybridForwardMo
         name: {"mean": e.mean(), "std": e.std(), "max": e.max()} for name, e in errors.items()
     }
     report.text(
-        "## Fig. 2: where the mechanical model errs",
-        f"All {len(data.q)} rows. Nominal mechanical model: mean "
+        "## Fig. 2: errors of the mechanical model",
+        f"All {len(data.q)} rows. Nominal model: mean "
         f"{100 * errors[mechanical].mean():.2f} cm, maximum "
         f"{100 * errors[mechanical].max():.1f} cm (paper: 2.5 and 9.3). The hybrid model was "
         "trained on 1900 of these rows.",
@@ -99,4 +99,4 @@ def _write_errors(report: Report, data: Bunch, models: dict[str, HybridForwardMo
     backbone = chain.backbone(torch.from_numpy(data.q[row])).numpy()
     figure, ax = new_figure(6.0, 5.0, subplot_kw={"projection": "3d"})
     WorkspaceDisplay(data.x, predictions[mechanical], backbone, row).plot(ax)
-    report.figure("workspace", figure, "Measured tips, error of the nominal model (Fig. 2, left).")
+    report.figure("workspace", figure, "Measured tips; error of the nominal model (Fig. 2, left).")

@@ -41,26 +41,26 @@ def table1(
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> list[dict[str, Any]]:
-    """Return the errors of every model of Table 1 over random test splits and network seeds.
+    """Return the errors of every model of Table 1, over random test splits and network seeds.
 
     Parameters
     ----------
     data : Bunch
         With ``q``, ``x`` and ``part``, as from `datasets.load_trunk`.
     n_splits : int, default=20
-        Draws of the 100 test rows among the fully random ones.
+        Number of random draws of the 100 test rows from the fully random ones.
     n_seeds : int, default=5
-        Random hidden layers per split.
+        Number of random hidden layers per split.
     n_jobs : int, optional
-        Processes; -1: one per core.
+        Number of processes; -1: one per core.
     progress : callable, optional
         Called with (what, done, total).
 
     Returns
     -------
     list of dict
-        One entry per model: "model", "learner", and for "train" and "test" the statistics of
-        `summary` [m].
+        One entry per model: "model", "learner", and the statistics of `summary` [m] for "train" and
+        "test".
 
     References
     ----------
@@ -87,7 +87,7 @@ def run_all(jobs: list[Any], n_jobs: int | None, progress: Progress, what: str) 
 
 
 def summary(errors: list[list[NDArray]]) -> dict[str, float]:
-    """Return mean, spread and maximum of errors by split and network seed.
+    """Return mean, standard deviations and maximum of errors by split and network seed.
 
     Parameters
     ----------
@@ -97,9 +97,9 @@ def summary(errors: list[list[NDArray]]) -> dict[str, float]:
     Returns
     -------
     dict
-        "mean"; "std": over the configurations of one test, averaged over tests; "max": the
-        largest of all; "std_splits": of the mean over splits, seeds averaged; "std_seeds": of the
-        mean over seeds, averaged over splits; "mean_max": the maximum of one test, averaged.
+        "mean"; "std": standard deviation over the configurations of one test, averaged over tests;
+        "max": the largest of all; "std_splits": standard deviation of the mean over splits (seeds
+        averaged); "std_seeds": the same over seeds (splits averaged); "mean_max": mean maximum.
     """
     runs = [[(run.mean(), run.std(), run.max()) for run in split] for split in errors]
     mean, std, top = np.moveaxis(np.array(runs), -1, 0)  # each (splits, seeds)
@@ -126,7 +126,7 @@ def _one_split(
         record(f"mechanical, {name}", "-", HybridForwardModel(chain, "drop"))
     roles = {"data-driven": None, **{f"hybrid on {name}": c for name, c in chains.items()}}
     for role, chain in roles.items():
-        # The paper trusts the error model everywhere.
+        # The paper uses the error model everywhere, without a guard.
         record(role, "linear", HybridForwardModel(chain, linear(), guard=None))
         record(role, "quadratic", HybridForwardModel(chain, quadratic(), guard=None))
         for seed in range(n_seeds):
@@ -136,28 +136,28 @@ def _one_split(
 
 
 def chains_of(q: NDArray, x: NDArray) -> dict[str, Chain]:
-    """Return the published mechanical model, and the same with radii and base from the rows."""
+    """Return the published mechanical model, and the same with calibrated radii and base."""
     nominal = robots.bionic_handling_assistant()
     return {"nominal": nominal, "calibrated": calibrate(nominal, q, x).chain}
 
 
 def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
-    """Add Table 1 to a report, the paper's own numbers beside ours."""
+    """Add Table 1 to a report, with the numbers of the paper beside ours."""
     report.record["table1"] = table
     means = {e["model"]: e["test"]["mean"] for e in table if e["learner"] in ("-", "ELM")}
     report.record["mechanical_over_hybrid"] = ratios = mechanical_over_hybrid(means)
     report.text(
         "## Table 1: error of the forward models",
         f"Tip error in cm: mean ± standard deviation over configurations (maximum). "
-        f"{report.record['n_splits']} random draws of the 100 test rows among the 500 fully random "
-        f"ones, the other 1900 rows for training; networks with {report.record['n_seeds']} random "
+        f"{report.record['n_splits']} random draws of 100 test rows from the 500 fully random "
+        f"ones; the other 1900 rows are for training. Networks: {report.record['n_seeds']} random "
         "hidden layers per draw (H = 100, lambda = 0.1). The hybrids have no guard, as in the "
-        "paper. The last columns give the other two kinds of spread: of the mean test error over "
-        "draws of the test set, and over hidden layers.",
-        f"Mechanical over hybrid ELM, test error: **{ratios['nominal']:.2f}** on the nominal "
-        f"mechanical model, {ratios['calibrated']:.2f} on the calibrated one (radii and base); "
-        'paper: 1.9 (2.5 to 1.3 cm). "Nominal" has the published radii, as in the paper. The '
-        "quadratic polynomial is not in the paper; it shows how much of the gain needs a network.",
+        "paper. The last two columns give the standard deviation of the mean test error over draws "
+        "of the test set, and over hidden layers.",
+        "Test error of the mechanical model divided by that of the hybrid with an ELM on it: "
+        f"**{ratios['nominal']:.2f}** for the nominal model with the published radii, "
+        f"{ratios['calibrated']:.2f} for the calibrated model (radii and base); paper: 1.9 (2.5 to "
+        "1.3 cm). The quadratic polynomial is not in the paper; it shows if a network is needed.",
     )
     header = ["model", "learner", "train", "paper: train", "test", "paper: test"]
     rows = []
@@ -180,11 +180,11 @@ def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
 
 
 def mechanical_over_hybrid(means: dict[str, float]) -> dict[str, float]:
-    """Return by mechanical model how many times its mean error is that of the hybrid on it."""
+    """Return the mean error of each mechanical model divided by that of the hybrid on it."""
     names = ("nominal", "calibrated")
     return {name: means[f"mechanical, {name}"] / means[f"hybrid on {name}"] for name in names}
 
 
 def cell(stats: dict[str, Any]) -> str:
-    """Return mean ± standard deviation (maximum), from metres to centimetres."""
+    """Return mean ± standard deviation (maximum) as text, converted from metres to centimetres."""
     return f"{100 * stats['mean']:.2f} ± {100 * stats['std']:.2f} ({100 * stats['max']:.1f})"

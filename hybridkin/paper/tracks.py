@@ -1,4 +1,4 @@
-"""Figs. 3 and 4 of Reinhart & Steil (2016): paths followed on the simulated trunk."""
+"""Figs. 3 and 4 of Reinhart & Steil (2016): tracking of paths with the simulated trunk."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MODELS = (
     *("mechanical, nominal", "mechanical, calibrated"),
     *("hybrid on nominal", "hybrid on calibrated", "serial on calibrated"),
 )
-"""Models that steer the trunk, in the order of the report."""
+"""Models that control the trunk, in the order of the report."""
 
 _MEASURED_SEED = 7
 
@@ -50,7 +50,7 @@ def tracking(
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> Tracks:
-    """Return, by path and model, how the plant follows commands computed on each model.
+    """Return the tracks of the plant, by path and model, for commands computed on each model.
 
     Parameters
     ----------
@@ -61,15 +61,15 @@ def tracking(
     plant_parameters : dict
         Arguments of `simulation.TrunkPlant`.
     feedback : {"model", "measured"} or None, default="model"
-        "model": feed-forward, the commands are computed on the model alone; "measured": the loop is
-        closed over the measured tips.
+        "model": feed-forward, the commands are computed on the model alone; "measured": closed
+        loop with the measured tips.
     n_jobs, progress
         As in `table1`.
 
     Returns
     -------
     dict of dict of Track
-        ``result[path][model]``; errors are those of the plant.
+        ``result[path][model]``, with the errors of the plant.
 
     References
     ----------
@@ -92,7 +92,7 @@ def paper_paths(n_points: int = 151) -> dict[str, Trajectory]:
 
 
 def tracked_models(q: NDArray, x: NDArray) -> dict[str, HybridForwardModel]:
-    """Return the models that steer the trunk, fitted to rows of one split."""
+    """Return the models that control the trunk, fitted to the rows of one split."""
     chains, models = chains_of(q, x), {}
     for name, chain in chains.items():
         elm = ELMRegressor(**PAPER_ELM, random_state=0)
@@ -135,13 +135,13 @@ def write_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Trac
     report.record |= {"tracking": record, "tracking_mechanical_over_hybrid": ratios}
     report.text(
         "## Figs. 3 and 4: tracking on the simulated trunk",
-        f"Each path of {len(paths['spiral'].x)} points becomes chamber lengths by eq. (1) on the "
-        "model alone (feed-forward; preferred posture: straight, 0.25 m), then moves the simulated "
-        "trunk with its measurement noise. The networks are trained on the 1900 rows of one split, "
-        "without a guard, as in the paper; the serial model, not in the paper, has one. "
-        "Tip error in cm: mean ± standard deviation (maximum).",
-        f"Mechanical over hybrid: **{ratios['nominal']:.2f}** on the nominal model, "
-        f"{ratios['calibrated']:.2f} on the calibrated one (paper: 2.5, from 4.16 to 1.67 cm).",
+        f"Eq. (1) converts each path of {len(paths['spiral'].x)} points to chamber lengths with "
+        "the model alone (feed-forward; preferred posture: straight, 0.25 m), which then move the "
+        "simulated trunk with its noise. As in the paper, the networks are trained on the 1900 "
+        "rows of one split and have no guard. The serial hybrid (quadratic features, with a guard) "
+        "is not in the paper. Tip error in cm: mean ± standard deviation (maximum).",
+        f"Mechanical model over hybrid: **{ratios['nominal']:.2f}** for the nominal model, "
+        f"{ratios['calibrated']:.2f} for the calibrated one (paper: 2.5, from 4.16 to 1.67 cm).",
     )
     header = ["path", "model", "tracking error", "95 %", "steps not settled", "paper: mean"]
     report.table(header, rows)
@@ -166,7 +166,7 @@ def _draw_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Trac
 
 
 def write_closed_loop(report: Report, feed_forward: Tracks, closed: Tracks) -> None:
-    """Add the tracks with the measured tip fed back to a report."""
+    """Add the tracks with feedback of the measured tip to a report."""
     rows, record = [], {}
     for name in MODELS:
         cells, record[name] = [], {}
@@ -179,11 +179,11 @@ def write_closed_loop(report: Report, feed_forward: Tracks, closed: Tracks) -> N
         rows.append([name, *cells])
     report.record["closed_loop"] = record
     report.text(
-        "## With the measured tip fed back",
-        "Both paths, in cm: mean ± standard deviation (maximum), 95 %; and the largest change of "
-        "a chamber from one time step to the next, in mm. In the closed loop every step takes the "
-        "tip measured after the last one, noise included. The serial model has its error inside "
-        "the robot; it is not in the paper.",
+        "## With feedback of the measured tip",
+        "Tip error on both paths in cm: mean ± standard deviation (maximum), 95 % quantile; and "
+        "the largest change of a chamber length in one time step, in mm. In the closed loop every "
+        "step uses the tip measured after the previous one, with its noise. The correction of the "
+        "serial hybrid acts inside the robot; it is not in the paper.",
     )
     report.table(["model", "feed-forward", "95 %", "step", "closed loop", "95 %", "step"], rows)
 

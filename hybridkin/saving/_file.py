@@ -3,13 +3,13 @@
 The header is a JSON object with
 
 - ``format``: "hybridkin-model";
-- ``version``: raised when earlier readers could no longer read the file;
+- ``version``: increased when earlier readers cannot read the file any more;
 - ``kind``, ``settings``, ``arrays``, ``parts``: the description of the model, see `Stored`.
-  ``arrays`` gives the name of every array in the file, so that equal arrays are written once;
-- everything else by name. A reader ignores entries that it does not know.
+  ``arrays`` gives the name of every array in the file; equal arrays are written once;
+- other entries by name. A reader ignores entries that it does not know.
 
-The checksum, SHA-256 of the header and of names, types, shapes and bytes of all arrays, stands
-beside the header. It detects accidents, not forgery: who can write a file can write its checksum.
+The checksum is the SHA-256 of the header and of names, types, shapes and bytes of all arrays. It
+detects accidents, not forgery: anyone who can write a file can write its checksum.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def packed(stored: Stored) -> tuple[Header, Arrays]:
 
 
 def unpacked(header: Header, arrays: Arrays) -> Stored:
-    """Return the description that `packed` wrote; a ValueError where it is none.
+    """Return the description that `packed` wrote; raise a ValueError if it is not one.
 
-    Parts that say the same are one object, as the parts of the model were.
+    Equal parts become one object, as in the model.
     """
     for name, array in arrays.items():
         if array.dtype == np.float64 and not (countable(array) | ~np.isfinite(array)).all():
@@ -83,11 +83,11 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
 
 
 def write(path: Path, header: Header, arrays: Arrays) -> None:
-    """Write header and arrays to a file, as `write_file` does; equal content gives equal bytes."""
+    """Write header and arrays to a file with `write_file`; equal content gives equal bytes."""
     text = json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False)
     whole = {name: np.array(array, order="C", ndmin=0) for name, array in arrays.items()}
     content = save(whole, metadata={_HEADER: text, _CHECKSUM: _checksum(text, whole)})
-    # safetensors orders its metadata by chance.
+    # safetensors writes its metadata in random order.
     end = 8 + int.from_bytes(content[:8], "little")
     head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 8)
@@ -100,7 +100,7 @@ def write(path: Path, header: Header, arrays: Arrays) -> None:
 
 
 def read(path: Path) -> tuple[Header, Arrays]:
-    """Return header and arrays of a file that is whole and of the version read here."""
+    """Return header and arrays of a file; raise if it is damaged or of another version."""
     if path.is_dir():
         found = sorted(file.name for file in path.glob("[!.]*.safetensors"))
         hint = f"; it contains {found[0]}." if found else " without a saved model."
@@ -117,7 +117,7 @@ def read(path: Path) -> tuple[Header, Arrays]:
     _check_version(path, header)
     if metadata.get(_CHECKSUM) != _checksum(metadata[_HEADER], arrays):
         raise ValueError(
-            f"{path} is damaged: its content does not match its checksum; copy it again, or save "
+            f"{path} is damaged: its content does not match its checksum. Copy it again, or save "
             "the model again."
         )
     return header, arrays
@@ -126,13 +126,13 @@ def read(path: Path) -> tuple[Header, Arrays]:
 def _check_version(path: Path, header: Any) -> None:
     known = isinstance(header, dict) and header.get("format") == FORMAT
     if not known or type(header.get("version")) is not int or header["version"] < 1:
-        raise ValueError(f"{path} is not a model saved by hybridkin: its header is another one.")
+        raise ValueError(f"{path} is not a model saved by hybridkin: its header does not match.")
     if header["version"] != VERSION:
         versions = header.get("versions")
         writer = versions.get("hybridkin") if isinstance(versions, dict) else None
         named = f", {writer[:40]}" if isinstance(writer, str) else ""
         raise ValueError(
-            f"{path} has format version {header['version']}, this hybridkin reads version "
+            f"{path} has format version {header['version']}, but this hybridkin reads version "
             f"{VERSION}; install the hybridkin that wrote it{named}, or save the model again."
         )
 

@@ -1,4 +1,4 @@
-"""Models on disk: one safetensors file of arrays with a JSON header, and no pickle."""
+"""Models on disk: one safetensors file of arrays with a JSON header, without pickle."""
 
 from __future__ import annotations
 
@@ -43,28 +43,28 @@ def save_model(
     model : a chain, a fitted HybridForwardModel, ELMRegressor or ELMRegressorCV
         A chain is a ConstantCurvatureChain, ElasticTendonChain or RigidChain. The hybrid's
         mechanical model must be one of these or None, its error model an ELM, a LinearRegression, a
-        KernelRidge with the kernel "rbf", or a name. Of an ELMRegressorCV the chosen ELMRegressor
+        KernelRidge with the kernel "rbf", or a name. For an ELMRegressorCV, the chosen ELMRegressor
         is stored.
     path : str or Path
-        File to write, usually ``*.safetensors``. It is replaced, with its permissions kept, only
-        once all is on the disk.
+        File to write, usually ``*.safetensors``. An existing file is replaced only when the new one
+        is completely on the disk; its permissions are kept.
     training : mapping of str to numbers, strings or lists, optional
-        What people should read about the training besides what the model knows of it, for example
+        Notes on the training, in addition to the model's own, for example
         ``{"log": "log.csv", "motions": 24, "held_out_rmse": 0.0031}``; see `model_header`.
 
     Raises
     ------
     TypeError
-        For other models: their parts could only be stored as code.
+        For other models, because their parts could only be stored as code.
 
     Notes
     -----
-    A reader ignores entries of the header that it does not know. For another format version,
-    `load_model` refuses the file and names the hybridkin that wrote it.
+    A reader ignores entries of the header that it does not know. A file of another format version
+    is not loaded: `load_model` raises an error that names the hybridkin version that wrote it.
 
-    Equal models give equal files: by the same versions, on the same day, or on the one that the
-    environment variable ``SOURCE_DATE_EPOCH`` names in seconds since 1970. A save that is killed
-    leaves the earlier file as it was. Of a symbolic link the target is replaced.
+    Equal models give equal files if the package versions and the date are the same. The environment
+    variable ``SOURCE_DATE_EPOCH`` sets the date, in seconds since 1970. A save that is killed does
+    not change the earlier file. If `path` is a symbolic link, its target is replaced.
 
     Examples
     --------
@@ -102,30 +102,30 @@ def save_model(
 
 
 def load_model(path: str | Path, *, device: str | torch.device | None = None) -> Any:
-    """Return the model that `save_model` wrote; nothing in the file is ever run as code.
+    """Return the model that `save_model` wrote; no part of the file is run as code.
 
     Parameters
     ----------
     path : str or Path
         File to read, from any machine.
     device : str or torch.device, optional
-        Where to put the model's tensors, ``"cuda"`` for example, whatever device it was saved
-        from. Default: the CPU. Dtypes are those that were saved.
+        Device for the model's tensors, for example ``"cuda"``; it does not depend on the device of
+        the saved model. Default: the CPU. Dtypes are those of the saved model.
 
     Returns
     -------
     ConstantCurvatureChain, ElasticTendonChain, RigidChain, HybridForwardModel or ELMRegressor
-        Ready to predict, and with the settings of the saved one to fit again; random states that
-        are not numbers come back as None.
+        Ready to predict, and to fit again with the saved settings. Random states that are not
+        numbers become None.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not such a model, is damaged, or has another format version.
+        If the file is not a saved model, is damaged, or has another format version.
     RuntimeError
-        If there is no such device here.
+        If this machine does not have the device.
     """
     path = as_path(path)
     at = device_named(device)
@@ -147,7 +147,7 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
 
 
 def model_header(path: str | Path) -> dict[str, Any]:
-    """Return what the header of a saved model says, without loading the model.
+    """Return the header of a saved model without loading the model.
 
     Parameters
     ----------
@@ -157,18 +157,18 @@ def model_header(path: str | Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        Of JSON values: ``created`` (date) and ``versions`` of what wrote it; ``units`` of q and x;
-        ``training`` (``rows``, errors [m], of error_model="auto" all candidates, and what
-        `save_model` was given); of a hybrid ``domain`` (``q_low`` and ``q_high`` of the training
-        rows, null for a column that did not vary, and the ``guard``). Then the model itself:
-        ``kind``, ``settings``, names of ``arrays``, and ``parts`` with these four again.
+        JSON values: ``created`` (date); ``versions`` of the packages that wrote it; ``units`` of q
+        and x; ``training`` (``rows``, errors [m], for error_model="auto" all candidates, and the
+        notes given to `save_model`); for a hybrid, ``domain`` (``q_low`` and ``q_high`` of the
+        training rows, null for a column that did not vary, and the ``guard``). The model itself:
+        ``kind``, ``settings``, names of ``arrays``, and ``parts``, each with these four entries.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not such a model, is damaged, or has another format version.
+        If the file is not a saved model, is damaged, or has another format version.
 
     Examples
     --------
@@ -206,6 +206,6 @@ def _units(model: object, output: str = "position") -> dict[str, str | list[str]
 def _domain(model: HybridForwardModel) -> dict[str, Any]:
     """Return the guard and the range of the training rows, NaN where a column did not vary."""
     center, scale = model._drift.center - as_array(model.module_.shift), model._drift.scale
-    varied = scale != 1.0  # a column without a range counts as one of [-1, 1]
+    varied = scale != 1.0  # columns without a range have the scale 1
     low, high = (np.where(varied, bound, np.nan) for bound in (center - scale, center + scale))
     return {"guard": model.guard, "q_low": plain(low), "q_high": plain(high)}

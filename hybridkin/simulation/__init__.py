@@ -1,4 +1,4 @@
-"""Simulated robots in the place of real ones: a plant to track with, a source of data."""
+"""Simulated robots instead of real ones: a plant to track with, and a source of data."""
 
 from hybridkin.simulation.trunk import NotSettledError, TrunkPlant
 

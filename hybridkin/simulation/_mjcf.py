@@ -3,7 +3,7 @@
 import numpy as np
 
 RADII = (0.100, 0.093, 0.079)  # hull radius per segment [m]
-REST_LENGTH = 0.25  # of every chamber [m]
+REST_LENGTH = 0.25  # rest length of every chamber [m]
 LINKS = 6  # per segment
 TIME_STEP = 0.0025  # [s]
 RELAXATION = 0.2  # damping / stiffness of every joint [s]
@@ -14,14 +14,14 @@ def trunk_mjcf(
 ) -> str:
     """Return the MJCF of a trunk along z, with sites and tendons for its nine chambers.
 
-    A link extends, bends about two axes, twists and extends. The halves of the extension lie on
-    either side of the bends, and the order of the two bends alternates, so that neither the
-    direction along the trunk nor a direction about it is preferred.
+    A link extends, bends about two axes, twists and extends. Half of the extension lies on each
+    side of the bends, and the order of the two bends alternates. The model therefore prefers no
+    direction, neither along the trunk nor about it.
 
     Parameters
     ----------
     gravity : tuple of two floats
-        Acceleration along x and z [m/s^2].
+        Gravitational acceleration along x and z [m/s^2].
     mass : float
         Mass of the three segments together [kg].
     tip_mass : float
@@ -32,7 +32,7 @@ def trunk_mjcf(
     Returns
     -------
     xml : str
-        The model; its tendons and motors are the chambers in the order of q, its site "tip" the
+        The model. Its tendons and motors are the chambers in the order of q; its site "tip" is the
         tip.
     """
     share = np.square(RADII) / RADII[0] ** 2
@@ -55,7 +55,7 @@ def trunk_mjcf(
     bodies = [ring(0, 0)]
     for s in range(3):
         bend, twist, stretch = (value * share[s] / height for value in stiffness)
-        slide = joint("slide", "0 0 1", 2 * stretch, 0.01)  # one of two in series
+        slide = joint("slide", "0 0 1", 2 * stretch, 0.01)  # each of two in series
         link_mass = mass * share[s] / share.sum() / LINKS
         for k in range(LINKS):
             axes = ("1 0 0", "0 1 0") if k % 2 == 0 else ("0 1 0", "1 0 0")

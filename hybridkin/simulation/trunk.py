@@ -1,4 +1,4 @@
-"""A pneumatic trunk under gravity, simulated in MuJoCo: commands in, lengths and tip out."""
+"""A pneumatic trunk under gravity, simulated in MuJoCo: from commands to lengths and the tip."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from hybridkin.simulation._mjcf import LINKS, REST_LENGTH, TIME_STEP, trunk_mjcf
 
-# What "settled" means, and the hold over which it is checked with the length servos on.
+# Limits for a settled trunk, and the hold in which they are checked with the length servos on.
 MAX_LENGTH_ERROR = 1e-5  # [m]
-MAX_SPEED = 1e-4  # of the tip [m/s]
-MAX_DRIFT = 1e-5  # of the tip over the hold [m]
+MAX_SPEED = 1e-4  # speed of the tip [m/s]
+MAX_DRIFT = 1e-5  # drift of the tip during the hold [m]
 HOLD_STEPS = 40  # 0.1 s
 SERVO_GAINS = (2000.0, 4000.0)  # proportional [N/m], integral [N/(m s)]
 
@@ -29,36 +29,36 @@ _MAY_BE_ZERO = ("tilt", "gravity", "tip_mass", "cable_noise", "mocap_noise")
 
 
 class NotSettledError(RuntimeError):
-    """The trunk did not come to rest at a stable shape; the message names the failed criterion."""
+    """The error for a trunk that does not come to rest; the message names the failed criterion."""
 
 
 class TrunkPlant:
-    """Simulated three-segment pneumatic trunk in the manner of Festo's Bionic Handling Assistant.
+    """Simulated three-segment pneumatic trunk, similar to Festo's Bionic Handling Assistant.
 
     A chain of short links hangs from a tilted base. Each link bends about two axes, twists and
     extends against linear springs; nine chambers act along the outer hull, each spanning its own
     segment (radii 0.100, 0.093 and 0.079 m, at 0, 120 and 240 degrees), and a servo drives every
     chamber to its commanded length. Shortening a chamber bends its segment towards it.
 
-    Gravity bends and twists a segment between its end plates, which the nine lengths do not
-    determine. That, and a base that differs from its nominal pose, is the residual of a
-    constant-curvature model. Without gravity and with ``base_error`` zero the trunk is a
+    Gravity bends and twists a segment between its end plates; the nine lengths do not determine
+    this shape. This, and a base that differs from its nominal pose, cause the residual of a
+    constant-curvature model. Without gravity and with ``base_error`` zero, the trunk is a
     constant-curvature arm to about a millimetre.
 
-    `settle` solves for the static equilibrium: Newton's method on MuJoCo's forces, followed from
-    the start shape to the command. It checks that the equilibrium is stable, then lets MuJoCo run
-    with the servos on and checks that lengths, speed and drift stay within their limits.
+    `settle` solves for the static equilibrium by Newton's method on MuJoCo's forces, continued from
+    the start shape to the command. It checks that the equilibrium is stable, then runs MuJoCo with
+    the servos on and checks that lengths, speed and drift stay within their limits.
 
     Parameters
     ----------
     tilt : float, default=35 degrees in radians
-        Angle between the base's z axis, along the straight trunk, and the direction of gravity
-        [rad]. At 0 the trunk hangs straight down; otherwise gravity pulls it towards the base's
-        +x.
+        Angle between the z axis of the base, along the straight trunk, and the direction of gravity
+        [rad]. At 0 the trunk hangs straight down; otherwise gravity pulls it towards +x of the
+        base.
     gravity : float, default=9.81
         Gravitational acceleration [m/s^2].
     mass : float, default=1.2
-        Mass of the three segments together [kg], shared out by the squares of their radii.
+        Mass of the three segments together [kg], divided by the squares of their radii.
     tip_mass : float, default=0.3
         Mass of the gripper at the tip [kg].
     bending_stiffness : float, default=1.0
@@ -69,8 +69,8 @@ class TrunkPlant:
     axial_stiffness : float, default=300.0
         Stiffness against extension [N].
     max_force : float, default=150.0
-        Largest push or pull of a chamber [N]. A chamber that would need more rests at a length
-        other than the commanded one.
+        Largest push or pull of a chamber [N]. A chamber that needs more force does not reach its
+        commanded length.
     base_error : array-like of shape (6,), default=(0.004, -0.003, 0.005, 0.015, -0.005, -0.015)
         True pose of the base in the motion-capture frame: position [m], rotation vector [rad].
     cable_noise : float, default=0.0
@@ -78,7 +78,7 @@ class TrunkPlant:
     mocap_noise : float, default=0.0
         Standard deviation of each coordinate of the measured tip position [m].
     max_iter : int, default=200
-        Newton iterations that one settling may take.
+        Largest number of Newton iterations for one command.
     random_state : int, Generator or None, default=None
         Source of the measurement noise.
 
@@ -87,7 +87,7 @@ class TrunkPlant:
     admissible : tuple of two floats
         Smallest and largest chamber length that may be commanded [m].
     segment_ends : ndarray of shape (3, 3)
-        After `settle`: where the segments end, base to tip, in the motion-capture frame without
+        After `settle`: ends of the segments, base to tip, in the motion-capture frame without
         noise [m]. The last one is the tip.
 
     Raises
@@ -97,7 +97,7 @@ class TrunkPlant:
     ValueError
         If a parameter is out of its range.
     NotSettledError
-        If the trunk has no rest shape under its own weight.
+        If the trunk has no stable shape under its own weight.
 
     Examples
     --------
@@ -160,14 +160,14 @@ class TrunkPlant:
         self._tip = self._model.site("tip").id
         rings = [[f"s{s}_{i}_{LINKS}" for i in range(3)] for s in range(3)]
         self._rings = [[self._model.site(name).id for name in ring] for ring in rings]
-        # A state is the joint positions and the forces of the nine chambers.
+        # A state holds the joint positions and the forces of the nine chambers.
         self._n_dof = self._model.nv
         straight, lengths = np.zeros(self._n_dof + 9), np.full(9, REST_LENGTH)
         self._rest, _ = self._equilibrium(straight, lengths, iter(range(self._max_iter)))
         self.reset()
 
     def reset(self) -> None:
-        """Bring the measurement noise back to its seed."""
+        """Reset the measurement noise to its seed."""
         self._rng = np.random.default_rng(self._random_state)
 
     def __call__(self, q_target: ArrayLike) -> NDArray[np.float64]:
@@ -199,22 +199,22 @@ class TrunkPlant:
             Commanded chamber lengths [m], three per segment from base to tip, within
             ``admissible``.
         random_state : int, sequence of ints, Generator or None, default=None
-            Source of the noise of this measurement alone; None draws from the plant's own.
+            Source of the noise of this measurement; None: the plant's own.
 
         Returns
         -------
         q : ndarray of shape (9,)
             Measured chamber lengths [m]: the command to 0.01 mm, plus ``cable_noise``, except
-            for chambers that would need more than ``max_force``.
+            for chambers that need more than ``max_force``.
         pose : ndarray of shape (4, 4)
             Tip pose in the motion-capture frame, with ``mocap_noise`` on the position.
 
         Raises
         ------
         ValueError
-            If `q_target` has the wrong shape, is not finite or leaves the admissible range.
+            If `q_target` has the wrong shape, is not finite or is outside the admissible range.
         NotSettledError
-            If the trunk did not come to rest at a stable shape.
+            If the trunk does not come to rest at a stable shape.
         """
         target = self._check_lengths(q_target)
         state, held = self._equilibrium(self._rest, target, iter(range(self._max_iter)))
@@ -233,7 +233,7 @@ class TrunkPlant:
         if target.shape != (9,):
             raise ValueError(
                 f"`q_target` must have shape (9,), got {target.shape}; the trunk has 3 segments "
-                "of 3 chambers and settles at one configuration at a time."
+                "of 3 chambers, and each call takes one configuration."
             )
         low, high = self.admissible
         bad = ~((target >= low) & (target <= high))  # NaN included
@@ -245,7 +245,7 @@ class TrunkPlant:
         return target
 
     def _forces(self, state):
-        """Unbalanced joint forces (n_dof,) and chamber lengths (9,) of a state at rest."""
+        """Return unbalanced joint forces (n_dof,) and chamber lengths (9,) of a state at rest."""
         mujoco, model, data = self._mujoco, self._model, self._data
         data.qpos[:] = state[: self._n_dof]
         data.qvel[:] = 0
@@ -259,7 +259,7 @@ class TrunkPlant:
         return data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator, data.ten_length.copy()
 
     def _derivatives(self, state):
-        """Joint derivatives of the forces (n_dof, n_dof) and of the lengths (9, n_dof)."""
+        """Return derivatives by the joints of forces (n_dof, n_dof) and lengths (9, n_dof)."""
         n = self._n_dof
 
         def both(joints):
@@ -268,7 +268,7 @@ class TrunkPlant:
         return np.split(np.asarray(approx_fprime(state[:n], both, DIFFERENCE)), [n])
 
     def _newton(self, state, target, held, budget):
-        """Equilibrium near `state`, or None; chambers not `held` keep their force."""
+        """Return an equilibrium near `state`, or None; chambers not `held` keep their force."""
         n, chambers = self._n_dof, np.arange(9)
         for _ in range(MAX_NEWTON):
             forces, lengths = self._forces(state)
@@ -295,7 +295,7 @@ class TrunkPlant:
         return None
 
     def _follow(self, state, target, held, budget):
-        """Equilibrium at the target, in as few fractions of the way as Newton's method allows."""
+        """Return the equilibrium at the target, in as few steps as Newton's method allows."""
         begin, done, fraction = self._forces(state)[1], 0.0, 1.0
         while done < 1.0:
             fraction = min(fraction, 1.0 - done)
@@ -307,27 +307,27 @@ class TrunkPlant:
             fraction /= 2
             if fraction < MIN_FRACTION:
                 raise NotSettledError(
-                    f"Not settled: no equilibrium was found beyond {done:.0%} of the way to the "
-                    "commanded lengths; command lengths nearer to each other, or make the trunk "
-                    "stiffer."
+                    f"Not settled: no equilibrium was found after {done:.0%} of the way to the "
+                    "commanded lengths. Command lengths that are closer to each other, or make the "
+                    "trunk stiffer."
                 )
         return state
 
     def _equilibrium(self, state, target, budget):
-        """Equilibrium state and which chambers hold their length; the others are saturated."""
+        """Return the equilibrium and which chambers hold their length; others are saturated."""
         n, limit, held = self._n_dof, self._max_force, np.ones(9, dtype=bool)
         for _ in range(10):
             state = self._follow(state, target, held, budget)
             force, gap = state[n:], target - self._forces(state)[1]
             saturated = held & (np.abs(force) > limit)
-            released = ~held & (force * gap < 0)  # pushes though too long, pulls though too short
+            released = ~held & (force * gap < 0)  # a push if too long, or a pull if too short
             if not (saturated | released).any():
                 return state, held
             held = (held & ~saturated) | released
             state = np.concatenate([state[:n], np.clip(force, -limit, limit)])
         raise NotSettledError(
-            "Not settled: the chambers alternate between holding their length and saturating; "
-            "raise `max_force`."
+            "Not settled: chambers alternate between their commanded length and their largest "
+            "force; raise `max_force`."
         )
 
     def _check_stable(self, state, held):
@@ -337,12 +337,12 @@ class TrunkPlant:
         lowest = eigvalsh(reduced, subset_by_index=(0, 0))[0]
         if not lowest > 0:
             raise NotSettledError(
-                f"Not settled: the shape is unstable, its lowest stiffness is {lowest:.3g} and "
-                "must be positive; the trunk is too soft for its weight and tilt."
+                f"Not settled: the shape is unstable, as its lowest stiffness is {lowest:.3g} and "
+                "must be positive. The trunk is too soft for its weight and tilt."
             )
 
     def _hold(self, state, target, held):
-        """Lengths (9,) and tip pose (4, 4) in the base frame after a moment of simulation."""
+        """Return lengths (9,) and tip pose (4, 4) in the base frame after a short simulation."""
         mujoco, model, data = self._mujoco, self._model, self._data
         mujoco.mj_resetData(model, data)
         data.qpos[:] = state[: self._n_dof]

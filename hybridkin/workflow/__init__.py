@@ -1,4 +1,4 @@
-"""From a log to a model, a report and a track: what the command line does."""
+"""From a log to a model, a report and a track: the functions behind the command line."""
 
 from hybridkin.workflow._describe import describe
 from hybridkin.workflow._domain import PathLimits, path_limits

@@ -1,4 +1,4 @@
-"""What is known of a model: geometry, training, domain, errors, and what was chosen."""
+"""The report on a model: geometry, training, domain, errors and the choices of its fit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hybridkin.workflow.report import Report, in_millimetres, millimetres
 
 
 def describe(loaded: LoadedModel) -> Report:
-    """Return a report on what is known of a model, in SI units and degrees.
+    """Return a report on a model; its record is in SI units and degrees.
 
     Parameters
     ----------
@@ -29,8 +29,8 @@ def describe(loaded: LoadedModel) -> Report:
     -------
     Report
         Its ``record`` holds "kind", "n_actuators", "geometry" of the chain, "error_model",
-        "training", "domain", "radius", "play" (width [m]), "auto", "log_format", "limits",
-        "created" and "versions" of the program that wrote the file; None where nothing is known.
+        "training", "domain", "radius", "play" (width [m]), "auto", "log_format", "limits", and
+        "created" and "versions" of the program that wrote the file. Unknown entries are None.
     """
     header, description, hybrid = loaded.header or {}, loaded.description, loaded.hybrid
     kind, trained = type(loaded.model).__name__, loaded.trained_range
@@ -78,9 +78,9 @@ def geometry(chain: Chain) -> dict[str, Any]:
     Returns
     -------
     dict
-        "kind"; "base" position [m] and rotation vector [deg]; of chains of arcs "routing" and
-        "segments", each with radius, length and offset [m], angles and rest bend [deg], gain where
-        it is not 1 [m per unit of q] and, of elastic tendons, stiffnesses.
+        "kind"; "base" position [m] and rotation vector [deg]. For chains of arcs also "routing" and
+        "segments", each with radius, length and offset [m], angles and rest bend [deg], gain if it
+        is not 1 [m per unit of q], and for elastic tendons stiffnesses.
     """
     pose = real_array(chain.base, "base")
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec(degrees=True)
@@ -125,13 +125,13 @@ def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
         report.table(header, rows)
     turn = ", ".join(f"{v:.1f}" for v in geometry["base"]["rotation_vector_deg"])
     position = in_millimetres(geometry["base"]["position"])
-    report.text(f"Base at {position}, turned by ({turn}) deg.")
+    report.text(f"Base at {position}, rotation vector ({turn}) deg.")
 
 
 def _write_model(report: Report, loaded: LoadedModel) -> None:
-    """Add error model, radius, play, domain, limits and the format of the logs.
+    """Add error model, radius, backlash, training range, limits and the format of the logs.
 
-    Domain and limits are in unit and sign of the logs, where these are known.
+    Training range and limits are in the unit and sign of the logs, if these are known.
     """
     record, description = report.record, loaded.description
     lengths = isinstance(loaded.chain, ArcChain) and loaded.chain.in_metres
@@ -146,7 +146,7 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
         report.text(record["radius"]["words"])
     if record["play"] is not None:
         report.text(f"Backlash (play) of the actuators: {millimetres(record['play'])}.")
-    known = {"Fitted for": loaded.trained_range, "Limits:": description and description.limits}
+    known = {"Training range:": loaded.trained_range, "Limits:": description and description.limits}
     for what, limits in known.items():
         shown = Limits() if limits is None else limits.scaled(1 / log_format.q_factor)
         for name, value in vars(shown).items():
@@ -161,7 +161,7 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
 
 
 def _write_training(report: Report, training: dict[str, Any]) -> None:
-    """Add what the file says of the fit; of one that was saved by hand it may be little."""
+    """Add the training notes in the file; a model that was saved by hand may have few."""
     if "log" in training:
         thinned = "" if training["n_whole"] == training["rows"] else f" of {training['n_whole']}"
         report.text(

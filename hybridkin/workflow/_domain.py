@@ -1,4 +1,4 @@
-"""Where a model may be steered: limits, commands in its domain, a posture that keeps it there."""
+"""Limits of a track, commands in the domain of a model, and a posture that stays in the domain."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.workflow.model import LoadedModel
 
-_WALKERS, _STEPS, _STEP = 256, 60, 0.12  # length of a step, as a share of the range
-_PLANAR = 1e-9  # of singular values: tendons in one plane
-_EASE = 0.5  # domain distance from which the posture turns back; 1 is the edge of the domain
+_WALKERS, _STEPS, _STEP = 256, 60, 0.12  # last: length of a step, as a share of the range
+_PLANAR = 1e-9  # relative cut-off of singular values, for tendons in one plane
+_EASE = 0.5  # domain distance from which the posture returns; 1 is the edge of the domain
 
 
 @dataclass(frozen=True, eq=False)
 class PathLimits:
-    """The limits that a track keeps to.
+    """The limits of a track.
 
     Attributes
     ----------
     q_min, q_max : ndarray of shape (n,)
-        Least and largest value of every actuator [m]; with play of what the actuators do.
+        Least and largest value of every actuator [m]; with backlash, of the actuators' motion.
     dq_max, ddq_max : ndarray of shape (n,) or None
         Largest speed [m/s] and acceleration [m/s^2].
     source : str
-        Where the first two come from.
+        Source of `q_min` and `q_max`, in words.
     """
 
     q_min: NDArray
@@ -52,9 +52,9 @@ def path_limits(
     *,
     within_fit: bool = True,
 ) -> PathLimits:
-    """Return the limits of the actuators: those given, else the description's within the fit's.
+    """Return the limits of the actuators: given ones, else those of the robot description.
 
-    By default a track does not leave the range that the model was fitted on.
+    By default they do not exceed the training range of the model.
 
     Parameters
     ----------
@@ -63,17 +63,17 @@ def path_limits(
     q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
         Limits of the commands [m], of their speed [m/s] and acceleration [m/s^2].
     within_fit : bool, default=True
-        Whether to stay within the range of the fit also where the description gives limits.
+        Whether to stay within the training range if the description gives limits.
 
     Returns
     -------
     PathLimits
-        With play the commands go half its width further.
+        With backlash, commands exceed these limits by half its width.
 
     Raises
     ------
     ValueError
-        If nobody knows the range of the actuators.
+        If the range of the actuators is not known.
     """
     half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
     described = robots.Limits() if loaded.description is None else loaded.description.limits
@@ -86,8 +86,8 @@ def path_limits(
     found = replace(found, **{name: overrides[name] for name in asked})
     if found.q_min is None or found.q_max is None:
         raise ValueError(
-            "`q_min` and `q_max` must be given (--q-min, --q-max), or stand as [limits] in the "
-            "robot description: this model does not know the range of its actuators."
+            "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
+            "robot description, because this model has no training range."
         )
     n = loaded.n_actuators
     for name, value in asked.items():
@@ -98,10 +98,10 @@ def path_limits(
     hard = None if found.ddq_max is None else np.broadcast_to(found.ddq_max, n).astype(float)
     if (low > high).any():
         raise ValueError(
-            "`q_min` must not exceed `q_max`, with half the play and the range of the fit counted "
-            f"in, got {low.tolist()} and {high.tolist()} m."
+            "`q_min` must not exceed `q_max`, including half the backlash and the training range, "
+            f"got {low.tolist()} and {high.tolist()} m; check their unit and sign."
         )
-    sources = {"robot description": described, "range of the fit": trained}
+    sources = {"robot description": described, "training range": trained}
     known = (words for words, limits in sources.items() if limits.q_min is not None)
     ends = len({"q_min", "q_max"} & {*asked})
     parts = ["given"] * (ends > 0) + [", within the ".join(known)] * (ends < 2)
@@ -110,7 +110,7 @@ def path_limits(
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """Where a model may be steered: within limits, and near the rows that it was fitted to."""
+    """The commands that a track may use: within limits, and in the domain of the model."""
 
     loaded: LoadedModel
     limits: PathLimits
@@ -119,9 +119,9 @@ class Domain:
     def preferred(self) -> NDArray:
         """A configuration (n,) in the domain of the model, within the limits.
 
-        It is the middle of the fit's range or, where that lies outside the domain, no tendon
-        pulled, or else the fitted row nearest to the middle; without a fit the second, else the
-        middle of the limits.
+        It is the first of these that lies in the domain: the middle of the training range, no
+        tendon pulled, the training row nearest to the middle. For a model without a fit it is no
+        tendon pulled, or for other robots the middle of the limits.
         """
         trained, limits = self.loaded.trained_range, self.limits
         low, high = (vars(trained or limits)[name] for name in ("q_min", "q_max"))
@@ -138,25 +138,25 @@ class Domain:
 
     @property
     def tendons(self) -> ArcChain | None:
-        """The chain, where the robot is one of tendons."""
+        """The chain if all its actuators are tendons, else None."""
         chain = self.loaded.chain
         return chain if isinstance(chain, ArcChain) and not any(chain.extensible) else None
 
     @property
     def rest(self) -> NDArray:
-        """The command (n,) at which no tendon is pulled, of other robots zero."""
+        """The command (n,) at which no tendon is pulled; for other robots zero."""
         chain = self.tendons
         return np.zeros(self.loaded.n_actuators) if chain is None else as_array(chain.rest.detach())
 
     @cached_property
     def sample(self) -> tuple[NDArray, NDArray]:
-        """Commands (K, n) from all over the domain, and their tips (K, 3) [m].
+        """Commands (K, n) from the whole domain, and their tips (K, 3) [m].
 
         The first is near the preferred one.
 
-        Random walks from the preferred configuration that do not leave the domain: with many
-        actuators most of the box around the training rows lies outside it. On a plain tendon chain
-        no tendon pulls against the others. Without a learned part they are drawn from the limits.
+        They are the ends of random walks from the preferred configuration that stay in the domain,
+        because with many actuators most of the training range lies outside the domain. On a plain
+        tendon chain no tendon pulls against another. Without a learned part the limits are sampled.
         """
         low, high, rng = self.limits.q_min, self.limits.q_max, np.random.default_rng(0)
         q = rng.uniform(low, high, (_WALKERS, len(low)))
@@ -167,7 +167,7 @@ class Domain:
                 inside = self.loaded.domain_distance(ahead) <= 1.0
                 inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
                 q[inside] = ahead[inside]
-            # Beside the preferred one, which may be exactly straight.
+            # Near the preferred one, because that may be exactly straight.
             near = 0.01 * (high - low) * rng.standard_normal(len(low)) @ self.bending
             q[0] = self.preferred + near
         tips = self.loaded.tips(q)
@@ -175,10 +175,10 @@ class Domain:
         return q[finite], tips[finite]
 
     def postures(self, n: int) -> NDArray:
-        """Return at most n commands from all over the limits, of tendons balanced ones.
+        """Return at most n commands from the whole range of the limits; tendons are balanced.
 
-        The tendons of a segment do not pull against each other. Where none can be slackened by what
-        another one pulls, the slackest is at its upper limit.
+        The tendons of a segment do not pull against each other. If a balanced command exceeds an
+        upper limit, all tendons of the segment are pulled until the slackest is at its limit.
         """
         low, high, chain = self.limits.q_min, self.limits.q_max, self.tendons
         q = np.random.default_rng(0).uniform(low, high, (n, len(low)))
@@ -196,10 +196,10 @@ class Domain:
 
     @cached_property
     def bending(self) -> NDArray:
-        """The projector (n, n) on what bends a plain tendon chain; of others the identity.
+        """The projector (n, n) on the q that bend a plain tendon chain; for others the identity.
 
-        The bendings of such a chain are linear in q, and blind to what its tendons pull against
-        each other.
+        The bendings of such a chain are linear in q and do not depend on the common pull of its
+        tendons.
         """
         chain = self.loaded.chain
         if not isinstance(chain, ConstantCurvatureChain) or any(chain.extensible):
@@ -211,9 +211,9 @@ class Domain:
     def posture(self, pull: float) -> Callable[[Tensor], Tensor] | NDArray:
         """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.
 
-        Half way to the edge of the domain it begins to turn back, down the domain distance of q,
-        and it is drawn to the `preferred` configuration, a share `pull` of the way; it is that
-        configuration where nothing guards the domain.
+        From half way to the edge of the domain it moves back, along the gradient of the domain
+        distance. In addition it moves by a share `pull` of the way to the `preferred`
+        configuration. Without a guard it is the `preferred` configuration.
         """
         hybrid, module, limits = self.loaded.hybrid, self.loaded.module, self.limits
         if hybrid is None or hybrid.guard is None or hybrid.error_model_ is None:

@@ -1,4 +1,4 @@
-"""What the report of a fit to a measured log says."""
+"""The text, tables and figures of the report of a fit to a measured log."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries, mill
 _SHOWN = ("mechanical, calibrated", "hybrid, ELM", "hybrid, auto")
 _SHOWN_OF_DATA = ("data-driven, linear", *_SHOWN[1:])  # of a robot without segments
 _MECHANICAL = (
-    '"Nominal" has the geometry of the robot description with only the base pose fitted, when that '
-    "is among the calibrated parameters."
+    '"Nominal": the robot description, with a fitted base if the base is calibrated. "Calibrated": '
+    'with the geometry fitted to the log. "Data-driven": without a mechanical model. "Hybrid": the '
+    'calibrated model plus a learned residual; "ELM" is a network, "auto" a chosen blend.'
 )
-_NO_MECHANICAL = "The robot has no segments: the hybrids correct the linear model of the data."
+_NO_MECHANICAL = 'The robot has no segments: "hybrid" models correct the linear model of the data.'
 
 
 def write_check(report: Report, log: MeasuredLog) -> None:
-    """Add what the check of the log found."""
+    """Add the findings of the check of the log."""
     report.record["log_check"] = log.report.to_dict()
-    report.text(f"## The log\n\nIts check found {log.report.summary()}.")
+    report.text(f"## The log\n\nThe check of the log found {log.report.summary()}.")
     for f in log.report.findings:
         report.text(f"- **{f.severity}**, {f.kind}: {f.message} Advice: {f.advice}")
 
@@ -36,16 +37,16 @@ def write_check(report: Report, log: MeasuredLog) -> None:
 def write_comparison(
     report: Report, errors: dict[str, NDArray], fold: NDArray, log: MeasuredLog
 ) -> None:
-    """Add the errors on held-out motions: table, figures, and the motions with the largest."""
+    """Add the errors on held-out motions: table, figures, and the motions of largest error."""
     n, n_whole, n_folds = len(log.q), report.record["n_whole"], int(fold.max()) + 1
     thinned = "" if n_whole == n else f" (of {n_whole}, evenly thinned)"
     report.text(
         "## Errors on held-out motions",
-        f"{n} rows{thinned}, {len(np.unique(log.motions))} {log.split}, held out whole in "
-        f"{n_folds} folds. Cross-validation over motions within the training part chooses the "
-        "ridge weight and the guard of the ELM, and coupling, features and penalties of "
-        f'"auto"; the errors of the ELM are the mean over {report.record["n_seeds"]} random hidden '
-        f"layers. {_MECHANICAL if 'mechanical, nominal' in errors else _NO_MECHANICAL}",
+        f"{n} rows{thinned}, {len(np.unique(log.motions))} {log.split}. Each of {n_folds} folds "
+        "holds out whole motions. A second cross-validation, over the other motions, chooses ridge "
+        'penalty and guard of an ELM, and coupling, features and penalties of "auto". Errors of '
+        f"an ELM are the mean over {report.record['n_seeds']} random hidden layers.\n\n"
+        f"{_MECHANICAL if 'mechanical, nominal' in errors else _NO_MECHANICAL}",
     )
     record: dict[str, dict[str, Any]] = {}
     for name, values in errors.items():
@@ -55,20 +56,20 @@ def write_comparison(
     report.record["held_out"] = record
     report.errors(record, ("mean", "std_error", "std", "p95", "max", "std_folds"))
     report.text(
-        "The standard error is that of the mean and counts every motion once, because the rows of "
-        "a motion err alike. The standard deviation over rows is the spread of single tips."
+        "Std: standard deviation. The standard error of the mean counts every motion as one "
+        "sample, because rows of a motion have similar errors. 95 %: quantile over rows."
     )
     shown = _SHOWN if _SHOWN[0] in record else _SHOWN_OF_DATA
     present = [name for name in shown if name in record]
     first, *others = ((name, record[name]["mean"]) for name in present)
-    ratios = [f"over {name}: **{first[1] / mean:.2f}**" for name, mean in others]
+    ratios = [f"by that of {name}: **{first[1] / mean:.2f}**" for name, mean in others]
     best = min(record, key=lambda name: record[name]["mean"])
-    start = "Calibrated mechanical model" if shown is _SHOWN else "Linear model"
-    report.text(f"{start} {', '.join(ratios)}. Least mean error: {best}.")
+    start = "the calibrated model" if shown is _SHOWN else "the linear model"
+    report.text(f"Mean error of {start} divided {', '.join(ratios)}. Least mean error: {best}.")
     _add_figures(report, errors, (present[0], present[-1]))
     motions, counts = np.unique(log.motions, return_counts=True)
     means = np.array([[errors[n][log.motions == m].mean() for n in present] for m in motions])
-    report.text(f"The five motions with the largest errors of {present[-1]}, mean error in mm:")
+    report.text(f"Mean errors in mm of the five motions with the largest errors of {present[-1]}:")
     rows = [
         [str(motions[i]), str(counts[i]), *(f"{1e3 * mean:.1f}" for mean in means[i])]
         for i in np.argsort(means[:, -1])[::-1][:5]
@@ -78,18 +79,18 @@ def write_comparison(
     by_fold = "; ".join(choices.get(saved, "-") for choices in report.record["choices_by_fold"])
     report.text(
         f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error of "
-        f"the models that a fit saves. Chosen in the folds: {by_fold}."
+        f"the models that can be saved. Settings chosen in each fold: {by_fold}."
     )
 
 
 def write_markers(report: Report, errors: NDArray, what: str) -> None:
-    """Add the errors (N, K) of several markers, one by one, NaN where one was not measured."""
+    """Add the errors (N, K) of several markers, one by one; NaN: not measured."""
     if errors.shape[1] == 1:
         return
     measured = [column[~np.isnan(column)] for column in errors.T]
     entries = [{"rows": len(column), **statistics(column)} for column in measured]
     report.record["markers"] = entries
-    report.text(f"Errors of the markers, base to tip ({what}); elsewhere the mean of them counts:")
+    report.text(f"Errors of the markers, base to tip ({what}). Other tables give their mean.")
     columns = ("rows", "mean", "p95", "max")
     report.errors({f"marker {k}": entry for k, entry in enumerate(entries)}, columns)
 
@@ -106,15 +107,14 @@ def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, s
 
 
 def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
-    """Return what a fitted HybridForwardModel with error_model="auto" chose.
+    """Return the choices of a fitted HybridForwardModel with error_model="auto".
 
     Returns
     -------
     dict
-        "chosen"; "weights" of the parts; "mechanical_models", the sets of parameters by name with
-        their mean distance on held-out motions, "cv", and outside the fitted rows, "io" [m], and
-        which was "taken"; "candidates" with their distance on held-out motions [m]; "play" of every
-        actuator [m], None without; the same in "words".
+        "chosen"; "weights" of the parts; "mechanical_models": for each set of parameters the mean
+        error on held-out motions, "cv", and outside the fitted rows, "io" [m]; the "taken" set;
+        "candidates" with their held-out error [m]; "play" of every actuator [m] or None; "words".
     """
     found = model.cv_results_ or {}
     entry = {
@@ -122,7 +122,7 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "weights": {name: float(w) for name, w in found["weights"].items() if w > 0.0},
         "taken": found.get("parameters", type(model.mechanical_model_).__name__),
         "mechanical_models": {
-            name: e if isinstance(e, dict) else {"cv": float(e)}  # one number in earlier files
+            name: e if isinstance(e, dict) else {"cv": float(e)}  # a number in earlier versions
             for name, e in found["mechanical_model"].items()
         },
         "candidates": dict(
@@ -135,7 +135,7 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
 
 
 def write_model(report: Report, model: HybridForwardModel) -> None:
-    """Add what auto chose and the estimated error radius, where the model has them."""
+    """Add the choices of auto and the estimated error radius, if the model has them."""
     if model.cv_results_ is not None:
         report.record["auto"] = auto_entry(model)
         report.text(" ".join(report.record["auto"]["words"]))
@@ -145,77 +145,77 @@ def write_model(report: Report, model: HybridForwardModel) -> None:
 
 
 def radius_entry(model: HybridForwardModel) -> dict[str, Any] | None:
-    """Return the estimated error radius of a model and the same in "words"; None without one."""
+    """Return the estimated error radius of a model, also in "words"; None without one."""
     if model.radius_ is None:
         return None
     radius = model.radius_
-    known = f"not known, because it takes at least {radius.least_groups} motions in the domain."
+    known = f"not known; at least {radius.least_groups} motions in the domain are needed."
     if np.isfinite(radius.inside):
-        known = f"{1e3 * radius.inside:.3g} mm, only in the domain and for motions like the log's."
-    words = f"Estimated error radius for {100 * radius.coverage:g} % of the tips: {known}"
+        known = f"{1e3 * radius.inside:.3g} mm, in the domain and for motions as in the log."
+    words = f"Estimated error radius covering {100 * radius.coverage:g} % of the tips: {known}"
     return {**radius._asdict(), "words": words}
 
 
 def auto_in_short(entry: dict[str, Any]) -> str:
-    """Return in a few words what auto chose: parts, mechanical model, play."""
+    """Return the choices of auto in a few words: parts, mechanical model, backlash."""
     weights = sorted(entry["weights"].items(), key=lambda item: -item[1])
     words = weights[0][0]
     if len(weights) > 1:
         words = "blend of " + ", ".join(f"{w:.1f} {name}" for name, w in weights)
     if len(entry["mechanical_models"]) > 1:
         words += f" on {entry['taken']}"
-    return words + ("" if entry["play"] is None else f", play {millimetres(entry['play'])}")
+    return words + ("" if entry["play"] is None else f", backlash {millimetres(entry['play'])}")
 
 
 def _in_words(entry: dict[str, Any]) -> list[str]:
-    """Return in sentences what auto compared on held-out motions, and what it chose."""
+    """Return the choices of auto, and the errors it compared, in sentences."""
     sentences = []
     tried = entry["mechanical_models"]
     if len(tried) > 1:
         sentences.append(
-            f"Of {len(tried)} sets of parameters auto calibrates {_of_set(entry['taken'], tried)}."
+            f"Of {len(tried)} sets of parameters, auto calibrates {_of_set(entry['taken'], tried)}."
         )
     candidates = entry["candidates"]
-    # Of one that was taken alone its own error, whichever has the least: a gain must be clear.
+    # A single candidate is named even if another one has less error: a gain must be clear.
     names = {*candidates} - {"blend"} if len(entry["weights"]) > 1 else {*entry["weights"]}
     least, alone = min((candidates[name], name) for name in names)
-    best, without = f"{1e3 * least:.2f} mm", f"{1e3 * candidates['mechanical']:.2f} mm without any."
-    text = f"Auto took the error model {alone}: {best} on held-out motions, {without}"
+    best, without = f"{1e3 * least:.2f} mm", f"{1e3 * candidates['mechanical']:.2f} mm without one."
+    text = f"Auto chose the error model {alone}: {best} on held-out motions, {without}"
     if alone == "mechanical":
-        text = f"Auto took no error model: {best} on held-out motions; no other is clearly better."
+        text = f"Auto chose no error model: {best} on held-out motions; none is clearly better."
     if len(entry["weights"]) > 1:
         text = (
-            "The blend of auto is the weighted mean of several hybrids: "
+            "Auto chose a blend, the weighted mean of several hybrids: "
             f"{1e3 * candidates['blend']:.2f} mm on held-out motions, {best} with the best of them "
             f"alone ({alone}), {without}"
         )
     sentences.append(text)
     if entry["play"] is not None:
         width = millimetres(entry["play"])
-        order = "Predictions follow the order of the rows, motion by motion."
+        order = "Predictions depend on the order of the rows in a motion."
         sentences.append(f"Backlash (play) of the actuators: {width}. {order}")
     elif entry["play_asked"]:
-        sentences.append("Auto looked for backlash (play); it did not lower the errors.")
+        sentences.append("Auto looked for backlash (play), but it did not lower the errors.")
     return sentences
 
 
 def _of_set(name: str, errors: dict[str, dict[str, float]]) -> str:
     """Return a set of parameters in words, with its errors on held-out and on outer rows."""
     cv, io = (errors[name].get(key, np.nan) for key in ("cv", "io"))
-    outside = "" if np.isnan(io) else f", {1e3 * io:.2f} mm outside the rows of the fit"
+    outside = "" if np.isnan(io) else f", {1e3 * io:.2f} mm outside the fitted rows"
     return f"{name}: {1e3 * cv:.2f} mm on held-out motions{outside}"
 
 
 def write_choice(report: Report, geometry: GeometryChoice) -> None:
-    """Add which parameters are calibrated, and the errors of all sets that were tried."""
+    """Add the set of parameters that is calibrated, and the errors of all tried sets."""
     tried = {name: errors.known() for name, errors in geometry.errors.items()}
     report.record["parameters"] = {"taken": geometry.name, "tried": tried}
     report.text(
         "## What is calibrated",
-        f"Calibrated: **{geometry.name}**. Mean tip distance in mm on held-out motions, and on the "
-        "outer 35 % of the rows after a fit to the inner 40 %. The set with nearly the least "
-        "product of the first with the square of the second is taken, unless the first is a tenth "
-        "above the least; of equals the smallest.",
+        f"Calibrated: **{geometry.name}**. Mean tip errors in mm on held-out motions and outside, "
+        "which is the outer 35 % of the rows after a fit to the inner 40 %. Sets whose first error "
+        "is over 10 % above the least are excluded. The smallest set with nearly the least product "
+        "of the first error and the square of the second is chosen.",
     )
     rows = [[n, *(f"{1e3 * e:.2f}" for e in errors)] for n, errors in geometry.errors.items()]
     report.table(["parameters", "held-out motions", "outside"], rows)
@@ -229,15 +229,15 @@ def write_calibration(
     title: str = "Calibration on all motions",
     key: str = "calibration",
 ) -> None:
-    """Add what the calibration found, and what the log does not identify."""
+    """Add the result of the calibration, and what the log does not identify."""
     report.text(
         f"## {title}",
-        f"Root mean square tip error {1000 * result.rmse:.2f} mm. Standard errors count every row "
-        "as independent and are too small where rows follow each other closely. A parameter is "
-        f"identified where the data narrow its prior at least {IDENTIFIED:.0f} times; other values "
-        'are assumptions. "Not physical": the parameter, or another one of its kind, left what is '
-        "physical; they compensate for what the model does not describe. The base by its turn from "
-        "the start and its position.",
+        f"Root mean square tip error {1000 * result.rmse:.2f} mm (training rows). Standard errors "
+        "assume independent rows and are too small for rows close in time. A parameter is "
+        f"identified if the data narrow its prior at least {IDENTIFIED:.0f} times; other values "
+        'are assumptions. "Not physical": this parameter, or another of its kind, has an '
+        "impossible value, because it compensates an effect that the model does not describe. "
+        "The base is given by its rotation from the start and its position.",
     )
     entries = geometry_entries(chain, result)
     report.geometry(entries)

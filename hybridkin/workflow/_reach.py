@@ -1,4 +1,4 @@
-"""Whether a path lies within the reach of a robot, and how much smaller it would."""
+"""Check that a path lies within the reach of a robot; else the scale at which it does."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from hybridkin.workflow._domain import Domain
 from hybridkin.workflow.path import scaled_path
 from hybridkin.workflow.report import Progress, in_millimetres
 
-_POINTS = 13  # of the path, evenly in time; those furthest in every direction come in addition
+_POINTS = 13  # of the path, evenly in time; the farthest points in each direction are added
 _HALVINGS = 7
-_OTHER_UNIT = 100.0  # a path so many times larger than the workspace is in another unit
+_OTHER_UNIT = 100.0  # a path this many times larger than the workspace is in another unit
 
 
 def check_reach(
     domain: Domain, path: Trajectory, tol: float, force: bool, progress: Progress
 ) -> None:
-    """Raise where a path is in another unit or, unless `force` is set, leaves the robot's reach."""
+    """Raise if a path is in another unit or, unless `force` is set, leaves the robot's reach."""
     loaded, limits, (commands, tips) = domain.loaded, domain.limits, domain.sample
     far, reach = (float(np.linalg.norm(x, axis=1).max()) for x in (path.x, tips))
     if far > _OTHER_UNIT * reach:
         raise ValueError(
-            f"`path` goes {far:.4g} m from the origin, the tips of the robot {reach:.3g} m; this "
-            "looks like millimetres read as metres: give --unit mm."
+            f"`path` goes {far:.4g} m from the origin, the tips of the robot {reach:.3g} m. This "
+            "looks like millimetres read as metres; give --unit mm."
         )
     if force:
         return
@@ -47,15 +47,15 @@ def check_reach(
         return
     worst = path.x[rows[missed.argmax()]]
     ends = " to ".join(map(in_millimetres, (tips.min(axis=0), tips.max(axis=0))))
-    way_out = f"its centre is out of reach too: tips go from {ends}, check --unit"
+    way_out = f"its centre is out of reach too: tips go from {ends}; check --unit"
     if not missed_by(0.0, far_out[:1]).any():
         scale = 0.0
         for step in 0.5 ** np.arange(1, _HALVINGS + 1):
             scale += 0.0 if missed_by(scale + step, far_out).any() else step
-        scale *= 0.99  # for points between those tried
-        way_out = f"about its centre {scale:.2g} of its size can be reached: --scale {scale:.2g}"
+        scale *= 0.99  # margin for points between the checked ones
+        way_out = f"{scale:.2g} of its size, about its centre, can be reached: --scale {scale:.2g}"
     raise ValueError(
         f"`path` leaves the reach of the robot within its limits ({limits.source}): "
-        f"{len(far_out)} of {len(rows)} points tried are out of reach, {in_millimetres(worst)} by "
-        f"{1e3 * missed.max():.3g} mm; {way_out}. To go as near as the tip can: --force."
+        f"{len(far_out)} of {len(rows)} checked points are out of reach, {in_millimetres(worst)} "
+        f"by {1e3 * missed.max():.3g} mm; {way_out}. To track as closely as possible: --force."
     )

@@ -1,4 +1,4 @@
-"""A model on a log: errors by motion, the share in its domain, where in space it errs."""
+"""The errors of a model on a log, by motion and in space, and the share of rows in its domain."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def evaluate_log(
     *,
     force: bool = False,
 ) -> tuple[Report, list[Path]]:
-    """Return the errors of a model on a log, and write them with figures when asked to.
+    """Return the errors of a model on a log, and write them with figures if `out` is given.
 
     Parameters
     ----------
@@ -38,18 +38,18 @@ def evaluate_log(
     out : str or Path, optional
         Folder to write into. Default: nothing is written.
     force : bool, default=False
-        Go on in spite of errors that the check of the log finds.
+        Continue if the check of the log finds errors.
 
     Returns
     -------
     report : Report
-        Its ``record`` holds "all" and "motions" with mean, median, p95 and max [m], and where the
-        model knows them "share_in_domain" and "share_in_radius". "fitted_rows" counts the rows that
-        the model was fitted to, None where it does not know; then "fitted" and "new" hold the
-        errors of those and of the others, and "held_out" those of the fit on held-out motions. A
-        row counts as fitted also where half of its motion was.
+        Its ``record`` holds "all" and "motions" with mean, median, p95 and max [m], and if the
+        model has them "share_in_domain" and "share_in_radius". "fitted_rows" is the number of rows
+        that the model was fitted to, None if not known. "fitted" and "new" hold the errors of
+        fitted rows and other rows, "held_out" those of the fit on held-out motions. If half of a
+        motion was fitted, all of its rows count as fitted.
     paths : list of Path
-        What was written.
+        The written files.
 
     Raises
     ------
@@ -60,14 +60,14 @@ def evaluate_log(
         check_out(out)
     if log.q.shape[1] != loaded.n_actuators:
         raise ValueError(
-            f"`q` must name {loaded.n_actuators} columns, as many as the model has actuators, got "
+            f"`q` must name {loaded.n_actuators} columns, one for each actuator of the model, got "
             f"{log.q.shape[1]}."
         )
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
     if loaded.play is not None:
-        measured.check_order("A model with play")
-    motion = measured.motions if measured.named else np.zeros(len(log.q))  # else it is one
+        measured.check_order("A model with backlash (play)")
+    motion = measured.motions if measured.named else np.zeros(len(log.q))  # else one motion
     predicted = loaded.predict(log.q, motion)
     markers = distances(predicted, log.x)
     columns = {"error": np.nanmean(markers, axis=1)}
@@ -115,7 +115,7 @@ def _write_errors(report: Report) -> None:
     motions = sorted(record["motions"].items(), key=lambda item: -item[1]["mean"])
     report.text("## Errors by motion, largest first")
     if record["fitted_rows"] is None:
-        report.text("The model does not say which rows it was fitted to; those err less here.")
+        report.text("The model does not say which rows it was fitted to; they have smaller errors.")
     if record["fitted_rows"]:
         report.text(
             f"**{record['fitted_rows']} of {everything['rows']} rows were fitted: their errors are "
@@ -126,7 +126,7 @@ def _write_errors(report: Report) -> None:
     columns = ["rows", "mean", "median", "p95", "max", *(s for s in _SHARES if s in everything)]
     report.errors({"all rows": everything, **parts, **dict(motions)}, columns)
     if "radius" in report.record:
-        report.text(f"{report.record['radius']['words']} Rows without a radius are not counted.")
+        report.text(f"{report.record['radius']['words']} Rows without a radius do not count.")
 
 
 def _add_figures(
@@ -143,4 +143,4 @@ def _add_figures(
         q = loaded.effective(log.q, motion)[row]
         body = BackboneDisplay.from_estimator(loaded.chain, q).points[0]
     WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row).plot(ax, unit="mm")
-    report.figure("workspace", figure, "Measured tips, coloured by the model's error.")
+    report.figure("workspace", figure, "Measured tips, coloured by the tip error of the model.")

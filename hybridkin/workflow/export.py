@@ -1,4 +1,4 @@
-"""A model as C code for a controller, with the step of its inverse kinematics where asked for."""
+"""A model as C code for a controller, with a step of inverse kinematics if requested."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ def export_model(
     out : str or Path
         Folder to write into.
     name : str, default="model"
-        Of the files and functions.
+        Name of the files and functions.
     dtype : {"float64", "float32"}, default="float64"
-        Numbers that the code computes with.
+        Number type of the code.
     dt : float, optional
-        Control period [s]. With it the step of inverse kinematics is written too, drawn to a
+        Control period [s]. If given, a step of inverse kinematics is written, too; it prefers a
         configuration in the domain of the model. Default: the model alone.
     limits : PathLimits, optional
-        What the step keeps to. Default: `path_limits`.
+        Limits of the step. Default: `path_limits`.
 
     Returns
     -------
     report : Report
-        Its ``record`` holds "n_actuators", "dtype", "dt", and "limits" where there is a step.
+        Its ``record`` holds "n_actuators", "dtype", "dt", and with a step "limits".
     paths : list of Path
-        The files.
+        The written files.
     """
     report, model = Report("C code"), loaded.module
     report.record.update(n_actuators=loaded.n_actuators, dtype=dtype, dt=dt)
@@ -58,7 +58,7 @@ def export_model(
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
     if loaded.play is not None:
         report.text(
-            "This robot has play, and q of the code are the values after it: what to send follows "
-            "from `PlayOperator.command`."
+            "This robot has backlash (play), and q in the code is the motion of the actuators. "
+            "`PlayOperator.command` gives the commands to send."
         )
     return report, export_c(model, out, name=name, dtype=dtype)

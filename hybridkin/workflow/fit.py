@@ -1,4 +1,4 @@
-"""A measured log: check, compare models on held-out motions, fit the best, report."""
+"""The fit to a measured log: check, compare models on held-out motions, fit the best, report."""
 
 from __future__ import annotations
 
@@ -46,26 +46,26 @@ from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.report import Progress, Report, check_out, linear, quadratic, quiet
 
 ALPHAS = tuple(10.0**k for k in range(-5, 4))
-"""Ridge weights to choose from."""
+"""Ridge penalties to choose from."""
 
 AUTO = "hybrid, auto"
 CALIBRATED = "mechanical, calibrated"
 ELM = "hybrid, ELM"
 LINEAR = "hybrid, linear"
 _DATA_LINEAR, _DATA_ELM = "data-driven, linear", "data-driven, ELM"
-_SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # what a file can hold
-_OF_CHAINS = ("mechanical, nominal", CALIBRATED, LINEAR)  # the others do without
+_SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # models that can be saved
+_OF_CHAINS = ("mechanical, nominal", CALIBRATED, LINEAR)  # models that need a chain
 _MODELS = (
     *("mechanical, nominal", CALIBRATED, _DATA_LINEAR, "data-driven, quadratic", _DATA_ELM),
     *(LINEAR, "hybrid, quadratic", ELM, AUTO),
 )
 _N_HIDDEN, _INNER_FOLDS = 100, 4
-_ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto: fewer do not pay for a start
+_ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto; fewer are not worth a start
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How models are fitted and compared.
+    """Settings of a fit and of the comparison of models.
 
     Attributes
     ----------
@@ -75,16 +75,16 @@ class FitSettings:
         Share of tips that the estimated error radius of the saved model covers, see
         `HybridForwardModel`. None: no radius.
     n_folds : int
-        Folds of motions, each of which is held out in turn.
+        Number of folds of motions that are held out, one after the other.
     n_seeds : int
-        Random hidden layers of the ELMs; their errors are averaged per row.
+        Number of random hidden layers of an ELM; the errors of each row are averaged over them.
     auto : bool
         Whether ``error_model="auto"`` is among the models; it takes most of the time.
     play : float, "auto" or None
-        Backlash (play) of the actuators [m] in that hybrid, see `HybridForwardModel`. It requires
-        `auto`, and named motions in the order of time.
+        Backlash (also called play) of the actuators [m] in that hybrid, see `HybridForwardModel`.
+        It requires `auto`, and named motions in order of time.
     max_rows : int or None
-        Of a longer log every k-th row is taken, so that at most so many remain; None: all rows.
+        Largest number of rows; of a longer log every k-th row is used. None: all rows.
     """
 
     loss: str = "linear"
@@ -105,18 +105,18 @@ class FitSettings:
 
 
 class Comparison(NamedTuple):
-    """Errors of models on motions that were held out while they were fitted.
+    """Errors of models on held-out motions.
 
     Attributes
     ----------
     errors : dict of str to ndarray of shape (N,)
-        Tip distance of each row when its motion was held out [m]; of several markers their mean.
+        Tip error of each row when its motion was held out [m]; for several markers their mean.
     markers : dict of str to ndarray of shape (N, K)
-        The distance of every marker [m], NaN where it was not measured.
+        Error of every marker [m], NaN if it was not measured.
     fold : ndarray of shape (N,)
         Fold in which a row was held out.
     choices : list of dict
-        What was chosen in each fold.
+        Settings that were chosen in each fold.
     """
 
     errors: dict[str, NDArray]
@@ -126,7 +126,7 @@ class Comparison(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Rows of a log, and what is fitted to them."""
+    """Rows of a log, with the robot and the settings of a fit to them."""
 
     q: NDArray
     x: NDArray
@@ -139,7 +139,7 @@ class _Rows(NamedTuple):
         return self._replace(q=self.q[rows], x=self.x[rows], groups=self.groups[rows])
 
     def with_geometry_chosen(self) -> _Rows:
-        """Return the rows with what to calibrate, where the robot leaves that open."""
+        """Return the rows with the parameters to calibrate, chosen if the robot says "auto"."""
         robot = self.robot
         if robot.chain is None or robot.calibrate != "auto":
             return self
@@ -149,7 +149,7 @@ class _Rows(NamedTuple):
         return self._replace(geometry=chosen)
 
     def calibrated(self) -> tuple[Chain | None, CalibrationResult | None, list[str]]:
-        """Return the chain before its calibration, what that found, and its warnings."""
+        """Return the chain before its calibration, the result, and its warnings."""
         geometry, chain, names = self.geometry, self.robot.chain, self.robot.calibrate
         start, messages = None, []
         if geometry is not None:
@@ -161,17 +161,17 @@ class _Rows(NamedTuple):
         return chain, result, messages + more
 
     def mechanical(self) -> ForwardModel:
-        """Return the calibrated chain; of a robot without segments a linear model of the rows."""
+        """Return the calibrated chain; for a robot without segments a linear model of the rows."""
         chain, result, _ = self.calibrated()
         if chain is None:
             return error_module(linear().fit(self.q, self.x), torch.from_numpy(self.q))
         return chain if result is None else result.chain
 
     def auto_model(self, calibrated: ForwardModel) -> HybridForwardModel:
-        """Return the hybrid that chooses for itself.
+        """Return the hybrid with error_model="auto".
 
-        It calibrates anew in every fold of its own, by least squares; a loss that bounds outliers
-        is kept by starting from the chain so calibrated.
+        It calibrates by least squares in each of its own folds. For another loss, which bounds
+        outliers, it gets the calibrated chain and does not calibrate.
         """
         anew = self.settings.loss == "linear" and self.robot.chain is not None
         return HybridForwardModel(
@@ -191,30 +191,29 @@ def compare_by_group(
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> Comparison:
-    """Return the errors of every model on motions that it has not seen.
+    """Return the errors of every model on held-out motions.
 
-    Whole motions are held out. Within the training motions of each fold the ridge weight and the
-    guard of the networks, and all that ``error_model="auto"`` chooses, are chosen by
-    cross-validation over motions, with the geometry calibrated anew, so that nothing of a test
-    motion enters its own prediction.
+    Whole motions are held out. In each fold, a second cross-validation over the training motions,
+    with its own calibrations, chooses ridge penalty and guard of the networks, and all settings of
+    ``error_model="auto"``. The prediction for a motion therefore never uses data of this motion.
 
     Parameters
     ----------
     log : Log
-        As from `read_log` or `datasets.load_log`; without groups it is cut into 10 stretches.
+        As from `read_log` or `datasets.load_log`; without groups it is cut into 10 parts.
     robot : RobotDescription
-        Nominal kinematics, and what to calibrate.
+        Nominal kinematics, and the parameters to calibrate.
     settings : FitSettings, optional
         Loss, folds, seeds and models.
     n_jobs : int, optional
-        Processes at most.
+        Largest number of processes.
     progress : callable, optional
         Called with (what, done, total).
 
     Returns
     -------
     Comparison
-        Errors [m] by model and row, the fold of each row, and what was chosen in each fold.
+        Errors [m] by model and row, the fold of each row, and the choices of each fold.
     """
     log = checked(log, robot.chain, robot.base_is_free)
     parts = folds(log.q, log.motions, settings.n_folds)
@@ -223,7 +222,7 @@ def compare_by_group(
     found = Comparison({}, {}, np.empty(len(log.q), dtype=int), [])
     most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
     most = min(effective_n_jobs(n_jobs or 1), len(parts), most)
-    # Else torch and BLAS start threads in every process, and these wait for each other.
+    # Otherwise torch and BLAS start threads in every process, which wait for each other.
     workers = Parallel(n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator")
     results: Any = workers(jobs)
     progress("cross-validation by motion", 0, len(parts))
@@ -250,9 +249,9 @@ def fit_log(
 ) -> tuple[Report, list[Path]]:
     """Check a log, compare models on held-out motions, fit the best to all of it, and report.
 
-    Saved is the model with the least mean error on held-out motions, of the calibrated mechanical
-    model and the hybrids with a linear error model, an ELM, and what ``error_model="auto"`` takes;
-    of a robot without segments a linear model of the data stands for the mechanical one.
+    The model with the least mean error on held-out motions is saved: the calibrated model, or a
+    hybrid with a linear error model, an ELM or ``error_model="auto"``. For a robot without
+    segments, a linear model of the data takes the place of the mechanical model.
 
     Parameters
     ----------
@@ -263,9 +262,9 @@ def fit_log(
     out : str or Path
         Folder to write into.
     settings : FitSettings, optional
-        How models are fitted and compared.
+        Settings of the fit and of the comparison.
     force : bool, default=False
-        Fit in spite of errors that the check of the log finds.
+        Fit even if the check of the log finds errors.
     n_jobs, progress
         As in `compare_by_group`.
 
@@ -274,7 +273,7 @@ def fit_log(
     report : Report
         Its ``record`` holds every number.
     paths : list of Path
-        What was written, the model among it.
+        The written files, including the model.
 
     Raises
     ------
@@ -302,7 +301,7 @@ def fit_log(
     report_fit = partial(progress, f"fitting {saved} to all motions")
     report_fit(0, 1)
     mechanical = rows.mechanical() if result is None else result.chain
-    # The linear model of a robot without segments is what stands for its mechanical one.
+    # For a robot without segments, a linear model takes the place of the mechanical one.
     model = _models(CALIBRATED if saved == _DATA_LINEAR else saved, rows, mechanical)[0]
     model.set_params(coverage=settings.coverage)
     given = {"groups": rows.groups, "geometry": rows.geometry, "progress": report_fit}
@@ -337,7 +336,7 @@ def fit_log(
 
 
 def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
-    """Raise where the log or the settings do not allow a comparison by motions."""
+    """Raise if the log or the settings do not allow a comparison by motions."""
     n_motions = len(np.unique(log.motions))
     if n_motions < 2:
         raise ValueError(
@@ -346,22 +345,22 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
         )
     if settings.play is not None:
         if not settings.auto:
-            raise ValueError("`play` requires `auto=True`; leave out --no-auto.")
+            raise ValueError("`play` requires `auto=True`; remove --no-auto.")
         if not log.named:
             raise ValueError(
-                "`play` needs motions, their rows in the order of time; name the column that tells "
-                "them apart: --groups COLUMN, or groups = in [log]."
+                "`play` needs motions with rows in order of time; name the column of the motions: "
+                "--groups COLUMN, or groups = in [log]."
             )
         log.check_order("`play`")
     log.check(force)
 
 
 def _write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:
-    """Add the calibration of the elastic tendons where auto took them in place of the chain."""
+    """Add the calibration of the elastic tendons if auto chose them instead of the chain."""
     if isinstance(model.mechanical_model_, ElasticTendonChain) and model.calibration_ is not None:
         if isinstance(chain, ConstantCurvatureChain):
             chain = ElasticTendonChain.from_chain(chain)
-        title = "Calibration of the elastic tendons that auto took"
+        title = "Calibration of the elastic tendons that auto chose"
         write_calibration(report, chain, model.calibration_, [], title, "calibration_of_saved")
 
 
@@ -372,7 +371,7 @@ def _add_model(
     kept = ("log", "robot", "n_whole", "n_motions", "excluded", "loss", "saved", "chosen")
     training = {key: report.record[key] for key in (*kept, "held_out")}
     training |= {"rows": report.record["n"], "split": log.split}
-    model._fitted_rows = np.unique(row_digests(log.q, log.x))  # with those between thinned ones
+    model._fitted_rows = np.unique(row_digests(log.q, log.x))  # with those dropped by thinning
     report.file("model.safetensors", lambda path: save_model(model, path, training=training))
     report.text("The model: `hybridkin.load_model('model.safetensors')`.")
     if robot.path is not None:  # the description it was made from
@@ -381,7 +380,7 @@ def _add_model(
 
 @one_thread()  # the processes share the cores already
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
-    """Return the errors on test rows of every model fitted to training rows, and the choices."""
+    """Return the errors of every model on test rows after a fit to training rows, and choices."""
     names = _MODELS if train.settings.auto else _MODELS[:-1]
     if train.robot.chain is None:
         names = [name for name in names if name not in _OF_CHAINS]
@@ -396,7 +395,7 @@ def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, 
 
 
 def _models(name: str, rows: _Rows, mechanical: ForwardModel) -> list[HybridForwardModel]:
-    """Return the models of that name, to be fitted: one, of ELMs one for each seed."""
+    """Return the unfitted models of that name: one, or for an ELM one for each seed."""
     part, learner = name.split(", ")
     base = None if part == "data-driven" else mechanical
     if learner == "auto":
@@ -416,13 +415,13 @@ def _models(name: str, rows: _Rows, mechanical: ForwardModel) -> list[HybridForw
 def _elm(
     base: ForwardModel | None, alpha: float | None, guard: str | None, seed: int = 0
 ) -> HybridForwardModel:
-    """Return an ELM by its ridge weight and guard; no ridge weight: no correction at all."""
+    """Return an ELM by its ridge penalty and guard; with alpha=None there is no correction."""
     elm = "drop" if alpha is None else ELMRegressor(_N_HIDDEN, alpha, random_state=seed)
     return HybridForwardModel(base, elm, guard=guard)
 
 
 def _chosen(model: HybridForwardModel) -> str:
-    """Return in words what was chosen for a fitted model."""
+    """Return the chosen settings of a fitted model in words."""
     if model.cv_results_ is not None:
         return auto_in_short(auto_entry(model))
     if isinstance(model.error_model, ELMRegressor):
@@ -431,17 +430,17 @@ def _chosen(model: HybridForwardModel) -> str:
 
 
 def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
-    """Return the errors (N, K) of the markers of test rows; the fit does not warn."""
+    """Return the errors (N, K) of the markers on test rows; the fit does not warn."""
     model.fit_with_messages(train.q, train.x, groups=train.groups, geometry=train.geometry)
     q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
     return distances(evaluate(model.module_, np.array(q, dtype=float))[0], test.x)
 
 
 def _choose(rows: _Rows, *, hybrid: bool) -> tuple[float | None, str | None]:
-    """Return weight and guard of the ELM with the least mean error on held-out groups."""
+    """Return penalty and guard of the ELM with the least mean error on held-out groups."""
     guards: Sequence[str | None] = ("leverage", "box", None) if hybrid else (None,)
     if hybrid and rows.robot.chain is None:
-        guards = ("leverage",)  # nothing else keeps a path near the data
+        guards = ("leverage",)  # only a guard keeps a path near the data
     candidates: list[Any] = [(alpha, guard) for guard in guards for alpha in ALPHAS]
     if len(guards) > 1:
         candidates.insert(0, (None, "leverage"))

@@ -1,4 +1,4 @@
-"""A log as a robot description says it is written: read, checked, its motions named."""
+"""Logs in the format of a robot description: read, checked, with named motions."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _BLOCKS = 10
 
 
 class LogError(ValueError):
-    """A log that does not pass its check.
+    """The error for a log that does not pass its check.
 
     Parameters
     ----------
     report : LogReport
-        What was found.
+        The findings.
     """
 
     def __init__(self, report: LogReport) -> None:
@@ -40,9 +40,9 @@ class MeasuredLog(Log):
     Attributes
     ----------
     report : LogReport
-        What the check of the whole log found.
+        Findings of the check of the whole log.
     named : bool
-        Whether the log names its motions; else they are stretches of it.
+        Whether the log names its motions; else they are ten parts of it.
     excluded : tuple of str
         Patterns of the motions that were left out.
     """
@@ -58,13 +58,13 @@ class MeasuredLog(Log):
 
     @property
     def split(self) -> str:
-        """What the motions are, in words."""
+        """The kind of the motions, in words."""
         if self.named:
             return "motions"
-        return f"{_BLOCKS} stretches of the log (no column of motions was named: give `--groups`)"
+        return f"parts of the log (cut into {_BLOCKS}; name a column of motions with `--groups`)"
 
     def check_order(self, why: str) -> None:
-        """Raise where rows of a motion are not in the order of time; `why` begins the message."""
+        """Raise if rows of a motion are not in order of time; `why` begins the message."""
         if self.time is None:
             return
         order = np.argsort(self.motions, kind="stable")
@@ -72,23 +72,23 @@ class MeasuredLog(Log):
         late = int((same & (np.diff(self.time[order]) < 0)).sum())
         if late:
             raise ValueError(
-                f"{why} needs the rows of a motion in the order of time, but {late} come before "
-                "the row above them; sort the log by motion and time."
+                f"{why} needs the rows of a motion in order of time, but {late} rows are earlier "
+                "than the row above; sort the log by motion and time."
             )
 
     def check(self, force: bool) -> None:
-        """Raise a `LogError` where the check found errors, unless `force` is set."""
+        """Raise a `LogError` if the check found errors, unless `force` is set."""
         if self.report.errors and not force:
             raise LogError(self.report)
 
     def misread(self, calibrated: Chain) -> list[str]:
-        """Return what the calibrated chain says of the order and the signs of q, if it is new."""
+        """Return new findings on order and signs of q, from a check with the calibrated chain."""
         known = {f.kind for f in self.report.misread}
         found = check_log(self, chain=calibrated).misread
         return [f"{f.message} {f.advice}" for f in found if f.kind not in known]
 
     def thinned(self, max_rows: int | None) -> MeasuredLog:
-        """Return every k-th row, so that at most `max_rows` are left; None: all."""
+        """Return every k-th row, so that at most `max_rows` remain; None: all rows."""
         if max_rows is None or len(self.q) <= max_rows:
             return self
         return self.rows(slice(None, None, -(-len(self.q) // max_rows)))
@@ -105,18 +105,18 @@ def read_log(
     drop_frozen: bool = False,
     delimiter: str | None = None,
 ) -> MeasuredLog:
-    """Return a log, read and checked; errors that the check finds are in its report.
+    """Return a log, read and checked; errors found by the check are in its report.
 
     Parameters
     ----------
     path : str or Path
         CSV, npz or parquet file.
     log_format : LogFormat
-        Its columns, units and sign.
+        Columns, units and sign of the log.
     chain, base_is_free
         As for `datasets.check_log`.
     exclude : sequence of str, optional
-        Patterns of motions to leave out, ``"*tendon*"`` for example.
+        Patterns of motions to leave out, for example ``"*tendon*"``.
     drop_invalid, drop_frozen : bool, default=False
         Leave out rows with missing or infinite values; rows whose tip is frozen.
     delimiter : str or None, default=None
@@ -132,7 +132,7 @@ def read_log(
     FileNotFoundError
         If there is no such file.
     ValueError
-        If columns or motions are not there.
+        If columns or motions do not exist.
     """
     if not isinstance(exclude, Sequence) or not all(isinstance(p, str) for p in exclude):
         raise TypeError(f"`exclude` must be a list of patterns of names, got {exclude!r:.80}.")
@@ -145,8 +145,8 @@ def read_log(
         kept = np.array([not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions])
         if not kept.any():
             raise ValueError(
-                f"at least 2 motions must be left, but `exclude` leaves none of "
-                f"{len({*motions})}; keep some."
+                f"`exclude` must leave at least 2 motions, but leaves none of {len({*motions})}; "
+                "use fewer patterns."
             )
         log = replace(log, groups=np.array(motions)).rows(kept)
     report = check_log(log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid)
@@ -159,7 +159,7 @@ def read_log(
 
 
 def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
-    """Return a log with its check and its motions, itself where it has them already."""
+    """Return a log with its check and its motions; a `MeasuredLog` is returned unchanged."""
     if isinstance(log, MeasuredLog):
         return log
     return _with_motions(log, check_log(log, chain=chain, base_is_free=base_is_free))

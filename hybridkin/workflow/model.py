@@ -1,4 +1,4 @@
-"""A model to work with: a saved one, the folder of a fit, or a robot description."""
+"""Loading a model: a saved one, the folder of a fit, or a robot description."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import load_model, model_header
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
-"""Endings of the files that are taken for logs."""
+"""Endings of files that are treated as logs."""
 
 _MODEL, _ROBOT = "model.safetensors", "robot.toml"
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedModel:
-    """A model q -> x with all that is known of it.
+    """A model q -> x, with its file and its robot description.
 
     Attributes
     ----------
     name : str
-        What to call it.
+        Name in reports.
     path : Path
         The file.
     model : Chain, HybridForwardModel or ELMRegressor
         A chain or a fitted model.
     description : RobotDescription or None
-        The robot's, where it stands beside the model or was given.
+        The robot description that was given or lies beside the model.
     header : dict or None
-        What the file says of the model, see `model_header`; of a saved model only.
+        Header of the file, see `model_header`; only for a saved model.
     """
 
     name: str
@@ -54,12 +54,12 @@ class LoadedModel:
 
     @property
     def hybrid(self) -> HybridForwardModel | None:
-        """The model where it is a hybrid, else None."""
+        """The model if it is a hybrid, else None."""
         return self.model if isinstance(self.model, HybridForwardModel) else None
 
     @property
     def chain(self) -> Chain | None:
-        """The mechanical part, where it is a chain."""
+        """The mechanical model if it is a chain, else None."""
         mechanical = self.model if self.hybrid is None else self.hybrid.mechanical_model_
         return mechanical if isinstance(mechanical, Chain) else None
 
@@ -75,54 +75,54 @@ class LoadedModel:
 
     @property
     def trained_range(self) -> robots.Limits | None:
-        """Least and largest q of the fit, where the model knows them.
+        """Training range: least and largest q of the fit, None if not known.
 
-        With play it is that of what the actuators did.
+        With backlash it is the range of the actuators' motion.
         """
         if self.hybrid is None:
             return None
         drift = self.hybrid._drift
-        half = np.where(drift.scale == 1.0, 0.0, drift.scale)  # one that never moved counts as 1
+        half = np.where(drift.scale == 1.0, 0.0, drift.scale)  # 1: the actuator never moved
         center = drift.center - as_array(self.hybrid.module_.shift)
         return robots.Limits(center - half, center + half)
 
     @property
     def play(self) -> PlayOperator | None:
-        """The play of the actuators, where the model has some."""
+        """The backlash of the actuators, None without."""
         return None if self.hybrid is None else self.hybrid.play_
 
     @property
     def play_width(self) -> list[float] | None:
-        """The width of the play of every actuator [m], None without play."""
+        """The backlash of every actuator [m], None without."""
         return None if self.hybrid is None else play_widths(self.hybrid)
 
     def effective(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
-        """Return what the actuators do (N, n) at commands q, of one motion or by motion."""
+        """Return the motion of the actuators (N, n) for commands q of one motion, or of groups."""
         if self.play is None:
             return q
         return self.play.apply_by_group(q, np.zeros(len(q)) if groups is None else groups)
 
     def predict(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
-        """Return tips (N, 3) [m], or all markers; with play by `groups`, the motion of a row."""
+        """Return tips (N, 3) [m], or all markers; `groups`, the motions, matter with backlash."""
         if self.hybrid is not None:
             return self.hybrid.predict(q, groups=groups)
         return evaluate(as_forward_model(self.model), np.array(q, dtype=float))[0]
 
     def tips(self, q: NDArray) -> NDArray:
-        """Return tips (N, 3) [m] where the actuators do q (N, n), whatever the play."""
+        """Return tips (N, 3) [m] for the motion q (N, n) of the actuators, without backlash."""
         return evaluate(self.module, np.array(q, dtype=float))[0]
 
     def domain_distance(self, q: NDArray) -> NDArray:
-        """Return how far rows q (N, n) are from those of the fit, at most 1 in the domain."""
+        """Return the distance of rows q (N, n) from the training rows, at most 1 in the domain."""
         return evaluate(self.module, np.array(q, dtype=float), value=False, distance=True)[0]
 
     def was_fitted(self, q: NDArray, x: NDArray, motions: NDArray) -> NDArray[np.bool_] | None:
-        """Return whether rows were fitted (N,): themselves, to a micrometre, or half their motion.
+        """Return whether each row (N,), to a micrometre, or half of its motion was fitted.
 
-        None where the model does not know.
+        None if the model does not hold its rows.
         """
         if self.hybrid is None or self.hybrid._fitted_rows is None:
-            return None if self.header else np.zeros(len(q), dtype=bool)  # nominal: of no row
+            return None if self.header else np.zeros(len(q), dtype=bool)  # nominal: no fit
         fitted = np.isin(row_digests(q, x), self.hybrid._fitted_rows)
         _, motion = np.unique(motions, return_inverse=True)
         return fitted | (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
@@ -153,7 +153,7 @@ class LoadedModel:
         return found
 
     def log_format(self) -> robots.LogFormat:
-        """Return how the robot's logs are written, or plain names in SI units."""
+        """Return the format of the robot's logs, or plain names in SI units."""
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
@@ -162,7 +162,7 @@ class LoadedModel:
 
 
 def play_widths(model: HybridForwardModel) -> list[float] | None:
-    """Return the width of the play of every actuator [m], None without play."""
+    """Return the backlash of every actuator [m], None without."""
     if model.play_ is None:
         return None
     chain, width = model.mechanical_model_, model.play_.width
@@ -177,8 +177,8 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     Parameters
     ----------
     path : str or Path
-        A saved model, a folder that `fit_log` wrote, or a robot description (TOML), which stands
-        for its nominal chain.
+        A saved model, a folder that `fit_log` wrote, or a robot description (TOML), which gives
+        its nominal chain.
     robot : str or Path, optional
         Robot description, for the format of its logs and its limits. Default: ``robot.toml`` in
         the folder of the model.
@@ -186,21 +186,21 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     Returns
     -------
     LoadedModel
-        The model, with what is known of it.
+        The model, with its header and its robot description.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it is no model, or not one of that robot.
+        If the file is not a model, or not one of that robot.
     """
     path = as_path(path)
     if path.suffix.lower() == ".toml":
         description = robots.read_description(path)
         if description.chain is None:
             raise ValueError(
-                f"`model` {path} describes a robot without segments, which has no model before a "
+                f"`model` {path} describes a robot without segments. It has no model before a "
                 f"fit: hybridkin fit LOG --robot {path} --out MODEL."
             )
         return LoadedModel(description.name, path, description.chain, description)
@@ -219,7 +219,7 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     loaded = LoadedModel(name, path, model, description, model_header(file))
     if description is not None and description.n_actuators not in (0, loaded.n_actuators):
         raise ValueError(
-            f"`robot` {description.name!r} has {description.n_actuators} actuators, the "
-            f"model {path} has {loaded.n_actuators}; give the description it was fitted with."
+            f"`robot` {description.name!r} has {description.n_actuators} actuators, but the model "
+            f"{path} has {loaded.n_actuators}; give the description that it was fitted with."
         )
     return loaded

@@ -1,4 +1,4 @@
-"""Which configurations to measure next, as a file to send to the robot."""
+"""The configurations to measure next, as a file of commands for the robot."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, quiet
 from hybridkin.workflow.track import best_track
 
-_POOL = 2000  # configurations to choose from
+_POOL = 2000  # number of configurations to choose from
 _SHOWN = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # rows of the table
-_TOL = 1e-3  # of the inverse kinematics along a path [m]
+_TOL = 1e-3  # tolerance of the inverse kinematics along a path [m]
 
 
 def next_rows(
@@ -35,10 +35,10 @@ def next_rows(
 ) -> tuple[Report, list[Path]]:
     """Choose the configurations to measure next, see `choose_rows`, and write them.
 
-    ``next.csv`` has one row per configuration in the order chosen: commands in the units, names and
-    sign of the robot's logs, and the expected error that remains after it. They lie within the
-    limits; tendons of a segment do not pull against each other. Of a model with play the commands
-    are those to send, in that order.
+    ``next.csv`` has one row per configuration, in the order of the choice: commands in the units,
+    names and sign of the robot's logs, and the expected error after this row. Commands lie within
+    the limits, and tendons of a segment do not pull against each other. With backlash, send the
+    commands in this order.
 
     Parameters
     ----------
@@ -47,14 +47,14 @@ def next_rows(
     out : str or Path
         Folder to write into.
     n : int, default=50
-        How many configurations.
+        Number of configurations.
     limits : PathLimits, optional
-        As from `path_limits`. Default: those of the description, else the range of the fit.
+        As from `path_limits`. Default: those of the description, else the training range.
     measured : MeasuredLog, optional
-        What was measured already.
+        Rows that are already measured.
     path : Trajectory, optional
-        Where the error is to be small [m]; its configurations are candidates, too. Default:
-        everywhere within the limits.
+        Path along which the error must be small [m]; its configurations are candidates, too.
+        Default: everywhere within the limits.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -62,14 +62,14 @@ def next_rows(
     -------
     report : Report
         Its ``record`` holds "expected_errors" [m], after each configuration, "n_measured",
-        "limits", and in words "where" the error is to be small.
+        "limits", and in words "where" the error must be small.
     paths : list of Path
-        What was written.
+        The written files.
 
     Raises
     ------
     ValueError
-        If nobody knows the range of the actuators, or fewer than `n` balanced configurations lie
+        If the range of the actuators is not known, or fewer than `n` balanced configurations lie
         within it.
     """
     check_out(out)
@@ -81,7 +81,7 @@ def next_rows(
         target = best_track(domain, path, _TOL, progress).q
         candidates = np.concatenate([target, candidates])
         far = distance(loaded.tips(target), path.x).max()
-        where = f"along the path, which the model misses by {1e3 * far:.3g} mm at most"
+        where = f"along the path, which the model reaches to within {1e3 * far:.3g} mm"
     known = None if measured is None else loaded.effective(measured.q, measured.motions)
     progress("choosing configurations", 0, 1)
     rows, errors = choose_rows(loaded.model, candidates, n, measured=known, target=target)
@@ -94,8 +94,8 @@ def next_rows(
     table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
     report.table(["rows", "expected error [mm]"], table)
     report.text(
-        f"Error {where}, expected before any tip is measured: it says where more rows end paying, "
-        f"not how large the error will be. {n_measured} rows are measured already. Limits: "
+        f"Expected error {where}, computed without measured tips. It shows when more rows bring "
+        f"little, not how large the error will be. {n_measured} rows are already measured. Limits: "
         f"{limits.source}."
     )
     cells = np.column_stack([sent / log.q_factor, errors / METRES[log.x_unit]]) + 0.0  # no -0

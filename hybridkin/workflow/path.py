@@ -1,4 +1,4 @@
-"""Paths for the tip: points of a file, or a named shape in the workspace of a model."""
+"""Paths of the tip: points from a file, or a named shape in the workspace of a model."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     Parameters
     ----------
     path : str or Path
-        The file; with three columns `dt` is needed.
+        The file; with three columns `dt` is required.
     unit : {"m", "cm", "mm"}, default="m"
-        Of the positions.
+        Unit of the positions.
     dt : float, optional
-        Time between points [s]; a file with times is read at this period, straight in between.
+        Time between points [s]; a file with times is interpolated linearly to this period.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it has no times and `dt` is not given, or is not a table of numbers.
+        If the file has no times and `dt` is not given, or is not a table of numbers.
     """
     file, dt = as_path(path), None if dt is None else number(dt, "dt")
     if not file.is_file():
@@ -49,11 +49,11 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise ValueError(f"`path` must be a CSV file of points, {file} is no text.") from error
+        raise ValueError(f"`path` must be a CSV file of points, {file} is not text.") from error
     rows = [line.split(",") for line in lines if line.strip() and line[0] != "#"]
     if max(map(len, rows), default=0) == 3:
         if dt is None:
-            raise ValueError(f"{file} has no times: give the time between its points (--dt 0.02).")
+            raise ValueError(f"{file} has no times; give the time between its points (--dt 0.02).")
         return trajectories.from_csv(file, dt=dt, unit=unit)
     timed = trajectories.from_csv(file, unit=unit)
     if dt is None:
@@ -70,12 +70,12 @@ def scaled_path(path: Trajectory, scale: float) -> Trajectory:
     path : Trajectory
         Points [m] and times [s].
     scale : float
-        Its size over that of `path`.
+        Its size relative to `path`.
 
     Returns
     -------
     Trajectory
-        The centre, that of the box around the points, stays where it is.
+        Its centre, that of the box around the points, does not change.
     """
     if not math.isfinite(number(scale, "scale")):
         raise ValueError(f"`scale` must be finite, got {scale!r}.")
@@ -105,20 +105,20 @@ def shape_path(
     limits : PathLimits
         As from `path_limits`.
     shape : {"figure-eight", "spiral", "line"}
-        What to draw.
+        Name of the shape.
     size : sequence of float
-        Width and height of a figure eight, first and last radius of a spiral, x, y and z from end
+        Width and height of a figure eight; first and last radius of a spiral; x, y and z from end
         to end of a line [m].
     center : array-like of shape (3,), optional
         Centre of the shape [m]. Default: a tip in the middle of the workspace.
     normal : array-like of shape (3,), optional
         Normal of its plane. Default: the z axis of the base.
     turns : float, default=3.0
-        Turns of a spiral.
+        Number of turns of a spiral.
     rise : float, default=0.0
         Rise of a spiral along the normal [m].
     duration, dt : float, default=10.0 and 0.02
-        Time for the shape, and between its points [s].
+        Time for the whole shape, and between its points [s].
 
     Returns
     -------
@@ -128,7 +128,7 @@ def shape_path(
     Raises
     ------
     ValueError
-        For another number of sizes than the shape has.
+        If the number of sizes does not fit the shape.
     """
     n_sizes = 3 if one_of(shape, "shape", _SHAPES) == "line" else 2
     extent = real_array(size, "size").tolist()

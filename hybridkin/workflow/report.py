@@ -1,4 +1,4 @@
-"""A report: text, tables, numbers and figures that reach the disk together or not at all."""
+"""A report: text, tables, numbers and figures that are written together or not at all."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ _COLUMNS = {  # of tables of errors: heading, factor, format; others in mm
 }
 
 IDENTIFIED = 10.0
-"""The data identify a parameter whose prior they narrow at least so many times, and that stays
-physical with the others of its kind."""
+"""A parameter is identified by the data if they narrow its prior at least this many times, and if
+it and the others of its kind stay physical."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
@@ -69,7 +69,7 @@ def statistics(errors: NDArray, motions: NDArray | None = None) -> dict[str, Any
     """Return mean, standard deviation, median, 95 % quantile and maximum of errors (N,).
 
     With the motion of every row (N,) also "std_error", the standard error of the mean over
-    motions: the rows of a motion err alike.
+    motions, because rows of a motion have similar errors.
 
     References
     ----------
@@ -83,23 +83,23 @@ def statistics(errors: NDArray, motions: NDArray | None = None) -> dict[str, Any
 
 
 def millimetres(lengths: Sequence[float]) -> str:
-    """Return the largest of some lengths [m] in words."""
+    """Return the largest of some lengths [m] as text."""
     return f"{1e3 * max(lengths):.3g} mm"
 
 
 def in_millimetres(point: NDArray) -> str:
-    """Return a point [m] in words."""
+    """Return a point [m] as text."""
     return f"({', '.join(f'{1e3 * v:.4g}' for v in point)}) mm"
 
 
 def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, Any]]:
-    """Return what a calibration from `start` found, one entry for each free parameter.
+    """Return the result of a calibration from `start`, one entry for each free parameter.
 
     Returns
     -------
     list of dict
-        "name"; "unit", "mm", "deg", "mm²/rad²" or "-", of gains "m/unit of q"; "start", "value" and
-        "std_error" in that unit, of the base its turn from the start and its position;
+        "name"; "unit", "mm", "deg", "mm²/rad²" or "-", for gains "m/unit of q"; "start", "value"
+        and "std_error" in that unit, for the base its rotation from the start and its position;
         "narrowing", "physical" and "identified".
     """
     entries = []
@@ -125,7 +125,7 @@ def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, 
 
 
 def _start_value(start: Chain, name: str) -> NDArray:
-    """Return the value of a parameter of `calibrate` at the start."""
+    """Return the start value of a parameter of `calibrate`."""
     geometry = {key: value.detach().cpu().numpy() for key, value in start.geometry().items()}
     if name == "turns" and isinstance(start, ArcChain):  # the angle of each ring's first actuator
         counts = np.array(start.actuators_per_segment)
@@ -138,7 +138,7 @@ def _start_value(start: Chain, name: str) -> NDArray:
 
 
 class Report:
-    """Markdown blocks, a JSON record and named files, written in one go.
+    """Markdown blocks, a JSON record and named files, written together.
 
     Parameters
     ----------
@@ -177,8 +177,8 @@ class Report:
         self.table(["tip error [mm]", *titles], rows)
 
     def geometry(self, entries: Sequence[dict[str, Any]]) -> None:
-        """Add a table of what a calibration found, see `geometry_entries`."""
-        header = ["parameter", "start", "calibrated", "standard error", "prior narrowed"]
+        """Add a table of calibrated parameters, see `geometry_entries`."""
+        header = ["parameter", "start", "calibrated", "standard error", "prior narrowed by"]
         rows = []
         for entry in entries:
             numbers = (f"{entry[key]:.2f}" for key in ("start", "value", "std_error"))
@@ -193,7 +193,7 @@ class Report:
         self.file(f"{name}.png", figure.savefig)
 
     def markdown(self) -> str:
-        """Return the report as it is written."""
+        """Return the report as Markdown text."""
         return "\n\n".join(markdown for markdown, _ in self._blocks) + "\n"
 
     def plain(self, table: Callable[..., str] | None = None) -> str:
@@ -203,13 +203,13 @@ class Report:
         return "\n\n".join(filter(None, blocks))
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
-        """Add a file that `write` makes when handed its path."""
+        """Add a file; `write` gets its path and writes it."""
         self._files[name] = write
 
     def write(self, out: str | Path) -> list[Path]:
         """Write everything into the folder `out` and return the paths.
 
-        A failure, an interrupt or a killed process leaves `out` as it was, see `write_files`.
+        A failure, an interrupt or a killed process does not change `out`, see `write_files`.
         """
         out = Path(out)
         texts = {"report.json": json_text(self.record) + "\n", "report.md": self.markdown()}
@@ -233,7 +233,7 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _wrapped(text: str) -> str:
-    """Return lines of Markdown as text of the width of a terminal."""
+    """Return lines of Markdown as text, wrapped to the width of a terminal."""
     lines: list[str] = []
     wrapper = textwrap.TextWrapper(_WIDTH, break_on_hyphens=False)
     for line in text.replace("**", "").splitlines():
@@ -243,7 +243,7 @@ def _wrapped(text: str) -> str:
 
 
 def check_out(out: str | Path) -> None:
-    """Raise, before any work is done, where `out` cannot become a folder of results."""
+    """Raise, before any work, if `out` cannot be used as a folder for results."""
     path = as_path(out, "out")
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"`out` must be a folder, got the file {path}; name another one.")
@@ -253,7 +253,7 @@ def check_out(out: str | Path) -> None:
 
 
 def quiet(label: str, done: int, total: int) -> None:
-    """Report no progress."""
+    """Ignore progress."""
 
 
 def json_text(record: Any) -> str:
@@ -262,7 +262,7 @@ def json_text(record: Any) -> str:
     Parameters
     ----------
     record : dict
-        Of numbers, strings, paths, arrays, and lists and dicts of them.
+        Numbers, strings, paths, arrays, and lists and dicts of them.
 
     Returns
     -------
@@ -273,7 +273,7 @@ def json_text(record: Any) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that matter."""
+    """Return the versions of Python and of the main packages."""
     found = {"python": platform.python_version()}
     for name in ("hybridkin", "torch", "numpy", "scikit-learn", "mujoco"):
         with suppress(PackageNotFoundError):

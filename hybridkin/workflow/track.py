@@ -1,4 +1,4 @@
-"""A model and a path: the commands that follow it, as a file to send to the robot."""
+"""The commands that follow a path with a model, as a file to send to the robot."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from hybridkin.workflow.report import Progress, Report, check_out, millimetres, 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
-_STEP = 0.002  # of the tip between two solutions, over the extent of the workspace
+_STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
 _GUESSES = 16
-_PEAK, _PUSH = 1.875, 10.0 / math.sqrt(3.0)  # of `min_jerk`: speed and acceleration
+_PEAK, _PUSH = 1.875, 10.0 / math.sqrt(3.0)  # largest speed and acceleration of `min_jerk`
 _SLOW, _DT = 0.1, 0.02  # without known limits: share of the range per second; period [s]
-_PULLS = (0.2, 0.0, 0.0, 0.2)  # to the preferred configuration, one attempt at the path each
+_PULLS = (0.2, 0.0, 0.0, 0.2)  # pull to the preferred configuration, in each attempt
 
 
 def track_path(
@@ -49,16 +49,15 @@ def track_path(
     force: bool = False,
     progress: Progress = quiet,
 ) -> tuple[Report, list[Path]]:
-    """Compute the commands that lead the tip along a path, and write them.
+    """Compute the commands that move the tip along a path, write them and return a report.
 
     ``track.csv`` has one row per point in the units, names and sign of the robot's logs: time,
-    commands, the model's tip, the target, the error and its status. Figures and the report come
-    with it. Points far apart are passed in several steps on a straight line; where points are
-    missed, other starts and postures are tried, and the track that reaches most within the domain
-    is kept. Rows with the status LEAD_IN lead from `start` to the path, within ``dq_max`` and
-    ``ddq_max`` of the limits; an unknown speed is a tenth of the largest range per second. Of a
-    model with play the commands are those to send, which lead or trail what the actuators do by
-    half its width, and further columns ``effective_NAME`` hold the latter.
+    commands, the model's tip, the target, the error and its status. Figures and a report are
+    written beside it. Points far apart are connected by several steps on a straight line. If points
+    are not reached, other starts and postures are tried, and the track that reaches most points in
+    the domain is kept. Rows with the status LEAD_IN move from `start` to the path, below ``dq_max``
+    (default: a tenth of the largest range per second) and ``ddq_max``. With backlash, columns
+    ``effective_NAME`` hold the motion of the actuators, half the backlash from the commands.
 
     Parameters
     ----------
@@ -71,13 +70,13 @@ def track_path(
     limits : PathLimits, optional
         As from `path_limits`, which is also the default.
     start : array-like of shape (n,), "rest" or "path", default="rest"
-        Where the robot stands before [m]. "rest": no tendon pulled, of robots without tendons zero
-        or, where that lies outside the limits, the middle of the range. "path": at the first
+        Configuration of the robot before the path [m]. "rest": no tendon pulled; for robots without
+        tendons zero, or the middle of the range if zero lies outside the limits. "path": the first
         command of the path, without a lead-in.
     tol : float, default=1e-4
         As for `InverseKinematics.track` [m].
     force : bool, default=False
-        Go as near as possible where points of the path are out of reach.
+        If points of the path are out of reach, track them as closely as possible.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -88,12 +87,12 @@ def track_path(
         None without a learned part), "limits", "lead_in" (rows, duration_s and start [m]) and
         "play" (width [m]).
     paths : list of Path
-        What was written.
+        The written files.
 
     Raises
     ------
     ValueError
-        If points of the path are out of reach, with the largest size that is not.
+        If points of the path are out of reach; the message gives the largest scale in reach.
     """
     check_out(out)
     log_format = loaded.log_format()
@@ -133,7 +132,7 @@ def track_path(
 
 
 def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
-    """Return where the actuators stand before the path (n,), None: at its first command."""
+    """Return the configuration (n,) before the path; None: its first command."""
     low, high = domain.limits.q_min, domain.limits.q_max
     if isinstance(start, str):
         if start not in ("rest", "path"):
@@ -151,9 +150,9 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
 
 
 def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[Track, int]:
-    """Return a track that begins at `start`, and how many rows lead from there to the path.
+    """Return a track that begins at `start`, and the number of rows from there to the path.
 
-    They begin and end at rest; their targets are the tips of the model.
+    These rows begin and end at rest; their targets are the tips of the model.
     """
     limits = domain.limits
     way = np.zeros_like(track.q[0]) if start is None else track.q[0] - start
@@ -173,7 +172,7 @@ def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[
 
 
 def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress) -> Track:
-    """Return of several attempts the track that reaches most points within the domain."""
+    """Return the track of several attempts that reaches most points in the domain."""
     commands, tips = domain.sample
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
@@ -191,16 +190,16 @@ def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress)
 
         first = _initial_guesses(ik, path.x[0], commands, tips, 0.1 * tol)[attempt % 2]
         found: Any = ik.track(fine, q0=first, tol=tol, progress=report)
-        # Of the steps between the points only the points are kept.
+        # Only the points are kept, not the steps between them.
         rows = {k: v[::every] for k, v in vars(found).items() if v is not None}
         tracks.append(replace(found, **rows))
         if _score(tracks[-1]) == (len(path), len(path)):
             break
-    return max(tracks, key=_score)  # of equals the first
+    return max(tracks, key=_score)  # of equal tracks the first
 
 
 def _in_steps(path: Trajectory, n: int) -> Trajectory:
-    """Return the path with every way between two points cut into n."""
+    """Return the path with every segment between two points cut into n."""
     places = np.arange((len(path) - 1) * n + 1) / n
     columns = np.column_stack([path.t, path.x])
     t, *x = (np.interp(places, np.arange(len(path)), column) for column in columns.T)
@@ -210,11 +209,11 @@ def _in_steps(path: Trajectory, n: int) -> Trajectory:
 def _initial_guesses(
     ik: InverseKinematics, target: NDArray, commands: NDArray, tips: NDArray, tol: float
 ) -> list[NDArray]:
-    """Return two configurations (n,) to start from, at the target.
+    """Return two start configurations (n,) at the target.
 
-    One that the first of the commands, near the preferred one, leads to; and of those from the
-    commands whose tips are nearest to the target, in the domain if possible, the one with the
-    largest singular value sigma_min.
+    The first is solved from the first of the commands, which is near the preferred one. The second
+    is the best of those solved from commands whose tips are nearest to the target: in the domain if
+    possible, with the largest singular value sigma_min.
     """
     near = np.argsort(np.linalg.norm(tips[1:] - target, axis=1))[:_GUESSES] + 1
     near = np.concatenate([[0], near])
@@ -229,7 +228,7 @@ def _initial_guesses(
 
 
 def _score(track: Track) -> tuple[int, int]:
-    """Return how many points were reached within the domain, and how many at all."""
+    """Return the number of points reached in the domain, and the number reached at all."""
     statuses = np.asarray(track.status)
     return int((statuses == IKStatus.CONVERGED).sum()), int(np.isin(statuses, _REACHED).sum())
 
@@ -244,34 +243,34 @@ def animate_track(
     n_frames: int = 150,
     progress: Progress = quiet,
 ) -> dict[str, Any]:
-    """Write a film or an interactive page of a robot that runs through a file of commands.
+    """Write a film or an interactive page of a robot that follows a file of commands.
 
     Parameters
     ----------
     loaded : LoadedModel
-        A model with a mechanical part.
+        A model with a chain as its mechanical model.
     path : str or Path
         ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format.
     out : str or Path
         File that ends in ".mp4", ".gif" or ".html".
     unit : {"m", "cm", "mm"}, default="cm"
-        Of the axes.
+        Unit of the axes.
     speed : float, default=1.0
-        Of the film over that of the motion.
+        Speed of the film relative to the motion.
     n_frames : int, default=150
-        Frames at most.
+        Largest number of frames.
     progress : callable, optional
         Called with (what, done, total).
 
     Returns
     -------
     dict
-        "frames", "duration_s", "fps", "path" and "bytes" of what was written.
+        "frames", "duration_s", "fps", "path" and "bytes" of the written file.
     """
     if loaded.chain is None:
         raise ValueError(
-            f"`model` {loaded.path} has no body to draw; animate one with a chain as its "
-            "mechanical part."
+            f"`model` {loaded.path} has no body to draw; give a model with a chain as its "
+            "mechanical model."
         )
     file = Path(path)
     if file.is_dir():
@@ -299,7 +298,7 @@ def animate_track(
 
 
 def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
-    """Return commands and times of a file; its tips are the targets where it has them."""
+    """Return commands and times of a file; its tips are the targets if it has them."""
     if not file.is_file():
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
@@ -314,7 +313,7 @@ def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
 def _write_track(
     track: Track, shown: dict[str, NDArray], statuses: list[str], log: robots.LogFormat, file: Path
 ) -> None:
-    """Write commands, and what the actuators do where that is something else, point by point."""
+    """Write commands, and with backlash the motion of the actuators, point by point."""
     scale = 1 / METRES[log.x_unit]
     sent, *effective = (_text(q / log.q_factor) for q in shown.values())
     rest = _text(scale * np.column_stack([track.x, track.target, track.error]))
@@ -345,7 +344,7 @@ def _add_path(report: Report, loaded: LoadedModel, track: Track) -> None:
 def _add_commands(
     report: Report, domain: Domain, t: NDArray, shown: dict[str, NDArray], n_lead: int
 ) -> None:
-    """Add the commands against the limits, in names, unit and sign of the robot's logs."""
+    """Add the commands and their limits, in names, unit and sign of the robot's logs."""
     loaded, limits = domain.loaded, domain.limits
     chain, log_format = loaded.chain, loaded.log_format()
     shares = chain.actuators_per_segment if isinstance(chain, ArcChain) else (loaded.n_actuators,)
@@ -368,15 +367,16 @@ def _write_summary(report: Report) -> None:
     columns, source = record["columns"], record["limits"]["source"]
     mean, most, largest = (f"{1e3 * record['errors'][key]:.3g}" for key in ("mean", "p95", "max"))
     report.text(
-        f"{record['reached']} of {record['n']} points reached to within {1e3 * record['tol']:g} "
-        f"mm, by the model. Error in mm: mean {mean}, 95 % {most}, max {largest}. Limits: {source}."
+        f"In the model, {record['reached']} of {record['n']} points are reached within "
+        f"{1e3 * record['tol']:g} mm. Solver error in mm: mean {mean}, 95 % quantile {most}, max "
+        f"{largest}; the error of the robot is larger. Limits: {source}."
     )
     report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
     if record["in_domain"] is not None:
         report.text(f"{100 * record['in_domain']:.0f} % of the points lie in the model's domain.")
     if record["lead_in"]["rows"]:
         report.text(
-            "Rows with the status LEAD_IN lead from where the robot stands to the path: {rows} in "
+            "Rows with the status LEAD_IN move from the start of the robot to the path: {rows} in "
             "{duration_s:.2f} s.".format(**record["lead_in"])
         )
     sign = ", shortening positive" if np.all(np.less(columns["q_sign"], 0)) else ""
@@ -384,6 +384,6 @@ def _write_summary(report: Report) -> None:
     report.text(f"track.csv: {units}")
     if record["play"] is not None:
         report.text(
-            f"Backlash (play) {millimetres(record['play'])}: a command jumps by that where its "
-            "actuator turns back. q is what to send, effective_... what the actuators do."
+            f"Backlash (play) {millimetres(record['play'])}: a command jumps by it when its "
+            "actuator reverses. Send q; effective_... is the motion of the actuators."
         )

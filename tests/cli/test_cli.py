@@ -218,7 +218,7 @@ def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
     assert record["radius"]["coverage"] == 0.9
     assert 0.85 < record["all"]["share_in_radius"] <= 1
     code, printed, _ = run(capsys, "describe", out)
-    assert "radius for 90 % of the tips" in printed
+    assert "radius covering 90 % of the tips" in printed
 
 
 def test_npz_and_parquet_are_read_as_csv_is(log, robot, tmp_path, capsys):
@@ -493,7 +493,7 @@ def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
     code, record = document(capsys, "track", fitted / "model", *shape, "--out", out)
     assert code == 0
     assert record["reached"] == record["n"] == 41
-    assert record["limits"]["source"] == "robot description, within the range of the fit"
+    assert record["limits"]["source"] == "robot description, within the training range"
     assert record["in_domain"] == 1.0
     assert record["play"] is None
     assert record["columns"]["x"] == ["x", "y", "z"]
@@ -538,7 +538,7 @@ def test_track_of_points_within_given_limits(fitted, tmp_path, capsys):
     limits = ["--dt", "1", "--q-min=-1", "--q-max", "0.2"]
     code, _, errors = run(capsys, *arguments, *limits)
     assert code == 2  # the last point is out of reach
-    assert "2 of 3 points tried are out of reach" in errors
+    assert "2 of 3 checked points are out of reach" in errors
     assert not out.exists()
     code, record = document(capsys, *arguments, *limits, "--force")
     assert code == 1
@@ -648,7 +648,7 @@ def test_track_without_known_limits_asks_for_them(fitted, tmp_path, capsys):
         capsys, "track", tmp_path / "alone.safetensors", *shape, "--unit", "mm", "--dt", "0.1"
     )
     assert code == 0
-    assert record["limits"]["source"] == "range of the fit"
+    assert record["limits"]["source"] == "training range"
     assert record["columns"]["q"] == ["q1", "q2", "q3", "q4", "q5", "q6"]
 
 
@@ -755,7 +755,9 @@ def test_evaluate_knows_where_the_motions_of_play_begin(playful, tmp_path, capsy
     log = write(tmp_path / "backwards.csv", table)
     code, _, errors = run(capsys, "evaluate", playful, log)
     assert code == 2
-    assert "A model with play needs the rows of a motion in the order of time, but 23" in errors
+    assert (
+        "A model with backlash (play) needs the rows of a motion in order of time, but 23" in errors
+    )
 
 
 @pytest.mark.slow
@@ -920,7 +922,7 @@ def test_groups_of_the_description_can_be_left_out(log, robot, capsys):
     ("arguments", "message"),
     [
         (["evaluate", "log.csv", "model"], "must be a model or a robot description, got the log"),
-        (["track", "model", "noise.bin", "--out", "t"], "noise.bin is no text"),
+        (["track", "model", "noise.bin", "--out", "t"], "noise.bin is not text"),
         (
             ["track", "model", *SHAPE, "--size", "5,5", "--q-min", "1,2", "--out", "t"],
             "number or 6",

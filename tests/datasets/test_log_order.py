@@ -80,7 +80,7 @@ def test_the_sign_of_one_column_is_named():
     assert "set q_sign = [1, 1, 1, 1, -1, 1, 1, 1, 1]" in finding.advice
 
 
-@pytest.mark.parametrize(("turn", "kind"), [([1, 2, 0], "turned."), ([1, 0, 2], "mirrored.")])
+@pytest.mark.parametrize(("turn", "kind"), [([1, 2, 0], "rotated."), ([1, 0, 2], "mirrored.")])
 def test_axes_of_the_tip_are_named_where_the_base_is_fixed(turn, kind):
     log = measured()
     finding = only(measured(x=log.x[:, turn]), base_is_free=False)
@@ -113,9 +113,9 @@ def test_a_moved_camera_and_tips_that_come_late():
     assert "drift" in {f.kind for f in findings}
     late = Log(log.q[3:], log.x[:-3], log.groups[3:], q_names=NAMES)
     finding = {f.kind: f for f in check_log(late).findings}["lag"]
-    assert "3 rows after q" in finding.message
+    assert "3 rows behind q" in finding.message
     early = Log(log.q[:-3], log.x[3:], log.groups[3:], q_names=NAMES)
-    assert "3 rows before q" in {f.kind: f for f in check_log(early).findings}["lag"].message
+    assert "3 rows ahead of q" in {f.kind: f for f in check_log(early).findings}["lag"].message
 
 
 def test_columns_that_hold_the_same():

@@ -251,7 +251,7 @@ def test_bad_data(log):
     with pytest.raises(TypeError, match="must be a torch module"):
         HybridForwardModel(lambda q: q).fit(q, x)
     for regressor in ("kernel", RandomForestRegressor(2)):
-        with pytest.raises(TypeError, match="`error_model` must give features that can act inside"):
+        with pytest.raises(TypeError, match="`error_model` must be None, one of"):
             HybridForwardModel(bha(), regressor, coupling="serial").fit(q, x)
     with pytest.raises(TypeError, match=r"must be a chain.*SmallSum"):
         HybridForwardModel(SmallSum(), calibrate=("radii",)).fit(q, x[:, 0])

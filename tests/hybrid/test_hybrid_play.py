@@ -102,7 +102,7 @@ def test_any_width_up_to_the_range_is_found(share):
 @pytest.mark.slow
 def test_play_of_the_whole_range_warns():
     q, x, groups, _ = log_with(2.0)  # only the first row of each motion has an effect
-    with pytest.warns(UserWarning, match="`play`='auto' found backlash of .* no upper limit"):
+    with pytest.warns(UserWarning, match="play='auto' found a backlash of .* no upper limit"):
         assert play_found(q, x, groups) > 0.95 * np.ptp(q, axis=0).max()
 
 
@@ -178,7 +178,7 @@ def test_clear_errors(log):
         HybridForwardModel(CHAIN, play=-1.0).fit(q, x)
     with pytest.raises(ValueError, match=r"`play` must be a width.*got 'some'"):
         HybridForwardModel(CHAIN, play="some").fit(q, x)
-    with pytest.warns(UserWarning, match="`play` 0.5 is no less than the range of `X`"):
+    with pytest.warns(UserWarning, match="`play` 0.5 must be less than the range of `X`"):
         HybridForwardModel(CHAIN, "drop", play=0.5).fit(q, x)
     model = HybridForwardModel(CHAIN, "linear", play=WIDTH).fit(q, x, groups=groups)
     message = r"`groups` must have shape \(480,\), got \(3,\); one entry for each row of the log"

@@ -44,5 +44,5 @@ def test_no_neighbour_of_the_tuned_kernel_is_better(n_outputs, grouped):
 
 def test_more_rows_than_the_memory_holds_are_refused():
     X = np.random.default_rng(0).uniform(size=(10_001, 2))
-    with pytest.raises(ValueError, match=r"at most 10000 different rows .*, got 10001; leave rows"):
+    with pytest.raises(ValueError, match=r"at most 10000 different rows .*, got 10001; use fewer"):
         HybridForwardModel(None, "kernel").fit(X, X)

@@ -158,7 +158,7 @@ def test_an_infinite_radius_is_saved_and_described(tmp_path):
     save_model(model, tmp_path / "model.safetensors")
     assert load_model(tmp_path / "model.safetensors").radius_ == model.radius_
     report = workflow.describe(workflow.open_model(tmp_path / "model.safetensors"))
-    assert "radius for 90 % of the tips: not known" in report.plain()
+    assert "radius covering 90 % of the tips: not known" in report.plain()
     assert "at least 9" in " ".join(report.plain().split())
     assert json.loads(json_text(report.record))["radius"]["inside"] is None
 

@@ -171,8 +171,8 @@ def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
     assert report.record["all"]["share_in_radius"] == pytest.approx(np.mean([*shares.values()]))
     assert re.search(r"\| 1[.0]* \|.*\| 0 \| - \|", report.markdown())
     text = " ".join(report.plain().split())
-    assert "radius for 80 % of the tips: " in text
-    assert "only in the domain and for motions like the log's. Rows without a radius" in text
+    assert "radius covering 80 % of the tips: " in text
+    assert "in the domain and for motions as in the log. Rows without a radius" in text
 
 
 def test_standard_error_counts_motions_once():
@@ -289,7 +289,7 @@ def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
     assert "on elastic tendons" in report.record["chosen"]
     assert any(sentence.startswith("Of 2 sets of parameters") for sentence in chosen["words"])
     text = (tmp_path / "m" / "report.md").read_text()
-    assert "## Calibration of the elastic tendons that auto took" in text
+    assert "## Calibration of the elastic tendons that auto chose" in text
     names = [entry["name"] for entry in report.record["calibration_of_saved"]["entries"]]
     assert "bending_stiffness[0]" in names
     header = model_header(tmp_path / "m" / "model.safetensors")
@@ -304,8 +304,11 @@ def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
 @pytest.mark.parametrize(
     ("weights", "sentence"),
     [
-        ([1.0, 0.0, 0.0], "Auto took no error model: 2.50 mm on held-out motions; no other is"),
-        ([0.0, 1.0, 0.0], "Auto took the error model linear: 2.45 mm on held-out motions, 2.50 mm"),
+        ([1.0, 0.0, 0.0], "Auto chose no error model: 2.50 mm on held-out motions; none is"),
+        (
+            [0.0, 1.0, 0.0],
+            "Auto chose the error model linear: 2.45 mm on held-out motions, 2.50 mm",
+        ),
         ([0.0, 0.5, 0.5], "2.30 mm on held-out motions, 2.40 mm with the best of them alone (ELM)"),
     ],
     ids=["nothing", "not the least", "blend"],
@@ -338,7 +341,7 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions():
     compared = workflow.compare_by_group(log, robot, settings, n_jobs=1)
     errors, choices = compared.errors, compared.choices
     assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
-    assert all(choice["hybrid, auto"].endswith("play 0.4 mm") for choice in choices)
+    assert all(choice["hybrid, auto"].endswith("backlash 0.4 mm") for choice in choices)
 
 
 def test_an_actuator_that_never_moved_is_held_where_it_was():
@@ -351,7 +354,7 @@ def test_an_actuator_that_never_moved_is_held_where_it_was():
     limits = workflow.path_limits(loaded)
     assert limits.q_min == pytest.approx(q.min(axis=0))
     assert limits.q_max == pytest.approx(q.max(axis=0))
-    assert limits.source == "range of the fit"
+    assert limits.source == "training range"
     assert model.module_.in_domain(torch.from_numpy(Domain(loaded, limits).sample[0])).all()
 
 
@@ -515,7 +518,7 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path, ca
     assert not loaded.hybrid.in_domain(measured.q + 300).any()
     text = workflow.describe(loaded).plain()
     assert "No mechanical model." in text
-    fitted_for = text[text.index("Fitted for") : text.index("Logs:")]
+    fitted_for = text[text.index("Training range") : text.index("Logs:")]
     assert re.search(r"q_min = 2\d\d(\.\d)?(, 2\d\d(\.\d)?){5}\.\n", fitted_for)
     x = loaded.predict(measured.q[:1])[0]
     way = trajectories.line(x, (x[0] + 0.005, x[1], x[2]), duration=1.0, dt=0.5)
