@@ -297,7 +297,7 @@ def _track(command: argparse.ArgumentParser) -> None:
     _add_limits(command)
     add("--tol", type=positive, default=0.1, metavar="MM", help="accepted error [mm] (0.1)")
     where = "where the robot stands before the path (rest)"
-    stand = {"default": "rest", "dest": "start", "metavar": "rest|path|A,B,..."}
+    stand: Any = {"default": "rest", "dest": "start", "metavar": "rest|path|A,B,..."}
     add("--from", type=start, help=where, **stand)
     add("--force", action="store_true", help="go as near as the tip can if out of reach")
 

@@ -141,7 +141,11 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
         title = {"text": f"{letter} [{scene.unit}]"}
         # Fewer ticks on short sides, or their numbers cover each other.
         ticks = MaxNLocator(max(2, round(5 * side))).tick_values(*corners)
-        space[f"{letter}axis"] = {"title": title, "range": corners, "tickvals": ticks.tolist()}
+        space[f"{letter}axis"] = {
+            "title": title,
+            "range": corners,
+            "tickvals": [*map(float, ticks)],
+        }
     layout = {
         **{"template": "plotly_white", "scene": space, "updatemenus": [menu], "sliders": [slider]},
         "margin": {"l": 20, "r": 20, "t": 20, "b": 110, "autoexpand": False},
