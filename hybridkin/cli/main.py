@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     before = _stamps(arguments)
     try:
         stages = Stages(arguments.quiet)
-        with contextlib.closing(stages), warnings.catch_warnings(), _terminable():
+        with contextlib.closing(stages), warnings.catch_warnings(), _interruptible():
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
             outcome = _RUN[arguments.command](arguments, stages)
@@ -78,21 +78,31 @@ class _Terminated(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM interrupt as SIGINT does, unless the caller handles it."""
-    ours = threading.current_thread() is threading.main_thread()
-    if not ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
+def _interruptible() -> Iterator[None]:
+    """Let SIGTERM interrupt as SIGINT does, unless the caller handles these signals.
 
-    def stop(*_: Any) -> None:
-        raise _Terminated
+    An error after a signal is the interrupt: C code turns it into an ImportError during an import.
+    """
+    usual = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    ours = [n for n, handler in usual.items() if in_main_thread and signal.getsignal(n) is handler]
+    caught: list[KeyboardInterrupt] = []
 
-    signal.signal(signal.SIGTERM, stop)
+    def stop(number: int, _: Any) -> None:
+        caught.append(_Terminated() if number == signal.SIGTERM else KeyboardInterrupt())
+        raise caught[-1]
+
+    for number in ours:
+        signal.signal(number, stop)
     try:
         yield
+    except _OF_INPUT as error:
+        if caught:
+            raise caught[-1] from error
+        raise
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in ours:
+            signal.signal(number, usual[number])
 
 
 def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:

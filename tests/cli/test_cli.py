@@ -394,6 +394,21 @@ def test_a_request_to_end_is_an_interrupt_and_says_what_was_written(
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
+def test_an_interrupt_that_an_import_turns_into_an_error(log, robot, tmp_path, capsys, monkeypatch):
+    def imported(*_, **__):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ImportError("could not import datetime") from None
+
+    monkeypatch.setattr(workflow, "fit_log", imported)
+    code, _, errors = run(capsys, "fit", log, "--robot", robot, "--out", tmp_path / "m")
+    assert code == 130
+    assert errors.split("\n\n")[-1] == "hybridkin: interrupted; nothing was written\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 @pytest.mark.slow
 def test_an_error_of_the_program_keeps_its_traceback(log, robot, tmp_path, monkeypatch):
     def broken(*_, **__):
