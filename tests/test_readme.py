@@ -13,6 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from hybridkin.cli._parser import parser
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -31,8 +33,9 @@ def commands(text):
 
 
 COMMANDS = commands(README)
-OWN_LOG = [c for c in COMMANDS if c[0] == "hybridkin" and "train.csv" not in c]
-RECORDING = [c for c in COMMANDS if c[0] == "hybridkin" and "train.csv" in c]
+FIRST_USE = [c for c in COMMANDS if c[:2] in (["hybridkin", "demo"], ["hybridkin", "init"])]
+OWN_LOG = [c for c in COMMANDS if c[0] == "hybridkin" and c not in FIRST_USE]
+RECORDING = commands((ROOT / "docs" / "results.md").read_text(encoding="utf-8"))
 
 
 def hybridkin(command, folder):
@@ -65,7 +68,19 @@ def test_python_runs_as_printed(capsys):
 def test_every_kind_of_command_is_tried_below():
     assert {command[0] for command in COMMANDS} == {"pip", "make", "hybridkin"}
     assert len(OWN_LOG) >= 2
-    assert RECORDING
+    assert all("train.csv" in command for command in RECORDING)
+
+
+def test_commands_of_the_first_use_are_known(tmp_path, monkeypatch):
+    """They run in tests/cli: one takes a minute, the other asks."""
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").touch()
+    found = [parser().parse_args(command[1:]).command for command in FIRST_USE]
+    assert found == ["demo", "init"]
+
+
+def test_length_of_the_readme():
+    assert 600 <= len(README.split()) <= 700
 
 
 def test_what_pip_installs_is_there():
@@ -140,7 +155,7 @@ def test_links_lead_to_files_that_are_there():
 
 
 def test_number_of_examples():
-    words = {10: "ten", 11: "eleven", 12: "twelve", 13: "thirteen", 14: "fourteen"}
+    words = {10: "ten", 11: "eleven", 12: "twelve", 13: "thirteen", 14: "fourteen", 15: "fifteen"}
     assert f"a gallery of {words[len(EXAMPLES)]} examples" in README
 
 
