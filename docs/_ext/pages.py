@@ -8,6 +8,7 @@ from docutils.utils.math import latex2mathml
 
 EXAMPLES = (
     "csv_to_track",
+    "notebook",
     "next_rows",
     "table1",
     "error_histogram",

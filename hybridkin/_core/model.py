@@ -16,6 +16,7 @@ from torch.autograd import grad
 
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_tensor
+from hybridkin._core.html import html_table
 from hybridkin._core.stored import Layout, Restore, Stored
 
 if TYPE_CHECKING:
@@ -122,6 +123,19 @@ class ForwardModel(PortableModule):
 
     n_actuators: int = 0
     n_outputs: int = 0
+
+    def _repr_html_(self) -> str:
+        return html_table(type(self).__name__, self.html_rows())
+
+    def html_rows(self) -> dict[str, object]:
+        """Return names and values that a notebook shows of the model."""
+        parts = self.named_children()
+        return {
+            "structure": self.extra_repr() or None,
+            "actuators": self.n_actuators or "not known",
+            "outputs": self.n_outputs or "not known",
+            **{name: part.html_rows() for name, part in parts if isinstance(part, ForwardModel)},
+        }
 
     @property
     def limits(self) -> dict[str, Any]:

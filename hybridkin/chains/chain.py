@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import check_shape, countable
 from hybridkin._core.blocks import check_tensor, check_vectors
+from hybridkin._core.html import numbers
 from hybridkin._core.model import PoseModel
 from hybridkin._core.units import span_message
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Chain"]
 
+_UNITS = {"angles": "rad", "rest_bends": "rad", "gains": "m per unit of q", "axial_stiffness": "-"}
+_UNITS |= {"bending_stiffness": "m²/rad²"}  # others are in metres
+_UNITS |= dict.fromkeys(("actuator_zeros", "joint_zeros"), "unit of q")
 _FAR = 50.0  # robot sizes; some extensible robots are long and thin
 
 
@@ -51,6 +55,12 @@ class Chain(PoseModel):
         """Return the geometry by name, as in the constructor; entries that are None are omitted."""
         entries = {name: self._buffers[name] for name in self._entries}
         return {name: value for name, value in entries.items() if value is not None}
+
+    def html_rows(self) -> dict[str, object]:
+        """Return names and values that a notebook shows of the chain."""
+        entries = self.geometry().items()
+        shown = {f"{name} [{_UNITS.get(name, 'm')}]": numbers(a.detach()) for name, a in entries}
+        return {**super().html_rows(), **shown}
 
     def with_geometry(self, **geometry: Tensor) -> Self:
         """Return a chain with parts of the geometry replaced, differentiable in the new values.

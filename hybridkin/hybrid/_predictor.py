@@ -14,12 +14,14 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 
+from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._fit import Rows, known_tips
+from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._radius import Radius
 from hybridkin.learning.hidden_layer import check_inputs
@@ -125,6 +127,25 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
+
+    @property
+    def _repr_html_(self) -> Callable[[], str]:
+        """What scikit-learn shows in a notebook, and below it what the fit found.
+
+        As in scikit-learn there is none where its `display` is "text".
+        """
+        shown = super()._repr_html_
+        return lambda: shown() + self._fit_html()
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
+        bundle = super()._repr_mimebundle_(**kwargs)
+        if "text/html" in bundle:
+            bundle["text/html"] += self._fit_html()
+        return bundle
+
+    def _fit_html(self) -> str:
+        title = f"{type(self).__name__}: what the fit found"
+        return html_table(title, fitted_rows(self)) if "module_" in vars(self) else ""
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array
+from hybridkin._core.html import html_table, numbers
 from hybridkin.ik.tasks import Task
 
 ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
@@ -218,6 +219,23 @@ class Track(Generic[ArrayT]):
         """Return a one-line summary."""
         step = f"largest step {self.largest_step:.3g}"
         return f"Track({_tally(self.status)}; {_errors(self.error)}; {step})"
+
+    def _repr_html_(self) -> str:
+        """Return the outcome of the points, the errors and the commands as an HTML table."""
+        q, margin = as_array(self.q), as_array(self.limit_margin).min(initial=np.inf)
+        tip = "tip of the model" if self.x_measured is None else "measured tip"
+        ends = zip(q.min(0, initial=np.inf), q.max(0, initial=-np.inf), strict=True)
+        commands = {f"q[{k}]": tuple(map(numbers, pair)) for k, pair in enumerate(ends)}
+        rows = {
+            "points": _tally(self.status),
+            "duration": f"{np.diff(as_array(self.t)).sum():.4g} s",
+            f"distance from path to {tip}": _errors(self.error),
+            "largest step of an actuator": f"{self.largest_step:.3g} (unit of q)",
+            "smallest distance to a limit": f"{margin:.3g} (unit of q)",
+            "smallest singular value": f"{as_array(self.sigma_min).min(initial=np.inf):.3g}",
+            "commands": {"": ("least", "largest"), **commands},
+        }
+        return html_table("Track", rows)
 
 
 def _tally(status: np.ndarray | Tensor) -> str:

@@ -1,0 +1,64 @@
+"""What a notebook shows of an object: a title and a table of names and values, as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+
+import numpy as np
+
+from hybridkin._core.arrays import Numbers, as_array
+
+_MOST = 48  # numbers of an array that are shown
+_ROUNDING = 12  # decimals
+# Text has the colour of the page and lines are half transparent: right on light and on dark pages.
+_STYLE = """<style>
+.hybridkin { font-size: 0.9em; margin: 0.5em 0; text-align: left; width: fit-content; }
+.hybridkin details { border: 1px solid rgba(128, 128, 128, 0.5); }
+.hybridkin summary { background: rgba(0, 114, 178, 0.18); cursor: pointer; padding: 0.3em 0.6em; }
+.hybridkin table { border-collapse: collapse; margin: 0.2em 0.6em; width: auto; }
+.hybridkin tbody tr:nth-child(n) { background: none; }
+.hybridkin tbody :is(th, td) { border: none; color: inherit; font: inherit; max-width: 60em;
+  padding: 0.15em 1em 0.15em 0; text-align: left; vertical-align: top; white-space: pre-wrap; }
+.hybridkin tbody th { opacity: 0.75; white-space: nowrap; }
+</style>"""
+
+
+def html_table(title: str, rows: Mapping[str, object]) -> str:
+    """Return names and values as an HTML table that can be folded, every text escaped.
+
+    Parameters
+    ----------
+    title : str
+        The line that stays when the table is folded.
+    rows : mapping of str
+        Names and values: a tuple has a cell for each entry, a mapping becomes a folded table, and
+        None is left out.
+    """
+    return f'{_STYLE}\n<div class="hybridkin">{_folding(title, rows, " open")}</div>'
+
+
+def numbers(values: Numbers) -> str:
+    """Return an array as text, one line for each row; of a long one its shape."""
+    array = as_array(values)
+    if array.size > _MOST:
+        return f"array of shape {array.shape}"
+    rows = np.round(array, _ROUNDING) + 0.0  # no negative zeros
+    lines = rows.reshape(-1, rows.shape[-1]) if rows.ndim > 1 else [np.ravel(rows)]
+    return "\n".join(", ".join(f"{value:.4g}" for value in line) for line in lines)
+
+
+def _folding(title: str, rows: Mapping[str, object], state: str = "") -> str:
+    body = "\n".join(_row(name, value) for name, value in rows.items() if value is not None)
+    return (
+        f"<details{state}><summary>{escape(title)}</summary>"
+        f"<table><tbody>\n{body}\n</tbody></table></details>"
+    )
+
+
+def _row(name: str, value: object) -> str:
+    if isinstance(value, Mapping):
+        return f'<tr><td colspan="9">{_folding(name, value)}</td></tr>'
+    cells = value if isinstance(value, tuple) else (value,)
+    columns = "".join(f"<td>{escape(str(cell))}</td>" for cell in cells)
+    return f'<tr><th scope="row">{escape(name)}</th>{columns}</tr>'

@@ -1,0 +1,92 @@
+"""What a notebook shows of a fitted `HybridForwardModel`, below its parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hybridkin._core.arrays import as_array
+from hybridkin._core.html import numbers
+from hybridkin.hybrid._readout_fit import ReadoutFit
+from hybridkin.learning.elm import ELMRegressor
+from hybridkin.learning.elm_cv import ELMRegressorCV
+
+_HELD_OUT = (ReadoutFit, ELMRegressor, ELMRegressorCV)  # their errors are those of held-out rows
+
+
+def fitted_rows(model: Any) -> dict[str, object]:
+    """Return names and values of what the fit of a hybrid found, for `html_table`."""
+    mechanical, found, play = model.mechanical_model_, model.calibration_, model.play_
+    known, fitted = model._fitted_rows, model.module_.fitted
+    changed = fitted is not model.module_ or fitted.drift is not None
+    domain = {None: "everywhere (no guard)", "box": "the training range of q"}
+    domain = domain.get(model.guard, "close to the training rows (guard by leverage)")
+    return {
+        "actuators": model.n_features_in_,
+        "mechanical model": "none" if mechanical is None else type(mechanical).__name__,
+        "calibrated": _calibrated(model),
+        "error model": _error_model(model),
+        **_error(model),
+        "training rows": None if known is None else f"{len(known)} different rows",
+        "domain": domain + ", as far as held-out groups tested it" * (fitted.tested is not None),
+        "radius": None if model.radius_ is None else _radius(model),
+        "backlash": None if play is None else f"{numbers(play.width)} (unit of q)",
+        "adapted": "after the fit; the errors are those of the fit" if changed else None,
+        "calibration": None if found is None else {"": repr(found)},
+        "geometry": None if mechanical is None else mechanical.html_rows(),
+        "training range of q": _range(model),
+    }
+
+
+def _calibrated(model: Any) -> str:
+    found, asked = model.calibration_, model.calibrate
+    if found is not None:
+        held_out = "" if found.cv_rmse is None else f", held-out groups {_mm(found.cv_rmse)}"
+        return f"{', '.join(found.values)}; root mean square error {_mm(found.rmse)}{held_out}"
+    chosen = (model.cv_results_ or {}).get("parameters")  # of a model from a file
+    return str(chosen or (asked if isinstance(asked, str) else ", ".join(asked or ()) or "nothing"))
+
+
+def _error_model(model: Any) -> str:
+    error, asked = model.error_model_, model.error_model
+    if model.cv_results_ is not None:
+        weights = model.cv_results_["weights"].items()
+        parts = [f"{share:.2f} {name}" for name, share in weights if share > 0.0]
+        return f'{" + ".join(parts)} (chosen by "auto")'
+    first = error[0] if type(error) is tuple else error  # of several markers
+    name = f'"{asked}"' if isinstance(asked, str) else type(first).__name__
+    rejected = isinstance(first, ReadoutFit) and np.isinf(first.alphas).all()
+    return f"{name}, {model.coupling}" + ", rejected by the held-out error" * bool(rejected)
+
+
+def _error(model: Any) -> dict[str, str]:
+    """Return the error on held-out rows or, where it is not known, on training rows."""
+    if (results := model.cv_results_) is not None:
+        means = dict(zip(results["candidate"], results["mean_distance"], strict=True))
+        alone = f", mechanical model alone {_mm(means['mechanical'])}"
+        return {"held-out error": f"mean {_mm(means[str(results['chosen'])])}{alone}"}
+    error = model.error_model_
+    held_out = isinstance(error[0] if type(error) is tuple else error, _HELD_OUT)
+    words = f"standard deviation of a coordinate {_mm(model._noise)}"
+    return {"held-out error" if held_out else "training error": words}
+
+
+def _radius(model: Any) -> str:
+    radius, share = model.radius_, f"{100 * model.radius_.coverage:g} % of the tips"
+    if np.isfinite(radius.inside):
+        return f"{_mm(radius.inside)} covers {share} inside the domain"
+    return f"not known: {share} need at least {radius.least_groups} groups in the domain"
+
+
+def _range(model: Any) -> dict[str, object]:
+    center, scale, *_ = model._drift
+    half = np.where(scale == 1.0, 0.0, scale)  # an actuator that never moved counts as 1
+    center = center - as_array(model.module_.shift)
+    names = vars(model).get("feature_names_in_", [f"q[{k}]" for k in range(len(half))])
+    ends = zip(map(numbers, center - half), map(numbers, center + half), strict=True)
+    return {"": ("least", "largest"), **dict(zip(map(str, names), ends, strict=True))}
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.3g} mm"

@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import ConstantCurvatureChain, InverseKinematics, RigidChain, tasks
+from hybridkin.ik.results import Track
+
+CHAIN = ConstantCurvatureChain([0.1, 0.093])
+HOSTILE = "<script>alert(1)</script>"
+URDF = f"""<robot name="a"><link name="base"/><link name="end"/>
+<joint name="{HOSTILE.replace("<", "&lt;")}" type="revolute">
+<parent link="base"/><child link="end"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+
+
+def track(**changed):
+    t = np.linspace(0.0, 1.0, 5)
+    q = np.stack([t, -t], axis=1)
+    error = np.array([0.001, 0.002, 0.003, np.nan, np.inf])
+    margin = np.full(5, np.inf)
+    parts = {"t": t, "q": q, "x": np.zeros((5, 3)), "x_measured": None, "target": np.zeros((5, 3))}
+    parts |= {"error": error, "status": np.array([0, 0, 1, 6, 6]), "sigma_min": np.ones(5)}
+    return Track(**{**parts, "limit_margin": margin, **changed})
+
+
+def test_all_settings_and_the_model():
+    ik = InverseKinematics(CHAIN, q_min=0.1, q_max=[0.3, 0.4] * 3, dt=0.05)
+    html = ik._repr_html_()
+    assert "q_max</th><td>0.3 to 0.4</td>" in html
+    assert "dt</th><td>0.05</td>" in html
+    assert "damping</th><td>&#x27;adaptive&#x27;</td>" in html
+    assert "<summary>model: ConstantCurvatureChain</summary>" in html
+    assert "radii [m]</th><td>0.1, 0.093</td>" in html
+    assert (
+        repr(ik)
+        == "InverseKinematics(ConstantCurvatureChain, q_min=0.1, q_max=0.3 to 0.4, dt=0.05)"
+    )
+
+
+def test_other_tasks_and_functions():
+    html = InverseKinematics(
+        tasks.PositionTask(lambda q: q[..., :3]), q_pref=lambda q: q
+    )._repr_html_()
+    assert "PositionTask" in html
+    assert "<function" not in html
+    assert "&lt;function" in html
+
+
+def test_outcome_errors_and_commands_of_a_track():
+    html = track()._repr_html_()
+    assert "5 targets: 2 CONVERGED, 1 AT_LIMITS, 2 INVALID_INPUT" in html
+    assert "distance from path to tip of the model</th><td>error mean 0.002 m, max 0.003 m" in html
+    assert "q[1]</th><td>-1</td><td>0</td>" in html
+    measured = track(x_measured=np.zeros((5, 3)), error=np.full(5, np.nan))._repr_html_()
+    assert "distance from path to measured tip</th><td>no error known</td>" in measured
+
+
+@pytest.mark.parametrize("n", [0, 1, 5])
+def test_tracks_of_tensors_and_short_ones(n):
+    whole = vars(track())
+    parts = {k: None if v is None else torch.from_numpy(v[:n]) for k, v in whole.items()}
+    assert f"{n} targets" in Track(**parts)._repr_html_()
+
+
+def test_names_of_joints_are_escaped():
+    arm = RigidChain.from_urdf(URDF, "end")
+    assert HOSTILE in repr(arm)
+    for html in (arm._repr_html_(), InverseKinematics(arm)._repr_html_()):
+        assert HOSTILE not in html
+        assert "&lt;script&gt;" in html
