@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from inspect import Signature
 from typing import TypeAlias
 
 import numpy as np
@@ -127,6 +128,22 @@ class StepSettings(Portable):
         full = (self.q_max - self.q_min >= _FULL * _TURN) & (self.limits != "off")
         periods = torch.where(turns.all(0) & full, self.q_max.new_tensor(_TURN), math.inf)
         object.__setattr__(self, "periods", periods)
+
+    def shown(self, arguments: Signature, defaults: bool = False) -> dict[str, str]:
+        """Return the settings that differ from their defaults, or all of them, in words."""
+        shown = {}
+        for name, default in arguments.parameters.items():
+            value = vars(self).get(name)
+            if isinstance(value, Tensor):
+                ends = dict.fromkeys(f"{float(end):.4g}" for end in (value.min(), value.max()))
+                whose = " of the model" if name in self.of_model else ""
+                if torch.isfinite(value).any():
+                    shown[name] = f"{' to '.join(ends)}{whose}"
+            elif value not in (None, default.default):
+                shown[name] = repr(value)
+            if defaults and name != "model":
+                shown.setdefault(name, repr(default.default))
+        return shown
 
     def unit_messages(self) -> list[str]:
         """Return warnings if limits or a posture seem to have another unit than the model."""

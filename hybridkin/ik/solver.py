@@ -165,29 +165,15 @@ class InverseKinematics:
 
     def __repr__(self) -> str:
         """Return the model's name, the limits, and the settings that differ from their defaults."""
-        shown = (f"{name}={text}" for name, text in self._shown().items())
+        settings = self.settings.shown(signature(type(self)))
+        shown = (f"{name}={text}" for name, text in settings.items())
         return f"InverseKinematics({', '.join([type(self.model).__name__, *shown])})"
 
     def _repr_html_(self) -> str:
         models = {f"model: {type(m).__name__}": m.html_rows() for m in self.settings.task.models}
+        settings = self.settings.shown(signature(type(self)), defaults=True)
         task = {"task": type(self.settings.task).__name__}
-        return html_table(type(self).__name__, {**task, **self._shown(defaults=True), **models})
-
-    def _shown(self, defaults: bool = False) -> dict[str, str]:
-        """Return the settings that differ from their defaults, or all of them, in words."""
-        shown = {}
-        for name, default in signature(type(self)).parameters.items():
-            value = vars(self.settings).get(name)
-            if isinstance(value, Tensor):
-                ends = dict.fromkeys(f"{float(end):.4g}" for end in (value.min(), value.max()))
-                whose = " of the model" if name in self.settings.of_model else ""
-                if torch.isfinite(value).any():
-                    shown[name] = f"{' to '.join(ends)}{whose}"
-            elif value not in (None, default.default):
-                shown[name] = repr(value)
-            if defaults and name != "model":
-                shown.setdefault(name, repr(default.default))
-        return shown
+        return html_table(type(self).__name__, {**task, **settings, **models})
 
     def stored(self) -> Stored:
         """Return the description of the solver, with its model as a part, for kernels.
