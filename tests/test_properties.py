@@ -204,6 +204,8 @@ ENTRIES = {
         datasets.load_log,
         {"path": CSV, **NAMES, "groups": "g", "time": None, **READ},
     ),
+    "datasets.log_columns": (datasets.log_columns, {"path": CSV, "delimiter": None}),
+    "plots.model_color": (plots.model_color, {"name": "hybrid, ELM", "default": "#000000"}),
     "datasets.check_log": (
         lambda q, x, groups, time, **k: str(
             datasets.check_log(datasets.Log(q, x, groups, time), **k)

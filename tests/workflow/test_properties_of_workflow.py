@@ -41,6 +41,7 @@ def settled(q, **given):
 
 ENTRIES = {
     "LoadedModel.effective": (LOADED.effective, {"q": Q, "groups": GROUPS}),
+    "LoadedModel.expected_errors": (LOADED.expected_errors, {"q": Q}),
     "fit_play": (
         fit_play,
         {

@@ -88,7 +88,7 @@ def test_paper_command_writes_everything_or_nothing(tmp_path, capsys):
     assert serial["feed-forward"]["mean"] < 0.5 * nominal["feed-forward"]["mean"]
     found = record["identifiability"]
     plain = re.sub(r"\s+", " ", printed)
-    assert "1500 rows of one segment moving alone and 400 fully random ones" in plain
+    assert re.search(r"In 1500 rows one .* moves alone, and 400 rows are fully random", plain)
     assert len(found["asked"]["entries"]) == 28
     for entry in found["asked"]["entries"]:
         answer = "yes" if entry["identified"] else "no"
