@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ForwardModel, InverseKinematics, RigidChain
 from hybridkin.ik._gram import (
+    RowGram,
     adaptive_damping,
     apply_columns,
     apply_rows,
@@ -132,6 +133,9 @@ def test_distances_between_poses_are_those_of_the_error_for_small_turns():
     )
     assert_close(task.distances(poses[None], targets), expected, rtol=1e-2, atol=1e-9)
     rows = poses.expand(3, 5, 4, 4)
+    assert_close(task.distances(rows, targets), expected, rtol=1e-2, atol=1e-9)
+    rows, order = torch.stack([poses, poses.flip(0), poses]), [0, 1, 2, 3, 4]
+    expected = torch.stack([expected[0], expected[1, order[::-1]], expected[2]])
     assert_close(task.distances(rows, targets), expected, rtol=1e-2, atol=1e-9)
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     far = task.distances(torch.eye(4, dtype=torch.float64)[None, None], half[None])
@@ -278,7 +282,109 @@ def test_what_pulls_against_limits_alone_is_blocked():
     way = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-1.0, 1.0, 0.1], [1.0, 0.0, 0.0]])
     blocked = [True, True, False, False]
     assert search._blocked(search._point(q, q + way)).tolist() == blocked
+    assert search._blocked(search._point(q, q + 0.1 * way)).tolist() == blocked
     assert not search._blocked(search._point(q, q - way)).any()
     found = InverseKinematics(model, q_min=-1.0, q_max=1.0).solve(q + way, q, restarts=0)
     assert (found.status == IKStatus.UNREACHABLE).tolist() == [True, True, True, False]
     assert (found.n_iter[:2] == 0).all()
+
+
+@pytest.mark.parametrize("m", [2, 4, 6])
+def test_singular_values_of_healthy_rows_are_known_and_estimated(m):
+    J = torch.randn(20, m, 8, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    sizes = torch.linalg.svdvals(J)
+    gram, quick = row_gram(J), quick_gram(J)
+    assert_close(gram.sigma_min, sizes[:, -1], rtol=1e-7, atol=0.0)
+    assert_close(gram.sigma_max, sizes[:, 0], rtol=1e-12, atol=0.0)
+    assert (quick.sigma_min <= sizes[:, -1] * (1.0 + 1e-6)).all()
+    assert (quick.sigma_min >= m**-0.25 * sizes[:, -1] * (1.0 - 1e-6)).all()
+
+
+def test_four_rows_have_their_own_singular_values():
+    J = torch.diag(torch.tensor([4.0, 3.0, 2.0, 0.5], dtype=torch.float64))[None]
+    gram, quick = row_gram(J), quick_gram(J)
+    assert_close(gram.sigma_min, J.new_tensor([0.5]))
+    assert_close(gram.sigma_max, J.new_tensor([4.0]))
+    # The estimate is at most the fourth root of the number of rows too small.
+    assert 0.5 / 4.0**0.25 <= float(quick.sigma_min) <= 0.5
+
+
+def test_what_dependent_rows_cannot_reach_is_dropped():
+    """The multipliers are those of the pseudo-inverse, also if the rows want different things."""
+    J = torch.tensor([[[1.0, 2.0, 2.0], [1.0, 2.0, 2.0]]], dtype=torch.float64)
+    v = torch.tensor([[3.0, 1.0]], dtype=torch.float64)
+    mu = damped_solve(row_gram(J), v)
+    assert_close(mu, (torch.linalg.pinv(J @ J.mT) @ v[..., None])[..., 0])
+    assert_close(apply_rows(J, apply_columns(J, mu)), torch.full_like(v, 2.0))
+
+
+def test_a_jacobian_is_singular_where_it_is_damped():
+    low = torch.tensor([0.0, 0.01, 0.02, 0.021, 1.0], dtype=torch.float64)
+    gram = RowGram((), low, torch.ones_like(low))
+    assert gram.is_singular.tolist() == [True, True, False, False, False]
+    assert (adaptive_damping(gram) > 0.0).tolist() == gram.is_singular.tolist()
+
+
+def test_a_healthy_cold_start_is_the_middle_of_the_limits():
+    """Without a posture the solution is then the nearest one, by the pseudo-inverse."""
+    ik = InverseKinematics(MODEL, q_min=[-1.0] * 5, q_max=2.0, beta=0.0)
+    middle = torch.full((5,), 0.5, dtype=torch.float64)
+    target = A @ middle + 0.1
+    expected = middle + torch.linalg.pinv(A) @ (target - A @ middle)
+    assert_close(ik.solve(target, tol=1e-9).q, expected, rtol=0.0, atol=1e-8)
+
+
+def test_one_row_settles_at_the_preferred_posture():
+    a = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    task = PositionTask((lambda q: q @ a[:, None], lambda q: a.expand(*q.shape[:-1], 1, 3)), 1)
+    preferred = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
+    found = InverseKinematics(task, q_pref=preferred).solve(a.new_tensor([0.7]), a)
+    assert found.converged
+    expected = preferred + a * (0.7 - a @ preferred) / a.square().sum()
+    assert_close(found.q, expected, rtol=0.0, atol=1e-6)
+
+
+def test_a_search_that_gains_next_to_nothing_ends():
+    """exp(-q) comes nearer to -1 with every step, but never nearer than 1."""
+    task = PositionTask((lambda q: torch.exp(-q), lambda q: -torch.exp(-q)[..., None]), 1)
+    q0, target = torch.zeros(1, dtype=torch.float64), -torch.ones(1, dtype=torch.float64)
+    found = InverseKinematics(task, beta=0.0).solve(target, q0, max_iter=500, restarts=0)
+    assert found.status == IKStatus.UNREACHABLE
+    assert_close(found.error, found.error.new_tensor(1.0), rtol=0.0, atol=1e-5)
+    assert found.n_iter < 100
+
+
+def test_starts_beside_singular_points_are_a_share_of_the_limits_away():
+    """By up to 5 % of the range where the error is small, and not all actuators alike."""
+    ik = InverseKinematics(MODEL, q_min=-1.0, q_max=1.0)
+    search, q = Search(ik.settings, 1e-4, 50), torch.zeros(1, 5, dtype=torch.float64)
+    moved = search._nudged(search._start(q, q @ A.T + 1e-6))[0]
+    assert 0.05 < float(moved.abs().max()) <= 0.1
+    assert len(moved.unique()) == 5
+
+
+def test_rows_that_are_not_finite_are_not_held_by_limits():
+    ik = InverseKinematics(MODEL, q_min=-1.0, q_max=1.0, dq_max=1.0)
+    q = torch.tensor([[0.0] * 5, [0.0, 1.0, 0.0, -1.0, 0.0]], dtype=torch.float64)
+    step = ik.step(q, torch.full((2, 3), torch.nan, dtype=torch.float64))
+    assert (step.dq == 0.0).all()
+    assert_close(step.saturated, q.abs() == 1.0)
+
+
+def test_a_gap_in_a_path_stops_the_feed_forward_only_there():
+    path = np.linspace(0.0, 0.5, 6)[:, None] * np.array([0.1, -0.2, 0.3])
+    path[2, 1] = np.nan
+    track = InverseKinematics(MODEL).track(path, q0=np.zeros(5))
+    known = [0, 1, 4, 5]  # after the gap one point is missed, because nothing led to it
+    np.testing.assert_allclose(track.x[known], path[known], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(track.x[2:4], path[[1, 1]], rtol=0.0, atol=1e-12)
+    assert track.status[2] == IKStatus.INVALID_INPUT
+
+
+def test_a_tracker_of_a_model_with_parameters_has_no_graph():
+    model = torch.nn.Linear(5, 3).double()
+    q = torch.zeros(5, dtype=torch.float64)
+    tracker = InverseKinematics(model).tracker(q)
+    assert not tracker.x.requires_grad
+    assert_close(tracker.x, model.bias.detach())
+    assert not tracker.step(torch.ones(3, dtype=torch.float64)).requires_grad

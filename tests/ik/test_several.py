@@ -58,6 +58,14 @@ def test_both_elbows_nearest_first_and_no_third(kind):
     assert_close(first.q, solution.q[0, 0, :1], rtol=0.0, atol=1e-9)
 
 
+def test_each_elbow_comes_first_if_the_start_is_nearest_to_it():
+    ik = InverseKinematics(planar(0.3, 0.2), q_min=-math.pi, q_max=math.pi)
+    target, both = np.array([0.3, 0.2, 0.0]), np.array(elbows(0.3, 0.2))
+    for order in (both, both[::-1]):
+        solution = ik.solve(target, order[0] + 0.01, tol=1e-6, n_solutions=2)
+        np.testing.assert_allclose(solution.q, order, rtol=0.0, atol=1e-4)
+
+
 def test_turns_of_a_joint_are_one_configuration_near_the_start():
     ik = InverseKinematics(planar(0.3, 0.2), q_min=-2.0 * math.pi, q_max=2.0 * math.pi)
     q0 = np.array([2.5, -2.0])

@@ -57,6 +57,14 @@ def test_spiral_radius_angle_and_rise():
     assert circle.x[1, 1] < CENTER[1]  # clockwise
 
 
+def test_spirals_begin_along_the_x_axis_as_seen_in_their_plane():
+    path = spiral(CENTER, 0.1, normal=(1, 1, 1))
+    assert_allclose(path.x[0] - CENTER, 0.1 * np.array([2.0, -1.0, -1.0]) / np.sqrt(6.0))
+    assert_allclose(spiral(CENTER, 0.1, normal=(-3, 0, 0)).x[0] - CENTER, [0, 0.1, 0], atol=1e-15)
+    path = spiral(CENTER)  # by default three turns outwards, to 0.15 m
+    assert_allclose(path.x[[0, -1]] - CENTER, [[0, 0, 0], [0.15, 0, 0]], atol=1e-12)
+
+
 @pytest.mark.parametrize("timing", ["min_jerk", "uniform"])
 def test_line_is_straight_and_meets_its_ends(timing):
     start, end = CENTER, np.array([0.3, 0.1, 0.9])
