@@ -388,3 +388,17 @@ def test_a_tracker_of_a_model_with_parameters_has_no_graph():
     assert not tracker.x.requires_grad
     assert_close(tracker.x, model.bias.detach())
     assert not tracker.step(torch.ones(3, dtype=torch.float64)).requires_grad
+
+
+def test_a_posture_costs_no_accuracy():
+    """The motion towards it may use up the tolerance; a last step then corrects the error."""
+
+    def bent(q):
+        return torch.stack([torch.sin(q[..., 0]) + q[..., 1] ** 2, q[..., 1] + q[..., 2].cos()], -1)
+
+    ik = InverseKinematics(PositionTask(bent, 2), q_min=-1.0, q_max=[1.0] * 3)
+    target = torch.tensor([[0.5, 0.9], [0.3, 1.2]], dtype=torch.float64)
+    found = ik.solve(target, tol=1e-2)
+    assert found.converged.all()
+    assert ((found.q > -1.0) & (found.q < 1.0)).all()
+    assert (found.error < 1e-4).all()
