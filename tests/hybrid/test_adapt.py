@@ -27,6 +27,7 @@ from hybridkin import (
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin.hybrid._adapt import _whitened
 from hybridkin.hybrid._adapted import AdaptedModel
+from hybridkin.hybrid._module import HybridModule
 
 SHIFT = 0.006 * np.array([1.0, -0.5, 0.8, -1.2, 0.3, 0.9, -1.0, 0.6, -0.7])
 TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.03, -0.05, 0.02])
@@ -315,3 +316,27 @@ def test_rows_too_large_for_the_model_are_refused():
     with pytest.raises(ValueError, match="`sample_weight` must lie within a factor"):
         copy.deepcopy(model).fit(q, x, weights)
     assert np.isfinite(model.partial_fit(q[:1], x[:1] + 0.01, alpha=5e-324).predict(q)).all()
+
+
+def test_an_adapted_model_takes_single_rows_and_batches():
+    chain = robots.bionic_handling_assistant()
+    motion = torch.eye(4).double()
+    motion[:3, :3] = rotation(torch.tensor([0.1, -0.2, 0.3]).double())[0]
+    motion[:3, 3] = torch.tensor([0.01, 0.02, -0.03])
+    shift = torch.full((9,), 0.001).double()
+    model = AdaptedModel(HybridModule(chain, [], shift[:0]), shift, motion)
+    q = torch.linspace(0.2, 0.3, 2 * 6 * 9).double().reshape(2, 6, 9)
+    expected = chain(q + shift) @ motion[:3, :3].mT + motion[:3, 3]
+    assert_close(model(q), expected)
+    assert_close(model(q[1, 2]), expected[1, 2])
+
+
+def test_the_warning_of_another_change_names_the_line_of_the_caller():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (30, 9))
+    model = HybridForwardModel(robots.bionic_handling_assistant(), "drop")
+    x = model.mechanical_model(torch.from_numpy(q)).numpy()
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(x.shape)
+    model.fit(q, x + noise)
+    with pytest.warns(UserWarning, match="has changed in a way") as caught:
+        model.adapt(q, x + 0.1 * np.sin(40.0 * q[:, :3]), parameters=["base"])
+    assert caught[0].filename == __file__

@@ -7,6 +7,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from saved_models import FOLDER, trunk_log
+from scipy.optimize import brentq
 from scipy.stats import multivariate_normal
 from sklearn.linear_model import Ridge
 from torch.testing import assert_close
@@ -160,3 +161,15 @@ def test_a_file_without_the_held_out_error_can_still_learn_a_drift():
     with pytest.raises(ValueError, match="`adapt` needs the held-out errors"):
         model.adapt(q[:5], x[:5])
     load_model(FOLDER / "blend.safetensors").adapt(q[:5], x[:5])  # has the scores of all candidates
+
+
+@pytest.mark.parametrize(("gain", "changed"), [(3.0, False), (5.0, True)])
+def test_a_change_needs_a_gain_of_two_for_offset_and_slope_each(gain, changed):
+    """An offset e of n rows, in noise s, gains (r - 1 - log r) / 2, with r = n e^2 / s^2."""
+    n, noise = 100, 0.01
+    r = brentq(lambda r: 0.5 * (r - 1.0 - np.log(r)) - gain, 1.0, 100.0)
+    offset = noise * np.sqrt(r / n)
+    gram, moment = np.diag([n, 0.0]), np.array([[n * offset], [0.0]])
+    squares = np.array(n * noise**2 + n * offset**2)
+    drift = Drift(np.zeros(1), np.ones(1), gram, moment, squares)
+    assert (drift.likeliest_alpha(noise) < np.inf) == changed

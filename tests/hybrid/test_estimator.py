@@ -484,3 +484,26 @@ def test_a_log_of_balanced_tendons_is_not_left_by_common_pulls(error_model):
     # A network has some slope in every direction; the others have none where nothing is known.
     most = 1.5e-3 if error_model is None else 2e-4
     assert np.abs(track.q.reshape(-1, 2, 3).mean(axis=2)).max() < most
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed"),
+    [
+        ("coupling", r"\('parallel', 'serial'\)"),
+        ("guard", r"\(.*'leverage'.*\)"),
+        ("output", r"\('position', 'pose'\)"),
+    ],
+)
+def test_a_word_that_is_no_choice_raises_with_the_choices(name, allowed):
+    model = HybridForwardModel(robots.bionic_handling_assistant(), **{name: "other"})
+    with pytest.raises(ValueError, match=f"^`{name}` must be one of {allowed}, got 'other'"):
+        model.fit(np.full((3, 9), 0.25), np.zeros((3, 3)))
+
+
+def test_warnings_of_units_name_the_line_of_the_caller():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (30, 9))
+    model = HybridForwardModel(robots.bionic_handling_assistant(), "drop")
+    model.fit(q, model.mechanical_model(torch.from_numpy(q)).numpy())
+    with pytest.warns(UserWarning, match="`X`") as caught:
+        model.predict(1e3 * q)
+    assert {one.filename for one in caught} == {__file__}

@@ -219,3 +219,9 @@ def test_poses_keep_to_the_tested_distance():
     share = model.in_domain(new).mean()
     model.module_.tested = None
     assert 0.0 < share < 0.7 * model.in_domain(new).mean()
+
+
+def test_at_most_128_rows_represent_the_log():
+    q = torch.linspace(-1.0, 1.0, 300).double()[:, None]
+    distance = GroupDistance.fit(q, np.arange(300) // 30)
+    assert len(distance.rows) == len(distance.rows.unique()) == 128

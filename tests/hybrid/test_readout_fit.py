@@ -1,6 +1,6 @@
 import copy
 import pickle
-from math import inf
+from math import inf, log10
 
 import pytest
 import torch
@@ -441,6 +441,8 @@ def test_choice_finds_the_least_of_a_bowl():
     found, tried = choose(scores)
     assert_close(found, (0.1, 10.0))
     assert len(tried) < 50
+    odd = lambda pair: (log10(pair[0]) + 0.5) ** 2 + (log10(pair[1]) - 1.5) ** 2  # noqa: E731
+    assert_close(choose(odd)[0], (10.0**-0.5, 10.0**1.5))  # to half a decade
     assert choose(lambda pair: 1.0)[0] == (inf, inf)
 
 
@@ -538,3 +540,26 @@ def test_derivatives_by_autograd(rng):
     assert torch.autograd.gradcheck(module, q.requires_grad_())
     assert torch.autograd.gradgradcheck(module, q)
     assert torch.autograd.gradcheck(module.jacobian, q)
+
+
+def test_a_serial_fit_settles_at_the_optimum(rng):
+    chain, q = rows_of("cables", rng, 30)
+    x = disturbed(chain, q, rng, size=0.005, noise=1e-4)[1]
+    fit = fit_readout(chain, Features.of_range(q), q, x, alphas=(0.01, inf), left_out=False)
+    assert fit.gradient < 1e-7
+
+
+def test_rows_with_missing_markers_do_not_count_for_the_ratio_of_noise(rng):
+    """Without the rows of missing markers the ratio is the same."""
+    chain, q = rows_of("trunk", rng, 60)
+    x, weight = chain(q), torch.ones(60).double()
+    x[::3] = torch.nan
+    residual = shaken(chain, q, rng) - chain(q)
+    residual[::3] = 0.0
+    seen = ~x.isnan().any(1)
+    of = lambda k: _Problem(chain, Features.of_range(q), q[k], x[k], weight[k], True)  # noqa: E731
+    ratio = of(seen).likeliest_ratio(residual[seen])
+    assert 0.0 < ratio < inf
+    every = of(torch.arange(60))
+    # the scale of the tried ratios is the mean over the rows with tips, too
+    assert every.likeliest_ratio(residual) == pytest.approx(ratio)
