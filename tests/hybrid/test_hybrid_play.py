@@ -242,7 +242,6 @@ def test_noise_alone_seldom_is_play(affine, rng_of_play):
     q = swinging(40)
     logs = [rng_of_play.standard_normal((40, 3)) for _ in range(6)]
     found = [choose_play(Spec(None, ()), Rows(q, x)) is not None for x in logs]
-    print(found)
     assert sum(found) <= 3
 
 
