@@ -455,6 +455,20 @@ def test_pose_jacobian_turns_the_tip_frame(chain, center, width, rng):
 
 
 @each_chain
+def test_moves_of_the_frames_give_the_jacobian_of_the_end(chain, center, width, rng):
+    q = random_q(rng, 5, chain.n_actuators, center, width)
+    frames = chain.frames_and_moves(q)
+    slope = frames.slope if frames.slope.ndim == 2 else frames.slope.permute(2, 0, 1)
+    for motion, rows in ((frames.moves, slice(3)), (frames.spins, slice(3, 6))):
+        J = motion.flatten(1, 2).permute(2, 0, 1) @ slope
+        expected = chain.base[:3, :3].T @ chain.pose_jacobian(q)[:, rows]
+        if motion is frames.spins and chain.stage is not None:  # without the turn of the stage
+            J, expected = J[..., 1:], expected[..., 1:]
+        scale = expected.abs().max()
+        assert_close(J / scale, expected / scale, rtol=0, atol=1e-12)
+
+
+@each_chain
 def test_poses_backbone_and_tip_agree(chain, center, width, rng):
     q = random_q(rng, 4, chain.n_actuators, center, width)
     poses, points = chain.poses(q), chain.backbone(q, n_points=7)

@@ -62,6 +62,15 @@ def test_derivatives_by_gains_and_zeros(kind):
     assert found.abs().amax((0, 1)).min() > 0
 
 
+def test_the_stage_turns_the_frame_by_its_own_gain():
+    gains = [2.0, 1e-3, 1e-3, 1e-3]
+    given = {"n_actuators": [1, 3], "lengths": [None, 0.1], "stage": "rotation", "gains": gains}
+    chain = ConstantCurvatureChain([0.01, 0.01], **given)
+    q = torch.tensor([[0.3, 1.0, -2.0, 1.0], [0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    turn = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64).expand(2, 3)
+    assert_close(chain.pose_jacobian(q)[:, 3:, 0], turn, rtol=0, atol=1e-14)
+
+
 def test_gains_of_all_of_segments_and_of_actuators():
     def gains(value):
         return ConstantCurvatureChain([0.01, 0.01], n_actuators=[3, 4], gains=value).gains.tolist()

@@ -359,6 +359,14 @@ def test_reach_bounds_the_tip(rng):
     assert_close(point.reach, torch.tensor(1.0, dtype=torch.float64), rtol=0, atol=0)
 
 
+def test_strokes_without_limits_do_not_count_in_the_reach():
+    origins, kinds = [translation(0.3, 0.0, 0.4)] * 2, ["prismatic"] * 2
+    half = RigidChain(origins, [Z, Z], kinds=kinds, q_min=[0.0, 0.0], q_max=[math.inf, 0.2])
+    assert_close(half.reach, torch.tensor(1.2, dtype=torch.float64), rtol=1e-14, atol=0)
+    free = RigidChain(origins, [Z, Z], kinds=kinds)
+    assert_close(free.reach, torch.tensor(1.0, dtype=torch.float64), rtol=1e-14, atol=0)
+
+
 def test_with_geometry_is_differentiable_and_leaves_the_arm(rng):
     chain, q = arm(), random_q(rng, 4)
 
@@ -808,6 +816,21 @@ def test_a_calibrated_urdf_is_read_as_the_calibrated_arm(text, end, tmp_path, rn
     assert plain.to_urdf(text, end) == text
     with pytest.raises(ValueError, match="must be the URDF of this arm"):
         plain.to_urdf(text, "e" if end == "f" else "l7")
+
+
+def test_only_the_urdf_of_the_arm_is_changed():
+    """Neither one with other names of as many joints, nor one with a joint more that mimics."""
+    first, second, tags = "<origin/>", '<origin xyz="0.1 0 0"/>', '<mimic joint="j"/>'
+    links = '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>{}</robot>'
+    one = joint("j", "a", "b", "continuous", first)
+    text = links.format(one + joint("k", "b", "c", "fixed", second))
+    chain = RigidChain.from_urdf(text, "c")
+    assert chain.to_urdf(text, "c") == text
+    renamed = links.format(one.replace('"j"', '"other"') + joint("k", "b", "c", "fixed", second))
+    longer = links.format(one + joint("k", "b", "c", "continuous", second, tags))
+    for other, got in ((renamed, r"\['other'\]"), (longer, r"\['j', 'j'\]")):
+        with pytest.raises(ValueError, match=rf"whose actuators are \['j'\], got {got} up to 'c'"):
+            chain.to_urdf(other, "c")
 
 
 def test_a_pitch_of_ninety_degrees_is_written_exactly(rng):

@@ -39,6 +39,7 @@ def test_one_number_is_one():
 def test_labels_of_any_kind():
     assert_array_equal(labels(np.array(["a", 1, None], dtype=object), 3), ["a", "1", "None"])
     assert_array_equal(labels(torch.tensor([2, 1]), 2), [2, 1])
+    assert_array_equal(labels(torch.tensor([2.0, 1.0], requires_grad=True), 2), [2, 1])
     assert labels([True, False], 2).dtype == bool
     with pytest.raises(ValueError, match=r"`groups` must have shape \(3,\).*one entry for each"):
         labels([1, 2], 3)

@@ -137,6 +137,8 @@ def test_input_scalings():
     standard = elm(input_scaling="standard").fit(X, Y)
     assert_allclose(standard.input_center_, X.mean(0), rtol=1e-14)
     assert_allclose(standard.input_scale_, X.std(0), rtol=1e-13)
+    read = elm(input_scaling="".join(["stan", "dard"])).fit(X, Y)  # as read from a file
+    assert_array_equal(read.input_scale_, standard.input_scale_)
     raw = elm(input_scaling=None).fit(X, Y)
     assert_array_equal(raw.input_center_, np.zeros(9))
     assert_array_equal(raw.input_scale_, np.ones(9))
@@ -472,6 +474,33 @@ def test_alpha_zero(fit_intercept):
     inside, split = X[:1], X[:1] + 0.1 * np.eye(9)[1]  # no row separates the two columns
     assert model.leverage(inside) < 1
     assert model.leverage(split) > 1e3
+
+
+def test_noise_of_a_singular_system_counts_its_rank():
+    """A penalty near rounding takes no degree of freedom."""
+    X, Y = trunk(60)
+    X[:, 1] = X[:, 0]
+    model = elm(3, alpha=1e-14, direct_link=True)
+    with pytest.warns(LinAlgWarning, match="singular"):
+        model.fit(X, Y)
+    assert model.solver_ == "eigh"
+    phi = features(model, X)
+    rank = np.linalg.matrix_rank(phi)
+    assert rank == phi.shape[1] - 1
+    rss = np.sum((Y - model.predict(X)) ** 2, axis=0)
+    assert_allclose(model.noise_variance_, rss / (60 - rank), rtol=1e-9)
+
+
+def test_a_column_too_small_to_be_squared_changes_nothing():
+    X, Y = trunk(60)
+    model = elm(3, alpha=0, input_scaling=None, direct_link=True)
+    X[:, 8] = 0.0
+    predictions = []
+    for size in (0.0, 1e-170):
+        X[:, 8] = size * X[:, 0]
+        with pytest.warns(LinAlgWarning, match="singular"), np.errstate(divide="raise"):
+            predictions.append(model.fit(X, Y).predict(X))
+    assert_allclose(*predictions, rtol=1e-9)
 
 
 def test_features_of_different_units_are_not_singular():

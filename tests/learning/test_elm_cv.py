@@ -186,6 +186,15 @@ def test_listed_splits_count_all_rows_and_hold_out_what_they_name():
     assert np.abs(model.left_out_errors_[4] - model.left_out_errors_[20]).max() > 1e-6
 
 
+def test_errors_too_large_to_be_squared_lose_in_silence():
+    """Small penalties give errors far larger than the targets, whose squares are finite."""
+    X, y = data(12)
+    X[0] = 50.0
+    model = quick(30, "auto").fit(X, 1e153 * y)
+    assert np.isinf(model.cv_results_["mean_squared_error"]).any()
+    assert np.isfinite(model.best_score_)
+
+
 def test_hopeless_penalties_are_never_chosen():
     # A row that alone holds a direction has leverage 1 as the penalty goes: no error to speak of.
     X, y = data(40)
@@ -407,6 +416,12 @@ def test_clear_errors(params, fit, message):
     X, y = data(60)
     with pytest.raises(ValueError, match=message):
         quick(**params).fit(X, y, **fit)
+
+
+def test_parameters_are_checked_before_the_fit():
+    X, y = data(12)
+    with pytest.raises(ValueError, match="'relevance_rounds' parameter of ELMRegressorCV must be"):
+        quick(relevance_rounds=-1).fit(X, y)
 
 
 @pytest.mark.slow

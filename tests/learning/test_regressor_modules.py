@@ -162,6 +162,20 @@ def test_a_read_only_prediction_gives_no_warning():
     assert_allclose(x.numpy(), regressor.predict(X[:3]))
 
 
+class _Cubic(DummyRegressor):
+    def predict(self, X):
+        return X**3
+
+
+@pytest.mark.parametrize("width", [1.0, 0.1])
+def test_the_step_is_the_cube_root_of_machine_precision(width):
+    """Central differences of a cube at zero are the square of the step."""
+    q = width * torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+    J = error_module(_Cubic(), q).jacobian(torch.zeros(1, 1, dtype=torch.float64))
+    step = width * np.finfo(np.float64).eps ** (1 / 3)
+    assert_allclose(J.item(), step**2, rtol=1e-12)
+
+
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_differences_follow_the_range_of_the_inputs(unit):
     """In another unit the Jacobian is the same, counted in that unit."""
