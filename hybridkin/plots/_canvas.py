@@ -115,7 +115,7 @@ def model_color(name: str, default: str = "#000000") -> str:
     >>> plots.model_color("hybrid, ELM") == plots.model_color("hybrid on nominal")
     True
     """
-    return next((color for words, color, _ in _MODELS if re.search(words, name)), default)
+    return next((color for words, color, _ in _MODELS if re.search(words, str(name))), default)
 
 
 def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:

@@ -237,7 +237,7 @@ def test_a_tip_that_follows_the_commands_has_no_play(affine, rng_of_play):
     assert choose_play(Spec(None, ()), Rows(q, x)) is None
 
 
-def test_noise_alone_seldom_is_play(affine, rng_of_play):
+def test_noise_alone_is_play_in_at_most_half_of_the_logs(affine, rng_of_play):
     """By chance some width is best, but its gain is within the standard error."""
     q = swinging(40)
     logs = [rng_of_play.standard_normal((40, 3)) for _ in range(6)]
