@@ -290,7 +290,8 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         read = hybridkin.workflow.read_log(log, log_format, chain=robot.chain, **options)
         _note(read.report, stages)
         report.record["log_check"], code = read.report.to_dict(), 0 if read.report.ok else 1
-    fit = f"hybridkin fit {log or 'log.csv'} --robot {out} --out model"
+    log_name, robot_name = (shlex.quote(str(path)) for path in (log or "log.csv", out))
+    fit = f"hybridkin fit {log_name} --robot {robot_name} --out model"
     report.text(f"Read through {out}, then fit a model:\n$ {fit}")
     write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
     return _Outcome(report.record, shown(report), [out], code)

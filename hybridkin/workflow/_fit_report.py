@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.plots import ErrorBoxDisplay, ErrorHistogramDisplay, new_figure
 from hybridkin.workflow.log import MeasuredLog
@@ -248,3 +250,12 @@ def write_calibration(
     names = ("values", "std_errors", "rmse", "identifiable", "unidentified")
     report.record[key] = {name: vars(result)[name] for name in names}
     report.record[key] |= {"warnings": warnings, "entries": entries}
+
+
+def write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:
+    """Add the calibration of the elastic tendons if auto chose them instead of the chain."""
+    if isinstance(model.mechanical_model_, ElasticTendonChain) and model.calibration_ is not None:
+        if isinstance(chain, ConstantCurvatureChain):
+            chain = ElasticTendonChain.from_chain(chain)
+        title = "Calibration of the elastic tendons that auto chose"
+        write_calibration(report, chain, model.calibration_, [], title, "calibration_of_saved")

@@ -24,8 +24,6 @@ from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.calibration.measured import distances, folds
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
@@ -39,6 +37,7 @@ from hybridkin.workflow._fit_report import (
     write_check,
     write_choice,
     write_comparison,
+    write_elastic_calibration,
     write_markers,
     write_model,
 )
@@ -330,7 +329,7 @@ def fit_log(
     if start is not None and result is not None:
         write_calibration(report, start, result, messages)
     if robot.chain is not None and rows.geometry is None:
-        _write_elastic_calibration(report, robot.chain, model)
+        write_elastic_calibration(report, robot.chain, model)
     _add_model(report, model, robot, complete)
     return report, report.write(out)
 
@@ -353,15 +352,6 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
             )
         log.check_order("`play`")
     log.check(force)
-
-
-def _write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:
-    """Add the calibration of the elastic tendons if auto chose them instead of the chain."""
-    if isinstance(model.mechanical_model_, ElasticTendonChain) and model.calibration_ is not None:
-        if isinstance(chain, ConstantCurvatureChain):
-            chain = ElasticTendonChain.from_chain(chain)
-        title = "Calibration of the elastic tendons that auto chose"
-        write_calibration(report, chain, model.calibration_, [], title, "calibration_of_saved")
 
 
 def _add_model(
