@@ -10,7 +10,7 @@ export OMP_NUM_THREADS ?= 1
 .PHONY: paper test quick bench examine coverage check docs clean dist oldest native
 
 paper: $(VENV)/.native
-	$(BIN)/python -m hybridkin paper --out $(OUT)
+	$(BIN)/python examples/paper --out $(OUT)
 
 test: $(VENV)/.native
 	$(BIN)/python -m pytest $(TESTS)

@@ -44,7 +44,7 @@ def fitted():
 
 def run(learn):
     """Return the measured tips [m]."""
-    from hybridkin.simulation import TrunkPlant
+    from paper import TrunkPlant
 
     model = fitted()
     plants = [

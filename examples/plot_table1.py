@@ -4,16 +4,17 @@ Table 1 of the paper
 
 Mechanical, data-driven and hybrid models of the tip, with the learners of Reinhart & Steil (2016).
 The trunk is **simulated**, the paper's robot is real: compare the order of the models and the
-factors between them, not the centimetres. ``hybridkin paper`` computes the whole table; this
-example has 4 random test sets and 2 hidden layers for each.
+factors between them, not the centimetres. ``python examples/paper`` computes the whole table;
+this example has 4 random test sets and 2 hidden layers for each.
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hybridkin import datasets, paper, plots
+from hybridkin import datasets, plots
+from paper import table1
 
-table = paper.table1(datasets.load_trunk(), n_splits=4, n_seeds=2, n_jobs=1)
+table = table1(datasets.load_trunk(), n_splits=4, n_seeds=2, n_jobs=1)
 
 # %%
 # Every model is fitted to 1500 rows of one moving segment and 400 random rows, and tested on the
@@ -39,8 +40,10 @@ ax.hlines(places, train, test, color=tints, linewidth=2.5, alpha=0.5)
 ax.scatter(train, places, facecolor="white", edgecolor=tints, s=45, zorder=3, label="training rows")
 ax.scatter(test, places, color=tints, s=45, zorder=3, label="test rows")
 known = [k for k, name in enumerate(names) if name in PAPER]
-paper = [PAPER[names[k]] for k in known]
-ax.scatter(paper, places[known], marker="x", color="black", label="paper, real robot, test rows")
+published = [PAPER[names[k]] for k in known]
+ax.scatter(
+    published, places[known], marker="x", color="black", label="paper, real robot, test rows"
+)
 ax.set_yticks(places, names)
 ax.set(xlabel="mean tip error [cm]", xlim=(0, None))
 ax.grid(axis="x", color="0.92")

@@ -34,7 +34,7 @@ path = trajectories.figure_eight((0.0, 0.0, 0.70), (0.50, 0.25), dt=0.125)
 
 def followed(model):
     """Return the track of the plant, commanded on a model."""
-    from hybridkin.simulation import TrunkPlant
+    from paper import TrunkPlant
 
     plant = TrunkPlant(**data.parameters["plant"], random_state=0)
     ik = InverseKinematics(model, q_min=0.1, q_max=0.4, q_pref=0.25, dt=0.125)

@@ -35,10 +35,9 @@ FOLDERS = (  # in one direction: each column imports from those left of it
     ("hybrid",),
     ("saving",),
     ("workflow",),
-    ("paper",),
     ("cli",),
 )
-BESIDE = ("simulation", "datasets", "plots")
+BESIDE = ("datasets", "plots")
 
 
 def box(ax, x, y, width, color, text, height=0.95):
@@ -86,8 +85,8 @@ def draw_folders(ax):
             arrow(ax, (0.1 + step * k, 1.95), (0.1 + step * (k - 1) + width, 1.95))
     for k, name in enumerate(BESIDE):
         box(ax, 0.1 + step * (k + 1), 0.1, width, GREY, name, 0.58)
-    beside = "beside them: for workflow, paper and cli (plots imports chains)"
-    ax.text(0.1 + 4 * step, 0.39, beside, va="center", fontsize=9.5)
+    beside = "beside them: for workflow and cli (plots imports chains)"
+    ax.text(0.1 + 3 * step, 0.39, beside, va="center", fontsize=9.5)
     ax.set(xlim=(0.0, 11.8), ylim=(0.0, 3.15))
 
 

@@ -300,7 +300,7 @@ def _timed(ik: InverseKinematics, q: NDArray, x: NDArray, stay: int = _STAY) -> 
     robot: Any = ik.tracker(q[0])._robot
     robot.tick(x[0], None, None)  # sets what is given
     # The call alone: `tracker.step` adds Python around it.
-    call, address, at = robot._follow, robot._address, robot.q
+    call, place, at = robot._follow, robot._call.place, robot.q
     target = robot._inputs[min(robot._inputs)]
     times, starts = np.empty((len(q), RUNS), dtype=np.int64), np.empty_like(q)
     clock = time.perf_counter_ns
@@ -312,7 +312,7 @@ def _timed(ik: InverseKinematics, q: NDArray, x: NDArray, stay: int = _STAY) -> 
         for run in range(RUNS):
             at[:] = starts[i]
             began = clock()
-            call(address)
+            call(place)
             times[i, run] = clock() - began
     return times, starts
 

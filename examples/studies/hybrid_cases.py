@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from simulated_trunk import PAPER_ELM, make_trunk
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import RidgeCV
@@ -26,13 +27,12 @@ from hybridkin import (
     datasets,
     robots,
 )
-from hybridkin.paper import PAPER_ELM
 
 PLANTS: dict[str, dict[str, Any]] = {
     "trunk 1": {},
     "trunk 2": {"tilt": 1.2, "mass": 1.6, "tip_mass": 0.15, "bending_stiffness": 1.3},
 }
-"""Arguments of `simulation.TrunkPlant` by name; the seed of a plant is its position."""
+"""Arguments of `TrunkPlant` by name; the seed of a plant is its position."""
 
 NOMINAL, CALIBRATED = "mechanical, nominal", "mechanical, calibrated"
 PAPER, AUTO, AUTO_PLAY = "parallel, the paper's ELM", "auto", 'auto, play="auto"'
@@ -181,7 +181,7 @@ def without_noise(
     name: str, folder: Any, n_jobs: int | None, **rows: Any
 ) -> tuple[NDArray, NDArray]:
     """Return rows of a plant without noise, so that it can be added or not."""
-    return datasets.make_trunk(
+    return make_trunk(
         **rows,
         n_segment=0,
         random_state=[*PLANTS].index(name),

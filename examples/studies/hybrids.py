@@ -70,7 +70,7 @@ def learning_curves(
 ) -> list[dict[str, Any]]:
     """Return the errors of all models against the number of training rows.
 
-    Two simulated trunks: fully random rows with the noise of `datasets.make_trunk`, tested on other
+    Two simulated trunks: fully random rows with the noise of `make_trunk`, tested on other
     rows without noise and with it. armlab_3cable: tested on a fifth of its grid lines, groups are
     lines.
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from simulated_trunk import PAPER_ELM
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.datasets import load_diabetes, make_friedman1, make_friedman2, make_friedman3
 from sklearn.exceptions import ConvergenceWarning
@@ -42,7 +43,6 @@ from hybridkin import (
     plots,
     robots,
 )
-from hybridkin.paper import PAPER_ELM
 from hybridkin.workflow.report import Report
 
 _LOOKS = ("o-#0072B2", "s-#D55E00", "D-#009E73", "^-#CC79A7")

@@ -26,12 +26,11 @@ from csv_tables import add_csv
 from hybrid_cases import _PAIRS, PLANTS, SPOOL, recording
 from joblib import Memory, Parallel, delayed
 from numpy.typing import NDArray
+from simulated_trunk import TrunkPlant, paper_protocol
 from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, datasets, robots
-from hybridkin.datasets import paper_protocol
-from hybridkin.simulation import TrunkPlant
 from hybridkin.workflow.report import Report
 
 SIZES = (25, 50, 100, 400)

@@ -17,9 +17,9 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from simulated_trunk import TrunkPlant
 
 from hybridkin import HybridForwardModel, InverseKinematics, datasets, plots, robots, trajectories
-from hybridkin.simulation import TrunkPlant
 
 FPS, N_COLORS = 12, 48
 DURATION, PERIOD = 6.0, 1.0 / FPS  # of the path, and between its points [s]

@@ -2,9 +2,8 @@
 
 from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
 from hybridkin.datasets._logs import Log, load_log, log_columns
-from hybridkin.datasets._protocol import paper_protocol, paper_split
 from hybridkin.datasets._recordings import load_armlab, load_asl_trunk, load_ftdcr
-from hybridkin.datasets._trunk import load_trunk, make_trunk
+from hybridkin.datasets._shipped import load_trunk, paper_split
 
 __all__ = [
     "Log",
@@ -17,7 +16,5 @@ __all__ = [
     "load_log",
     "load_trunk",
     "log_columns",
-    "make_trunk",
-    "paper_protocol",
     "paper_split",
 ]

@@ -149,7 +149,7 @@ def _invalid(log: Log, valid: NDArray, drop_invalid: bool) -> Iterator[LogFindin
     if len(lines) == 0:
         return
     n = len(valid) + len(log.invalid_lines)
-    what = f"{len(lines)} of {n} rows have a missing, NaN or infinite value"
+    what = f"{len(lines)} of {n} rows have a missing, NaN or infinite value, or no motion"
     what = f"{what} ({named_rows(lines, kind)})"
     if drop_invalid and valid.all():
         advice = "find out why: a marker that is hidden in some poses leaves a gap in the data."

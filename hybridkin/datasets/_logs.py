@@ -22,6 +22,7 @@ from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
 
 _DELIMITERS = (",", ";", "\t")
+_UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing name of a motion, as text
 _MOST_COLUMNS, _LONGEST = 10_000, 256  # columns of a file; characters of a motion's name
 
 
@@ -124,7 +125,8 @@ def load_log(
     groups : str or None, default=None
         Column that names the motion, run or day of a row, for splits by groups.
     time : str or None, default=None
-        Column of the time stamp [s].
+        Column of the time stamp [s]. In npz and parquet files also dates, which become seconds
+        since 1970 (UTC), and durations.
     q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
         not converted: counts or pressures, for a chain with `gains`.
@@ -136,7 +138,8 @@ def load_log(
     delimiter : str or None, default=None
         Separator of a text file. None: the most frequent in the header of comma, semicolon and tab.
     drop_invalid : bool, default=False
-        Leave out rows with a missing, NaN or infinite value instead of raising an error.
+        Leave out rows with a missing, NaN or infinite value, or without the name of their motion,
+        instead of raising an error.
 
     Returns
     -------
@@ -150,7 +153,8 @@ def load_log(
     ImportError
         If a parquet file is given and pandas cannot read it.
     ValueError
-        If a column is unknown, a cell is not a number, rows are invalid, or no row is left.
+        If a column is unknown or used twice, a cell is not a number, rows are invalid, a quote in
+        a text file is not closed, or no row is left.
 
     Warns
     -----
@@ -179,22 +183,24 @@ def load_log(
             f"`x` must name 3 columns, or 3 for each of several markers, got {len(x)}: {x}."
         )
     factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
-    values, labels = table.rows([*q, *x, *([] if time is None else [time])], groups)
+    values, motions = table.rows([*q, *x, *([] if time is None else [time])], time, groups)
     places = np.arange(len(values)) if table.lines is None else table.lines
-    n, K = len(q), len(x) // 3
+    tips = slice(len(q), len(q) + len(x))
     known = countable(values)
-    seen = known[:, n : n + 3 * K].reshape(-1, K, 3).all(axis=2)
-    values[:, n : n + 3 * K][~seen.repeat(3, axis=1)] = np.nan
-    valid = known[:, :n].all(axis=1) & known[:, n + 3 * K :].all(axis=1) & np.any(seen, axis=1)
+    seen = known[:, tips].reshape(len(known), -1, 3).all(axis=2)
+    values[:, tips][~seen.repeat(3, axis=1)] = np.nan
+    valid = np.delete(known, tips, axis=1).all(axis=1) & seen.any(axis=1)
+    if motions is not None:
+        valid &= ~np.isin(motions, _UNNAMED)
     if not valid.any() or not (drop_invalid or valid.all()):
         where = named_rows(places[~valid], "row" if table.lines is None else "line")
         raise ValueError(
             f"{(~valid).sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
-            f"infinite value ({where}); correct them, or leave them out with drop_invalid=True if "
-            "others are left."
+            f"infinite value, or no motion ({where}); correct them, or leave them out with "
+            "drop_invalid=True if others are left."
         )
     values = values[valid]
-    columns = values[:, :n], values[:, n : n + 3 * K]
+    columns = values[:, : len(q)], values[:, tips]
     for name, unit, column in zip("qx", (q_unit, x_unit), columns, strict=True):
         span = np.nanmax(np.nanmax(column, axis=0) - np.nanmin(column, axis=0))
         middle = np.nanmedian(np.abs(column))
@@ -207,7 +213,7 @@ def load_log(
     return Log(
         columns[0] * factor,
         columns[1] * METRES[x_unit],
-        groups=None if labels is None else labels[valid],
+        groups=None if motions is None else motions[valid],
         time=None if time is None else values[:, -1],
         line=places[valid],
         invalid_lines=places[~valid],
@@ -248,7 +254,7 @@ def _read(path: Path, delimiter: str | None) -> _Table:
 class _Cells:
     """The columns of a text, with empty cells if rows are short; made on access."""
 
-    by_row: list[list[str]]
+    by_row: Sequence[list[str]]
 
     def __getitem__(self, i: int) -> list[str]:
         return [row[i] if i < len(row) else "" for row in self.by_row]
@@ -295,25 +301,32 @@ class _Table(NamedTuple):
             f"There is no column {name!r} in {path!r}; {hint:.400} columns: {self.header!s:.1000}."
         )
 
-    def numbers(self, name: str) -> NDArray:
-        """Return the column of that name as numbers, NaN for empty cells."""
+    def numbers(self, name: str, as_time: bool) -> NDArray:
+        """Return the column of that name as numbers, NaN for empty cells; times in seconds."""
         column = self.column(name)
         if self.lines is not None:
             cells = zip(column, self.lines, strict=True)
             return np.array([_number(str(cell), name, line, self.path) for cell, line in cells])
-        kind = np.asarray(column).dtype
+        values = np.asarray(column)
+        kind = values.dtype
         try:
-            if kind.kind in "cV":  # astype would use only their real part
+            if as_time and kind.kind in "mM":
+                return (values - kind.type(0, "s")) / np.timedelta64(1, "s")
+            if kind.kind in "cVmM":  # astype would use a real part, or ticks of some unit
                 raise TypeError(kind)
-            return np.asarray(column).astype(float)
+            return values.astype(float)
         except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(
                 f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
             ) from error
 
-    def rows(self, names: list[str], groups: str | None) -> tuple[NDArray, NDArray | None]:
-        """Return columns as numbers (N, k), and the group of every row."""
-        found, labels = {name: self.numbers(name) for name in names}, None
+    def rows(
+        self, names: list[str], time: str | None, groups: str | None
+    ) -> tuple[NDArray, NDArray | None]:
+        """Return columns as numbers (N, k), that of the time in seconds, and the groups."""
+        found, labels = {name: self.numbers(name, name == time) for name in names}, None
+        if len(found) < len(names):
+            raise ValueError(f"`q`, `x` and `time` must name a column once, got {names}.")
         sizes = {name: len(column) for name, column in found.items()}
         if groups is not None:
             named = [str(value).strip() for value in self.column(groups)]
@@ -353,16 +366,15 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
             delimiter = delimiter or max(_DELIMITERS, key=file.readline().count)
             file.seek(0)
             reader = csv.reader(file, delimiter=delimiter)
-            header = [name.strip() for name in next(reader, [])]
             rows = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(
-            f"{str(path)!r} is not a text file in UTF-8 ({error}); save the log as CSV, npz or "
-            "parquet."
+            f"{str(path)!r} is not a text file in UTF-8, or does not close a quote ({error}); save "
+            "the log as CSV, npz or parquet."
         ) from error
-    if not header:
+    if not rows:
         raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
-    n = len(header)
+    n = len(rows[0][1])
     if n > _MOST_COLUMNS:
         raise ValueError(f"{str(path)!r} must have at most {_MOST_COLUMNS} columns, got {n}.")
     for line, row in rows:
@@ -371,8 +383,17 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
                 f"Line {line} of {str(path)!r} has {len(row)} cells, the header {n}; check "
                 f"`delimiter` (now {delimiter!r})."
             )
-    cells = _Cells([row for _, row in rows])
-    return _Table(path, header, cells, np.array([line for line, _ in rows], dtype=int))
+        # A cell may have line breaks, but with all delimiters of a row it hides one.
+        text = delimiter.join(row)
+        more = len(text.splitlines()) - 1
+        if more > 0 and text.count(delimiter) >= len(row) + n - 2:
+            raise ValueError(
+                f'A quote (") in line {line - more} of {str(path)!r} hides rows up to line {line}; '
+                "close or remove it."
+            )
+    lines, cells = zip(*rows, strict=True)
+    header = [name.strip() for name in cells[0]]
+    return _Table(path, header, _Cells(cells[1:]), np.array(lines[1:], dtype=int))
 
 
 def _read_npz(path: Path) -> _Table:
@@ -396,6 +417,8 @@ def _read_parquet(path: Path) -> _Table:
 
         _check_rows(path)
         frame = pd.read_parquet(path)
+        for name in frame.select_dtypes("datetimetz"):
+            frame[name] = frame[name].dt.tz_convert(None)  # to UTC
     except ImportError as error:
         raise ImportError(
             f"Reading {str(path)!r} needs pandas and pyarrow (pip install pandas pyarrow); or "

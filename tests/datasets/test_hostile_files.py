@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from hybridkin.datasets import _npz, load_armlab, load_log, make_trunk
+from hybridkin.datasets import _npz, load_armlab, load_log
 from hybridkin.ik import trajectories
 
 Q, X = ["q1", "q2", "q3"], ["x", "y", "z"]
@@ -109,18 +109,3 @@ def test_paths_that_are_no_text_or_no_file(tmp_path):
         os.mkfifo(tmp_path / "pipe")
         with pytest.raises(FileNotFoundError, match="`path` must be a CSV file of points"):
             trajectories.from_csv(tmp_path / "pipe")
-
-
-@pytest.mark.slow
-def test_a_damaged_checkpoint_is_made_again_and_runs_nothing(tmp_path):
-    pytest.importorskip("mujoco")
-    options = {"n_segment": 1, "n_random": 1, "random_state": 0, "return_X_y": True}
-    whole = make_trunk(**options, checkpoint=tmp_path)
-    (file,) = tmp_path.iterdir()
-    content = file.read_bytes()
-    objects = np.array([print, None])
-    file.write_bytes(content[:-100])
-    np.testing.assert_array_equal(make_trunk(**options, checkpoint=tmp_path)[1], whole[1])
-    assert np.load(file).files == np.load(io.BytesIO(content)).files
-    np.savez(file, q=objects)
-    np.testing.assert_array_equal(make_trunk(**options, checkpoint=tmp_path)[1], whole[1])

@@ -1,11 +1,15 @@
+import json
+import re
+
 import numpy as np
 import pytest
 from sklearn.utils import Bunch
 
-from hybridkin import HybridForwardModel, datasets, paper, robots
-from hybridkin.paper import tables, tracks
-from hybridkin.paper.identifiability import ASKED, IDENTIFIABLE, identifiability
-from hybridkin.paper.tables import summary
+from hybridkin import HybridForwardModel, datasets, robots
+from paper import table1, tables, tracks
+from paper.__main__ import main
+from paper.identifiability import ASKED, IDENTIFIABLE, identifiability
+from paper.tables import summary
 
 
 def test_the_kinds_of_spread_differ():
@@ -20,7 +24,7 @@ def test_the_kinds_of_spread_differ():
 
 @pytest.mark.slow
 def test_table1_orders_the_models_as_the_paper_does():
-    table = paper.table1(datasets.load_trunk(), n_splits=3, n_seeds=2, n_jobs=1)
+    table = table1(datasets.load_trunk(), n_splits=3, n_seeds=2, n_jobs=1)
     test = {(e["model"], e["learner"]): e["test"]["mean"] for e in table}
     train = {(e["model"], e["learner"]): e["train"]["mean"] for e in table}
     mechanical = test["mechanical, nominal", "-"]
@@ -46,7 +50,7 @@ def test_the_hybrids_of_the_paper_have_no_guard(monkeypatch):
     data = datasets.load_trunk()
     rows = np.flatnonzero(data.part == 3)[::4]
     few = Bunch(q=data.q[rows], x=data.x[rows], part=data.part[rows])
-    paper.table1(few, n_splits=1, n_seeds=1, n_jobs=1)
+    table1(few, n_splits=1, n_seeds=1, n_jobs=1)
     hybrids = [m for m in fitted if m.mechanical_model is not None and m.error_model != "drop"]
     assert len(hybrids) == 6
     assert {model.guard for model in hybrids} == {None}
@@ -72,7 +76,47 @@ def test_which_geometry_the_protocol_identifies():
     assert len(sentences) == 10
     # Asked for once each, all are identified, and the tip error is the same.
     assert set(IDENTIFIABLE) < set(ASKED)
-    assert all(entry["identified"] for entry in found["identifiable"]["entries"])
+    entries = found["identifiable"]["entries"]
+    assert len(entries) == 16
+    assert all(entry["identified"] for entry in entries)
     assert found["identifiable"]["unidentified"] == ()
     assert found["identifiable"]["test"] == pytest.approx(found["asked"]["test"], rel=0.01)
     assert found["identifiable"]["test"] < found["default"]["test"]
+
+
+@pytest.mark.slow
+def test_the_command_writes_everything_or_nothing(tmp_path, capsys):
+    pytest.importorskip("mujoco")
+    out = tmp_path / "results"
+    options = ["--splits", "2", "--seeds", "2", "--points", "25", "--jobs", "1"]
+    main(["--out", str(out), *options])
+    printed, errors = capsys.readouterr()
+    assert "warning" not in errors
+    record = json.loads((out / "report.json").read_text())
+    report = (out / "report.md").read_text()
+    assert record["tracking_mechanical_over_hybrid"]["nominal"] > 2.0
+    assert len(record["table1"]) == 11
+    closed = record["closed_loop"]
+    assert len(closed) == 5
+    for runs in closed.values():
+        assert runs["closed loop"]["mean"] < 1.1 * runs["feed-forward"]["mean"]
+        assert max(run["largest_step"] for run in runs.values()) < 0.06  # at 25 points
+    serial, nominal = closed["serial on calibrated"], closed["mechanical, nominal"]
+    assert serial["feed-forward"]["mean"] < 0.5 * nominal["feed-forward"]["mean"]
+    found = record["identifiability"]
+    plain = re.sub(r"\s+", " ", printed)
+    assert re.search(r"In 1500 rows one .* moves alone, and 400 rows are fully random", plain)
+    assert len(found["asked"]["entries"]) == 28
+    for entry in found["asked"]["entries"]:
+        answer = "yes" if entry["identified"] else "no"
+        assert re.search(rf"{re.escape(entry['name'])} .* {answer}\n", printed)
+        assert f"| {entry['name']} [{entry['unit']}] | " in report
+    for sentence in found["asked"]["unidentified"]:
+        assert f"- {sentence}" in report
+        assert sentence in plain
+    pictures = set(re.findall(r"\((\w+\.png)\)", report))
+    assert len(pictures) == 6
+    for name in pictures | {"report.json", "report.md"}:
+        assert (out / name).stat().st_size > 500
+        assert str(out / name) in printed
+    assert [p.name for p in tmp_path.iterdir()] == ["results"]

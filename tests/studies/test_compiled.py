@@ -41,8 +41,8 @@ def test_every_tick_is_timed():
     found = ticks(CASES["trunk"](), 400, np.random.default_rng(0))
     assert found.once.shape == found.least.shape == (400,)
     assert (found.least <= found.once).all()
-    assert 0.1 < found.least.min()
-    assert found.slowest < 1e3
+    assert 0.1 < found.least.min() < 1e3  # [us], of the fastest tick: on a busy machine too
+    assert found.slowest > 0.0
 
 
 def test_runs_from_the_command_line(tmp_path, capsys):

@@ -157,7 +157,9 @@ def test_inner_rows_teach_and_outer_ones_examine(one_plant, recordings, folder):
 
 
 def test_lines_and_motions_are_held_out_whole(recordings):
-    for case in cases.armlab_cases((50, 300), 2, 200, recordings):
+    by_lines = cases.armlab_cases((50, 300), 2, 200, recordings)
+    assert len(by_lines) == 4
+    for case in by_lines:
         rows = {tuple(row) for row in np.rint(1e4 * case.q)}
         assert len(case.q) in (50, 300)
         assert case.groups is not None

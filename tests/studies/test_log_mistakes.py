@@ -21,7 +21,7 @@ def test_an_advised_order_mends_the_log():
 
 
 @pytest.mark.slow
-def test_mistakes_are_named_and_none_is_silently_wrong(tmp_path):
+def test_mistakes_are_named_and_none_is_silently_wrong():
     found = study(3)
     assert found["clean_alarms"] == found["silent"] == []
     assert len(found["mistakes"]) >= 20

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from sklearn.utils import Bunch
 
-from hybridkin.calibration.calibrate import calibrate
+from hybridkin import calibrate, robots
 from hybridkin.calibration.measured import distance
-from hybridkin.chains import robots
 from hybridkin.datasets import paper_split
 from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries
 

@@ -9,25 +9,20 @@ import os
 import warnings
 from functools import partial
 from importlib.metadata import version
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
-from sklearn.utils import Bunch
 
 from hybridkin._core.arrays import shaped
 from hybridkin._core.files import write_file
+from hybridkin.datasets import load_trunk
 from hybridkin.datasets._npz import arrays_of
-from hybridkin.datasets._protocol import RANGE, draw, paper_protocol
-from hybridkin.simulation import NotSettledError, TrunkPlant
+from paper.protocol import RANGE, draw, paper_protocol
+from paper.trunk import NotSettledError, TrunkPlant
 
-PAPER = (
-    "R. F. Reinhart and J. J. Steil, Hybrid Mechanical and Data-driven Modeling Improves Inverse "
-    "Kinematic Control of a Soft Robot, Procedia Technology 26, 12-19, 2016."
-)
 OWN = -1  # part of a row with a given command
 PARTS = ("segment 0", "segment 1", "segment 2", "all segments")
 CHUNK = 25  # rows that a process computes at once, and loses if it is interrupted
@@ -51,8 +46,8 @@ def make_trunk(
 ) -> Any:
     """Return simulated data of a pneumatic trunk, by default with the paper's protocol.
 
-    The rows are chamber lengths and tip positions of `hybridkin.simulation.TrunkPlant`, a MuJoCo
-    model similar to Festo's Bionic Handling Assistant, sampled by the protocol of Reinhart and
+    The rows are chamber lengths and tip positions of `TrunkPlant`, a MuJoCo model
+    similar to Festo's Bionic Handling Assistant, sampled by the protocol of Reinhart and
     Steil (2016). All data are simulated, not measured on a robot. To repeat row i::
 
         plant = TrunkPlant(**data.parameters["plant"])
@@ -84,7 +79,7 @@ def make_trunk(
     return_X_y : bool, default=False
         If True, return ``(q, x)`` only.
     **plant_parameters
-        Arguments of `hybridkin.simulation.TrunkPlant`.
+        Arguments of `TrunkPlant`.
 
     Returns
     -------
@@ -111,7 +106,7 @@ def make_trunk(
 
     Examples
     --------
-    >>> from hybridkin.datasets import make_trunk
+    >>> from paper import make_trunk
     >>> data = make_trunk(n_segment=1, n_random=2, random_state=0)
     >>> data.q.shape, data.x.shape, data.part.tolist()
     ((5, 9), (5, 3), [0, 1, 2, 3, 3])
@@ -160,35 +155,6 @@ def _targets(
             f"not, first row {bad[0]}: {targets[bad[0]]}; clip them or convert them to metres."
         )
     return targets, np.full(len(targets), OWN, np.int8), {}
-
-
-def load_trunk(*, return_X_y: bool = False) -> Any:
-    """Return the shipped simulated data of a pneumatic trunk: 2000 rows of the paper's protocol.
-
-    They were made by ``make_trunk(random_state=0)``: simulated, 3 x 500 + 500 rows with 1 mm cable
-    noise and 0.5 mm motion-capture noise. Loading does not need MuJoCo.
-
-    Parameters
-    ----------
-    return_X_y : bool, default=False
-        If True, return ``(q, x)`` only.
-
-    Returns
-    -------
-    data : :class:`~sklearn.utils.Bunch`
-        As from `make_trunk`.
-
-    Examples
-    --------
-    >>> from hybridkin.datasets import load_trunk
-    >>> data = load_trunk()
-    >>> data.q.shape, data.x.shape
-    ((2000, 9), (2000, 3))
-    """
-    with as_file(files("hybridkin.datasets") / "data" / "trunk.npz") as path, np.load(path) as file:
-        columns = {name: file[name] for name in ("q", "x", "q_target", "part")}
-        parameters = json.loads(str(file["parameters"]))
-    return _bunch({**columns, "row": np.arange(len(columns["q"]))}, parameters, [], return_X_y)
 
 
 def _kept(checkpoint, rows, targets, part, made):
@@ -251,14 +217,8 @@ def _bunch(columns, parameters, failed, return_X_y):
     """Return rows with their source; `columns` are q, x, q_target, part and row."""
     if return_X_y:
         return columns["q"], columns["x"]
-    own = (columns["part"] == OWN).any()
-    return Bunch(
-        **{**columns, "part": None if own else columns["part"]},
-        groups=None,
-        failed=failed,
-        parameters=parameters,
-        units={"q": "m", "x": "m"},
-        source="simulated by hybridkin.simulation.TrunkPlant",
-        citation=PAPER,
-        DESCR=inspect.getdoc(make_trunk),
-    )
+    data = load_trunk()  # the same units, source and citation
+    data.update(columns, failed=failed, parameters=parameters, DESCR=inspect.getdoc(make_trunk))
+    if (data.part == OWN).any():
+        data.part = None
+    return data

@@ -9,19 +9,21 @@ import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
 
-from hybridkin._core.model import ForwardModel
+from hybridkin import (
+    ELMRegressor,
+    ForwardModel,
+    HybridForwardModel,
+    InverseKinematics,
+    Track,
+    robots,
+    trajectories,
+)
 from hybridkin._core.turns import one_thread
-from hybridkin.chains import robots
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.ik import trajectories
-from hybridkin.ik.results import Track
-from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.learning.elm import ELMRegressor
-from hybridkin.paper.tables import PAPER_ELM, cell, chains_of, mechanical_over_hybrid, run_all
 from hybridkin.plots import ActuatorDisplay, ErrorBoxDisplay, TrackingDisplay, new_figure
-from hybridkin.simulation import TrunkPlant
 from hybridkin.workflow.report import Progress, Report, quiet
+from paper.tables import PAPER_ELM, cell, chains_of, mechanical_over_hybrid, run_all
+from paper.trunk import TrunkPlant
 
 PAPER_TRACKING = {"mechanical, nominal": 4.16, "hybrid on nominal": 1.67}
 """Mean tracking error of the paper, both paths [cm]."""
@@ -59,7 +61,7 @@ def tracking(
     paths : dict of str to Trajectory
         Target paths [m].
     plant_parameters : dict
-        Arguments of `simulation.TrunkPlant`.
+        Arguments of `TrunkPlant`.
     feedback : {"model", "measured"} or None, default="model"
         "model": feed-forward, the commands are computed on the model alone; "measured": closed
         loop with the measured tips.

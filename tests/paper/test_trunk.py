@@ -1,6 +1,6 @@
-import importlib
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from hybridkin import ConstantCurvatureChain
-from hybridkin.simulation import NotSettledError, TrunkPlant
-from hybridkin.simulation._mjcf import RADII, TIME_STEP
-from hybridkin.simulation.trunk import SERVO_GAINS
+from paper import NotSettledError, TrunkPlant, trunk
+from paper.mjcf import RADII, TIME_STEP
+from paper.trunk import SERVO_GAINS
 
 mujoco = pytest.importorskip("mujoco", reason="the simulated trunk needs hybridkin[sim]")
 
@@ -246,9 +246,8 @@ def test_an_unstable_equilibrium_is_not_settled():
     [("MAX_SPEED", "tip speed"), ("MAX_DRIFT", "tip drift"), ("MAX_LENGTH_ERROR", "length error")],
 )
 def test_a_trunk_that_moves_is_not_settled(plant, working, monkeypatch, limit, message):
-    module = importlib.import_module("hybridkin.simulation.trunk")
     for name in ("MAX_SPEED", "MAX_DRIFT", "MAX_LENGTH_ERROR"):
-        monkeypatch.setattr(module, name, np.inf if name != limit else getattr(module, name))
+        monkeypatch.setattr(trunk, name, np.inf if name != limit else getattr(trunk, name))
     state, held = plant._equilibrium(plant._rest, working[0], iter(range(200)))
     plant._hold(state, working[0], held)  # at rest all is well
     state = state.copy()
@@ -306,12 +305,13 @@ def test_missing_mujoco_names_the_extra(monkeypatch):
     def refuse(name, *args):
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr("hybridkin.simulation.trunk.import_module", refuse)
+    monkeypatch.setattr("paper.trunk.import_module", refuse)
     with pytest.raises(ImportError, match=r"pip install hybridkin\[sim\]"):
         TrunkPlant()
 
 
 @pytest.mark.slow
 def test_importing_the_folder_does_not_import_mujoco():
-    code = "import sys, hybridkin.simulation, hybridkin.datasets; sys.exit('mujoco' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    code = "import sys, paper; sys.exit('mujoco' in sys.modules)"
+    examples = Path(trunk.__file__).parents[1]
+    assert subprocess.run([sys.executable, "-c", code], cwd=examples, check=False).returncode == 0

@@ -8,15 +8,14 @@ import numpy as np
 import torch
 from sklearn.utils import Bunch
 
+from hybridkin import HybridForwardModel, robots
 from hybridkin.calibration.measured import distance
-from hybridkin.chains import robots
 from hybridkin.datasets import load_trunk, paper_split
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.paper import tables, tracks
-from hybridkin.paper.identifiability import identifiability, write_identifiability
 from hybridkin.plots import ErrorHistogramDisplay, WorkspaceDisplay, new_figure
-from hybridkin.simulation import TrunkPlant
 from hybridkin.workflow.report import Progress, Report, check_out, quiet
+from paper import tables, tracks
+from paper.identifiability import identifiability, write_identifiability
+from paper.trunk import TrunkPlant
 
 
 def run_paper(
@@ -46,7 +45,7 @@ def run_paper(
     paths : list of Path
         The written files.
     """
-    check_out(out)
+    check_out(out, "paper", force=True)  # the folder is its own
     TrunkPlant()  # fails at once, with advice, if MuJoCo is missing
     data = load_trunk()
     table = tables.table1(data, n_splits, n_seeds, n_jobs=n_jobs, progress=progress)

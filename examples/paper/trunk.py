@@ -12,7 +12,7 @@ from scipy.linalg import eigvalsh, null_space
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from hybridkin.simulation._mjcf import LINKS, REST_LENGTH, TIME_STEP, trunk_mjcf
+from paper.mjcf import LINKS, REST_LENGTH, TIME_STEP, trunk_mjcf
 
 # Limits for a settled trunk, and the hold in which they are checked with the length servos on.
 MAX_LENGTH_ERROR = 1e-5  # [m]
@@ -102,7 +102,7 @@ class TrunkPlant:
     Examples
     --------
     >>> import numpy as np
-    >>> from hybridkin.simulation import TrunkPlant
+    >>> from paper import TrunkPlant
     >>> plant = TrunkPlant(gravity=0.0, base_error=np.zeros(6))
     >>> q, pose = plant.settle(np.full(9, 0.3))
     >>> bool(abs(pose[2, 3] - 0.9) < 1e-6)

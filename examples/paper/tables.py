@@ -9,14 +9,11 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
+from hybridkin import ELMRegressor, HybridForwardModel, calibrate, robots
 from hybridkin._core.turns import one_thread
-from hybridkin.calibration.calibrate import calibrate
 from hybridkin.calibration.measured import distance
-from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.learning.elm import ELMRegressor
 from hybridkin.plots import model_color, new_figure
 from hybridkin.workflow.report import Progress, Report, linear, quadratic, quiet
 

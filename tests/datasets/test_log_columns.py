@@ -1,0 +1,213 @@
+"""Columns that could be read as other numbers without a word: dates, names, quotes, motions."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hybridkin.chains.robots import LogFormat
+from hybridkin.datasets import load_log
+from hybridkin.datasets._log_report import LogReport
+from hybridkin.workflow import read_log
+
+N = 6
+NAMES = {"q": ["a", "b", "c"], "x": ["X", "Y", "Z"]}
+SECONDS = 86_400.0 * np.arange(N)
+FIRST = 1_704_067_200.0  # 2024-01-01 in seconds since 1970
+HEADER = "t,a,b,c,X,Y,Z,m\n"
+ROWS = [f"{0.1 * i:.1f},{i}e-3,0,1e-3,0.0{i},.02,.1,{'u' if i < 4 else 'v'}\n" for i in range(8)]
+
+
+def arrays(**changed):
+    """The columns of a log, some of them changed."""
+    numbers = 1e-3 * np.arange(float(6 * N)).reshape(6, N)
+    motions = np.repeat(["u", "v"], N // 2)
+    return {**dict(zip("abcXYZ", numbers, strict=True)), "t": np.arange(N), "m": motions, **changed}
+
+
+def npz(folder, **changed):
+    np.savez(folder / "log.npz", **arrays(**changed))
+    return folder / "log.npz"
+
+
+def parquet(folder, **changed):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    pd.DataFrame(arrays(**changed)).to_parquet(folder / "log.parquet")
+    return folder / "log.parquet"
+
+
+def text(folder, *parts):
+    (folder / "log.csv").write_text("".join(parts))
+    return folder / "log.csv"
+
+
+# dates and durations
+
+
+@pytest.mark.parametrize("unit", ["ns", "us", "ms", "s", "m", "h", "D"])
+def test_dates_and_durations_of_any_unit_are_seconds(tmp_path, unit):
+    days = np.arange(N).astype("m8[D]").astype(f"m8[{unit}]")
+    dates = (np.datetime64("2024-01-01") + days).astype(f"M8[{unit}]")
+    assert_array_equal(load_log(npz(tmp_path, t=days), **NAMES, time="t").time, SECONDS)
+    assert_array_equal(load_log(npz(tmp_path, t=dates), **NAMES, time="t").time, FIRST + SECONDS)
+
+
+@pytest.mark.parametrize("unit", ["ns", "us", "ms", "s"])
+def test_dates_and_durations_of_data_frames_are_seconds(tmp_path, unit):
+    days = np.arange(N).astype("m8[D]").astype(f"m8[{unit}]")
+    dates = np.datetime64("2024-01-01") + days
+    assert_allclose(load_log(parquet(tmp_path, t=days), **NAMES, time="t").time, SECONDS)
+    log = load_log(parquet(tmp_path, t=dates), **NAMES, time="t")
+    assert_allclose(log.time, FIRST + SECONDS, rtol=1e-15)
+
+
+def test_a_time_zone_does_not_change_the_time(tmp_path):
+    pd = pytest.importorskip("pandas")
+    dates = pd.date_range("2024-03-31 00:30", periods=N, freq="1h", tz="UTC")  # summer time begins
+    local = load_log(parquet(tmp_path, t=dates.tz_convert("Europe/Berlin")), **NAMES, time="t")
+    assert_array_equal(local.time - local.time[0], 3600.0 * np.arange(N))
+    assert local.time[0] == dates[0].timestamp()
+
+
+def test_fractions_of_a_second_are_kept(tmp_path):
+    ticks = np.array([0, 1, 10, 100, 1000, 10_000]).astype("m8[us]")
+    log = load_log(npz(tmp_path, t=np.datetime64("2024-01-01") + ticks), **NAMES, time="t")
+    assert_allclose(log.time - FIRST, 1e-6 * ticks.astype(float), atol=2.5e-7)
+
+
+def test_a_missing_date_is_a_missing_value(tmp_path):
+    dates = np.datetime64("2024-01-01") + np.arange(N).astype("m8[s]")
+    dates[2] = "NaT"
+    with pytest.raises(ValueError, match=r"1 of 6 rows .* missing.* \(row 2\)"):
+        load_log(npz(tmp_path, t=dates), **NAMES, time="t")
+    log = load_log(npz(tmp_path, t=dates), **NAMES, time="t", drop_invalid=True)
+    assert_array_equal(log.time, FIRST + np.array([0, 1, 3, 4, 5]))
+
+
+@pytest.mark.parametrize("name", ["a", "X"])
+@pytest.mark.parametrize("kind", ["M8[s]", "m8[ms]"])
+def test_dates_are_no_actuators_and_no_tips(tmp_path, name, kind):
+    dates = np.arange(N).astype(kind)
+    for write in (npz, parquet):
+        with pytest.raises(ValueError, match=rf"Column '{name}' .* must hold numbers, got .*time"):
+            load_log(write(tmp_path, **{name: dates}), **NAMES)
+
+
+def test_months_have_no_seconds(tmp_path):
+    with pytest.raises(ValueError, match=r"'t' .* must hold numbers, got timedelta64\[M\]"):
+        load_log(npz(tmp_path, t=np.arange(N).astype("m8[M]")), **NAMES, time="t")
+
+
+# a column has one use
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        {"q": ["a", "b", "X"]},
+        {"q": ["a", "b", "t"], "time": "t"},
+        {"x": ["X", "Y", "t"], "time": "t"},
+    ],
+)
+def test_a_column_is_used_once(tmp_path, use):
+    for path in (text(tmp_path, HEADER, *ROWS), npz(tmp_path)):
+        with pytest.raises(ValueError, match="must name a column once"):
+            load_log(path, **{**NAMES, **use})
+
+
+def test_a_column_of_an_array_is_used_once(tmp_path):
+    np.savez(tmp_path / "log.npz", q=np.zeros((N, 3)), x=np.ones((N, 3)))
+    with pytest.raises(ValueError, match="must name a column once"):
+        load_log(tmp_path / "log.npz", ["q", "q[0]"], ["x"])
+
+
+def test_a_motion_may_be_named_by_an_actuator(tmp_path):
+    log = load_log(text(tmp_path, HEADER, *ROWS), **NAMES, groups="a", time="t")
+    assert_allclose(log.q[:, 0], 1e-3 * np.arange(8))
+    assert_allclose(log.x[:, 0], 1e-2 * np.arange(8))
+    assert log.groups.tolist() == [f"{i}e-3" for i in range(8)]
+
+
+# the motion of every row
+
+
+@pytest.mark.parametrize("missing", ["", "  ", "nan", "NaN", "None"])
+def test_rows_without_a_motion_are_named(tmp_path, missing):
+    path = text(tmp_path, HEADER, *(row.replace("u", missing) for row in ROWS))
+    with pytest.raises(ValueError, match=r"4 of 8 rows .* no motion \(lines 2-5\); .*drop_invalid"):
+        load_log(path, **NAMES, groups="m")
+    log = load_log(path, **NAMES, groups="m", drop_invalid=True)
+    assert log.groups.tolist() == ["v"] * 4
+    assert log.invalid_lines.tolist() == [2, 3, 4, 5]
+    assert len(load_log(path, **NAMES).q) == 8  # motions do not matter if they are not read
+
+
+@pytest.mark.parametrize(
+    "motions",
+    [
+        np.array([1, 1, np.nan, np.nan, 2, 2]),
+        np.array(["u", "u", "", " ", "v", "v"]),
+        np.array(["2024-01-01", "2024-01-02", "", "", "2024-01-03", "2024-01-03"], "M8[D]"),
+    ],
+)
+def test_rows_of_arrays_without_a_motion_are_named(tmp_path, motions):
+    with pytest.raises(ValueError, match=r"2 of 6 rows .* \(rows 2-3\)"):
+        load_log(npz(tmp_path, m=motions), **NAMES, groups="m")
+
+
+@pytest.mark.parametrize("kind", ["object", "category", "Int64"])
+def test_rows_of_data_frames_without_a_motion_are_named(tmp_path, kind):
+    pd = pytest.importorskip("pandas")
+    values = [1, 1, None, None, 2, 2] if kind == "Int64" else ["u", "u", None, None, "v", "v"]
+    with pytest.raises(ValueError, match=r"2 of 6 rows .* \(rows 2-3\)"):
+        load_log(parquet(tmp_path, m=pd.Series(values, dtype=kind)), **NAMES, groups="m")
+
+
+def test_the_check_of_a_log_names_rows_without_a_motion(tmp_path):
+    path = text(tmp_path, HEADER, *(row.replace("u", "") for row in ROWS))
+    reports: list[LogReport] = []
+    for drop in (False, True):
+        log = read_log(path, LogFormat(**NAMES, groups="m"), drop_invalid=drop)
+        assert log.groups.tolist() == ["v"] * 4
+        reports.append(log.report)
+    first, second = ([f for f in report.findings if f.kind == "invalid"] for report in reports)
+    assert [finding.severity for finding in (*first, *second)] == ["error", "warning"]
+    assert "lines 2-5" in first[0].message
+
+
+# quotes
+
+
+@pytest.mark.parametrize("at", [1, 2, 5, 6])
+@pytest.mark.parametrize("end", [None, 6, 7])
+@pytest.mark.parametrize("cell", [0, 3, 7])
+def test_a_quote_that_hides_rows_is_noticed(tmp_path, at, end, cell):
+    rows = [row.strip().split(",") for row in ROWS]
+    rows[at][cell] = f'"{rows[at][cell]}'
+    if end is not None and end > at:
+        rows[end][-1] += '"'
+    path = text(tmp_path, HEADER, *(",".join(row) + "\n" for row in rows))
+    with pytest.raises(ValueError, match=rf"quote .* in line {at + 2} .* up to line \d|\d+ cells"):
+        load_log(path, ["b", "c"], NAMES["x"])
+
+
+def test_a_quote_in_the_header_is_noticed(tmp_path):
+    path = text(tmp_path, HEADER.replace("m", '"m'), *ROWS)
+    with pytest.raises(ValueError, match=r"in line 1 .* hides rows up to line 9"):
+        load_log(path, **NAMES)
+
+
+def test_a_quote_that_hides_a_long_file_is_noticed(tmp_path):
+    path = text(tmp_path, HEADER, ROWS[0].replace("u", '"u'), *(1000 * ROWS))
+    with pytest.raises(ValueError, match=r"does not close a quote .*field limit"):
+        load_log(path, **NAMES)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+def test_cells_may_have_quotes_delimiters_and_line_breaks(tmp_path, newline):
+    note = '"moved, base""s screw;\nand, more"'
+    rows = [ROWS[0], ROWS[1].replace("u", note), "\n", *ROWS[2:]]
+    content = HEADER.replace("m", '"m\n[name]"') + "".join(rows)
+    (tmp_path / "log.csv").write_text(content.replace("\n", newline), newline="")
+    log = load_log(tmp_path / "log.csv", **NAMES)
+    assert_allclose(log.q[:, 0], 1e-3 * np.arange(8))

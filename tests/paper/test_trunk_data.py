@@ -1,0 +1,186 @@
+"""Data of the simulated trunk: what is drawn, settled, kept in a checkpoint and shipped."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hybridkin.datasets import load_trunk
+from paper import NotSettledError, TrunkPlant, make_trunk, paper_protocol, trunk_data
+
+pytest.importorskip("mujoco", reason="the simulated trunk needs hybridkin[sim]")
+
+SMALL = {"n_segment": 2, "n_random": 4, "random_state": 5}
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(trunk_data, "CHUNK", 3)
+
+
+def test_shipped_rows_are_reproduced_by_the_plant():
+    data = load_trunk()
+    plant, seed = TrunkPlant(**data.parameters["plant"]), data.parameters["random_state"]
+    for row in (0, 499, 500, 1000, 1499, 1500, 1999):
+        q, pose = plant.settle(data.q_target[row], random_state=[seed, trunk_data.NOISE, row])
+        assert_allclose(q, data.q[row], rtol=0, atol=1e-7)
+        assert_allclose(pose[:3, 3], data.x[row], rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_make_trunk_follows_the_plant():
+    data = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0, tilt=0.1)
+    plant = TrunkPlant(tilt=0.1)
+    assert data.parameters["plant"]["tilt"] == 0.1
+    for q_target, q, x in zip(data.q_target, data.q, data.x, strict=True):
+        assert_allclose(q, q_target, atol=1e-8)
+        assert_allclose(x, plant(q_target), atol=1e-8)
+
+
+@pytest.mark.slow
+def test_make_trunk_noise_leaves_the_truth_alone():
+    clean = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0)
+    noisy = make_trunk(**SMALL, cable_noise=1e-3, mocap_noise=5e-4)
+    assert_array_equal(clean.q_target, noisy.q_target)
+    assert_allclose((noisy.q - clean.q).std(), 1e-3, rtol=0.3)
+    assert_allclose((noisy.x - clean.x).std(), 5e-4, rtol=0.4)
+
+
+@pytest.mark.slow
+def test_result_does_not_depend_on_processes(small_chunks):
+    alone, shared = make_trunk(**SMALL), make_trunk(**SMALL, n_jobs=2)
+    assert_allclose(shared.q, alone.q, rtol=0, atol=1e-9)
+    assert_allclose(shared.x, alone.x, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_resumed_equals_uninterrupted(small_chunks, monkeypatch, tmp_path):
+    settled = []
+
+    class Interrupted(TrunkPlant):
+        def settle(self, *arguments, **options):
+            if len(settled) == 6:
+                raise KeyboardInterrupt
+            settled.append(options["random_state"][-1])
+            return super().settle(*arguments, **options)
+
+    whole = make_trunk(**SMALL)
+    with monkeypatch.context() as patch:
+        patch.setattr(trunk_data, "TrunkPlant", Interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            make_trunk(**SMALL, checkpoint=tmp_path)
+        assert settled == [0, 1, 2, 3, 4, 5]
+        settled[:] = [-1]  # so many more may be made: the chunks that are missing
+        resumed = make_trunk(**SMALL, checkpoint=tmp_path)
+        assert settled == [-1, 6, 7, 8, 9]
+        # A complete checkpoint is the data.
+        again = make_trunk(**SMALL, checkpoint=tmp_path)
+        assert settled == [-1, 6, 7, 8, 9]
+    assert_array_equal(again.x, resumed.x)
+    assert_allclose(resumed.q, whole.q, rtol=0, atol=1e-12)
+    assert_allclose(resumed.x, whole.x, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"random_state": 6},
+        {"cable_noise": 0.0},
+        {"tilt": 0.0},
+        {"q_target": np.full((1, 9), 0.25)},
+    ],
+)
+def test_a_checkpoint_of_another_run_is_not_taken(tmp_path, change):
+    arguments = {"n_segment": 0, "n_random": 1, "random_state": 5}
+    make_trunk(**arguments, checkpoint=tmp_path)
+    data = make_trunk(**{**arguments, **change}, checkpoint=tmp_path)
+    assert_array_equal(data.x, make_trunk(**{**arguments, **change}).x)
+
+
+def test_unseeded_runs_keep_their_seed():
+    data = make_trunk(n_segment=0, n_random=1)
+    again = make_trunk(n_segment=0, n_random=1, random_state=data.parameters["random_state"])
+    assert_allclose(again.x, data.x, rtol=0, atol=1e-12)
+    json.dumps(data.parameters)
+
+
+@pytest.fixture
+def stubborn(monkeypatch):
+    """A plant that does not settle where the first chamber is long."""
+
+    class Stubborn(TrunkPlant):
+        def settle(self, q_target, **kwargs):
+            if q_target[0] > 0.25:
+                raise NotSettledError("Not settled: stubborn.")
+            return super().settle(q_target, **kwargs)
+
+    monkeypatch.setattr(trunk_data, "TrunkPlant", Stubborn)
+
+
+@pytest.mark.slow
+def test_rows_that_do_not_settle_are_drawn_again(stubborn):
+    with pytest.warns(UserWarning, match="did not settle and were drawn again"):
+        data = make_trunk(n_segment=2, n_random=12, random_state=0)
+    assert np.bincount(data.part).tolist() == [2, 2, 2, 12]
+    assert data.q_target[:, 0].max() <= 0.25
+    assert_array_equal(data.row, np.arange(18))
+    first_draw, _ = paper_protocol(0, n_segment=2, n_random=12)
+    failed = {row for row, _, _ in data.failed}
+    assert failed == set(np.flatnonzero(first_draw[:, 0] > 0.25).tolist())
+    kept = np.setdiff1d(np.arange(18), list(failed))
+    assert_array_equal(data.q_target[kept], first_draw[kept])
+
+
+def test_given_rows_that_do_not_settle_are_left_out(stubborn):
+    q_target = np.full((4, 9), 0.24)
+    q_target[2] = 0.26
+    with pytest.warns(UserWarning, match="1 configurations did not settle and were left out"):
+        data = make_trunk(q_target, random_state=0)
+    assert data.row.tolist() == [0, 1, 3]
+    assert data.part is None
+    ((row, target, message),) = data.failed
+    assert row == 2
+    assert_array_equal(target, q_target[2])
+    assert "stubborn" in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"q_target": np.full((2, 8), 0.25)}, r"shape \(n_samples, 9\), got \(2, 8\)"),
+        ({"q_target": np.full((2, 9), 250.0)}, r"2 rows are not, first row 0"),
+        ({"q_target": np.full((2, 9), np.nan)}, r"2 rows are not"),
+        ({"random_state": -1}, "`random_state` must be an integer >= 0"),
+        ({"cable_noise": -1.0}, "`cable_noise` must be"),
+    ],
+)
+def test_make_trunk_bad_input(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_trunk(**arguments)
+
+
+def test_make_trunk_knows_the_parameters_of_the_plant():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'stiffness'"):
+        make_trunk(stiffness=1.0)
+
+
+@pytest.mark.slow
+def test_a_damaged_checkpoint_is_made_again_and_runs_nothing(tmp_path):
+    options = {"n_segment": 1, "n_random": 1, "random_state": 0, "return_X_y": True}
+    whole = make_trunk(**options, checkpoint=tmp_path)
+    (file,) = tmp_path.iterdir()
+    content = file.read_bytes()
+    objects = np.array([print, None])
+    file.write_bytes(content[:-100])
+    np.testing.assert_array_equal(make_trunk(**options, checkpoint=tmp_path)[1], whole[1])
+    assert np.load(file).files == np.load(io.BytesIO(content)).files
+    np.savez(file, q=objects)
+    np.testing.assert_array_equal(make_trunk(**options, checkpoint=tmp_path)[1], whole[1])
+
+
+@pytest.mark.parametrize("value", ["a", ["a", "b"], 1j, {}])
+def test_commands_that_are_no_numbers_are_refused_by_name(value):
+    with pytest.raises((TypeError, ValueError), match="`q_target`"):
+        make_trunk(value)
