@@ -28,6 +28,9 @@ _TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # of the test, relative to the 
 # Buffers with the middle and the half width of the training rows of a learned part.
 _RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "half_width"))
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
+_LIMITED = 1  # flag of a step, see src/ik_step.h
+_NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
+_MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
 _STEPS, _MEMORY = 4, 5.0  # steps per run of the test; memory in periods
 # Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
 _OPERATIONS = {
@@ -40,7 +43,7 @@ _OPERATIONS = {
 
 @runtime_checkable
 class _Controller(Protocol):
-    model: Any
+    settings: Any
 
     def stored(self) -> Stored: ...
     def tracker(self, q0: Any, *, memory: float | None = None) -> Any: ...
@@ -91,13 +94,15 @@ def export_c(
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}.")
     controller = model if isinstance(model, _Controller) else None
-    module = as_forward_model(model if controller is None else controller.model)
+    # The model of a task: of several markers it is the one that is steered.
+    module = controller.settings.task.models[0] if controller else as_forward_model(model)
     try:
-        plan = Plan((module if controller is None else controller).stored())
-        if controller is not None and plan.n_outputs > 3:
+        plan = Plan((controller or module).stored())
+        if controller and plan.n_outputs > 3:
             raise NoKernel("a step to a target pose has no kernel")
+        _check_stack(plan, dtype)
     except (NoKernel, TypeError) as error:
-        way = "use it from Python, or fit an error model that has a kernel"
+        way = "use it from Python, or a model and a task that have kernels"
         raise NoKernel(f"`model` cannot be written in C: {error}; {way}.") from None
     files = {f"{name}.h": "model.h", f"{name}.c": "model.c", f"{name}_test.c": "check.c"}
     files |= {file: file for file in ("CMakeLists.txt", "README.md")}
@@ -158,8 +163,18 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
         words = (", ".join(f"{v:.6g}" for v in row) for row in limits)
         found |= zip(("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX"), words, strict=True)
         found |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
+        sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
+        found["LIMITS"] = _filled(sentence, found)
         found["NEWTON"] = f"{10 * plan.n_inputs**2 + 80 * plan.n_inputs:,}"
     return found
+
+
+def _check_stack(plan: Plan, dtype: str) -> None:
+    """Raise if the code would need more than 64 KiB of stack; bounds the HK_MODEL_WORK of src."""
+    n, segments, m, features, powers = plan.code[:5].tolist()
+    numbers = 2 * (features + powers) + max(n, 3 * segments, m) * (n + 37) + 140 * segments + 30
+    if numbers * np.dtype(dtype).itemsize > _MOST_STACK:
+        raise NoKernel("its sizes need more than 64 KiB of stack, too much for a controller")
 
 
 def _operations(plan: Plan) -> int:
@@ -174,9 +189,15 @@ def _operations(plan: Plan) -> int:
 
 
 def _limits(plan: Plan) -> tuple[NDArray, float]:
-    """Return q_min, q_max, dq_max, ddq_max, shape (4, n), and the period of inverse kinematics."""
+    """Return q_min, q_max, dq_max, ddq_max, shape (4, n), and the period of inverse kinematics.
+
+    What a step does not keep is infinite.
+    """
     n, numbers = plan.n_inputs, plan.data[plan.code[plan.root + 3] :]
-    return numbers[: 4 * n].reshape(4, n), float(numbers[6 * n + 2])
+    limits = numbers[: 4 * n].reshape(4, n)
+    if not plan.code[plan.root + 5] & _LIMITED:
+        limits = np.repeat(_NO_LIMITS, n, axis=1)
+    return limits, float(numbers[6 * n + 2])
 
 
 def _literals(values: NDArray) -> str:

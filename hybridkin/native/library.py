@@ -5,17 +5,18 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import threading
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.stored import Stored
@@ -26,7 +27,6 @@ _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 _LEVELS = {"hk_v2": 2, "hk_v3": 3, "hk_v4": 4}  # smallest hk_level() of each
 _CHUNK = 20_000  # rows per task of a thread
 _BYTE = ctypes.c_char
-_version = attrgetter("_version")
 
 Results = tuple[NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.float64] | None]
 
@@ -34,6 +34,14 @@ Results = tuple[NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.floa
 def library() -> ctypes.CDLL | None:
     """Return the compiled library, or None if there is none."""
     return _opened()[0]
+
+
+def opened_library() -> ctypes.CDLL:
+    """Return the compiled library; RuntimeError if there is none."""
+    opened, reason = _opened()
+    if opened is None:
+        raise RuntimeError(f"the compiled core is not available: {reason}.")
+    return opened
 
 
 def available() -> bool:
@@ -82,8 +90,10 @@ def _fault(opened: ctypes.CDLL) -> str:
     if opened.hk_sources() & 0xFFFFFFFF != stamp:
         return "was compiled from other sources; reinstall hybridkin, or run hatch_build.py"
     pointer = ctypes.c_void_p
-    opened.hk_evaluate.argtypes = [pointer, pointer, ctypes.c_int32, pointer, ctypes.c_int64]
-    opened.hk_evaluate.argtypes += [pointer] * 3
+    opened.hk_evaluate.argtypes = [pointer, pointer, ctypes.c_int64, *[pointer] * 3]
+    opened.hk_work.argtypes = [pointer, ctypes.c_int32]
+    opened.hk_work.restype = ctypes.c_int64
+    opened.hk_ik_tick.argtypes = [pointer]
     opened.hk_evaluate.restype = opened.hk_play.restype = None
     opened.hk_play.argtypes = [ctypes.c_int64, ctypes.c_int32, ctypes.c_int32, *[pointer] * 5]
     return "" if _is_right(opened) else "computes wrong numbers"
@@ -118,6 +128,33 @@ def _is_right(opened: ctypes.CDLL) -> bool:
     return True
 
 
+class Call(threading.local):
+    """A plan with memory to compute in: what functions of the library are called with.
+
+    Every thread has its own memory.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+    opened : ctypes.CDLL
+        The library.
+    more : int
+        Further pointers that a function needs.
+
+    Attributes
+    ----------
+    place : int
+        The address to call functions with.
+    """
+
+    def __init__(self, plan: Plan, opened: ctypes.CDLL, *more: int) -> None:
+        head = plan.code.ctypes.data, plan.data.ctypes.data, plan.root
+        self._work = np.empty(opened.hk_work(head[0], plan.root))
+        self._pointers = np.array([*head, self._work.ctypes.data, *more])
+        self.place = self._pointers.ctypes.data
+
+
 class Program:
     """A model that the compiled core evaluates.
 
@@ -130,13 +167,11 @@ class Program:
     """
 
     def __init__(self, plan: Plan, opened: ctypes.CDLL | None = None) -> None:
-        opened = opened or library()
-        if opened is None:
-            raise RuntimeError(f"the compiled core is not available: {_opened()[1]}.")
+        opened = opened or opened_library()
         self.plan = plan
         self._sizes = plan.n_inputs, plan.n_outputs
         self._evaluate = opened.hk_evaluate
-        self._head = plan.code.ctypes.data, plan.data.ctypes.data, plan.root
+        self._call = Call(plan, opened)
 
     def __reduce__(self) -> tuple[type[Program], tuple[Plan]]:
         return Program, (self.plan,)
@@ -161,7 +196,7 @@ class Program:
             a, size = np.empty(m + m * n + 1), m + m * n
             at, row = _address(a) or 0, np.asarray(q, np.float64).tobytes()
             places = at + 8 * m if jacobian else None, at + 8 * size if distance else None
-            self._evaluate(*self._head, row, 1, at, *places)
+            self._evaluate(self._call.place, row, 1, at, *places)
             J = a[m:size].reshape(m, n) if jacobian else None
             return a[:m], J, a[size, ...] if distance else None
         x = np.empty((*lead, m))
@@ -190,7 +225,7 @@ class Program:
 
         def run(start: int, count: int) -> None:
             to = [None if place is None else place + start * step for place, step in places]
-            self._evaluate(*self._head, q + 8 * n * start, count, *to)
+            self._evaluate(self._call.place, q + 8 * n * start, count, *to)
 
         in_chunks(rows, run)
 
@@ -222,15 +257,12 @@ def play(rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool) -> list
     lead : bool
         Whether to return commands for effective changes instead of the reverse.
     """
-    opened = library()
-    if opened is None:
-        raise RuntimeError(f"the compiled core is not available: {_opened()[1]}.")
     n = rows.shape[1]
     vectors = np.empty((3, n))
     vectors[0], vectors[1], vectors[2] = half, *state
     at, found = _address(vectors), np.empty_like(rows)
     places = at, _address(rows), at + 8 * n, at + 16 * n, _address(found)
-    opened.hk_play(len(rows), n, lead, *places)
+    opened_library().hk_play(len(rows), n, lead, *places)
     return [found, vectors[1], vectors[2]]
 
 
@@ -242,32 +274,49 @@ def _address(a: NDArray | None) -> int | None:
 
 
 class _Compiled:
-    """The program of a model, and the buffers and submodules from which it was made."""
+    """The program of a model, and what it was made of.
+
+    A tensor counts with its place in memory and its bytes, because writes through ``.data`` or
+    NumPy do not change its version.
+    """
 
     def __init__(self, model: ForwardModel) -> None:
         self.program, self.reason = None, ""
+        self.tensors, self.views = [], []
         modules = [*model.modules()]
         dicts = [d for m in modules for d in (m._modules, m._buffers, m._parameters)]
         self.dicts = [d for d in dicts if d]
-        self.seen = [dict(d) for d in self.dicts]
-        self.tensors, self.versions = [], []
+        self.parts = [dict(d) for d in self.dicts]
+        portable = [m for m in modules if isinstance(m, PortableModule)]
+        self.settings = [(vars(m), name) for m in portable for name in m.layout.settings]
+        self.content, self.state = [], self._state()
         try:
             _check_classes(modules)
             tensors = [*model.buffers(), *model.parameters()]
             if any(a.device.type != "cpu" or a.is_inference() for a in tensors):
                 raise NoKernel("the compiled core needs tensors on the CPU, no inference tensors")
-            self.tensors, self.versions = tensors, [*map(_version, tensors)]
+            self.tensors, self.views = tensors, [*map(_memory, tensors)]
+            self.content, self.state = [*map(bytearray, self.views)], self._state()
             self.program = Program(Plan(model.stored()))
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
 
+    def _state(self) -> list[Any]:
+        places = [*map(Tensor.data_ptr, self.tensors), *map(Tensor.stride, self.tensors)]
+        return places + [attributes.get(name) for attributes, name in self.settings]
+
     def holds(self) -> bool:
         """Return whether the model is still the same."""
         try:
-            same = self.dicts == self.seen  # identity first; else tensors are compared
+            same = self.dicts == self.parts  # identity first; else tensors are compared
         except RuntimeError:
             return False
-        return same and [*map(_version, self.tensors)] == self.versions
+        return same and self.state == self._state() and self.content == self.views
+
+
+def _memory(a: Tensor) -> memoryview:
+    """Return the memory that a tensor reads."""
+    return torch.empty(0, dtype=a.dtype, device=a.device).set_(a.untyped_storage()).numpy().data
 
 
 def _check_classes(modules: list[torch.nn.Module]) -> None:

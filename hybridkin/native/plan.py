@@ -15,11 +15,13 @@ from hybridkin._core.stored import Stored
 
 # Kinds of nodes, numbered as in src/plan.h.
 ARCS, ELASTIC, RIGID, AFFINE, ELM, POLYNOMIAL, KERNEL, READOUT = range(1, 9)
-LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK, GROUP_DISTANCE, ADAPTED = range(9, 16)
+LEVERAGE_GUARD, BOX_GUARD, QUADRATIC_LEVERAGE, HYBRID, IK, GROUP_DISTANCE = range(9, 15)
+ADAPTED, PROJECTED = range(15, 17)
 GROUPED = (AFFINE, ELM, KERNEL, QUADRATIC_LEVERAGE)
 GROUP = 8  # hidden units, or columns of a leverage, stored together
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
 QUADRATIC, POSE = 1, 3  # features of a readout
+MAX_NORMALS = 6  # IK_MOST_ROWS - IK_ROWS in src/ik_box.h
 ROUNDING = 1e-7  # of weights that sum to one
 # Largest sizes that the kernels support, see src/plan.h.
 MOST = {"actuators": 64, "segments": 16, "outputs": 64, "features": 2048, "powers": 1024}
@@ -35,8 +37,8 @@ class Plan:
     Attributes
     ----------
     code : ndarray of int32
-        For each node: kind, lengths of input and output, place of its numbers, then its sizes
-        and the places of its parts.
+        The largest sizes, in the order of MOST. Then for each node: kind, lengths of input and
+        output, place of its numbers, then its sizes and the places of its parts.
     data : ndarray of float64
         All numbers.
     n_inputs, n_outputs : int
@@ -50,13 +52,14 @@ class Plan:
     """
 
     def __init__(self, stored: Stored) -> None:
-        self._code: list[int] = []
+        self._code = [0] * len(MOST)  # then the largest sizes
         self._data: list[NDArray] = []
         self._length = 0
         self.largest: dict[str, int] = {}
         self._known: dict[tuple, int] = {}
         self.root = self.node_of(stored)
         self.n_inputs, self.n_outputs = self._code[self.root + 1 : self.root + 3]
+        self._code[: len(MOST)] = [self.largest.get(what, 0) for what in MOST]
         self.code = np.array(self._code, dtype=np.int32)
         whole = np.zeros(self._length + 2 * GROUP)
         start = -whole.ctypes.data // 8 % GROUP  # at the start of a cache line
@@ -371,6 +374,12 @@ def _adapted(plan: Plan, stored: Stored) -> int:
     return plan.node(ADAPTED, n, m, numbers, fitted)
 
 
+def _projected(plan: Plan, stored: Stored) -> int:
+    model = plan.node_of(stored.part("model"))
+    n, m = plan.entry(model, 1), plan.entry(model, 2)
+    return plan.node(PROJECTED, n, m, [stored.array("matrix").T, stored.array("offset")], model)
+
+
 def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     model = plan.node_of(stored.part("model"))
     n, m = plan._code[model + 1 : model + 3]
@@ -386,9 +395,16 @@ def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     weights = stored.array("weights", [n])
     flags = (stored.settings["limits"] == "saturate") + 2 * stored.settings["has_posture"]
     flags += 4 * bool((weights != 1.0).any()) + 8 * stored.settings["accelerates"]
-    periods = stored.array("periods", [n], finite=False)
-    numbers = [*vectors, weights**-0.5, np.array([*rates, radian]), periods]
-    return plan.node(IK, n, 6 if radian else 3, numbers, model, flags)
+    periods, pulls = stored.array("periods", [n], finite=False), stored.array("pulls", [n])
+    flags += 16 * bool(pulls.any())
+    normals = stored.array("normals").T
+    if len(normals) > MAX_NORMALS:
+        raise NoKernel(
+            f"the log leaves {len(normals)} directions of q out, more than {MAX_NORMALS}"
+        )
+    rates = np.array([*rates, radian])
+    numbers = [*vectors, weights**-0.5, rates, periods, pulls, normals]
+    return plan.node(IK, n, 6 if radian else 3, numbers, model, flags, len(normals))
 
 
 WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
@@ -406,5 +422,6 @@ WRITERS: dict[str, Callable[[Plan, Stored], int]] = {
     "group_distance": _group_distance,
     "hybrid_module": _hybrid,
     "adapted_model": _adapted,
+    "projected": _projected,
     "inverse_kinematics": _inverse_kinematics,
 }

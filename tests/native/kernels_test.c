@@ -43,6 +43,7 @@ int main(int argc, char **argv) {
     const size_t n = (size_t)code[at + HK_N], m = (size_t)code[at + HK_M];
     double *q = filled(file, sizeof *q, (size_t)rows * n);
     fclose(file);
+    const hk_call call = {code, data, at, filled(NULL, sizeof *data, (size_t)hk_work(code, at))};
     double worst[4] = {0.0, 0.0, 0.0, 0.0};
     for (int count = 1; count <= rows; count++) { /* full and partial blocks */
         const size_t N = (size_t)count;
@@ -53,13 +54,13 @@ int main(int argc, char **argv) {
             block[k] = filled(NULL, sizeof **block, lengths[k]);
         }
         for (size_t i = 0; i < N; i++) {
-            hk_evaluate(code, data, at, q + i * n, 1, NULL, one[3] + i * n, one[2] + i);
-            hk_evaluate(code, data, at, q + i * n, 1, one[0] + i * m, one[1] + i * m * n, one[2] + i);
+            hk_evaluate(&call, q + i * n, 1, NULL, one[3] + i * n, one[2] + i);
+            hk_evaluate(&call, q + i * n, 1, one[0] + i * m, one[1] + i * m * n, one[2] + i);
         }
-        hk_evaluate(code, data, at, q, count, NULL, block[3], block[2]);
-        hk_evaluate(code, data, at, q, count, block[0], NULL, NULL);
+        hk_evaluate(&call, q, count, NULL, block[3], block[2]);
+        hk_evaluate(&call, q, count, block[0], NULL, NULL);
         worst[0] = fmax(worst[0], difference(one[0], block[0], lengths[0]));
-        hk_evaluate(code, data, at, q, count, block[0], block[1], block[2]);
+        hk_evaluate(&call, q, count, block[0], block[1], block[2]);
         for (int k = 0; k < 4; k++) {
             worst[k] = fmax(worst[k], difference(one[k], block[k], lengths[k]));
             free(one[k]);
@@ -68,6 +69,7 @@ int main(int argc, char **argv) {
     }
     printf("%.3e %.3e %.3e %.3e\n", worst[0], worst[1], worst[2], worst[3]);
     free(q);
+    free(call.work);
     free(data);
     free(code);
     free(head);

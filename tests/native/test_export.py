@@ -1,16 +1,26 @@
 """Exported C code: it compiles without a warning, and computes what the Python model does."""
 
 import importlib.util
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from saved_models import FOLDER, tendon_chain
+import torch
+from painted import LIMIT, painted, stacks
+from saved_models import FOLDER, arm, tendon_chain, trunk
 
-from hybridkin import ConstantCurvatureChain, InverseKinematics, as_forward_model, load_model
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    InverseKinematics,
+    load_model,
+)
 from hybridkin.cli.main import main
+from hybridkin.ik.tasks import PointsTask, PoseTask, as_task
 from hybridkin.native import export_c
 from hybridkin.native.plan import NoKernel
 
@@ -25,7 +35,7 @@ needs_zig = pytest.mark.skipif(ZIG is None, reason="the package ziglang is not t
 
 def limited(model, **settings):
     """Inverse kinematics within limits that suit the small models, 1 kHz."""
-    extensible = getattr(as_forward_model(model).robot, "lengths", 0.1) is None
+    extensible = getattr(as_task(model).models[0].robot, "lengths", 0.1) is None
     low, high = (0.15, 0.35) if extensible else (-0.004, 0.004)
     settings = {"q_min": low, "q_max": high, "dq_max": 1.0, "dt": 1e-3, "ddq_max": 2e3, **settings}
     return InverseKinematics(model, **settings)
@@ -51,6 +61,114 @@ def test_the_code_computes_what_the_model_does(tmp_path, name, dtype):
     done = subprocess.run([built(tmp_path, *more)], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 failures" in done.stdout
+
+
+def agrees(folder, model, *more, **options):
+    """Whether the exported test passes."""
+    export_c(model, folder, name="robot", **options)
+    done = subprocess.run([built(folder, *more)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    return "0 failures" in done.stdout
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_without_limits_no_limit_is_kept_or_promised(tmp_path, dtype):
+    ik = limited(trunk(), q_min=0.15, q_max=0.35, limits="off")
+    assert agrees(tmp_path, ik, dtype=dtype)
+    readme = (tmp_path / "README.md").read_text()
+    assert "keeps no limits" in readme
+    assert "It keeps q between" not in readme
+
+
+@needs_cc
+@pytest.mark.slow
+def test_arms_of_prismatic_joints(tmp_path):
+    for kinds in (["prismatic", "revolute", "revolute"], ["prismatic"] * 3):
+        assert agrees(tmp_path, limited(arm(kinds=kinds), q_min=-1.0, q_max=1.0))
+
+
+@needs_cc
+@pytest.mark.slow
+def test_one_number_limits_all_actuators_of_a_data_only_hybrid(tmp_path):
+    assert agrees(tmp_path, limited(load_model(FOLDER / "data_only.safetensors")))
+
+
+@needs_cc
+@pytest.mark.slow
+def test_of_several_markers_the_steered_one_is_written(tmp_path):
+    marked = ConstantCurvatureChain([0.1, 0.09]).with_markers([(0, 1.0), (1, 1.0)])
+    assert agrees(tmp_path, limited(marked, q_min=0.15, q_max=0.35))
+    assert "enum { ROBOT_N = 6, ROBOT_OUTPUTS = 3 }" in (tmp_path / "robot.h").read_text()
+
+
+@needs_cc
+@pytest.mark.slow
+def test_a_soft_backbone_of_few_taut_tendons(tmp_path):
+    rng = np.random.default_rng(2)
+    radii, lengths = rng.uniform(0.004, 0.03, 3), rng.uniform(0.05, 0.15, 3)
+    soft = {"bending_stiffness": 1e-8, "axial_stiffness": 1e-3}
+    assert agrees(tmp_path, ElasticTendonChain(radii, lengths, **soft))
+
+
+FOLLOWS = """
+#include <stdio.h>
+#include "robot.h"
+int main(void) {
+    const double start[9] = {%s}, target[3] = {%s};
+    robot_state state;
+    robot_reset(&state, start);
+    for (int i = 0; i < 120; i++) {
+        robot_step(&state, target, NULL, NULL);
+        for (int j = 0; j < 9; j++) printf("%%.17g ", state.q[j]);
+        printf("%%.17g\\n", state.error);
+    }
+    return 0;
+}
+"""
+
+
+@needs_cc
+@pytest.mark.parametrize("start", [0.0, 0.005])  # straight; all tendons slack
+def test_on_tendons_that_only_pull_it_arrives_as_in_python(tmp_path, start):
+    chain = ElasticTendonChain([0.01] * 3, [0.1] * 3)
+    ik = InverseKinematics(chain, q_min=-0.01, q_max=0.01, dq_max=0.05, dt=0.02)
+    q = np.full(9, start)
+    target = chain(torch.from_numpy(np.random.default_rng(0).uniform(-0.01, 0.01, 9))).numpy()
+    export_c(ik, tmp_path, name="robot")
+    numbers = (", ".join(map(repr, map(float, a))) for a in (q, target))
+    (tmp_path / "main.c").write_text(FOLLOWS % tuple(numbers))
+    printed = subprocess.check_output([built(tmp_path, sources=("main.c", "robot.c"))], text=True)
+    *commands, error = np.array(printed.split(), float).reshape(120, 10).T
+    assert error[-20:].max() < 1e-4
+    tracker = ik.tracker(q)
+    expected = [tracker.step(target) for _ in range(120)]
+    np.testing.assert_allclose(np.array(commands).T, expected, rtol=0, atol=1e-9)
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize("level", ["-O0", "-O1", "-O3", "-Os"])
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_no_level_of_optimisation_warns(tmp_path, compiler, level):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"no {compiler}")
+    export_c(limited(load_model(FOLDER / "serial_pose.safetensors")), tmp_path, name="robot")
+    built(tmp_path, level, compiler=[compiler])
+
+
+@needs_cc
+@pytest.mark.slow
+def test_the_readme_bounds_the_stack(tmp_path):
+    model = limited(load_model(FOLDER / "blend.safetensors"))
+    export_c(model, tmp_path, name="robot")
+    readme = " ".join((tmp_path / "README.md").read_text().split())
+    bound = int(re.search(r"on top\): \d+ and (\d+) bytes", readme)[1])
+    program = painted(tmp_path, "-DEXPORTED", "-DSTEPS", "-Os", tmp_path / "robot.c")
+    for name, size in stacks(program).items():
+        assert 0 < size <= bound + 1024, name  # and the functions of math.h
+    assert bound <= LIMIT
 
 
 @needs_zig
@@ -114,6 +232,12 @@ def test_only_files_of_an_export_are_replaced(tmp_path):
         export_c(rigid, tmp_path, name="arm_3")
 
 
+def test_code_that_needs_too_much_stack_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("hybridkin.native.export._MOST_STACK", 1000)
+    with pytest.raises(NoKernel, match="its sizes need more than 64 KiB of stack"):
+        export_c(tendon_chain(), tmp_path / "out")
+
+
 def test_wrong_arguments(tmp_path):
     for options, message in (
         ({"dtype": "float16"}, r"`dtype` must be .* got 'float16'"),
@@ -123,8 +247,15 @@ def test_wrong_arguments(tmp_path):
             export_c(tendon_chain(), tmp_path / "out", **options)
     with pytest.raises(NoKernel, match=r"cannot be written in C: a FunctionModel .* use it from"):
         export_c(lambda q: q, tmp_path / "out")
-    with pytest.raises(NoKernel, match=r"cannot be written in C: .* posture"):
-        export_c(limited(tendon_chain(), q_pref=lambda q: 0.0 * q), tmp_path / "out")
+    for ik, reason in (
+        (limited(tendon_chain(), q_pref=lambda q: 0.0 * q), "a posture that is a function"),
+        (limited(tendon_chain(), tip_limits=([[0.0, 0.0, 1.0]], [0.9])), "limits of the tip"),
+        (limited(PoseTask(arm()), q_min=-1.0, q_max=1.0), "a step to a target pose"),
+        (limited(PoseTask(tendon_chain())), "the kernels for poses support rigid arms only"),
+        (limited(PointsTask(tendon_chain(), [1.0])), "a PointsTask has no kernel"),
+    ):
+        with pytest.raises(NoKernel, match=f"cannot be written in C: {reason}"):
+            export_c(ik, tmp_path / "out")
     with pytest.raises(TypeError, match="`model` must be"):
         export_c(3, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -7,6 +7,7 @@ import pytest
 import torch
 from compiled import random_settings
 from scipy.spatial.transform import Rotation
+from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -114,7 +115,8 @@ def test_a_stream_is_that_of_torch(memory):
     ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=3.0, weights=np.arange(1.0, 10.0))
     q = 0.25 + 0.05 * draw.standard_normal(9)
     ours, theirs = ik.tracker(q, memory=memory), ik.tracker(torch.from_numpy(q), memory=memory)
-    assert (ours.backend, theirs.backend) == ("compiled", "torch")
+    assert ours.backend == "compiled"
+    assert theirs.backend == "torch: `q0` is no float64 array of NumPy"
     seen = set()
     for i in range(60):
         x = np.array([0.1 * np.sin(0.1 * i), 0.05, 0.75]) * draw.choice([1.0, 1.0, np.nan, 1.6])
@@ -178,10 +180,42 @@ def test_what_has_no_kernel_runs_in_torch():
         InverseKinematics(BHA, tip_limits=(np.eye(3), np.ones(3)), **limits),
     ]
     for ik in others:
-        assert ik.tracker(q).backend == "torch"
+        assert ik.tracker(q).backend.startswith("torch: ")
         with pytest.raises((TypeError, NoKernel)):
             Plan(ik.stored())
-    assert InverseKinematics(BHA, **limits).tracker(q.astype(np.float32)).backend == "torch"
+    single = InverseKinematics(BHA, **limits).tracker(q.astype(np.float32))
+    assert single.backend == "torch: `q0` is no float64 array of NumPy"
+
+
+def test_why_a_tracker_runs_in_torch():
+    q, limits = np.full(9, 0.25), {"q_min": 0.1, "q_max": 0.4}
+    reasons = {
+        "a FunctionModel has no kernel": InverseKinematics(lambda q: BHA(q), **limits),
+        "only positions have a kernel of a step": InverseKinematics(
+            PoseTask(RigidChain([np.eye(4)], [[0, 0, 1]]))
+        ),
+        "a posture that is a function has no kernel": InverseKinematics(
+            BHA, q_pref=lambda q: q, **limits
+        ),
+    }
+    for reason, ik in reasons.items():
+        start = q[: ik.settings.n_actuators]
+        assert ik.tracker(start).backend == f"torch: {reason}"
+    tracker = InverseKinematics(BHA, **limits).tracker(torch.from_numpy(q))
+    assert tracker.backend == "torch: `q0` is no float64 array of NumPy"
+
+
+@pytest.mark.parametrize("error_model", [ELMRegressor(8, random_state=0), LinearRegression()])
+def test_a_model_of_data_alone_is_compiled_with_scalar_limits(error_model):
+    draw = np.random.default_rng(0)
+    q = draw.uniform(0.2, 0.3, (60, 9))
+    x = BHA(torch.from_numpy(q)).numpy()
+    model = HybridForwardModel(None, error_model).fit(q, x)
+    assert (model.module_.n_actuators, model.module_.n_outputs) == (9, 3)
+    tracker = InverseKinematics(model, q_min=0.1, q_max=0.4).tracker(q[0])
+    assert tracker.backend == "compiled"
+    vectors = InverseKinematics(model, q_min=np.full(9, 0.1), q_max=np.full(9, 0.4)).tracker(q[0])
+    np.testing.assert_array_equal(tracker.step(x[1]), vectors.step(x[1]))
 
 
 def test_a_tracker_keeps_its_model_until_it_is_reset():

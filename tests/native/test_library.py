@@ -222,7 +222,7 @@ def test_models_work_after_a_fork():
     model = chain()
     compute(model)
     with multiprocessing.get_context("fork").Pool(1) as pool:
-        said, found = pool.apply_async(compute, (model,)).get(timeout=60)
+        said, found = pool.apply_async(compute, (model,)).get(timeout=300)
     assert said == "compiled"
     agree(found, by_torch(model, ROWS))
 
@@ -253,5 +253,5 @@ def test_what_has_no_kernel_says_so():
     with torch.inference_mode():
         frozen = chain()
     for model in (chain().to("meta"), frozen):
-        assert backend(model) == backend(model)
-        assert backend(model).startswith("torch: the compiled core needs tensors on the CPU")
+        for _ in range(2):  # the second answer is that of the program that was kept
+            assert backend(model).startswith("torch: the compiled core needs tensors on the CPU")

@@ -49,7 +49,7 @@ static inline HK(stumpff_t) HK(stumpff)(V s) {
    `frame` holds the rotation of the base (3, 3), its position (3), the robot's reach and the rigid
    offsets (S). */
 HK_INLINE void HK(arcs_tip_of)(
-    int S, const real *frame, const V *z, V *x, V *C) {
+    int S, const real *frame, const V *restrict z, V *restrict x, V *restrict C) {
     const real *turn = frame, *origin = frame + 9, *offsets = frame + HK_FRAME;
     HK(stumpff_t) arc[HK_MAX_S];
     V across[HK_MAX_S], rest[HK_MAX_S], tail[HK_MAX_S][3];

@@ -12,6 +12,16 @@ static inline int HK(n_coordinates)(const hk_plan *p, int at) {
     return (HK_CHAIN_IS(p, at, HK_RIGID) ? 1 : 3) * p->code[at + HK_MORE];
 }
 
+/* Memory for what `pull` needs. */
+static inline HK(inside) HK(inside_of)(const hk_plan *p, int at, V **work) {
+    HK(inside) in = {NULL, NULL};
+    if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
+        in.inverse = HK(take)(work, 6 * p->code[at + HK_MORE + 1]);
+        in.taut = HK(take)(work, p->code[at + HK_N]);
+    }
+    return in;
+}
+
 /* How far the n actuators of a rigid arm move its joints (joints, n), NULL where they are them. */
 static inline const real *HK(couplings)(const hk_plan *p, int at) {
     const int32_t *more = p->code + at + HK_MORE;
@@ -19,7 +29,7 @@ static inline const real *HK(couplings)(const hk_plan *p, int at) {
 }
 
 /* The inner coordinates z of q, and what `pull` needs. */
-static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, HK(inside) *in) {
+static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, const HK(inside) *in) {
     (void)in;
     if (HK_CHAIN_IS(p, at, HK_RIGID)) {
         const int n = p->code[at + HK_N];
@@ -48,10 +58,12 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, H
 }
 
 /* The tip x (3) of inner coordinates z, and its derivative C (3, k) where not NULL. */
-static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V *x, V *C) {
+static inline void HK(from_coordinates)(
+    const hk_plan *p, int at, const V *z, V *x, V *C, V *work) {
     const int32_t *more = p->code + at + HK_MORE;
+    (void)work;
     if (HK_CHAIN_IS(p, at, HK_RIGID))
-        HK(rigid)(more[0], more + 2, hk_numbers(p, at), z, x, C, NULL);
+        HK(rigid)(more[0], more + 2, hk_numbers(p, at), z, x, C, NULL, work);
     else if (HK_USES(HK_ARCS) || HK_USES(HK_ELASTIC))
         HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
 }
@@ -93,15 +105,18 @@ static inline void HK(pull)(const hk_plan *p, int at, const HK(inside) *in, cons
     HK(pull_rows)(p, at, in, 3, C, J);
 }
 
-static inline void HK(chain)(const hk_plan *p, int at, const V *q, V *x, V *J) {
-    V z[HK_MAX_Z], C[3 * HK_MAX_Z];
-    HK(inside) in;
+#define HK_CHAIN_WORK(n, S) (4 * HK_MOST_Z(n, S) + HK_INSIDE_WORK(n, S) + HK_RIGID_WORK(n))
+
+static inline void HK(chain)(const hk_plan *p, int at, const V *q, V *x, V *J, V *work) {
+    const int k = HK(n_coordinates)(p, at);
+    V *z = HK(take)(&work, k), *C = HK(take)(&work, 3 * k);
+    HK(inside) in = HK(inside_of)(p, at, &work);
     if (HK_CHAIN_IS(p, at, HK_RIGID) && !HK(couplings)(p, at)) { /* q are its coordinates */
-        HK(from_coordinates)(p, at, q, x, J);
+        HK(from_coordinates)(p, at, q, x, J, work);
         return;
     }
     HK(coordinates)(p, at, q, z, &in);
-    HK(from_coordinates)(p, at, z, x, J ? C : NULL);
+    HK(from_coordinates)(p, at, z, x, J ? C : NULL, work);
     if (!J) return;
     for (int i = 0; i < 3 * p->code[at + HK_N]; i++) J[i] = SPLAT(0.0);
     HK(pull)(p, at, &in, C, J);

@@ -8,9 +8,11 @@
 
 /* What `pull` needs to know of a row besides z. */
 typedef struct {
-    V inverse[HK_MAX_S][6]; /* of the reduced D_k */
-    V taut[HK_MAX_N];       /* 1 or 0 */
+    V *inverse; /* of the reduced D_k (S, 6) */
+    V *taut;    /* (n), 1 or 0 */
 } HK(inside);
+
+#define HK_INSIDE_WORK(n, S) (HK_USES(HK_ELASTIC) * (6 * (S) + (n)))
 
 /* Sizes and numbers of a node. Of a segment these are its stiffnesses (3), its E (3), the arc at
    rest up to the tip (3), and the shares of t_k and of t_{k-1} in what is up to the tip; of a tendon its zero [m], the x and y of
@@ -77,21 +79,21 @@ HK_INLINE void HK(balance)(
     HK(elastic_t) e, const HK(inside) *in, V *t) {
     for (int k = e.S - 1; k > 0; k--) {
         V moved[3];
-        HK(symmetric)(in->inverse[k], t + 3 * k, moved);
+        HK(symmetric)(in->inverse + 6 * k, t + 3 * k, moved);
         for (int i = 0; i < 3; i++)
             t[3 * k - 3 + i] = t[3 * k - 3 + i] + moved[i] * e.segments[HK_SEGMENT * k + HK_PASSED + i];
     }
-    HK(symmetric)(in->inverse[0], t, t);
+    HK(symmetric)(in->inverse, t, t);
     for (int k = 1; k < e.S; k++) {
         for (int i = 0; i < 3; i++)
             t[3 * k + i] = t[3 * k + i] + t[3 * k - 3 + i] * e.segments[HK_SEGMENT * k + HK_PASSED + i];
-        HK(symmetric)(in->inverse[k], t + 3 * k, t + 3 * k);
+        HK(symmetric)(in->inverse + 6 * k, t + 3 * k, t + 3 * k);
     }
 }
 
 /* Factor the system of the taut tendons, and solve it: t (3 S). */
 HK_INLINE void HK(shape)(
-    HK(elastic_t) e, const V *q, HK(inside) *in, V *t) {
+    HK(elastic_t) e, const V *q, const HK(inside) *in, V *t) {
     int first = e.n;
     V passed[6] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
     for (int k = e.S - 1; k >= 0; k--) {
@@ -109,7 +111,7 @@ HK_INLINE void HK(shape)(
             force[1] = force[1] + d * of[1];
             force[2] = force[2] + d * of[2];
         }
-        V D[6], *inverse = in->inverse[k];
+        V D[6], *inverse = in->inverse + 6 * k;
         for (int i = 0; i < 6; i++) D[i] = pulled[i];
         D[0] = D[0] + own[0];
         D[3] = D[3] + own[1];
@@ -135,7 +137,7 @@ static inline M HK(first_wrong)(M found, M was, V stretch, V size, M *none) {
 /* Find the taut tendons by block principal pivoting from all taut (Murty 1974, Judice & Pires 1994),
    and the shape t (3 S) at balance. */
 HK_INLINE void HK(settle)(
-    HK(elastic_t) e, const V *q, HK(inside) *in, V *t) {
+    HK(elastic_t) e, const V *q, const HK(inside) *in, V *t) {
     const int most = HK_WHOLE_STEPS + (1 << (e.n < HK_MOST_TURNS ? e.n : HK_MOST_TURNS));
     for (int i = 0; i < e.n; i++) in->taut[i] = SPLAT(1.0);
     for (int step = 0; step < most; step++) {
@@ -162,7 +164,7 @@ HK_INLINE void HK(settle)(
 
 /* The arcs z (3 tip) of q. */
 HK_INLINE void HK(elastic_arcs)(
-    HK(elastic_t) e, const V *q, HK(inside) *in, V *z) {
+    HK(elastic_t) e, const V *q, const HK(inside) *in, V *z) {
     V t[3 * HK_MAX_S];
     HK(settle)(e, q, in, t);
     for (int i = 0; i < 3; i++)

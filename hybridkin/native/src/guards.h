@@ -3,9 +3,17 @@
 /* The features of a row and their share of the leverage; guards of one hybrid often share them. */
 typedef struct {
     int phi_of, white_of; /* places of the models, -1: of none */
-    V leverage;
-    V phi[HK_MAX_F + HK_GROUP], white[HK_MAX_F + HK_GROUP];
+    V leverage, *phi, *white;
 } HK(seen);
+
+/* Features are written in whole groups; after those of a network stand its inputs. */
+#define HK_SEEN_WORK(n, features) ((features) ? 2 * ((features) + (n) + HK_GROUP) : 0)
+
+static inline HK(seen) HK(seen_of)(const hk_plan *p, V **work) {
+    const int count = HK_SEEN_WORK(p->code[HK_MOST_N], p->code[HK_MOST_F]) / 2;
+    HK(seen) seen = {-1, -1, SPLAT(0.0), HK(take)(work, count), HK(take)(work, count)};
+    return seen;
+}
 
 /* Where R begins: offset and center are filled up, so that its blocks are aligned as their node. */
 #define HK_LEVER(f) ((1 + (f) + HK_GROUP - 1) / HK_GROUP * HK_GROUP)
@@ -94,14 +102,14 @@ static inline const real *HK(lever)(const hk_plan *p, int at, int *f, int *full)
 }
 
 /* The leverage of q by the features of a network, or by [1, u, u^2]. */
-static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *seen) {
+static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *work) {
     const int n = p->code[at + HK_N];
     int f, full;
     const real *lever = HK(lever)(p, at, &f, &full);
     if (seen->white_of == at) return seen->leverage;
     if (seen->phi_of != at && HK_IS(p, at, HK_ELM)) {
-        V x[HK_MAX_M];
-        HK(regress)(p, at, q, x, NULL, seen->phi);
+        V *x = HK(take)(&work, p->code[at + HK_M]);
+        HK(regress)(p, at, q, x, NULL, seen->phi, work);
     } else if (seen->phi_of != at) {
         seen->phi[0] = SPLAT(1.0);
         HK(scaled)(n, hk_numbers(p, at), q, seen->phi + 1);
@@ -115,11 +123,11 @@ static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *
 
 /* Its slope (n) by q, after `leverage_at`. */
 static inline void HK(leverage_slope_at)(
-    const hk_plan *p, int at, const V *q, HK(seen) *seen, V *slope) {
+    const hk_plan *p, int at, const V *q, HK(seen) *seen, V *slope, V *work) {
     const int32_t *node = p->code + at;
     const int n = node[HK_N], m = node[HK_M];
     const real *center = hk_numbers(p, at), *w = center + 2 * n + m + m * n;
-    V u[HK_MAX_N], *back = seen->phi;
+    V *u = HK(take)(&work, n), *back = seen->phi;
     int f, full;
     const real *lever = HK(lever)(p, at, &f, &full);
     HK(leverage_slope)(f, full, lever, seen->white, back);
@@ -141,11 +149,11 @@ static inline void HK(leverage_slope_at)(
 }
 
 /* How far q is from the training rows of a guard, at most 1 among them. */
-static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen) *seen) {
+static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *work) {
     const int n = p->code[at + HK_N];
     const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
     if (HK_IS(p, at, HK_LEVERAGE_GUARD))
-        return HK(leverage_at)(p, p->code[at + HK_MORE], q, seen) / numbers[1];
+        return HK(leverage_at)(p, p->code[at + HK_MORE], q, seen, work) / numbers[1];
     V sum = SPLAT(1.0);
     for (int j = 0; j < n; j++) {
         const V below = HK(max)(low[j] - q[j], SPLAT(0.0)), above = HK(max)(q[j] - high[j], SPLAT(0.0));
@@ -157,11 +165,11 @@ static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen
 
 /* Its slope (n), after `guard_distance`. */
 static inline void HK(guard_slope)(
-    const hk_plan *p, int at, const V *q, HK(seen) *seen, V *slope) {
+    const hk_plan *p, int at, const V *q, HK(seen) *seen, V *slope, V *work) {
     const int n = p->code[at + HK_N];
     const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
     if (HK_IS(p, at, HK_LEVERAGE_GUARD)) {
-        HK(leverage_slope_at)(p, p->code[at + HK_MORE], q, seen, slope);
+        HK(leverage_slope_at)(p, p->code[at + HK_MORE], q, seen, slope, work);
         for (int j = 0; j < n; j++) slope[j] = slope[j] / numbers[1];
         return;
     }
@@ -175,16 +183,16 @@ static inline void HK(guard_slope)(
    excess begins at three times the limit of the domain. Returns whether any row fades; else g is 1
    and the slope is not written. */
 static inline int HK(fading)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *distance,
-                             V *g, V *slope) {
+                             V *g, V *slope, V *work) {
     const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? R(3.0) : R(1.0);
     *g = SPLAT(1.0);
-    *distance = HK(guard_distance)(p, at, q, seen);
+    *distance = HK(guard_distance)(p, at, q, seen, work);
     if (!HK(any)(NOT(*distance <= SPLAT(full)))) return 0;
     const V excess = HK(max)(*distance / full - R(1.0), SPLAT(0.0));
     *g = R(1.0) / (R(1.0) + excess * excess * excess);
     if (!slope) return 1;
     const V along = -(*g * *g) * (R(3.0) * excess * excess) / full;
-    HK(guard_slope)(p, at, q, seen, slope);
+    HK(guard_slope)(p, at, q, seen, slope, work);
     for (int j = 0; j < p->code[at + HK_N]; j++) slope[j] = slope[j] * along;
     return 1;
 }
@@ -192,7 +200,7 @@ static inline int HK(fading)(const hk_plan *p, int at, const V *q, HK(seen) *see
 /* How a correction that is too long is shortened: across its direction by `factor`, along it by
    `factor + bend`. */
 typedef struct {
-    V factor, bend, along[HK_MAX_M];
+    V factor, bend, *along; /* (m) */
 } HK(shortening);
 
 /* Whether any correction x (m) is longer than the longest of the training rows, and then how it is
@@ -229,10 +237,10 @@ static inline void HK(shorten)(const HK(shortening) *how, int m, int k, V *J) {
 /* The squared distance of q from the nearest of the rows that stand for the training rows, and its
    slope (n) where not NULL. After the center (n) and the axes (k, n) these rows stand in groups of
    HK_GROUP columns (k). */
-static inline V HK(group_distance)(const hk_plan *p, int at, const V *q, V *slope) {
+static inline V HK(group_distance)(const hk_plan *p, int at, const V *q, V *slope, V *work) {
     const int n = p->code[at + HK_N], count = p->code[at + HK_MORE], k = p->code[at + HK_MORE + 1];
     const real *center = hk_numbers(p, at), *axes = center + n, *rows = axes + k * n;
-    V y[HK_MAX_N], to[HK_MAX_N], nearest = SPLAT(0.0);
+    V *y = HK(take)(&work, k), *to = HK(take)(&work, k), nearest = SPLAT(0.0);
     for (int i = 0; i < k; i++) {
         y[i] = to[i] = SPLAT(0.0);
         for (int j = 0; j < n; j++) y[i] = y[i] + axes[n * i + j] * (q[j] - center[j]);
@@ -258,3 +266,7 @@ static inline V HK(group_distance)(const hk_plan *p, int at, const V *q, V *slop
     }
     return nearest;
 }
+
+/* What the functions of guards take at most besides `seen`. */
+#define HK_GUARD_WORK(n, S, m, powers) \
+    (HK_USES(HK_GROUP_DISTANCE) * 2 * (n) + (m) + HK_REGRESS_WORK(n, S, powers))

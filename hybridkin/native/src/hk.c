@@ -15,7 +15,7 @@
 
 static HK_NOINLINE void ik_model(const ik_settings *ik, const real *q, real *x, real *J,
                                  real *distance) {
-    hk_model(&ik->plan, ik->model, q, x, J, distance);
+    hk_model(&ik->plan, ik->model, q, x, J, distance, ik->work);
 }
 
 #if defined(_WIN32)
@@ -48,15 +48,33 @@ HK_API int32_t hk_level(void) { return 0; }
 /* A checksum of the sources that this was compiled from. */
 HK_API uint32_t hk_sources(void) { return HK_SOURCES; }
 
-static void hk_block(const hk_plan *p, int at, const real *q, int rows, real *x, real *J,
+/* What every function is called with: a plan, the place of a node in it, and memory to compute in,
+   at any address, as long as hk_work says. Calls that run at the same time need their own. */
+typedef struct {
+    const int32_t *code;
+    const real *data;
+    int64_t at;
+    real *work;
+} hk_call;
+
+/* Numbers of memory to compute in. */
+HK_API int64_t hk_work(const int32_t *code, int32_t at) {
+    const int n = code[HK_MOST_N], S = code[HK_MOST_S], m = code[HK_MOST_M];
+    const int model = HK_MODEL_WORK(n, S, m, code[HK_MOST_F], code[HK_MOST_P]);
+    const int of_units = (m + m * n) * HK_LANES; /* see hkr_units */
+    const int around = code[at + HK_KIND] == HK_IK ? IK_SEARCH_WORK(n, S) : n + m + m * n;
+    return (int64_t)HK_LANES * (1 + around + model) + of_units;
+}
+
+static void hk_block(const hk_plan *p, int at, V *work, const real *q, int rows, real *x, real *J,
                      real *distance) {
-    V vq[HK_MAX_N], vx[HK_MAX_M], vJ[HK_MAX_M * HK_MAX_N], far;
     const int n = p->code[at + HK_N], m = x ? p->code[at + HK_M] : 1;
+    V *vq = hkv_take(&work, n), *vx = hkv_take(&work, m), *vJ = hkv_take(&work, m * n), far;
     EACH(i) for (int j = 0; j < n; j++) vq[j][i] = q[(i < rows ? i : rows - 1) * n + j];
     if (x)
-        hkv_model(p, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL);
+        hkv_model(p, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL, work);
     else
-        hkv_domain(p, at, vq, &far, J ? vJ : NULL);
+        hkv_domain(p, at, vq, &far, J ? vJ : NULL, work);
     for (int i = 0; i < rows; i++) {
         for (int j = 0; x && j < m; j++) x[i * m + j] = vx[j][i];
         for (int j = 0; J && j < m * n; j++) J[i * m * n + j] = vJ[j][i];
@@ -66,17 +84,17 @@ static void hk_block(const hk_plan *p, int at, const real *q, int rows, real *x,
 
 /* x (rows, m), J (rows, m, n) and domain distances (rows) of q (rows, n); NULL: no J, no distance.
    Where x is NULL, the distances alone, and their slopes (rows, n) in J. */
-HK_API void hk_evaluate(const int32_t *code, const real *data, int32_t at, const real *q,
-                        int64_t rows, real *x, real *J, real *distance) {
-    const hk_plan plan = {code, data};
-    const int n = code[at + HK_N], m = x ? code[at + HK_M] : 1;
+HK_API void hk_evaluate(const hk_call *call, const real *q, int64_t rows, real *x, real *J,
+                        real *distance) {
+    const hk_plan plan = {call->code, call->data};
+    const int at = (int)call->at, n = plan.code[at + HK_N], m = x ? plan.code[at + HK_M] : 1;
     if (rows == 1 && !x)
-        hk_domain(&plan, at, q, distance, J);
+        hk_domain(&plan, at, q, distance, J, call->work);
     else if (rows == 1)
-        hk_model(&plan, at, q, x, J, distance);
+        hk_model(&plan, at, q, x, J, distance, call->work);
     else
         for (int64_t r = 0; r < rows; r += HK_LANES)
-            hk_block(&plan, at, q + r * n, (int)(rows - r < HK_LANES ? rows - r : HK_LANES),
+            hk_block(&plan, at, hkv_aligned(call->work), q + r * n, (int)(rows - r < HK_LANES ? rows - r : HK_LANES),
                      x ? x + r * m : NULL, J ? J + r * m * n : NULL, distance ? distance + r : NULL);
 }
 
@@ -86,25 +104,27 @@ HK_API void hk_play(int64_t rows, int32_t n, int32_t lead, const real *half, con
     hk_play_rows(rows, n, lead, half, given, command, effective, found);
 }
 
-/* What follows targets: settings and the state of `ik_tick`. */
+/* What follows targets: settings, and the state of `ik_tick`. */
 typedef struct {
-    const int32_t *code;
-    const real *data;
-    int64_t at;
+    hk_call call;
     real *state;
 } ik_follower;
 
+static ik_settings ik_settings_in(const hk_call *call) {
+    return ik_settings_of(call->code, call->data, (int)call->at, call->work);
+}
+
 HK_API void hk_ik_tick(const ik_follower *f) {
-    const ik_settings ik = ik_settings_of(f->code, f->data, (int)f->at);
+    const ik_settings ik = ik_settings_in(&f->call);
     ik_tick(&ik, f->state);
 }
 
 /* Single ticks for rows of q (rows, n), targets, and with the mode their motions and measured tips
    (rows, 3); `last` (rows, n) are the steps before. `out` (rows, n + 6) holds dq, x, |e|, sigma_min, damping; held (rows, n). */
-HK_API void hk_ik_steps(const int32_t *code, const real *data, int32_t at, int64_t rows, int32_t mode,
+HK_API void hk_ik_steps(const hk_call *call, int64_t rows, int32_t mode,
                      const real *q, const real *target, const real *feed, const real *tip,
                      const real *last, real *out, unsigned char *held) {
-    const ik_settings ik = ik_settings_of(code, data, at);
+    const ik_settings ik = ik_settings_in(call);
     const int n = ik.n;
     real state[IK_STATE] = {mode, ik.dt};
     for (int64_t r = 0; r < rows; r++, out += n + 6) {
@@ -130,9 +150,9 @@ HK_API void hk_ik_steps(const int32_t *code, const real *data, int32_t at, int64
 }
 
 /* The search, see ik_search.h. */
-HK_API void hk_ik_find(const int32_t *code, const real *data, int32_t at, int64_t rows, int32_t mode,
-                    int32_t max_iter, real tol, real turn_tol, const real *target, real *q, real *J, real *e,
+HK_API void hk_ik_find(const hk_call *call, int64_t rows, int32_t mode, int32_t max_iter,
+                    real tol, real turn_tol, const real *target, real *q, real *J, real *e,
                     int32_t *found, int32_t *n_iter) {
-    const ik_search_t search = {ik_settings_of(code, data, at), mode, max_iter, tol, turn_tol};
+    ik_search_t search = {ik_settings_in(call), mode, max_iter, tol, turn_tol};
     ik_search(&search, rows, target, q, J, e, found, n_iter);
 }

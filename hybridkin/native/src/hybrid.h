@@ -3,21 +3,31 @@
 
 /* What all corrections of a row add to. C and its own `pull` hold df/dq in inner coordinates. */
 typedef struct {
-    V x[HK_MAX_M], *J;           /* x, and dx/dq without what C brings, or NULL */
-    V z[HK_MAX_Z], f[3];         /* inner coordinates of q, and their tip */
-    V C0[3 * HK_MAX_Z];          /* df/dz, if it was needed */
-    V C[3 * HK_MAX_Z];           /* the total derivative by z */
-    V trust, slope[HK_MAX_N];    /* of the drift */
-    V farthest;                  /* distance of any guard */
+    V *x, *J;         /* x (m), and dx/dq without what C brings, or NULL */
+    V *z, f[3];       /* inner coordinates (k) of q, and their tip */
+    V *C0;            /* df/dz (3, k), if it was needed */
+    V *C;             /* the total derivative (3, k) by z */
+    V trust, *slope;  /* of the drift, (n) */
+    V farthest;       /* distance of any guard */
     int has_C0, fades;
     HK(inside) in;
     HK(seen) seen;
 } HK(total);
 
+/* What the sum takes, then the largest of its terms: at the tip, inside, and what they call. */
+#define HK_SUM_WORK(n, S, m, features) \
+    ((m) + 7 * HK_MOST_Z(n, S) + (n) + HK_INSIDE_WORK(n, S) + HK_SEEN_WORK(n, features))
+#define HK_TERM_WORK(n, S, m) \
+    ((m) * ((n) + 2) > HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3 \
+         ? (m) * ((n) + 2) : HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3)
+#define HK_HYBRID_WORK(n, S, m, features, powers) \
+    (HK_USES(HK_HYBRID) * (HK_SUM_WORK(n, S, m, features) + HK_TERM_WORK(n, S, m) + (n) + \
+                           HK_GUARD_WORK(n, S, m, powers)))
+
 /* df/dz, computed once. */
-static inline const V *HK(base_slope)(const hk_plan *p, int base, HK(total) *sum) {
+static inline const V *HK(base_slope)(const hk_plan *p, int base, HK(total) *sum, V *work) {
     V f[3];
-    if (!sum->has_C0) HK(from_coordinates)(p, base, sum->z, f, sum->C0);
+    if (!sum->has_C0) HK(from_coordinates)(p, base, sum->z, f, sum->C0, work);
     sum->has_C0 = 1;
     return sum->C0;
 }
@@ -33,10 +43,10 @@ static inline void HK(fade)(int m, int k, V g, const V *slope, const V *x, V *J)
 
 /* The guard's weight of a correction; keeps its part of trust and domain. */
 static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, HK(total) *sum, V *g,
-                              V *slope) {
+                              V *slope, V *work) {
     V distance;
     if (guard < 0) return 0;
-    const int fades = HK(fading)(p, guard, q, &sum->seen, &distance, g, sum->J ? slope : NULL);
+    const int fades = HK(fading)(p, guard, q, &sum->seen, &distance, g, sum->J ? slope : NULL, work);
     /* NaN is the farthest. */
     sum->farthest = SELECT(NOT(distance <= sum->farthest), distance, sum->farthest);
     if (!fades) return 0;
@@ -49,14 +59,15 @@ static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, H
 
 /* Adds a correction at the tip, w s(q). */
 static inline void HK(tip_correction)(
-    const hk_plan *p, const int32_t *part, const V *q, int m, real w, HK(total) *sum) {
+    const hk_plan *p, const int32_t *part, const V *q, int m, real w, HK(total) *sum, V *work) {
     const int at = part[HK_REGRESSOR], guard = part[HK_GUARD], n = p->code[at + HK_N];
     const int own = guard >= 0 && HK_IS(p, guard, HK_LEVERAGE_GUARD) && p->code[guard + HK_MORE] == at;
-    V x[HK_MAX_M], J[HK_MAX_M * HK_MAX_N], g, slope[HK_MAX_N];
+    V *x = HK(take)(&work, m), *J = HK(take)(&work, m * n), *slope = HK(take)(&work, n), g;
     HK(shortening) how;
-    HK(regress)(p, at, q, x, sum->J ? J : NULL, own ? sum->seen.phi : NULL);
+    how.along = HK(take)(&work, m);
+    HK(regress)(p, at, q, x, sum->J ? J : NULL, own ? sum->seen.phi : NULL, work);
     if (own) sum->seen.phi_of = at;
-    if (HK(guarded)(p, guard, q, w, sum, &g, slope)) {
+    if (HK(guarded)(p, guard, q, w, sum, &g, slope, work)) {
         if (sum->J) HK(fade)(m, n, g, slope, x, J);
         for (int i = 0; i < m; i++) x[i] = x[i] * g;
     }
@@ -72,26 +83,27 @@ static inline void HK(tip_correction)(
    are too long need df/dz as well. All is linear in the columns, so one `pull` at the end serves
    all corrections: C takes what multiplies dz/dq, J the rest. */
 static inline void HK(inner_correction)(
-    const hk_plan *p, int base, const int32_t *part, const V *q, real w, HK(total) *sum) {
+    const hk_plan *p, int base, const int32_t *part, const V *q, real w, HK(total) *sum, V *work) {
     const int guard = part[HK_GUARD], n = p->code[base + HK_N], k = HK(n_coordinates)(p, base);
-    V z[HK_MAX_Z], turn[HK_MAX_Z * HK_MAX_N], x[3], C[3 * HK_MAX_Z], J[3 * HK_MAX_N], g;
-    V slope[HK_MAX_N];
+    V *z = HK(take)(&work, k), *turn = HK(take)(&work, k * n), *C = HK(take)(&work, 3 * k);
+    V *J = HK(take)(&work, 3 * n), *slope = HK(take)(&work, n), along[3], x[3], g;
     HK(shortening) how;
-    HK(regress)(p, part[HK_REGRESSOR], q, z, sum->J ? turn : NULL, NULL);
+    how.along = along;
+    HK(regress)(p, part[HK_REGRESSOR], q, z, sum->J ? turn : NULL, NULL, work);
     for (int i = 0; i < k; i++) z[i] = z[i] + sum->z[i];
-    HK(from_coordinates)(p, base, z, x, sum->J ? C : NULL);
+    HK(from_coordinates)(p, base, z, x, sum->J ? C : NULL, work);
     if (HK_COMMON(sum->J && n == 9 && k == 9))
         HK(multiply)(9, 9, C, turn, J);
     else if (sum->J)
         HK(multiply)(k, n, C, turn, J);
     if (guard >= 0) {
         for (int i = 0; i < 3; i++) x[i] = x[i] - sum->f[i];
-        const int fades = HK(guarded)(p, guard, q, w, sum, &g, slope);
+        const int fades = HK(guarded)(p, guard, q, w, sum, &g, slope, work);
         V own[3] = {x[0], x[1], x[2]};
         for (int i = 0; fades && i < 3; i++) own[i] = own[i] * g;
         const int too_long = HK(is_long)(p, guard, 3, own, &how);
         if (sum->J && (fades || too_long)) {
-            const V *C0 = HK(base_slope)(p, base, sum);
+            const V *C0 = HK(base_slope)(p, base, sum, work);
             for (int i = 0; i < 3 * k; i++) C[i] = C[i] - C0[i];
             if (fades) HK(fade)(3, k, g, NULL, x, C);
             if (fades) HK(fade)(3, n, g, slope, x, J);
@@ -106,36 +118,43 @@ static inline void HK(inner_correction)(
     if (sum->J) HK(add)(3 * n, w, J, sum->J);
 }
 
-static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance) {
+static inline void HK(hybrid)(
+    const hk_plan *p, int at, const V *q, V *x, V *J, V *distance, V *work) {
     const int32_t *node = p->code + at, *more = node + HK_MORE, *part = more + HK_FIRST;
     const int n = node[HK_N], m = node[HK_M], base = more[HK_BASE], count = more[HK_COUNT];
     const real *w = hk_numbers(p, at), share = w[count]; /* of f beside inner corrections */
     const int inner = w[count + 1] != R(0.0), k = inner ? HK(n_coordinates)(p, base) : 0;
     HK(total) sum;
+    sum.x = HK(take)(&work, m);
     sum.J = J;
+    sum.z = HK(take)(&work, k);
+    sum.C0 = HK(take)(&work, 3 * k);
+    sum.C = HK(take)(&work, 3 * k);
+    sum.slope = HK(take)(&work, n);
+    if (inner) sum.in = HK(inside_of)(p, base, &work);
+    sum.seen = HK(seen_of)(p, &work);
     sum.has_C0 = sum.fades = 0;
-    sum.seen.phi_of = sum.seen.white_of = -1;
     sum.trust = SPLAT(1.0);
     sum.farthest = SPLAT(0.0);
     for (int i = 0; i < m; i++) sum.x[i] = SPLAT(0.0);
     for (int i = 0; J && i < m * n; i++) J[i] = SPLAT(0.0);
     if (inner) {
         HK(coordinates)(p, base, q, sum.z, &sum.in);
-        HK(from_coordinates)(p, base, sum.z, sum.f, NULL);
+        HK(from_coordinates)(p, base, sum.z, sum.f, NULL, work);
         HK(add)(3, share, sum.f, sum.x);
         for (int i = 0; i < 3 * k; i++) sum.C[i] = SPLAT(0.0);
-        if (J && share != R(0.0)) HK(add)(3 * k, share, HK(base_slope)(p, base, &sum), sum.C);
+        if (J && share != R(0.0)) HK(add)(3 * k, share, HK(base_slope)(p, base, &sum, work), sum.C);
     } else if (base >= 0)
-        HK(chain)(p, base, q, sum.x, J);
+        HK(chain)(p, base, q, sum.x, J, work);
     for (int c = 0; c < count; c++, part += HK_STRIDE)
         if (part[HK_INNER])
-            HK(inner_correction)(p, base, part, q, w[c], &sum);
+            HK(inner_correction)(p, base, part, q, w[c], &sum, work);
         else
-            HK(tip_correction)(p, part, q, m, w[c], &sum);
+            HK(tip_correction)(p, part, q, m, w[c], &sum, work);
     if (inner && J) HK(pull)(p, base, &sum.in, sum.C, J);
     if (more[HK_DRIFT] >= 0) {
-        V d[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N];
-        HK(regress)(p, more[HK_DRIFT], q, d, J ? slope : NULL, NULL);
+        V *d = HK(take)(&work, m), *slope = HK(take)(&work, m * n);
+        HK(regress)(p, more[HK_DRIFT], q, d, J ? slope : NULL, NULL, work);
         if (J) HK(fade)(m, n, sum.trust, sum.fades ? sum.slope : NULL, d, slope);
         for (int i = 0; i < m; i++) sum.x[i] = sum.x[i] + d[i] * sum.trust;
         if (J) HK(add)(m * n, R(1.0), slope, J);
@@ -144,31 +163,31 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
     if (!distance) return;
     *distance = sum.farthest;
     if (more[HK_TESTED] < 0) return;
-    const V here = HK(group_distance)(p, more[HK_TESTED], q, NULL);
+    const V here = HK(group_distance)(p, more[HK_TESTED], q, NULL, work);
     *distance = SELECT(NOT(here <= *distance), here, *distance);
 }
 
 /* The largest distance of any guard and of the groups, and its slope (n) by q where not NULL. */
-static inline void HK(farthest)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
+static inline void HK(farthest)(
+    const hk_plan *p, int at, const V *q, V *distance, V *slope, V *work) {
     const int32_t *node = p->code + at, *part = node + HK_MORE + HK_FIRST;
     const int n = node[HK_N], count = HK_IS(p, at, HK_HYBRID) ? node[HK_MORE + HK_COUNT] : 0;
-    HK(seen) seen;
-    seen.phi_of = seen.white_of = -1;
+    V *own = HK(take)(&work, n);
+    HK(seen) seen = HK(seen_of)(p, &work);
     *distance = SPLAT(0.0);
     for (int j = 0; slope && j < n; j++) slope[j] = SPLAT(0.0);
     for (int c = 0; c < count; c++, part += HK_STRIDE) {
         if (part[HK_GUARD] < 0) continue;
-        V own[HK_MAX_N];
-        const V here = HK(guard_distance)(p, part[HK_GUARD], q, &seen);
+        const V here = HK(guard_distance)(p, part[HK_GUARD], q, &seen, work);
         const M farther = NOT(here <= *distance);
         *distance = SELECT(farther, here, *distance);
         if (!slope || !HK(any)(farther)) continue;
-        HK(guard_slope)(p, part[HK_GUARD], q, &seen, own);
+        HK(guard_slope)(p, part[HK_GUARD], q, &seen, own, work);
         for (int j = 0; j < n; j++) slope[j] = SELECT(farther, own[j], slope[j]);
     }
     if (HK_IS(p, at, HK_HYBRID) && node[HK_MORE + HK_TESTED] >= 0) {
-        V own[HK_MAX_N];
-        const V here = HK(group_distance)(p, node[HK_MORE + HK_TESTED], q, slope ? own : NULL);
+        const V here = HK(group_distance)(
+            p, node[HK_MORE + HK_TESTED], q, slope ? own : NULL, work);
         const M farther = NOT(here <= *distance);
         *distance = SELECT(farther, here, *distance);
         for (int j = 0; slope && j < n; j++) slope[j] = SELECT(farther, own[j], slope[j]);

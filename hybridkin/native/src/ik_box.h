@@ -7,12 +7,17 @@ enum { IK_NEWTON = 60, IK_PROXIMAL = 2 };
 
 #ifdef HK_KINDS /* a controller steers positions */
 enum { IK_ROWS = 3 };
-#define IK_OF(m, f, ...) ((void)(m), f(3, __VA_ARGS__))
+#define IK_OF(m, f, ...) ((m) == 3 ? f(3, __VA_ARGS__) : f(m, __VA_ARGS__))
 #else
 enum { IK_ROWS = 6 };
-#define IK_OF(m, f, ...) ((m) == 3 ? f(3, __VA_ARGS__) : f(6, __VA_ARGS__))
+#define IK_OF(m, f, ...) \
+    ((m) == 3 ? f(3, __VA_ARGS__) : (m) == 6 ? f(6, __VA_ARGS__) : f(m, __VA_ARGS__))
 #endif
-enum { IK_PAIRS = IK_ROWS * (IK_ROWS + 1) / 2 };
+enum {
+    IK_PAIRS = IK_ROWS * (IK_ROWS + 1) / 2,
+    IK_MOST_ROWS = IK_ROWS + 6, /* with the normals of a plane */
+    IK_MOST_PAIRS = IK_MOST_ROWS * (IK_MOST_ROWS + 1) / 2
+};
 
 static inline real ik_clip(real y, real lower, real upper) {
     y = y < lower ? lower : y;
@@ -35,7 +40,7 @@ static inline real ik_norm(int n, const real *a) {
 
 /* r (m) = J step. */
 HK_INLINE void ik_rows_of(int m, int n, const real *J, const real *step, real *r) {
-    real sum[IK_ROWS] = {R(0.0)};
+    real sum[IK_MOST_ROWS] = {R(0.0)};
     for (int j = 0; j < n; j++)
         for (int i = 0; i < m; i++) sum[i] += J[n * i + j] * step[j];
     for (int i = 0; i < m; i++) r[i] = sum[i];
@@ -53,7 +58,7 @@ HK_INLINE void ik_columns_of(
 
 /* g = the columns of the lower half of the sum over actuators of keep J J^T, one after another. */
 HK_INLINE void ik_products(int m, int n, const real *J, const real *keep, real *g) {
-    real sum[IK_PAIRS] = {R(0.0)};
+    real sum[IK_MOST_PAIRS] = {R(0.0)};
     for (int j = 0; j < n; j++)
         for (int k = 0, at = 0; k < m; k++) {
             const real a = keep ? keep[j] * J[n * k + j] : J[n * k + j];
@@ -81,7 +86,7 @@ static inline void ik_singular_values(const real *g, real *low, real *high) {
 
 /* LDL^T of g + lambda^2 1, and 1 / D. What depends on the rows before, to rounding, is dropped. */
 typedef struct {
-    real l[IK_ROWS][IK_ROWS], inverse[IK_ROWS];
+    real l[IK_MOST_ROWS][IK_MOST_ROWS], inverse[IK_MOST_ROWS];
 } ik_factors;
 
 HK_INLINE real ik_trace(int m, const real *g) {
@@ -92,8 +97,8 @@ HK_INLINE real ik_trace(int m, const real *g) {
 
 HK_INLINE ik_factors ik_factor(int m, const real *g, real damping_sq) {
     const real least = R(8.0) * HK_EPS * (ik_trace(m, g) + (real)m * damping_sq);
-    real scaled[IK_ROWS][IK_ROWS];
-    ik_factors f;
+    real scaled[IK_MOST_ROWS][IK_MOST_ROWS];
+    ik_factors f = {0};
     for (int k = 0, at = 0; k < m; k++)
         for (int i = k; i < m; i++) {
             real t = i == k ? g[at++] + damping_sq : g[at++];
@@ -118,7 +123,7 @@ HK_INLINE void ik_pivots(int m, const real *g, real *low, real *high) {
 }
 
 HK_INLINE void ik_solve(int m, const ik_factors *f, const real *v, real *mu) {
-    real w[IK_ROWS];
+    real w[IK_MOST_ROWS];
     for (int i = 0; i < m; i++) {
         w[i] = v[i];
         for (int p = 0; p < i; p++) w[i] -= f->l[i][p] * w[p];
@@ -133,7 +138,7 @@ HK_INLINE void ik_solve(int m, const ik_factors *f, const real *v, real *mu) {
 HK_INLINE void ik_null_projection(int m, int n, const real *J, const real *g, real *step) {
     const ik_factors f = ik_factor(m, g, R(0.0));
     for (int twice = 0; twice < 2; twice++) {
-        real moved[IK_ROWS], mu[IK_ROWS];
+        real moved[IK_MOST_ROWS], mu[IK_MOST_ROWS];
         ik_rows_of(m, n, J, step, moved);
         ik_solve(m, &f, moved, mu);
         for (int i = 0; i < m; i++) mu[i] = -mu[i];
@@ -187,8 +192,8 @@ HK_INLINE void ik_box_of(int m, int n, const real *J, const real *v, const real 
     real y[HK_MAX_N], slope[HK_MAX_N], free[HK_MAX_N];
     int settled = 0;
     for (int round = 0;; round++) {
-        real residual[IK_ROWS] = {R(0.0)}, scale[IK_ROWS] = {R(0.0)};
-        real newton[IK_ROWS], g[IK_PAIRS];
+        real residual[IK_MOST_ROWS] = {R(0.0)}, scale[IK_MOST_ROWS] = {R(0.0)};
+        real newton[IK_MOST_ROWS], g[IK_MOST_PAIRS];
         ik_columns_of(m, n, J, mu, z, y);
         for (int j = 0; j < n; j++) dq[j] = ik_clip(y[j], lower[j], upper[j]);
         if (settled || round == IK_NEWTON) return;
@@ -249,7 +254,7 @@ static void ik_proximal_box(int m, int n, const real *J, const real *v, const re
                             real *mu, real *dq) {
     const real used = damping_sq < least ? least : damping_sq, excess = used - damping_sq;
     for (int round = 0; round <= IK_PROXIMAL; round++) {
-        real wanted[IK_ROWS];
+        real wanted[IK_MOST_ROWS];
         for (int i = 0; i < m; i++) wanted[i] = v[i] + excess * mu[i];
         ik_box(m, n, J, wanted, z, lower, upper, used, mu, dq);
         if (excess == R(0.0)) return;
@@ -266,7 +271,7 @@ static void ik_strict_box(int m, int n, const real *J, const real *g, const real
     const real size_sq = HK_MATH(sqrt)(sum);
     const real rounding = HK_MATH(sqrt)(HK_EPS), relative = rounding > R(1e-6) ? rounding : R(1e-6);
     const real least = size_sq > R(0.0) ? relative * size_sq : R(1.0);
-    real mu[IK_ROWS] = {R(0.0)}, moved[IK_ROWS], none[HK_MAX_N];
+    real mu[IK_MOST_ROWS] = {R(0.0)}, moved[IK_MOST_ROWS], none[HK_MAX_N];
     int preferred = 0;
     for (int j = 0; j < n; j++) {
         none[j] = R(0.0);

@@ -108,7 +108,7 @@ static void ik_wish(const ik_search_t *s, const ik_point *at, real *wish, real *
     real J[IK_ROWS * HK_MAX_N], g[IK_PAIRS];
     if (s->mode & IK_TO_DOMAIN) { /* Newton's step of the domain distance */
         real distance, square = R(0.0);
-        hk_domain(&ik->plan, ik->model, at->q, &distance, wish);
+        hk_domain(&ik->plan, ik->model, at->q, &distance, wish, ik->work);
         for (int j = 0; j < n; j++) square += wish[j] * wish[j];
         const real beyond = distance - IK_INSIDE;
         const real share = (beyond < R(0.0) ? R(0.0) : beyond) / (square > R(0.0) ? square : R(1.0));
@@ -247,21 +247,29 @@ static void ik_take(const ik_search_t *s, ik_row *r, const ik_point *now) {
     }
 }
 
+/* Memory of a search besides that of the model: q, x, J, then z and C of poses, and the rows. */
+#define IK_ROW_LANES (int)((sizeof(ik_row) * HK_LANES + sizeof(V) - 1) / sizeof(V))
+#define IK_SEARCH_WORK(n, S) \
+    ((n) + 3 + IK_ROWS * (n) + (IK_ROWS + 1) * HK_MOST_Z(n, S) + HK_INSIDE_WORK(n, S) + IK_ROW_LANES)
+
 /* Search `rows` rows from q (rows, n), which becomes the best configurations; J (rows, m, n) there,
    errors e (rows, m), what was found (rows), and the iterations (rows). */
-static void ik_search(const ik_search_t *s, int64_t rows, const real *target, real *q, real *J,
+static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q, real *J,
                       real *e, int32_t *found, int32_t *n_iter) {
     const int n = s->ik.n, m = s->ik.m, pose = m == 6, width = pose ? 16 : 3;
     const hk_plan *plan = &s->ik.plan;
     const int32_t *more = plan->code + s->ik.model + HK_MORE;
-    ik_row lane[HK_LANES];
+    const int k = pose ? hkv_n_coordinates(plan, s->ik.model) : 0;
+    V *work = hkv_aligned(s->ik.work), frame[9], distance = SPLAT(0.0);
+    V *vq = hkv_take(&work, n), *vx = hkv_take(&work, 3), *vJ = hkv_take(&work, m * n);
+    V *z = hkv_take(&work, k), *C = hkv_take(&work, m * k);
+    ik_row *lane = (ik_row *)hkv_take(&work, IK_ROW_LANES);
     ik_point now;
-    V vq[HK_MAX_N], vx[3], vJ[IK_ROWS * HK_MAX_N], frame[9], distance = SPLAT(0.0);
-    V z[HK_MAX_Z], C[IK_ROWS * HK_MAX_Z];
-    hkv_inside inside;
+    const hkv_inside inside = hkv_inside_of(plan, s->ik.model, &work);
     int64_t next = 0;
     int busy = 0;
     for (int j = 0; j < n; j++) vq[j] = SPLAT(0.0);
+    s->ik.work = (real *)work;
     EACH(i) lane[i].phase = IK_DONE;
     do {
         EACH(i) {
@@ -279,11 +287,11 @@ static void ik_search(const ik_search_t *s, int64_t rows, const real *target, re
         if (!busy) return;
         if (pose) {
             hkv_coordinates(plan, s->ik.model, vq, z, &inside);
-            hkv_rigid(more[0], more + 2, hk_numbers(plan, s->ik.model), z, vx, C, frame);
+            hkv_rigid(more[0], more + 2, hk_numbers(plan, s->ik.model), z, vx, C, frame, work);
             for (int j = 0; j < 6 * n; j++) vJ[j] = SPLAT(0.0);
             hkv_pull_rows(plan, s->ik.model, &inside, 6, C, vJ);
         } else
-            hkv_model(plan, s->ik.model, vq, vx, vJ, &distance);
+            hkv_model(plan, s->ik.model, vq, vx, vJ, &distance, work);
         EACH(i) {
             ik_row *r = lane + i;
             if (r->phase == IK_DONE) continue;
@@ -298,6 +306,7 @@ static void ik_search(const ik_search_t *s, int64_t rows, const real *target, re
                 for (int j = 3; j < 6; j++) now.e[j] *= s->ik.radian;
                 for (int j = 3 * n; j < 6 * n; j++) now.J[j] = s->ik.radian * vJ[j][i];
             }
+            ik_in_plane(&s->ik, m, now.J);
             now.error = ik_norm(m, now.e), now.distance = distance[i];
             ik_take(s, r, &now);
             if (r->phase != IK_DONE) continue;

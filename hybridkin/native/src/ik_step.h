@@ -4,15 +4,21 @@
 #include "ik_box.h"
 
 #define IK_HEALTHY R(0.02) /* sigma_min / sigma_max above which no damping is needed */
+#define IK_SLACK R(0.02)   /* a tendon that moves the tip less, relative to the most, is slack */
+#define IK_SLIP R(1e-4)    /* of the tip, relative to the motion of all actuators */
+#define IK_LEAST_PULL R(0.01)
+#define IK_BALANCE R(30.0) /* of the tip's motion: of a motion that leaves the plane */
+enum { IK_CORRECTIONS = 3 };
 
-enum { IK_LIMITED = 1, IK_POSTURE = 2, IK_WEIGHTS = 4, IK_ACCELERATES = 8 };
+enum { IK_LIMITED = 1, IK_POSTURE = 2, IK_WEIGHTS = 4, IK_ACCELERATES = 8, IK_PULLS = 16 };
 
 /* The settings: limits of q, of its speed and acceleration, posture, and units in which nothing has
    a weight. */
 typedef struct {
     hk_plan plan;
-    int model, n, m, flags;
-    const real *low, *high, *speed, *accel, *posture, *unit, *period;
+    real *work; /* memory of a call */
+    int model, n, m, flags, n_normals; /* last: of the plane to keep to */
+    const real *low, *high, *speed, *accel, *posture, *unit, *period, *pulls, *normals;
     real gain, beta, dt, damping; /* gain < 0: 1 / dt; damping < 0: adaptive */
     real radian;                  /* what a radian of a pose counts */
 } ik_settings;
@@ -24,12 +30,13 @@ typedef struct {
     unsigned char held[HK_MAX_N];
 } ik_step_t;
 
-static inline ik_settings ik_settings_of(const int32_t *code, const real *data, int at) {
+static inline ik_settings ik_settings_of(const int32_t *code, const real *data, int at, real *work) {
     const int32_t *node = code + at;
     const int n = node[HK_N];
     const real *a = data + node[HK_DATA], *b = a + 6 * n;
-    const ik_settings ik = {{code, data}, node[HK_MORE], n, node[HK_M], node[HK_MORE + 1], a, a + n,
-                      a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n, b + 5, b[0], b[1], b[2], b[3], b[4]};
+    const ik_settings ik = {{code, data}, work, node[HK_MORE], n, node[HK_M], node[HK_MORE + 1],
+                      node[HK_MORE + 2], a, a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n, b + 5,
+                      b + 5 + n, b + 5 + 2 * n, b[0], b[1], b[2], b[3], b[4]};
     return ik;
 }
 
@@ -39,6 +46,39 @@ static inline real ik_damping_sq(const ik_settings *ik, real low, real high) {
     const real bound = IK_HEALTHY * high, ratio = low / (bound > R(0.0) ? bound : R(1.0));
     const real lack = R(1.0) - ratio * ratio, lambda = bound * (lack < R(0.0) ? R(0.0) : lack);
     return lambda * lambda;
+}
+
+/* Take the part normal to the plane out of the motions a (rows, n). */
+static inline void ik_in_plane(const ik_settings *ik, int rows, real *a) {
+    for (int i = 0; i < rows; i++, a += ik->n)
+        for (int k = 0; k < ik->n_normals; k++) {
+            const real *normal = ik->normals + k * ik->n;
+            real off = R(0.0);
+            for (int j = 0; j < ik->n; j++) off += a[j] * normal[j];
+            for (int j = 0; j < ik->n; j++) a[j] -= off * normal[j];
+        }
+}
+
+/* Solve for a step at its limits with further rows, so that only the posture step `aside` (NULL:
+   none) leaves the plane: else a limit that stops one actuator would unbalance the others. */
+static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J, const real *v,
+                                            const real *z, const real *aside, const real *lower,
+                                            const real *upper, real damping_sq, real *dq) {
+    const int n = ik->n, m = ik->m;
+    real rows[IK_MOST_ROWS * HK_MAX_N], motion[IK_MOST_ROWS], g[IK_MOST_PAIRS];
+    const real stiff = IK_BALANCE * ik_norm(m * n, J);
+    for (int i = 0; i < m * n; i++) rows[i] = J[i];
+    for (int i = 0; i < m; i++) motion[i] = v[i];
+    for (int k = 0; k < ik->n_normals; k++) {
+        real *row = rows + (m + k) * n;
+        motion[m + k] = R(0.0);
+        for (int j = 0; j < n; j++) {
+            row[j] = stiff * (ik->normals[k * n + j] * ik->unit[j]);
+            motion[m + k] += aside ? row[j] * (aside[j] / ik->unit[j]) : R(0.0);
+        }
+    }
+    ik_products(m + ik->n_normals, n, rows, NULL, g);
+    ik_strict_box(m + ik->n_normals, n, rows, g, motion, z, lower, upper, damping_sq, dq);
 }
 
 /* Fill in a step for the task v within its bounds; `slides`: with its posture step. `trust` is
@@ -73,9 +113,12 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     if (slides) ik_null_projection(m, n, J, g, z);
     ik_columns_of(m, n, J, mu, z, dq);
     if (ik->flags & IK_LIMITED) {
-        int over = 0;
+        int over = ik->n_normals > 0 && ik->flags & IK_WEIGHTS; /* weights turn J out of the plane */
         for (int j = 0; j < n; j++) over |= ik_clip(dq[j], lower[j], upper[j]) != dq[j];
-        if (over) ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, dq);
+        if (over && ik->n_normals > 0)
+            ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, damping_sq, dq);
+        else if (over)
+            ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, dq);
     }
     for (int j = 0; j < n; j++) {
         s->held[j] = (unsigned char)((dq[j] <= lower[j]) | (dq[j] >= upper[j]));
@@ -94,6 +137,8 @@ static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, co
     default: IK_OF(ik->m, ik_limited_step_of, ik->n, ik, J, v, slides, trust, s);
     }
 }
+
+static inline real ik_larger(real a, real b) { return a > b ? a : b; }
 
 /* The largest first step for which steps that shrink by `change` stop within `way`. */
 static inline real ik_stopping(real way, real change) {
@@ -148,20 +193,124 @@ static inline real ik_brake(const ik_settings *ik, const real *q, const real *J,
     return ik_stopping(R(1.0), least);
 }
 
+/* The model at one configuration. Every step and tick calls this one, and gets the same bits; who
+   includes this file writes it. */
+static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance);
+
+/* A step of a model whose Jacobian jumps where tendons get slack or taut: J where it ends, and what
+   is missing there of the motion of the tip, as the model computes it. */
+typedef struct {
+    real dq[HK_MAX_N], J[3 * HK_MAX_N], missing[3], distance;
+} ik_end;
+
+/* Clear what a learned error makes of the columns of slack tendons: it would drive them far. */
+static void ik_clear_slack(const ik_settings *ik, real *J) {
+    real size[HK_MAX_N], largest = R(0.0);
+    for (int j = 0; j < ik->n; j++) {
+        const real column[3] = {J[j], J[ik->n + j], J[2 * ik->n + j]};
+        size[j] = ik_norm(3, column);
+        largest = ik_larger(size[j], largest);
+    }
+    for (int j = 0; j < ik->n; j++)
+        if (ik->pulls[j] != R(0.0) && size[j] <= IK_SLACK * largest)
+            for (int i = 0; i < 3; i++) J[ik->n * i + j] = R(0.0);
+}
+
+static void ik_evaluate(const ik_settings *ik, const real *q, const real *x, const real *motion,
+                        ik_end *end) {
+    real at[HK_MAX_N], tip[3];
+    for (int j = 0; j < ik->n; j++) at[j] = q[j] + end->dq[j];
+    ik_model(ik, at, tip, end->J, NULL);
+    ik_in_plane(ik, 3, end->J);
+    ik_clear_slack(ik, end->J);
+    for (int i = 0; i < 3; i++) end->missing[i] = motion[i] - (tip[i] - x[i]);
+    end->distance = ik_norm(3, end->missing);
+}
+
+/* Newton's method for a motion of the tip, from an end and within the bounds of the step: the
+   nearest of a few ends. */
+static void ik_approach(const ik_settings *ik, const real *q, const real *x, const real *motion,
+                        real close, const ik_step_t *s, ik_end *best) {
+    ik_evaluate(ik, q, x, motion, best);
+    ik_end end = *best;
+    for (int i = 0; i < IK_CORRECTIONS && best->distance > close; i++) {
+        ik_step_t more;
+        for (int j = 0; j < ik->n; j++) {
+            more.lower[j] = s->lower[j] - end.dq[j];
+            more.upper[j] = s->upper[j] - end.dq[j];
+        }
+        ik_limited_step(ik, end.J, end.missing, 0, NULL, &more);
+        for (int j = 0; j < ik->n; j++) {
+            end.dq[j] = ik_clip(end.dq[j] + more.dq[j], s->lower[j], s->upper[j]);
+            if (more.dq[j] <= more.lower[j]) end.dq[j] = s->lower[j]; /* to the last bit */
+            if (more.dq[j] >= more.upper[j]) end.dq[j] = s->upper[j];
+        }
+        ik_evaluate(ik, q, x, motion, &end);
+        if (end.distance < best->distance) *best = end;
+    }
+}
+
+/* Pull in slack tendons by a share of the way to the bounds; return whether any moved. */
+static int ik_pull_in(const ik_settings *ik, const ik_step_t *s, real share, ik_end *end) {
+    int moved = 0;
+    for (int j = 0; j < ik->n; j++) {
+        const real to = ik->pulls[j] < R(0.0) ? s->lower[j] : s->upper[j], way = to - end->dq[j];
+        const real column[3] = {end->J[j], end->J[ik->n + j], end->J[2 * ik->n + j]};
+        if (ik->pulls[j] == R(0.0) || ik_norm(3, column) > R(0.0) || !ik_finite(1, &way)) continue;
+        end->dq[j] = ik_clip(to - (R(1.0) - share) * way, s->lower[j], s->upper[j]);
+        moved |= way != R(0.0);
+    }
+    return moved;
+}
+
+/* Change a step so that the tip of the model moves as the step promised. Where that is less than
+   half of the motion v, pull in slack tendons, as far as the tip gets nearer to v or not away. */
+static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const real *J,
+                      const real *v, ik_step_t *s) {
+    const int n = ik->n;
+    const real slip = ik_norm(3 * n, J) *
+                      (IK_SLIP * ik_norm(n, s->dq) + R(32.0) * HK_EPS * ik_norm(n, q));
+    real promised[3], left[3];
+    ik_end end;
+    ik_rows_of(3, n, J, s->dq, promised);
+    for (int j = 0; j < n; j++) end.dq[j] = s->dq[j];
+    ik_approach(ik, q, x, promised, ik_larger(R(0.5) * ik_norm(3, promised), slip), s, &end);
+    for (int i = 0; i < 3; i++) left[i] = v[i] - promised[i] + end.missing[i];
+    const real rounding = R(1.0) + HK_MATH(sqrt)(HK_EPS); /* a slack tendon does not move the tip */
+    const real most = ik_norm(3, left), close = ik_larger(R(0.5) * ik_norm(3, v), slip);
+    for (real share = R(1.0); most > close && share > IK_LEAST_PULL; share *= R(0.125)) {
+        ik_end pulled = end;
+        if (!ik_pull_in(ik, s, share, &pulled)) break;
+        ik_approach(ik, q, x, v, slip, s, &pulled);
+        if (pulled.distance > rounding * most) continue;
+        end = pulled;
+        break;
+    }
+    for (int j = 0; j < n; j++) {
+        s->dq[j] = end.dq[j];
+        s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
+    }
+}
+
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
    taken back. What is not finite, or overflows, holds still, with a limit of acceleration after it
    has braked; from outside the limits the actuators that are known walk back. */
-static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *J,
-                                   const real *e, const real *feed, real seconds,
+static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *x,
+                                   const real *J, const real *e, const real *feed, real seconds,
                                    const real *last, ik_step_t *s) {
     const int n = ik->n;
-    real v[3], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds, beta = ik->beta * seconds;
+    real taut[3 * HK_MAX_N], v[3], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds, beta = ik->beta * seconds;
     gain = gain > R(1.0) ? R(1.0) : gain;
     beta = beta > R(1.0) ? R(1.0) : beta;
     for (int i = 0; i < 3; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));
     const real sizes[2] = {ik_norm(3, e), ik_norm(3, v)};
     const int known = !last || ik_finite(n, last);
     if (known && ik_finite(n, q) && ik_finite(3 * n, J) && ik_finite(2, sizes)) {
+        if (ik->flags & IK_PULLS) {
+            for (int j = 0; j < 3 * n; j++) taut[j] = J[j];
+            ik_clear_slack(ik, taut);
+            J = taut;
+        }
         for (int j = 0; j < n; j++) s->posture[j] = beta * (ik->posture[j] - q[j]);
         if (ik->flags & IK_ACCELERATES) {
             const real share = ik_brake(ik, q, J, e, seconds, s);
@@ -170,6 +319,7 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
         }
         ik_step_bounds(ik, q, seconds, last, s);
         ik_limited_step(ik, J, v, ik->flags & IK_POSTURE, NULL, s);
+        if (ik->flags & IK_PULLS && ik_finite(n, s->dq)) ik_arrive(ik, q, x, J, v, s);
         if (ik_finite(n, s->dq)) return; /* else v is too large to compute with */
     }
     ik_step_bounds(ik, q, seconds, known ? last : NULL, s);
@@ -179,10 +329,6 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
     }
     s->sigma_min = R(NAN), s->damping = R(0.0);
 }
-
-/* The model at one configuration. Every step and tick calls this one, and gets the same bits; who
-   includes this file writes it. */
-static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance);
 
 /* The state of a robot that follows targets, one array: what goes in, what comes out, and what is
    kept from tick to tick, the offset of the measured tip, q and dq. */
@@ -214,6 +360,7 @@ static inline void ik_tick(const ik_settings *ik, real *state) {
     real used[3] = {R(0.0), R(0.0), R(0.0)}, *last = NULL, moved[HK_MAX_N];
     ik_step_t step;
     ik_model(ik, q, x, J, NULL);
+    ik_in_plane(ik, 3, J);
     for (int i = 0; i < 3; i++) error[i] = R(NAN);
     if (mode & IK_HAS_TARGET) {
         real apart[3];
@@ -237,7 +384,7 @@ static inline void ik_tick(const ik_settings *ik, real *state) {
         last = moved;
         for (int j = 0; j < n; j++) last[j] = ratio * dq[j];
     }
-    ik_control(ik, q, J, used, mode & IK_HAS_FEED ? state + IK_FEED : NULL, period, last, &step);
+    ik_control(ik, q, x, J, used, mode & IK_HAS_FEED ? state + IK_FEED : NULL, period, last, &step);
     state[IK_LAST] = period;
     if (memory > R(0.0))
         for (int i = 0; i < 3; i++) offset[i] *= HK_MATH(exp)(-period / memory);

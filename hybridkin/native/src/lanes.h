@@ -26,6 +26,12 @@ typedef hk_bits hk_mask __attribute__((vector_size(HK_LANES * sizeof(real))));
 #define SELECT(m, a, b) ((V)(((M)(a) & (m)) | ((M)(b) & ~(m))))
 #define EACH(i) for (int i = 0; i < HK_LANES; i++)
 
+/* The first place for lanes in memory. */
+static inline V *hkv_aligned(real *work) {
+    const uintptr_t at = (uintptr_t)work + sizeof(V) - 1;
+    return (V *)(at - at % sizeof(V));
+}
+
 static inline int hkv_any(M m) {
     hk_bits any = 0;
     EACH(i) any |= m[i];
@@ -48,9 +54,11 @@ static inline V hkv_min(V a, V b) {
     return a;
 }
 
-/* exp by x = k ln 2 + r and a minimax polynomial in r, right to 3e-16 up to ln 2 / 2. */
+/* exp by x = k ln 2 + r and a minimax polynomial in r, right to 3e-16 up to ln 2 / 2. The product
+   with 2^k keeps every NaN; a sum of bits would not. */
 static inline V hkv_exp(V x) {
-    const V round = SPLAT(6755399441055744.0); /* 1.5 * 2^52: the sum's last bits are k */
+    const V round = SPLAT(6755399441056767.0); /* 1.5 * 2^52 + 1023: the sum's last bits are those
+                                                  of the exponent of 2^k */
     x = hkv_min(hkv_max(x, SPLAT(-708.0)), SPLAT(709.0));
     const V shifted = x * 1.4426950408889634 + round, k = shifted - round;
     const V r = (x - k * 6.93147180369123816490e-1) - k * 1.90821492927058770002e-10;
@@ -65,7 +73,7 @@ static inline V hkv_exp(V x) {
     y = y * r + 4.9999999999998320886e-1;
     y = y * r + 1.0;
     y = y * r + 1.0;
-    return (V)((M)y + ((M)shifted << 52));
+    return y * (V)((M)shifted << 52);
 }
 
 static inline V hkv_logistic(V x) {

@@ -1,4 +1,15 @@
-/* Small dense products with constant matrices. */
+/* Memory of a call, and small dense products with constant matrices.
+
+   What a function needs on its way, sized by the model, stands in memory that the caller owns, not on
+   the stack: threads may have 128 KiB. `work` points to numbers that are free. A function takes from
+   the front and passes the rest on; when it returns, all is free again. HK_..._WORK beside the
+   functions tell how many numbers they take at most. */
+
+static inline V *HK(take)(V **work, int count) {
+    V *taken = *work;
+    *work = taken + count;
+    return taken;
+}
 
 /* y (m) = A (m, n) x (n) + b (m). */
 HK_INLINE void HK(affine)(
@@ -12,7 +23,7 @@ HK_INLINE void HK(affine)(
 
 /* J (3, n) = C (3, k) T (k, n), for a T that differs from row to row. */
 HK_INLINE void HK(multiply)(
-    int k, int n, const V *C, const V *T, V *J) {
+    int k, int n, const V *restrict C, const V *restrict T, V *restrict J) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < n; j++) {
             V sum = SPLAT(0.0);

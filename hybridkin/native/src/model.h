@@ -11,6 +11,10 @@
 #include "guards.h"
 #include "hybrid.h"
 
+#define HK_MODEL_WORK(n, S, m, features, powers) \
+    ((n) + HK_CHAIN_WORK(n, S) + HK_REGRESS_WORK(n, S, powers) + \
+     HK_HYBRID_WORK(n, S, m, features, powers))
+
 /* The q (n) of the fit for one of a robot that has changed since, and the place of the fit. */
 static inline int HK(before)(const hk_plan *p, int at, const V *q, V *then) {
     const real *shift = hk_numbers(p, at);
@@ -29,21 +33,22 @@ static inline void HK(turn)(int n, const real *R, V *a) {
 
 /* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. Of a robot that has
    changed since the fit it is x = R f(q + shift) + p. */
-static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance) {
+static inline void HK(model)(
+    const hk_plan *p, int at, const V *q, V *x, V *J, V *distance, V *work) {
     const int n = p->code[at + HK_N], adapted = HK_IS(p, at, HK_ADAPTED);
     const real *R = adapted && p->code[at + HK_M] == 3 ? hk_numbers(p, at) + n : NULL;
-    V then[HK_MAX_N];
+    V *then = HK(take)(&work, n);
     if (adapted) {
         at = HK(before)(p, at, q, then);
         q = then;
     }
     if (distance) *distance = SPLAT(0.0);
     if (HK_IS(p, at, HK_HYBRID))
-        HK(hybrid)(p, at, q, x, J, distance);
+        HK(hybrid)(p, at, q, x, J, distance, work);
     else if (HK_IS(p, at, HK_ARCS) || HK_IS(p, at, HK_ELASTIC) || HK_IS(p, at, HK_RIGID))
-        HK(chain)(p, at, q, x, J);
+        HK(chain)(p, at, q, x, J, work);
     else
-        HK(regress)(p, at, q, x, J, NULL);
+        HK(regress)(p, at, q, x, J, NULL, work);
     if (!R) return;
     HK(turn)(1, R, x);
     for (int i = 0; i < 3; i++) x[i] = x[i] + R[9 + i];
@@ -51,11 +56,12 @@ static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V
 }
 
 /* The largest distance of any guard, and its slope (n) by q where not NULL. */
-static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope) {
-    V then[HK_MAX_N];
+static inline void HK(domain)(
+    const hk_plan *p, int at, const V *q, V *distance, V *slope, V *work) {
+    V *then = HK(take)(&work, p->code[at + HK_N]);
     if (HK_IS(p, at, HK_ADAPTED)) {
         at = HK(before)(p, at, q, then);
         q = then;
     }
-    HK(farthest)(p, at, q, distance, slope);
+    HK(farthest)(p, at, q, distance, slope, work);
 }

@@ -36,7 +36,7 @@ typedef int64_t hk_bits;
 #define HK_INLINE static inline __attribute__((always_inline))
 #define HK_NOINLINE __attribute__((noinline))
 
-/* Largest sizes that the kernels support, on the stack. */
+/* Largest sizes that the kernels support. */
 #define HK_MAX_N 64 /* actuators */
 #define HK_MAX_S 16 /* segments */
 #define HK_MAX_M 64 /* outputs of a regressor, or inner coordinates */
@@ -44,7 +44,10 @@ typedef int64_t hk_bits;
 #define HK_MAX_P 1024 /* powers of the inputs of a polynomial */
 #endif
 #define HK_GROUP 8 /* hidden units, or columns of a leverage, stored together */
-#define HK_MAX_Z (3 * HK_MAX_S > HK_MAX_N ? 3 * HK_MAX_S : HK_MAX_N) /* inner coordinates */
+#define HK_MOST_Z(n, S) (3 * (S) > (n) ? 3 * (S) : (n)) /* inner coordinates */
+
+/* A plan begins with its largest sizes. */
+enum { HK_MOST_N, HK_MOST_S, HK_MOST_M, HK_MOST_F, HK_MOST_P };
 
 /* A node of a plan: code[at] is its kind, then the lengths of its input and output, where its
    numbers begin in `data`, and what else its kind needs: sizes, and where its parts stand. */
@@ -69,7 +72,8 @@ enum {
     HK_HYBRID,
     HK_IK,
     HK_GROUP_DISTANCE,
-    HK_ADAPTED
+    HK_ADAPTED,
+    HK_PROJECTED
 };
 
 enum { HK_LOGISTIC, HK_TANH, HK_SIN, HK_GAUSSIAN };

@@ -97,17 +97,22 @@ static inline V HK(virtual_work)(int S, const HK(posed) *s, V reach, const real 
     return value;
 }
 
+/* Numbers of a pose, then z and the slope by them, for every segment. */
+#define HK_POSE_WORK(n, S) (HK_USES(HK_READOUT) * (57 * (S) + HK_INSIDE_WORK(n, S)))
+
 /* value (n_out) += W phi(q) and slope (n_out, n), where not NULL, += its derivative, for weights W
    (n_out, 18 S - 6) of the pose features of a chain of arcs, which ends at the robot's end. */
 static inline void HK(pose_readout)(
-    const hk_plan *p, int at, int n_out, const real *weights, const V *q, V *value, V *slope) {
+    const hk_plan *p, int at, int n_out, const real *weights, const V *q, V *value, V *slope,
+    V *work) {
     const int S = p->code[at + HK_MORE], n = p->code[at + HK_N];
     const real *frame = hk_numbers(p, at);
     const V reach = SPLAT(frame[HK_FRAME - 1]);
-    V z[3 * HK_MAX_S], by_arcs[3 * HK_MAX_S];
+    const int numbers = (int)(sizeof(HK(posed)) / sizeof(V));
+    V *z = HK(take)(&work, 3 * S), *by_arcs = HK(take)(&work, 3 * S);
     V axes[3][3], end[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
-    HK(posed) segments[HK_MAX_S];
-    HK(inside) in;
+    HK(posed) *segments = (HK(posed) *)HK(take)(&work, numbers * S);
+    HK(inside) in = HK(inside_of)(p, at, &work);
     HK(coordinates)(p, at, q, z, &in);
     for (int i = 0; i < 9; i++) axes[i / 3][i % 3] = SPLAT(i % 4 == 0 ? 1.0 : 0.0);
     for (int k = 0; k < S; k++)

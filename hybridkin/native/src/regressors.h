@@ -69,7 +69,7 @@ HK_INLINE void HK(units_of)(
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
 /* One row with lanes over the hidden units, below; it stands in the library alone. */
 static void hkr_units(int n, int m, int units, int activation, const real *w, const real *u,
-                      real shift, real *x, real *J, real *features);
+                      real shift, real *x, real *J, real *features, real *work);
 #endif
 #if HK_LANES > 1
 static inline V HK(load)(const real *a) {
@@ -88,9 +88,10 @@ static inline real HK(sum)(V v) {
 
 HK_INLINE void hkr_units_of(
     int n, int m, int units, int activation, const real *w, const real *u, real shift, real *x,
-    real *J, real *features) {
+    real *J, real *features, real *work) {
     const int each = HK_GROUP / HK_LANES, stride = HK_GROUP * (n + 1 + m);
-    V value[HK_MAX_M], slope[HK_MAX_M * HK_MAX_N], s[HK_BLOCK / HK_LANES], d[HK_BLOCK / HK_LANES];
+    V s[HK_BLOCK / HK_LANES], d[HK_BLOCK / HK_LANES], *lanes = HK(aligned)(work);
+    V *value = HK(take)(&lanes, m), *slope = HK(take)(&lanes, m * n);
     for (int o = 0; o < m; o++) value[o] = SPLAT(0.0);
     for (int k = 0; J && k < m * n; k++) slope[k] = SPLAT(0.0);
     for (; units > 0; units -= HK_BLOCK, w += HK_BLOCK / HK_GROUP * stride) {
@@ -123,20 +124,21 @@ HK_INLINE void hkr_units_of(
 }
 
 static void hkr_units(int n, int m, int units, int activation, const real *w, const real *u,
-                      real shift, real *x, real *J, real *features) {
+                      real shift, real *x, real *J, real *features, real *work) {
     if (units == 0) return; /* affine */
     if (n == 9 && m == 3)
-        hkr_units_of(9, 3, units, activation, w, u, shift, x, J, features);
+        hkr_units_of(9, 3, units, activation, w, u, shift, x, J, features, work);
     else
-        hkr_units_of(n, m, units, activation, w, u, shift, x, J, features);
+        hkr_units_of(n, m, units, activation, w, u, shift, x, J, features, work);
 }
 #endif
 
 static inline void HK(units)(int n, int m, int units, int activation, const real *w, const V *u,
-                             V shift, V *x, V *J, V *features) {
+                             V shift, V *x, V *J, V *features, V *work) {
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
-    hkr_units(n, m, units, activation, w, u, shift, x, J, features);
+    hkr_units(n, m, units, activation, w, u, shift, x, J, features, work);
 #else
+    (void)work;
     if (HK_COMMON(n == 9 && m == 3))
         HK(units_of)(9, 3, units, activation, w, u, shift, x, J, features);
     else if (HK_COMMON(n == 6 && m == 3))
@@ -156,18 +158,19 @@ static inline void HK(scaled)(int n, const real *center, const V *q, V *u) {
 
    Writes the features too where asked: the hidden units', then u. A Gaussian at u_i is the unit
    exp(u_i . u - |u_i|^2 / 2 - |u|^2 / 2). */
-static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features) {
+static inline void HK(elm)(
+    const hk_plan *p, int at, const V *q, V *x, V *J, V *features, V *work) {
     const int32_t *node = p->code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M], n_hidden = more[0], activation = more[1];
     const int gaussian = activation == HK_GAUSSIAN;
     const real *center = hk_numbers(p, at), *inverse = center + n;
     const real *intercept = inverse + n, *direct = intercept + m;
-    V u[HK_MAX_N], shift = SPLAT(0.0);
+    V *u = HK(take)(&work, n), shift = SPLAT(0.0);
     HK(scaled)(n, center, q, u);
     for (int j = 0; gaussian && j < n; j++) shift = shift - R(0.5) * u[j] * u[j];
     for (int o = 0; o < m; o++) x[o] = SPLAT(0.0);
     for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(0.0);
-    HK(units)(n, m, n_hidden, activation, direct + m * n, u, shift, x, J, features);
+    HK(units)(n, m, n_hidden, activation, direct + m * n, u, shift, x, J, features, work);
     for (int o = 0; o < m; o++) {
         for (int j = 0; J && j < n; j++) {
             if (gaussian) J[n * o + j] = J[n * o + j] - x[o] * u[j];
@@ -181,11 +184,11 @@ static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *
 }
 
 /* Sums of products of powers of u. Their factors stand as places in the table of powers. */
-static inline void HK(polynomial)(const hk_plan *p, int at, const V *q, V *x, V *J) {
+static inline void HK(polynomial)(const hk_plan *p, int at, const V *q, V *x, V *J, V *work) {
     const int32_t *node = p->code + at, *factor = node + HK_MORE + 2;
     const int n = node[HK_N], m = node[HK_M], terms = node[HK_MORE], powers = node[HK_MORE + 1];
     const real *center = hk_numbers(p, at), *readout = center + 2 * n;
-    V u[HK_MAX_N], power[HK_MAX_P];
+    V *u = HK(take)(&work, n), *power = HK(take)(&work, n * powers);
     HK(scaled)(n, center, q, u);
     for (int j = 0; j < n; j++) {
         power[j * powers] = SPLAT(1.0);
@@ -203,7 +206,8 @@ static inline void HK(polynomial)(const hk_plan *p, int at, const V *q, V *x, V 
 
 /* value = c + D u + u' A u / 2 with symmetric A, output by output; its slope by u is D + A u. */
 HK_INLINE void HK(quadratic_of)(
-    int n, int m, const real *c, const real *inverse, const V *u, V *x, V *J) {
+    int n, int m, const real *c, const real *inverse, const V *restrict u, V *restrict x,
+    V *restrict J) {
     for (int o = 0; o < m; o++, c += 1 + n + n * n) {
         V slope[HK_MAX_N], sum = SPLAT(0.0);
         for (int j = 0; j < n; j++) slope[j] = SPLAT(c[1 + j]);
@@ -216,11 +220,11 @@ HK_INLINE void HK(quadratic_of)(
 }
 
 /* A readout of quadratic features, or of the pose: linear features, then loads on the shape. */
-static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J) {
+static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J, V *work) {
     const int32_t *node = p->code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M];
     const real *center = hk_numbers(p, at), *inverse = center + n, *c = inverse + n;
-    V u[HK_MAX_N];
+    V *u = HK(take)(&work, n);
     HK(scaled)(n, center, q, u);
     if (more[0] == HK_QUADRATIC_FEATURES) {
         if (HK_COMMON(n == 9))
@@ -232,15 +236,40 @@ static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J)
     const real *direct = c + m;
     HK(affine)(m, n, direct, c, u, x);
     for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(direct[k] * inverse[k % n]);
-    HK(pose_readout)(p, more[1], m, direct + m * n, q, x, J);
+    HK(pose_readout)(p, more[1], m, direct + m * n, q, x, J, work);
 }
 
-/* Any regressor. `features` is for networks alone. */
-static inline void HK(regress)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features) {
+/* A regressor of q itself. `features` is for networks alone. */
+static inline void HK(regress_all)(
+    const hk_plan *p, int at, const V *q, V *x, V *J, V *features, V *work) {
     if (HK_IS(p, at, HK_POLYNOMIAL))
-        HK(polynomial)(p, at, q, x, J);
+        HK(polynomial)(p, at, q, x, J, work);
     else if (HK_IS(p, at, HK_READOUT))
-        HK(readout)(p, at, q, x, J);
+        HK(readout)(p, at, q, x, J, work);
     else if (HK_USES(HK_ELM) || HK_USES(HK_AFFINE) || HK_USES(HK_KERNEL))
-        HK(elm)(p, at, q, x, J, features);
+        HK(elm)(p, at, q, x, J, features, work);
+}
+
+#define HK_REGRESS_WORK(n, S, powers) \
+    ((1 + HK_USES(HK_PROJECTED)) * (n) + HK_POSE_WORK(n, S) + HK_USES(HK_POLYNOMIAL) * (powers))
+
+/* Any regressor, also one of A q + b, the part of q that its training rows moved; A (n, n). */
+static inline void HK(regress)(
+    const hk_plan *p, int at, const V *q, V *x, V *J, V *features, V *work) {
+    if (!HK_IS(p, at, HK_PROJECTED)) {
+        HK(regress_all)(p, at, q, x, J, features, work);
+        return;
+    }
+    const int n = p->code[at + HK_N], m = p->code[at + HK_M];
+    const real *A = hk_numbers(p, at);
+    V *moved = HK(take)(&work, n);
+    HK(affine)(n, n, A, A + n * n, q, moved);
+    HK(regress_all)(p, p->code[at + HK_MORE], moved, x, J, NULL, work);
+    for (int o = 0; J && o < m; o++, J += n) {
+        V slope[HK_MAX_N];
+        for (int j = 0; j < n; j++) slope[j] = SPLAT(0.0);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) slope[j] = slope[j] + J[i] * A[n * i + j];
+        for (int j = 0; j < n; j++) J[j] = slope[j];
+    }
 }

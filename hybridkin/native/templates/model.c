@@ -14,15 +14,22 @@ const @REAL@ @NAME@_home[@N@] = {@HOME@};
 
 static const hk_plan plan = {code, data};
 
-void @NAME@_forward(const @REAL@ *q, @REAL@ *x) { hk_model(&plan, @MODEL@, q, x, NULL, NULL); }
+/* Numbers of memory to compute in, on the stack. */
+enum { WORK = HK_MODEL_WORK(HK_MAX_N, HK_MAX_S, HK_MAX_M, HK_MAX_F, HK_MAX_P) };
+
+void @NAME@_forward(const @REAL@ *q, @REAL@ *x) {
+    real work[WORK];
+    hk_model(&plan, @MODEL@, q, x, NULL, NULL, work);
+}
 
 void @NAME@_jacobian(const @REAL@ *q, @REAL@ *x, @REAL@ *J) {
-    hk_model(&plan, @MODEL@, q, x, J, NULL);
+    real work[WORK];
+    hk_model(&plan, @MODEL@, q, x, J, NULL, work);
 }
 
 @REAL@ @NAME@_domain(const @REAL@ *q) {
-    real distance;
-    hk_domain(&plan, @MODEL@, q, &distance, NULL);
+    real work[WORK], distance;
+    hk_domain(&plan, @MODEL@, q, &distance, NULL, work);
     return distance;
 }
 @STEP_C@

@@ -2,8 +2,7 @@
 #include "ik_step.h"
 
 static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance) {
-    (void)ik;
-    hk_model(&plan, @MODEL@, q, x, J, distance);
+    hk_model(&plan, @MODEL@, q, x, J, distance, ik->work);
 }
 
 void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
@@ -16,8 +15,8 @@ void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
 
 void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
     const @REAL@ *measured) {
-    const ik_settings ik = ik_settings_of(code, data, @ROOT@);
-    real all[IK_STATE] = {0};
+    real work[WORK], all[IK_STATE] = {0};
+    const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
     for (int i = 0; i < 3; i++) {
         all[IK_TARGET + i] = target[i];
         all[IK_FEED + i] = dx ? ik.dt * dx[i] : (real)0;

@@ -15,7 +15,7 @@ typedef struct {
 /* Start at rest at the actuator vector q, as read from the robot; sets memory to 0. */
 void @NAME@_reset(@NAME@_state *state, const @REAL@ *q);
 
-/* One period of @DT@ s: q of the state becomes the next command, which is within the limits.
+/* One period of @DT@ s: q of the state becomes the next command, within the limits of README.md.
 
    target: desired tip now [m]; dx: its velocity [m/s], may be NULL (at rest);
    measured: measured tip [m], may be NULL (use the model's), NaN if there is no measurement. */
