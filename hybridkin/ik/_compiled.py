@@ -18,7 +18,14 @@ from hybridkin.ik._search import Found, Point, Search
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
 from hybridkin.ik.tasks import PositionTask, Task, Tolerance
-from hybridkin.native.library import Program, in_chunks, library, program_of
+from hybridkin.native.library import (
+    Call,
+    Program,
+    backend,
+    in_chunks,
+    opened_library,
+    program_of,
+)
 from hybridkin.native.plan import NoKernel, Plan
 
 # The state of `ik_tick`, see native/src/ik_step.h.
@@ -51,11 +58,18 @@ def core_of(settings: StepSettings, search: bool = False) -> Core | None:
     kept, model = vars(settings).get("_program"), program_of(settings.task.models[0])
     if kept is None or kept[0] is not model:
         try:
-            kept = model, None if model is None else Core(settings, model)
-        except (NoKernel, TypeError):
-            kept = model, None
+            kept = model, None if model is None else Core(settings, model), ""
+        except (NoKernel, TypeError) as error:
+            kept = model, None, str(error)
         object.__setattr__(settings, "_program", kept)
     return kept[1] if search or settings.task.parts == (3,) else None
+
+
+def why_torch(settings: StepSettings) -> str:
+    """Return why settings that `core_of` has seen have no core for a step."""
+    reason = vars(settings)["_program"][2] or "only positions have a kernel of a step"
+    model = backend(settings.task.models[0])
+    return reason if model == "compiled" else model.removeprefix("torch: ")
 
 
 class Core:
@@ -77,12 +91,12 @@ class Core:
     """
 
     def __init__(self, settings: StepSettings, model: Program) -> None:
-        self._plan, self._made_of = Plan(settings.stored()), (settings, model)
-        self.n, self.program = self._plan.n_inputs, model
+        self.plan, self._made_of = Plan(settings.stored()), (settings, model)
+        self.n, self.program = self.plan.n_inputs, model
         self.settings, self.rows = settings, sum(settings.task.parts)
         if self.rows == 3:
             self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
-        self.head = self._plan.code.ctypes.data, self._plan.data.ctypes.data, self._plan.root
+        self._call = Call(self.plan, opened_library())
         self._idle: list[Follower] = []  # one for every thread that has used `step`
         n = self.n
         self._places = {
@@ -101,7 +115,10 @@ class Core:
         """Return the state of a step of one row and the places of its fields; else None."""
         if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
             return None
-        follower = self._idle.pop() if self._idle else Follower(self, None, _MUST_SEE + _FROM_REST)
+        try:
+            follower = self._idle.pop()
+        except IndexError:  # other threads use them
+            follower = Follower(self, None, _MUST_SEE + _FROM_REST)
         follower.q[...] = q
         found = (follower.state.copy(), self._places) if follower.tick(target, dx, tip) else None
         self._idle.append(follower)
@@ -143,13 +160,13 @@ class Core:
 
     def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
         """Call a function of the library for all rows of arrays."""
-        function, (code, data, root) = _function(name), self.head
-        head = ctypes.c_void_p(code), ctypes.c_void_p(data), ctypes.c_int32(root)
+        function = getattr(opened_library(), name)
         places = [None if a is None else (a.ctypes.data, a.strides[0]) for a in arrays]
 
         def run(start: int, count: int) -> None:
             at = [p if p is None else ctypes.c_void_p(p[0] + start * p[1]) for p in places]
-            function(*head, ctypes.c_int64(count), *numbers, *at)
+            call = ctypes.c_void_p(self._call.place)
+            function(call, ctypes.c_int64(count), *numbers, *at)
 
         in_chunks(rows, run)
 
@@ -182,20 +199,20 @@ class Follower:
         self.q, self._held = state[_Q : _Q + n], state[_Q + 3 * n : _Q + 4 * n]
         self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
         self._inputs = {at: state[at : at + 3] for at in (_TARGET, _FEED, _TIP)}
-        self._pointers = np.array([*core.head, state.ctypes.data])  # ik_follower
-        self._follow, self._mode = _function("hk_ik_tick"), -1
-        self._address = ctypes.c_void_p(self._pointers.ctypes.data)
+        self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
+        self._follow, self._mode = opened_library().hk_ik_tick, -1
 
     def __reduce__(self) -> tuple[type[Follower], tuple]:
         return Follower, (self.core, self._memory, self._least, self.state.copy())
 
-    def start(self, q: Tensor) -> None:
-        """Set the initial configuration (1, n), at rest."""
+    def start(self, q: Tensor, dq: Tensor) -> None:
+        """Set the initial configuration (1, n), and the step that led to it."""
         state, n = self.state, self.core.n
         state[_SIGMA_MIN:] = 0.0
         state[[_SIGMA_MIN, _DISTANCE, *range(_ERROR, _Q)]] = math.nan
         state[_X:_ERROR] = self.core.settings.evaluate(q)[0][0]
-        state[_LAST] = 0.0
+        state[_LAST] = self._dt
+        state[_Q + n : _Q + 2 * n] = dq[0]
         self.q[:] = state[_Q + 2 * n : _Q + 3 * n] = q[0]
 
     def tick(self, target: Any, dx: Any, tip: Any) -> bool:
@@ -217,7 +234,7 @@ class Follower:
             mode |= _HAS_TIP
         if mode != self._mode:
             self.state[_MODE] = self._mode = mode
-        self._follow(self._address)
+        self._follow(self._call.place)
         return True
 
     def _put(self, at: int, point: Any) -> bool:
@@ -244,7 +261,7 @@ class Follower:
                 mode += bit
         self.state[_MODE] = self._mode = mode
         self.state[_PERIOD] = period or self._dt
-        self._follow(self._address)
+        self._follow(self._call.place)
         self.state[_PERIOD] = self._dt
         return self.last()
 
@@ -305,10 +322,6 @@ class _CoreSearch(Search):
 
     def _find(self, mode: int, q: Tensor, target: Tensor) -> Found:
         return self.core.find(mode, q, target, self.tol, self.max_iter)
-
-
-def _function(name: str) -> Any:
-    return getattr(library(), name)
 
 
 def _plain(a: Tensor) -> NDArray:

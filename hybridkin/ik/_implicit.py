@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import warnings
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from hybridkin._core.model import slopes
-from hybridkin.ik._gram import apply_columns, apply_rows, damped_solve, row_gram
+from hybridkin.ik._gram import apply_columns, apply_rows
 from hybridkin.ik._settings import StepSettings
+from hybridkin.ik.tasks import Tolerance
 
 _POLISHES = 4
 
 
-def differentiable(settings: StepSettings, q: Tensor, target: Tensor, reached: Tensor) -> Tensor:
+def differentiable(
+    settings: StepSettings, q: Tensor, target: Tensor, reached: Tensor, tol: Tolerance
+) -> Tensor:
     """Return q with its graph to the targets and to the model's parameters.
 
     A solution is a root of F = (W (q_pref - q) + J^T mu, f(q) - x) in q and mu, with actuators at a
-    limit fixed. A Newton step from the root, with a constant matrix, is zero but has the right
-    derivatives.
+    limit fixed. A Newton step from the root, with constant matrices, is zero but has the right
+    derivatives. Where J lacks rows, e.g. for a planar arm, F counts along the range of J only.
 
     Parameters
     ----------
@@ -29,54 +35,78 @@ def differentiable(settings: StepSettings, q: Tensor, target: Tensor, reached: T
         Their targets, with a graph.
     reached : Tensor of shape (N,)
         Rows that are solutions; the others get no derivatives.
+    tol : float or tuple of float
+        Tolerance that polished rows must meet, else they stay as they are.
 
     Returns
     -------
     Tensor of shape (N, n)
-        Polished q, differentiable.
+        Polished q, differentiable. Rows have no derivatives, with a warning, where J loses rank at
+        the solution but not beside it.
     """
     rows = reached.nonzero()[:, 0]
-    if rows.numel() == 0:  # an empty write, so that there is a graph
-        return q.index_put((rows,), target[rows].flatten(1)[:, :1].expand(-1, q.shape[-1]))
     part, goal = q[rows], target[rows]
     lower, upper = settings.box(part)
     free = (part > lower) & (part < upper)
-    dq, lacking = _newton(settings, part, goal.detach(), free)
-    for _ in range(_POLISHES):
-        new = part + dq.detach()
-        dq_new, lacking_new = _newton(settings, new, goal.detach(), free)
-        better = (lacking_new < lacking) & (((new > lower) & (new < upper)) | ~free).all(-1)
-        part = torch.where(better[:, None], new, part)
-        dq = torch.where(better[:, None], dq_new, 0.0)
-        lacking = torch.where(better, lacking_new, lacking)
-    dq, _ = _newton(settings, part, goal, free)
-    return q.index_put((rows,), part + dq - dq.detach())
+    best, least = part, torch.full_like(part[:, 0], torch.inf)
+    for _ in range(_POLISHES + 1):
+        dq, lacking = _newton(settings, part, goal.detach(), free, tol)
+        better = lacking < least
+        best = torch.where(better[:, None], part, best)
+        least = torch.where(better, lacking, least)
+        part = torch.clamp(part + dq.detach(), lower, upper)
+    dq, _ = _newton(settings, best, goal, free, tol)
+    regular = _is_regular(settings, best, free)
+    if not regular.all():
+        warnings.warn(
+            f"{int((~regular).sum())} of {len(q)} solutions are at a singular configuration, e.g. "
+            "a stretched arm, and have no derivatives there; move their targets.",
+            stacklevel=4,
+        )
+    dq = torch.where(regular[:, None], dq - dq.detach(), 0.0)
+    return q.index_put((rows,), best + dq)
 
 
 def _newton(
-    settings: StepSettings, q: Tensor, target: Tensor, free: Tensor
+    settings: StepSettings, q: Tensor, target: Tensor, free: Tensor, tol: Tolerance
 ) -> tuple[Tensor, Tensor]:
-    """Return the Newton step of F in q with a constant matrix, and |F|; only `free` moves."""
-    n = q.shape[-1]
+    """Return the Newton step of F with constant matrices for the `free` q, and |F| in units of q.
+
+    In units of q in which all weights are 1, let P = J+ and N = 1 - P J. The step is P e, and in
+    the null space -N (N H N)+ N (g + H P e), where g = q_pref - q - J^T mu has the slope H. |F| is
+    infinite outside the tolerance.
+    """
     unit = settings.unit(q)
-    weights = unit.square().reciprocal().expand_as(q)
+    cutoff = _cutoff(q)
     leaf = q.detach().requires_grad_(True)
     x, J = settings.evaluate(leaf)
     e = settings.task.difference(x, target)
-    held = torch.where(free[:, None], J.detach(), 0.0)
-    pull, H = torch.zeros_like(q), -torch.diag_embed(weights)
+    held = torch.where(free[:, None], J.detach(), 0.0) * unit
+    inverse = torch.linalg.pinv(held, rtol=cutoff)
+    null = torch.diag_embed(free.to(q)) - inverse @ held
+    step = apply_rows(inverse, e)
+    lacking = step
     if settings.has_posture:
-        posture = weights * (settings.preferred(leaf) - leaf)
-        scaled = held * unit
-        mu = damped_solve(row_gram(scaled), apply_rows(scaled, unit * posture.detach()))
-        pull = posture - apply_columns(J, mu)
-        H = slopes(pull, leaf)
-    both = free[:, :, None] & free[:, None, :]
-    H = torch.where(both, H.detach(), torch.diag_embed((~free).to(q)))
-    corner = held.new_zeros(len(q), held.shape[-2], held.shape[-2])
-    upper, lower = torch.cat([H, held.mT], dim=-1), torch.cat([held, corner], dim=-1)
-    right = torch.cat([torch.where(free, -pull, 0.0), e], dim=-1)
-    step = torch.linalg.solve_ex(torch.cat([upper, lower], dim=-2), right)[0][:, :n]
-    # Posture in its unit and task in metres: both parts have the same weight.
-    lacking = torch.cat([unit * right[:, :n], e], dim=-1).detach().norm(dim=-1)
-    return step.nan_to_num(0.0, 0.0, 0.0), lacking
+        wish = (settings.preferred(leaf) - leaf) / unit
+        pull = wish - unit * apply_columns(J, apply_columns(inverse, wish.detach()))
+        H = unit * slopes(pull, leaf).detach()
+        compliance = null @ torch.linalg.pinv(null @ H @ null, atol=cutoff, rtol=cutoff) @ null
+        lacking = torch.cat([step, apply_rows(null, pull)], dim=-1)
+        step = step - apply_rows(compliance, pull + apply_rows(H, step))
+    size = lacking.detach().norm(dim=-1)
+    return unit * step, torch.where(settings.task.reached(e, tol), size, torch.inf)
+
+
+def _is_regular(settings: StepSettings, q: Tensor, free: Tensor) -> Tensor:
+    """Return whether the free columns of J have the same rank at q and beside it."""
+    # Unequal factors, because equal ones can cancel in a symmetric robot.
+    aside = torch.cos(torch.ones_like(q).cumsum(-1))
+    beside = torch.where(free, q + _cutoff(q) ** 0.5 * aside, q)
+    at_q, at_beside = (settings.evaluate(a)[1] * free[:, None] for a in (q, beside))
+    rank = partial(torch.linalg.matrix_rank, rtol=_cutoff(q))
+    return rank(at_q) == rank(at_beside)
+
+
+def _cutoff(q: Tensor) -> float:
+    """Return the ratio of singular values below which a direction counts as lost."""
+    return torch.finfo(q.dtype).eps ** 0.75

@@ -99,11 +99,11 @@ class Search:
     def solve(self, q: Tensor, target: Tensor, cold: bool, restarts: int) -> Found:
         """Return the best points from starts q (N, n), and from further starts if these fail."""
         settings = self.settings
-        q, target = settings.inside(q), settings.allowed(target)
+        q, target = settings.start_at(q), settings.allowed(target)
         if cold and len(q) > 0 and row_gram(settings.evaluate(q[:1])[1]).is_singular.all():
             # At a straight backbone, motions that cancel to first order would be missed.
             at_start = self._start(q, target)
-            nudged = settings.inside(self._nudged(at_start))
+            nudged = settings.start_at(self._nudged(at_start))
             stay = at_start.reached | ~torch.isfinite(at_start.error)
             q = torch.where(stay[:, None], q, nudged)
         found = self._attempt(q, target)
@@ -141,7 +141,9 @@ class Search:
             size, near = torch.zeros_like(best.error[some]), start[some].repeat_interleave(s, 0)
             starts = even_starts(settings, start[some], size, restarts).expand(len(some), -1, -1)
             starts = torch.cat([best.q[some, None], starts], dim=1).flatten(0, 1)
-            more = fine._attempt(settings.inside(starts), best.target[some].repeat_interleave(s, 0))
+            more = fine._attempt(
+                settings.start_at(starts), best.target[some].repeat_interleave(s, 0)
+            )
             if settings.has_posture:
                 fine._to_posture(more)
             turned = more.q + settings.whole_turns(near - more.q)
@@ -177,7 +179,7 @@ class Search:
         if rows.numel() == 0 or n_starts == 0:
             return
         q, target = starts.flatten(0, 1), found.target[rows].repeat_interleave(n_starts, 0)
-        again = self._attempt(self.settings.inside(q), target)
+        again = self._attempt(self.settings.start_at(q), target)
         n_iter = found.n_iter[rows] + again.n_iter.view(-1, n_starts).sum(1)
         n_tried = found.n_starts[rows] + n_starts
         cost = self._cost(again).nan_to_num(torch.inf).view(-1, n_starts)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from inspect import Signature
 from typing import TypeAlias
 
@@ -34,7 +34,7 @@ Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 def bound(value: Array, name: str, *, finite: bool = False, positive: bool = False) -> Tensor:
     """Return a limit, a posture or weights as a float64 tensor of shape () or (n,)."""
-    a = as_tensor(value, name).cpu().double()
+    a = as_tensor(value, name).cpu().double().clone()
     good = a.ndim < 2 and a.numel() > 0 and not torch.isnan(a).any()
     require(good, f"`{name}` must be a number or of shape (n,), without NaN, got {a.tolist()}.")
     good = torch.isfinite(a).all() or not finite
@@ -44,6 +44,12 @@ def bound(value: Array, name: str, *, finite: bool = False, positive: bool = Fal
         (a > 0.0).all() or not positive, f"`{name}` must be positive, got {a.tolist()}; {lock}."
     )
     return a
+
+
+def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
+    """Return these limits of the model of a task."""
+    limits = task.models[0].robot.limits
+    return {name: bound(limits[name], name, positive=name == "dq_max") for name in names}
 
 
 def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
@@ -78,6 +84,7 @@ def stopping(way: Tensor, change: Tensor) -> Tensor:
 _FAST = 5.0  # largest plausible speed: this many times the largest plausible q per second
 _TURN = 2.0 * math.pi
 _FULL = 0.999  # a range of this share of a turn counts as a whole turn
+PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,7 @@ class StepSettings(Portable):
     Limits, weights and a fixed posture are float64 tensors of shape () or (n,). `posture` is
     `q_pref`, or by default the middle of the limits. `of_model` names the limits taken from the
     model. `periods`, shape () or (n,), are the periods of q: a turn for an angle with a range of a
-    whole turn, else inf.
+    whole turn, else inf. `pulls` is that of the robot, see `ForwardModel`.
     """
 
     task: Task
@@ -106,6 +113,7 @@ class StepSettings(Portable):
     tip_limits: HalfSpaces | None
     posture: Tensor | Posture | None = field(init=False)
     periods: Tensor = field(init=False)
+    pulls: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         """Check the settings; without `q_pref` the posture is the middle of the limits."""
@@ -116,7 +124,10 @@ class StepSettings(Portable):
         low, high = self.q_min.tolist(), self.q_max.tolist()
         good = (self.q_min <= self.q_max).all()
         require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
-        object.__setattr__(self, "posture", self.middle if self.q_pref is None else self.q_pref)
+        posture = self.middle if self.q_pref is None else self.q_pref
+        if isinstance(posture, Tensor):
+            posture = self.on_plane(posture)
+        object.__setattr__(self, "posture", posture)
         good = 0.0 < self.dt < LARGEST
         require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
         self.rates()
@@ -128,6 +139,17 @@ class StepSettings(Portable):
         full = (self.q_max - self.q_min >= _FULL * _TURN) & (self.limits != "off")
         periods = torch.where(turns.all(0) & full, self.q_max.new_tensor(_TURN), math.inf)
         object.__setattr__(self, "periods", periods)
+        object.__setattr__(self, "pulls", bound(models[0].robot.pulls, "pulls"))
+
+    def present(self) -> StepSettings:
+        """Return the settings for the model that the estimator of the task has now."""
+        task = self.task.present()
+        if task is self.task:
+            return self
+        n, before = task.n_actuators, self.task.n_actuators
+        way = "make a new InverseKinematics"
+        require(n == before, f"`model` must keep its {before} actuators, but now has {n}; {way}.")
+        return replace(self, task=task, **limits_of(task, self.of_model))
 
     def shown(self, arguments: Signature, defaults: bool = False) -> dict[str, str]:
         """Return the settings that differ from their defaults, or all of them, in words."""
@@ -158,8 +180,18 @@ class StepSettings(Portable):
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if targets lie too far from the robot to be in metres."""
-        points = x[..., :3, 3] if self.task.shape == (4, 4) else x
+        points = self._positions(x)
         return self.task.models[0].robot.far_messages(points, name) if points.shape[-1] == 3 else []
+
+    def misses(self, target: Tensor) -> Tensor:
+        """Return proven lower bounds (N,) of the errors at targets [m]; not positive: no proof."""
+        low, high = self.box(target.double())
+        largest = torch.maximum(low.abs(), high.abs()).clamp(max=LARGEST)
+        missed = self.task.models[0].misses(self._positions(target), largest)
+        return missed[..., None].flatten(1).amax(-1) * min(self.task.units)
+
+    def _positions(self, x: Tensor) -> Tensor:
+        return x[..., :3, 3] if self.task.shape == (4, 4) else x
 
     def _sizes(self) -> dict[str, int]:
         """Return the numbers of actuators given by the settings and the model, by name."""
@@ -206,12 +238,17 @@ class StepSettings(Portable):
         ------
         TypeError
             If they could only be stored as code: tasks other than a `PositionTask` or a
-            `PoseTask`, a posture that is a function, or tip limits.
+            `PoseTask`, a posture that is a function, or tip limits; or if n is not known.
         """
         model, n = self.task.models[0], self.n_actuators
-        of_code = callable(self.posture) or self.tip_limits is not None
-        if type(self.task) not in (PositionTask, PoseTask) or of_code or n is None:
-            raise TypeError("only a position or pose task with a fixed posture can be data")
+        if type(self.task) not in (PositionTask, PoseTask):
+            raise TypeError(f"a {type(self.task).__name__} has no kernel")
+        if callable(self.posture):
+            raise TypeError("a posture that is a function has no kernel")
+        if self.tip_limits is not None:
+            raise TypeError("limits of the tip have no kernel")
+        if n is None:
+            raise TypeError("the number of actuators is unknown; give one limit for each")
         arrays = {
             "q_min": self.q_min,
             "q_max": self.q_max,
@@ -220,24 +257,48 @@ class StepSettings(Portable):
             "posture": 0.0 if self.posture is None else self.posture,
             "weights": 1.0 if self.weights is None else self.weights,
             "periods": self.periods,
+            "pulls": self.pulls,
         }
         arrays = {name: np.broadcast_to(as_array(a), n) for name, a in arrays.items()}
+        arrays["normals"] = np.zeros((n, 0)) if self.plane is None else as_array(self.plane[1])
         names = ("beta", "gain", "damping", "limits", "dt", "has_posture", "accelerates")
         settings = {name: getattr(self, name) for name in names}
         settings["radian"] = self.task.units[1] if len(self.task.parts) > 1 else 0.0
         return Stored.of("inverse_kinematics", arrays, {"model": model.stored()}, **settings)
 
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """The plane of q to keep to, if any, see `ForwardModel`."""
+        return self.task.models[0].plane
+
+    def in_plane(self, motion: Tensor) -> Tensor:
+        """Return motions (..., n) without their part normal to the plane."""
+        if self.plane is None:
+            return motion
+        normals = self.plane[1].to(motion)
+        return motion - motion @ normals @ normals.mT
+
+    def on_plane(self, q: Tensor) -> Tensor:
+        """Return the points of the plane that are nearest to q, shape () or (..., n)."""
+        if self.plane is None:
+            return q
+        point = self.plane[0].to(q)
+        return point + self.in_plane(q - point)
+
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x (N, ...) and J (N, m, n) at q of shape (N, n)."""
+        """Return x (N, ...) and J (N, m, n) of motions in the plane, at q of shape (N, n)."""
         if len(q) > 0:
-            return self.task.evaluate(q)
+            x, J = self.task.evaluate(q)
+            return x, self.in_plane(J)
         return q.new_zeros(0, *self.task.shape), q.new_zeros(0, sum(self.task.parts), q.shape[1])
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
         wanted = self.posture(q) if callable(self.posture) else self.posture
-        assert wanted is not None
-        return wanted.to(q)
+        if not isinstance(wanted, Tensor):
+            got = type(wanted).__name__
+            raise TypeError(f"`q_pref` must map torch tensors to torch tensors, got {got}.")
+        return self.on_plane(wanted.to(q))
 
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); if it is a function, evaluate it mid-range."""
@@ -278,6 +339,12 @@ class StepSettings(Portable):
         low, high = self.box(q)
         turned = q - self.whole_turns(q - 0.5 * (low + high))
         return torch.clamp(torch.where((q < low) | (q > high), turned, q), low, high)
+
+    def start_at(self, q: Tensor) -> Tensor:
+        """Return q moved onto the plane and into the limits."""
+        for _ in range(0 if self.plane is None else PLANE_ROUNDS):
+            q = self.inside(self.on_plane(q))
+        return self.inside(q)
 
     def allowed(self, x: Tensor) -> Tensor:
         """Return the points nearest to x within the tip limits."""

@@ -41,6 +41,7 @@ def nearest_starts(
     task, n = settings.task, q.shape[-1]
     k = max(count, _SHARED if torch.isfinite(settings.q_max - settings.q_min).all() else _OWN)
     sample = even_starts(settings, q, size, k)
+    sample = settings.start_at(sample)
     x, _ = settings.evaluate(sample.flatten(0, 1))
     away = task.distances(x.unflatten(0, (-1, k)), target)
     away = away * torch.where(task.in_domain(sample.flatten(0, 1)), 1.0, _OUTSIDE).view(-1, k)

@@ -21,6 +21,11 @@ from hybridkin.ik._gram import (
 from hybridkin.ik._settings import StepSettings, stopping
 
 _PROJECTIONS, _EXCESS = 8, 1.5  # for a step that would leave the tip limits
+_BALANCE = 30.0  # of the tip's motion: of a motion that leaves the plane
+_CORRECTIONS = 3
+_SLACK = 0.02  # a tendon that moves the tip less, relative to the most, is slack
+_SLIP = 1e-4  # of the tip, relative to the motion of all actuators
+_PULLS = (1.0, 0.125, 0.015625)
 
 
 class StepRows(NamedTuple):
@@ -79,7 +84,8 @@ def control_step(
     before = 0.0 if last is None else torch.where(torch.isfinite(last).all(-1)[:, None], last, 0.0)
     fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
     at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
-    J, posture = torch.where(fine[..., None], J, 0.0), None
+    J, posture = _only_taut(settings, torch.where(fine[..., None], J, 0.0)), None
+    limits = None if tip is None else settings.tip_limits
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
     change = settings.change(q, seconds)
@@ -92,15 +98,19 @@ def control_step(
             posture = torch.clamp(posture, -most, most)
     v = gain * e if feed_forward is None else torch.where(fine, feed_forward + gain * e, 0.0)
     bounds = settings.step_bounds(q, seconds, before)
-    if tip is None or settings.tip_limits is None:
+    if limits is None:
         step = limited_step(settings, J, v, posture, *bounds)
     else:
-        margin = settings.tip_limits.margin(torch.where(fine, tip, 0.0))
+        assert tip is not None
+        margin = limits.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
-            normals = settings.tip_limits.normals.to(J)
+            normals = limits.normals.to(J)
             brakes = [_braking(settings, J, a.expand(len(J), -1), change) for a in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
         step = _step_inside(settings, margin, J, v, posture, *bounds)
+        v = v + limits.way_in(margin - limits.along(v))
+    if settings.pulls.any():
+        step = _arriving(settings, at, J, v, step, *bounds)
     fine = fine & torch.isfinite(step.dq).all(-1, keepdim=True)
     still = torch.where(torch.isfinite(q), torch.clamp(torch.zeros_like(q), *bounds), 0.0)
     held = (still <= bounds[0]) | (still >= bounds[1])
@@ -188,16 +198,121 @@ def limited_step(
     if settings.limits != "off":
         # Rows within all limits keep the unlimited step; the others are solved in the box.
         clipped = torch.clamp(dq, lower, upper)
-        over = (clipped != dq).any(-1).nonzero()[:, 0]
+        unbalanced = settings.plane is not None and settings.weights is not None
+        over = ((clipped != dq).any(-1) | unbalanced).nonzero()[:, 0]
         if over.numel() > 0:
             low, high = (a.expand_as(dq) for a in (lower, upper))
-            problem = BoxProblem(J, v, z, low, high).take(over)
+            rows, motion = _with_plane(settings, J, v, posture)
+            problem = BoxProblem(rows, motion, z, low, high).take(over)
             clipped[over] = strict_box_step(problem, damping_sq[over])
         dq = clipped
     held = (dq <= lower) | (dq >= upper)
     if settings.weights is not None:
         dq = torch.clamp(dq * unit, *box)
     return StepRows(dq, gram.sigma_min, damping_sq.sqrt(), held)
+
+
+def _with_plane(
+    settings: StepSettings, J: Tensor, v: Tensor, posture: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return J and v with further rows: only `posture` leaves the plane, also at the limits.
+
+    Else a limit that stops one actuator would unbalance the others.
+    """
+    if settings.plane is None:
+        return J, v
+    stiff = _BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
+    rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
+    aside = torch.zeros_like(rows[..., 0]) if posture is None else apply_rows(rows, posture)
+    return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
+
+
+def _only_taut(settings: StepSettings, J: Tensor) -> Tensor:
+    """Return J (N, m, n) without the columns of slack tendons.
+
+    A learned error makes them small instead of zero, and a step would drive these tendons far.
+    """
+    size = J.norm(dim=-2, keepdim=True)
+    slack = (size <= _SLACK * size.amax(-1, keepdim=True)) & (settings.pulls.to(J) != 0.0)
+    return torch.where(slack, 0.0, J)
+
+
+class _End(NamedTuple):
+    """Ends of steps: what is missing of the motions of the tips, as the model computes them."""
+
+    dq: Tensor
+    J: Tensor
+    missing: Tensor
+
+    @property
+    def distance(self) -> Tensor:
+        return self.missing.norm(dim=-1, keepdim=True)
+
+    def where(self, better: Tensor, other: _End) -> _End:
+        """Return the ends of `other` in the rows (N, 1) where it is better."""
+        pairs = zip(other, self, strict=True)
+        return _End(*(a.where(better if a.ndim == 2 else better[..., None], b) for a, b in pairs))
+
+
+def _arriving(
+    settings: StepSettings,
+    q: Tensor,
+    J: Tensor,
+    v: Tensor,
+    step: StepRows,
+    lower: Tensor,
+    upper: Tensor,
+) -> StepRows:
+    """Return steps whose tips move as the steps promised, with tendons that can only pull.
+
+    Their Jacobian jumps where a tendon gets slack or taut, so each end is evaluated by the model.
+    Newton's method corrects it within the bounds. Where the result is less than half of the motion
+    v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
+    """
+    pulls, task, x = settings.pulls.to(q), settings.task, settings.evaluate(q)[0]
+
+    def end_of(dq: Tensor, motion: Tensor) -> _End:
+        tip, slope = settings.evaluate(q + dq)
+        return _End(dq, _only_taut(settings, slope), motion - task.difference(x, tip))
+
+    def approach(dq: Tensor, motion: Tensor, close: Tensor) -> _End:
+        best = end = end_of(dq, motion)
+        for _ in range(_CORRECTIONS):
+            going = best.distance > close
+            if not going.any():
+                break
+            low, high = lower - end.dq, upper - end.dq
+            more = limited_step(settings, end.J, end.missing, None, low, high).dq
+            dq = torch.clamp(end.dq + more, lower, upper)
+            dq = torch.where(more <= low, lower, torch.where(more >= high, upper, dq))
+            end = end_of(dq, motion)
+            best = best.where(going & (end.distance < best.distance), end)
+        return best
+
+    size = J.flatten(1).norm(dim=-1, keepdim=True)
+    moved = [a.norm(dim=-1, keepdim=True) for a in (step.dq, q)]
+    eps = torch.finfo(q.dtype).eps
+    slip = size * (_SLIP * moved[0] + 32.0 * eps * moved[1])
+    promised = apply_rows(J, step.dq)
+    close = torch.maximum(0.5 * promised.norm(dim=-1, keepdim=True), slip)
+    end = approach(step.dq, promised, close)
+    end = end._replace(missing=v - promised + end.missing)
+    weak = end.distance > torch.maximum(0.5 * v.norm(dim=-1, keepdim=True), slip)
+    to = torch.where(pulls < 0.0, lower, upper)
+    slack = (end.J == 0.0).all(-2) & (pulls != 0.0)
+    to = torch.where(slack & torch.isfinite(to), to, end.dq)
+    way = to - end.dq
+    weak &= (way != 0.0).any(-1, keepdim=True)
+    for share in _PULLS:
+        if not weak.any():
+            break
+        pulled = approach(torch.clamp(to - (1.0 - share) * way, lower, upper), v, slip)
+        # A slack tendon moves the tip by rounding alone.
+        better = weak & (pulled.distance <= (1.0 + eps**0.5) * end.distance)
+        end = end.where(better, pulled)
+        weak = weak & ~better
+    held = (end.dq <= lower) | (end.dq >= upper)
+    return step._replace(dq=end.dq, saturated=held)
 
 
 def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:

@@ -29,13 +29,17 @@ class IKStatus(IntEnum):
     AT_LIMITS = 1
     """Not converged; limits restricted the last step of the best start, which did not finish."""
     UNREACHABLE = 2
-    """No motion within the limits brings the tip nearer, from any start; the nearest is returned.
+    """Out of reach for certain: farther from the base than the robot, stretched within its limits,
+    is long, or outside `tip_limits`. The nearest point found is returned.
 
-    ``IKSolution.n_starts`` is the number of starts tried."""
+    Functions have no such bound."""
     SINGULAR = 3
     """Not converged; the Jacobian has (nearly) lost a direction."""
     MAX_ITER = 4
-    """Not converged within `max_iter` iterations."""
+    """Not converged within `max_iter` iterations, or no motion within the limits brings the tip
+    nearer than the best of all starts: most likely out of reach, but not for certain.
+
+    ``IKSolution.n_starts`` is the number of starts tried; more `restarts` can help."""
     OUT_OF_DOMAIN = 5
     """Converged, but outside the domain of the model (its `in_domain` is False)."""
     INVALID_INPUT = 6

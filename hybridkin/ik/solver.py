@@ -26,7 +26,15 @@ from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
-from hybridkin.ik._settings import Array, Posture, StepSettings, bound, half_spaces, require
+from hybridkin.ik._settings import (
+    Array,
+    Posture,
+    StepSettings,
+    bound,
+    half_spaces,
+    limits_of,
+    require,
+)
 from hybridkin.ik._step import control_step
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
@@ -88,10 +96,16 @@ class InverseKinematics:
     model : object
         The model as given.
     settings : StepSettings
-        The other arguments, checked; limits, weights and a fixed posture as float64 tensors.
+        The other arguments, checked and copied; limits, weights and a fixed posture as float64
+        tensors.
 
     Notes
     -----
+    Every call of `step`, `solve` and `track` uses the model as it is then, whatever has changed it.
+    A `Tracker` keeps a copy from its `reset`; only a refit of an estimator (`fit`, `partial_fit`,
+    `adapt`) reaches it, at its next step. Functions, and modules that are not `ForwardModel`, are
+    called as they are.
+
     With limits="saturate" a step within all limits is exactly the unlimited step. Otherwise it
     minimises ``|dq - z|^2 + |J dq - v|^2 / lambda^2`` in the box, with the projected posture step
     z. The task keeps priority: (a) lambda^2 is only 1e-6 of sigma_max^2 in float64, and two
@@ -137,14 +151,15 @@ class InverseKinematics:
         tip_limits: Sequence[Array] | None = None,
     ) -> None:
         self.model, task = model, as_task(model)
-        own, given = task.models[0].robot.limits, {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
-        good = 0 not in np.shape(own["q_min"])
+        good = 0 not in np.shape(task.models[0].robot.limits["q_min"])
         require(good, "`model` must have an actuator, but all its joints are fixed.")
-        bounds = {
-            name: bound(own[name] if value is None else value, name, positive=name == "dq_max")
-            for name, value in given.items()
-        }
-        self.settings = StepSettings(
+        given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
+        of_model = tuple(name for name, value in given.items() if value is None)
+        bounds = limits_of(task, of_model)
+        for name, value in given.items():
+            if value is not None:
+                bounds[name] = bound(value, name, positive=name == "dq_max")
+        self._settings = StepSettings(
             task,
             bounds["q_min"],
             bounds["q_max"],
@@ -157,11 +172,17 @@ class InverseKinematics:
             one_of(limits, "limits", ("saturate", "off")),
             number(dt, "dt"),
             None if weights is None else bound(weights, "weights", finite=True, positive=True),
-            tuple(name for name, value in given.items() if value is None),
+            of_model,
             None if tip_limits is None or limits == "off" else half_spaces(tip_limits, task),
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
+
+    @property
+    def settings(self) -> StepSettings:
+        """The arguments, checked, and the model of the task that they are for."""
+        self._settings = self._settings.present()
+        return self._settings
 
     def __repr__(self) -> str:
         """Return the model's name, the limits, and the settings that differ from their defaults."""
@@ -301,8 +322,11 @@ class InverseKinematics:
         -----
         The derivatives are those of the solution nearest to `q_pref` near the one found, with
         actuators at a limit fixed there; without posture they are J+. They are exact if that
-        solution is unique and the set of fixed actuators does not change nearby. Rows that have
-        not converged have no derivatives. The model must be twice differentiable by torch.
+        solution is unique and the set of fixed actuators does not change nearby. They are zero in
+        directions in which the free actuators cannot move the tip, e.g. across the plane of a
+        planar arm. Rows that have not converged have no derivatives; nor have, with a warning,
+        those where such a direction exists only at the solution, e.g. a stretched arm. The model
+        must be twice differentiable by torch.
         """
         settings, task = self.settings, self.settings.task
         tolerance = settings.tolerance(tol)
@@ -333,15 +357,17 @@ class InverseKinematics:
         if differentiable:
             with torch.enable_grad():
                 goal = rows_of(torch.as_tensor(x_target, device=q.device).to(q), lead, axes)
-                q = with_derivatives(settings, q, goal, found.reached & ~moved)
+                q = with_derivatives(settings, q, goal, found.reached & ~moved, tolerance)
         # Error and status refer to the returned q.
         x, J = settings.evaluate(q.detach())
         e = task.difference(x, target)
         error, gram = e.norm(dim=-1), row_gram(J)
         reached = task.reached(e, tolerance)
         status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
-        ended = found.stationary | (found.reached & moved)
-        status[ended & ~reached & torch.isfinite(error)] = IKStatus.UNREACHABLE
+        missed = ~reached & torch.isfinite(error)
+        status[missed & found.stationary] = IKStatus.MAX_ITER
+        beyond = moved | (settings.misses(target) > np.max(tolerance))
+        status[missed & beyond] = IKStatus.UNREACHABLE
         further = torch.arange(len(q), device=q.device) % places > 0
         status[further & q.isnan().all(-1)] = IKStatus.NO_FURTHER
         margin = settings.margin(q.detach())

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeAlias, cast, runtime_checkable
 
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import as_tensor, identity, number, whole
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import ForwardModel, PoseModel, as_forward_model
+from hybridkin._core.model import Fitted, ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["PointsTask", "PoseTask", "PositionTask", "Task"]
 
@@ -36,12 +40,39 @@ class Task:
         Metres per unit of every part.
     models : tuple of ForwardModel
         The models that are evaluated.
+    estimator, module : Fitted and nn.Module, or None
+        The estimator that the model was taken from, and its module then.
     """
 
     shape: tuple[int, ...]
     parts: tuple[int, ...]
     units: tuple[float, ...]
     models: tuple[ForwardModel, ...]
+    estimator: Fitted | None = None
+    module: nn.Module | None = None
+
+    def present(self) -> Self:
+        """Return the task for the module that its estimator has now."""
+        if self.estimator is None or self.estimator.module_ is self.module:
+            return self
+        task = copy.copy(self)
+        task._follow(self.estimator)
+        return task
+
+    def frozen(self) -> Self:
+        """Return the task with copies of its models, see `ForwardModel.frozen`."""
+        task = copy.copy(self)
+        task.models = tuple(model.frozen() for model in self.models)
+        return task
+
+    def _follow(self, model: object) -> None:
+        """Take the model of the task, and remember its estimator."""
+        if isinstance(model, Fitted) and not isinstance(model, nn.Module):
+            self.estimator, self.module = model, model.module_
+        self.models = (self._suitable(as_forward_model(model)),)
+
+    def _suitable(self, model: ForwardModel) -> ForwardModel:
+        return model
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x ``(N, *shape)`` and minus the derivative of the error (N, m, n), q (N, n).
@@ -128,9 +159,12 @@ class PositionTask(Task):
     """
 
     def __init__(self, model: object, size: int = 3) -> None:
-        found, count = as_forward_model(model), whole(size, "size")
-        self.models = (found.tip_model if count == 3 else found,)
+        count = whole(size, "size")
         self.shape, self.parts, self.units = (count,), (count,), (1.0,)
+        self._follow(model)
+
+    def _suitable(self, model: ForwardModel) -> ForwardModel:
+        return model.tip_model if self.shape == (3,) else model
 
     @classmethod
     def from_numpy(
@@ -200,18 +234,20 @@ class PoseTask(Task):
     def __init__(self, model: object, radian: float = 0.1) -> None:
         if not 0.0 < number(radian, "radian") < math.inf:
             raise ValueError(f"`radian` must be a positive length [m], got {radian!r}.")
-        model = as_forward_model(model)
+        self.shape, self.parts, self.units = (4, 4), (3, 3), (1.0, float(radian))
+        self._follow(model)
+
+    def _suitable(self, model: ForwardModel) -> ForwardModel:
         if not isinstance(model, PoseModel):
             raise TypeError(
                 "`model` must be a PoseModel, which returns the pose of the tip, got "
                 f"{type(model).__name__}; use a chain, or fit a hybrid with output='pose'."
             )
-        self.models, self._model = (model,), model
-        self.shape, self.parts, self.units = (4, 4), (3, 3), (1.0, float(radian))
+        return model
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip's poses (N, 4, 4) and J (N, 6, n), its angular rows times `radian`."""
-        T, J = in_blocks(self._model.pose_and_jacobian, q)
+        T, J = in_blocks(cast(PoseModel, self.models[0]).pose_and_jacobian, q)
         return T.to(q), torch.cat([J[:, :3], self.units[1] * J[:, 3:]], dim=-2).to(q)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:

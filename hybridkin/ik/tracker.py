@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from operator import attrgetter
+from dataclasses import replace
+from threading import Lock
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
 from hybridkin._core.model import Portable
-from hybridkin.ik._compiled import Follower, Tick, core_of
+from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
@@ -25,14 +26,21 @@ Plant = Callable[["NDArray | Tensor"], Array]
 
 
 def _seen(name: str, text: str) -> Any:
-    return property(attrgetter(f"_robot.{name}"), doc=text)
+    def read(self: Tracker) -> Any:
+        with self._lock:
+            return getattr(self._robot, name)
+
+    read.__doc__ = text
+    return property(read)
 
 
 class Tracker(Portable):
     """Inverse kinematics step by step: each target gives the next command.
 
     The law is that of `InverseKinematics.step`, for one configuration and any task. Trackers are
-    made by `InverseKinematics.tracker`; arrays are NumPy or torch, like its `q0`.
+    made by `InverseKinematics.tracker`; arrays are NumPy or torch, like its `q0`. It keeps a copy
+    of the model from `reset`, but a refit of an estimator reaches it at the next `step`: `q` and
+    its speed stay, a remembered offset is forgotten. Threads that share it wait for each other.
 
     Attributes
     ----------
@@ -50,7 +58,7 @@ class Tracker(Portable):
     damping : float
         Damping lambda of the last step, in the unit of `sigma_min`.
     backend : str
-        "compiled" for NumPy and models that have kernels, else "torch".
+        "compiled" for NumPy and models that have kernels, else "torch: " and the reason.
 
     Examples
     --------
@@ -72,14 +80,19 @@ class Tracker(Portable):
         require(good, f"`memory` must be a positive time [s], got {memory!r}.")
         self._settings, self._tol, self._memory = settings, tol, memory
         self._as_numpy = is_numpy(q0)
+        self._lock = Lock()  # of the state, for threads that share the tracker
         self.reset(q0)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._lock = Lock()
 
     def __repr__(self) -> str:
         """Return a one-line summary."""
         n = len(self.q)
         return f"Tracker({n} actuators, {self.status.name}, error {self.error:.3g} m)"
 
-    backend = _seen("backend", '"compiled" for NumPy and models that have kernels, else "torch".')
+    backend = _seen("backend", '"compiled", or "torch: " and the reason.')
     q = _seen("command", "The present command, shape (n,).")
     x = _seen("x", "The model's tip before the last step [m], in the shape of the task.")
     error = _seen("error", "Distance from the tip, measured or the model's, to the target [m].")
@@ -93,17 +106,19 @@ class Tracker(Portable):
 
         CONVERGED if `error` is within the tolerance, or OUT_OF_DOMAIN if the configuration is
         outside the model's domain. Else AT_LIMITS if a limit restricted the step, SINGULAR if it
-        was damped, MAX_ITER otherwise. INVALID_INPUT before the first step, and if the target, the
-        measured tip or the model's output was not finite.
+        was damped or no motion is possible, MAX_ITER otherwise. INVALID_INPUT before the first
+        step, and if the target, the measured tip or the model's output was not finite.
         """
-        robot = self._robot
-        if not math.isfinite(robot.error + robot.sigma_min):
-            return IKStatus.INVALID_INPUT
-        if robot.reached(self._tol):
-            return IKStatus.CONVERGED if robot.in_domain() else IKStatus.OUT_OF_DOMAIN
-        if robot.saturated.any() or robot.stopped:
-            return IKStatus.AT_LIMITS
-        return IKStatus.SINGULAR if robot.damping > 0.0 else IKStatus.MAX_ITER
+        with self._lock:
+            robot = self._robot
+            if not math.isfinite(robot.error + robot.sigma_min):
+                return IKStatus.INVALID_INPUT
+            if robot.reached(self._tol):
+                return IKStatus.CONVERGED if robot.in_domain() else IKStatus.OUT_OF_DOMAIN
+            if robot.saturated.any() or robot.stopped:
+                return IKStatus.AT_LIMITS
+            damped = robot.damping > 0.0 or robot.sigma_min == 0.0
+            return IKStatus.SINGULAR if damped else IKStatus.MAX_ITER
 
     def reset(self, q: Array) -> None:
         """Restart at rest from an actuator vector, as read from the robot.
@@ -113,18 +128,26 @@ class Tracker(Portable):
         q : array-like of shape (n,)
             Actuator vector, in the unit of q. From outside the limits it returns at `dq_max`.
         """
-        given, settings = as_tensor(q, "q", self._settings.task.device), self._settings
-        n = settings.n_actuators
+        given = as_tensor(q, "q", self._settings.task.device)
+        n = self._settings.n_actuators
         good = given.ndim == 1 and n in (None, len(given)) and torch.isfinite(given).all()
         need = f"finite and of shape ({n or 'n'},)"
         require(good, f"`q` must be {need}, got {given.tolist()}; read it from the robot.")
-        core = core_of(settings) if self._as_numpy and given.dtype == torch.float64 else None
-        if core is not None:
-            self._robot = Follower(core, self._memory)
+        with self._lock:
+            self._like = given.clone()
+            self._start(self._like, torch.zeros_like(given))
+
+    def _start(self, q: Tensor, dq: Tensor) -> None:
+        """Read the model, and start at q (n,) after a step dq (n,)."""
+        self._settings = settings = self._settings.present()
+        core, task = core_of(settings), settings.task
+        if core is not None and self._as_numpy and q.dtype == torch.float64:
+            robot = Follower(core, self._memory)
         else:
-            self._robot = _InTorch(settings, self._memory, self._as_numpy)
-        self._like = given.clone()
-        self._robot.start(self._like[None])
+            reason = "`q0` is no float64 array of NumPy" if core else why_torch(settings)
+            robot = _InTorch(settings, self._memory, self._as_numpy, reason)
+        robot.start(q[None], dq[None])
+        self._estimator, self._module, self._robot = task.estimator, task.module, robot
 
     def step(
         self, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
@@ -149,9 +172,17 @@ class Tracker(Portable):
             The command, exactly within the limits; a new array. If `x_target` or `dx` is not
             finite, the robot stops (with `ddq_max` it brakes first).
         """
-        settings, like, robot = self._settings, self._like, self._robot
-        if robot.tick(x_target, dx, x_measured):
+        with self._lock:
+            if self._estimator is not None and self._estimator.module_ is not self._module:
+                self._start(as_tensor(self._robot.command, "q"), self._robot.last().step.dq[0])
+            robot = self._robot
+            if not robot.tick(x_target, dx, x_measured):
+                self._step(x_target, dx, x_measured)
             return robot.command
+
+    def _step(self, x_target: Array, dx: Array | None, x_measured: Array | None) -> None:
+        """Do a step with arguments that need full checks."""
+        settings, like = self._settings, self._like
         target = settings.points(x_target, "x_target", like, lead="")[None]
         feed_forward, tip = None, None
         if dx is not None:
@@ -159,8 +190,7 @@ class Tracker(Portable):
             feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)[None]
         if x_measured is not None:
             tip = settings.points(x_measured, "x_measured", like, lead="")[None]
-        robot.advance(None, target, feed_forward, tip)
-        return robot.command
+        self._robot.advance(None, target, feed_forward, tip)
 
     def follow(
         self,
@@ -211,19 +241,20 @@ class Tracker(Portable):
 class _InTorch:
     """The torch counterpart of `Follower`, for any task."""
 
-    backend = "torch"
-
-    def __init__(self, settings: StepSettings, memory: float | None, as_numpy: bool) -> None:
-        self._settings, self._memory, self._as_numpy = settings, memory, as_numpy
-        self.task = settings.task
+    def __init__(
+        self, settings: StepSettings, memory: float | None, as_numpy: bool, reason: str
+    ) -> None:
+        self._memory, self._as_numpy, self.backend = memory, as_numpy, f"torch: {reason}"
+        self.task = settings.task.frozen()
+        self._settings = replace(settings, task=self.task)
 
     @torch.no_grad()
-    def start(self, q: Tensor) -> None:
-        """Set the initial configuration (1, n), at rest."""
+    def start(self, q: Tensor, dq: Tensor) -> None:
+        """Set the initial configuration (1, n), and the step that led to it."""
         self._q, (x, J) = q, self._settings.evaluate(q)
         self._offset = x.new_zeros(1, sum(self.task.parts))  # last measured minus model
         unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(q)
-        step = StepRows(none, unknown[:, 0], none[:, 0], none > 0.0)
+        step = StepRows(dq, unknown[:, 0], none[:, 0], none > 0.0)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 
@@ -265,6 +296,10 @@ class _InTorch:
             self._offset = math.exp(-seconds / self._memory) * self._offset
         self._last, self._period = Tick(self._q, x, J, error, step), seconds
         self._q = self._q + step.dq
+        return self._last
+
+    def last(self) -> Tick:
+        """Return the results of the last tick."""
         return self._last
 
     def reached(self, tol: Tolerance) -> bool:

@@ -1,11 +1,12 @@
 """Derivatives of solved configurations against the conditions of optimality, in closed form."""
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import InverseKinematics
-from hybridkin.ik.tasks import PositionTask
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, InverseKinematics, RigidChain
+from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
 
 Q_PREF = torch.tensor([0.3, -0.2, 0.1, 0.4], dtype=torch.float64)
 WEIGHTS = torch.tensor([1.0, 4.0, 0.5, 2.0], dtype=torch.float64)
@@ -63,3 +64,138 @@ def test_without_a_posture_nothing_moves_but_for_the_target():
     root = WEIGHTS.sqrt()
     J = torch.autograd.functional.jacobian(bent, q.detach())
     assert_close(slope, torch.linalg.pinv(J / root) / root[:, None], rtol=1e-9, atol=1e-12)
+
+
+# J of full rank is the exception: planar arms, pairs of tendons, locked actuators, five joints.
+
+
+def arm(links, axes):
+    origins = np.stack([np.eye(4)] * len(links))
+    origins[1:, 0, 3] = links[:-1]
+    return RigidChain(origins, axes, tool=[links[-1], 0.0, 0.0])
+
+
+PLANAR = arm([0.3, 0.25, 0.2], [[0, 0, 1]] * 3)
+FIVE = arm([0.1, 0.3, 0.25, 0.1, 0.1], [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0]])
+PAIRS = ConstantCurvatureChain([0.02] * 3, lengths=[0.1] * 3, n_actuators=2)
+TRUNK = ConstantCurvatureChain([0.100, 0.093, 0.079])
+BEND = [0.3, 0.5, -0.4]
+PULLS = [0.004, -0.004, 0.003, -0.003, -0.002, 0.002]
+LENGTHS = [0.2, 0.25, 0.3, 0.22, 0.24, 0.3, 0.21, 0.27, 0.25]
+TURNS = {"q_min": -2.0, "q_max": 2.0}
+PULLED = {"q_min": -0.02, "q_max": 0.02}
+LOCKED = {"q_min": [0.1, 0.1, *LENGTHS[2:]], "q_max": [0.4, 0.4, *LENGTHS[2:]]}
+DEFICIENT = {
+    "planar arm": (PLANAR, BEND, TURNS, 1e-4),
+    "weighted": (PLANAR, BEND, {**TURNS, "weights": [1.0, 4.0, 0.5]}, 1e-4),
+    "no posture": (arm([0.3, 0.25], [[0, 0, 1]] * 2), BEND[:2], {**TURNS, "beta": 0.0}, 1e-4),
+    "pose in a plane": (PoseTask(PLANAR), BEND, TURNS, 1e-4),
+    "pose of five joints": (PoseTask(FIVE), [*BEND, 0.6, 0.2], TURNS, 1e-4),
+    "pairs of tendons": (PAIRS, PULLS, {**PULLED, "q_pref": PULLS[::-1]}, 1e-5),
+    "points of pairs": (PointsTask(PAIRS, [2, 3], [0.5, 1.0]), PULLS, PULLED, 1e-5),
+    "one segment": (ConstantCurvatureChain([0.02], lengths=[0.1]), [0.0] * 3, PULLED, 1e-5),
+    "locked": (TRUNK, LENGTHS, LOCKED, 1e-5),
+    "limits": (TRUNK, LENGTHS, {"q_min": 0.1, "q_max": 0.27, "q_pref": 0.27}, 1e-5),
+}
+
+
+def slope_of(q, t):
+    """Return dq/dt of a solution by a scalar."""
+    return torch.stack([torch.autograd.grad(a, t, retain_graph=True)[0] for a in q])
+
+
+def difference(solve, start, h):
+    """Return dq/dt at 0 from differences of solutions, to the fourth order."""
+    ends = {}
+    for k in (-2, -1, 1, 2):
+        solution = solve(torch.tensor(k * h, dtype=torch.float64), start)
+        assert solution.converged
+        ends[k] = solution.q.detach()
+    return (8.0 * (ends[1] - ends[-1]) - (ends[2] - ends[-2])) / (12.0 * h)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DEFICIENT)
+def test_derivatives_in_reachable_directions_are_those_of_the_solutions(name):
+    task, q, options, h = DEFICIENT[name]
+    ik = InverseKinematics(task, **options)
+    settings = ik.settings
+    start = settings.inside(torch.tensor(q, dtype=torch.float64))
+    x = settings.evaluate(start[None])[0][0].requires_grad_()
+    start = ik.solve(x, start, tol=1e-9, differentiable=True).q.detach()
+    low, high = settings.box(start)
+    free = (start > low) & (start < high)
+    way = torch.where(free, torch.cos(2.0 * torch.arange(len(start)).double()), 0.0)
+
+    def solve(t, q0):
+        moving = settings.evaluate((start + t * way)[None])[0][0]
+        moving = moving if moving.requires_grad else moving.requires_grad_()
+        return ik.solve(moving, q0, tol=1e-9, differentiable=True)
+
+    t = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    expected = difference(solve, start, h)
+    assert expected.abs().max() > 0.1
+    assert_close(slope_of(solve(t, start).q, t), expected, rtol=1e-8, atol=1e-8)
+
+
+def test_derivatives_across_the_plane_of_an_arm_are_zero_and_single_precision_agrees():
+    ik = InverseKinematics(PLANAR, **TURNS)
+    target = PLANAR(torch.tensor(BEND, dtype=torch.float64))
+    target[2] = 5e-5  # within the tolerance
+    slopes = {}
+    for dtype in (torch.float64, torch.float32):
+        moving = target.to(dtype).requires_grad_()
+        solution = ik.solve(moving, torch.tensor(BEND, dtype=dtype), differentiable=True)
+        assert solution.converged
+        slopes[dtype] = slope_of(solution.q, moving)
+        assert (slopes[dtype][:, 2] == 0.0).all()
+        assert slopes[dtype].abs().max() > 1.0
+    assert_close(slopes[torch.float32].double(), slopes[torch.float64], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("chain", "q", "entry", "options", "h"),
+    [
+        (PLANAR, BEND, "links", TURNS, 1e-5),
+        (PAIRS, PULLS, "lengths", PULLED, 1e-6),
+        (PAIRS, PULLS, "radii", PULLED, 1e-6),
+    ],
+)
+def test_derivatives_by_the_geometry_of_deficient_robots(chain, q, entry, options, h):
+    q = torch.tensor(q, dtype=torch.float64)
+    target, value = chain(q), chain.geometry()[entry]
+    change = torch.cos(torch.arange(value.numel()).double()).view(value.shape)
+    if entry == "links":
+        change[0] = change[:, 2] = 0.0  # the arm stays in its plane
+
+    def solve(t, q0):
+        moved = chain.with_geometry(**{entry: value + t * change})
+        ik = InverseKinematics(moved, **options)
+        return ik.solve(target.clone().requires_grad_(), q0, tol=1e-9, differentiable=True)
+
+    t = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    start = solve(t, q).q.detach()
+    expected = difference(solve, start, h)
+    assert_close(slope_of(solve(t, start).q, t), expected, rtol=1e-7, atol=1e-7)
+
+
+def test_singular_solutions_have_no_derivatives_and_say_so():
+    tendons = ConstantCurvatureChain([0.02] * 2, lengths=[0.1] * 2, routing="base")
+    bent = torch.tensor([0.004, -0.002, 0.001, 0.003, -0.004, 0.002]).double()
+    target = tendons(torch.stack([0.0 * bent, bent])).requires_grad_()
+    ik = InverseKinematics(tendons, **PULLED)
+    with pytest.warns(UserWarning, match="1 of 2 solutions"):
+        solution = ik.solve(target, differentiable=True)
+    assert solution.converged.all()
+    (slope,) = torch.autograd.grad(solution.q.sum(), target)
+    assert (slope[0] == 0.0).all()
+    assert (slope[1] != 0.0).all()
+
+
+def test_a_solution_with_derivatives_stays_within_the_tolerance(rng):
+    """Newton's steps to the exact solution can leave it, at tendons that go slack."""
+    chain = ElasticTendonChain([0.02] * 2, [0.1] * 2)
+    rng.manual_seed(4)
+    q = 0.02 * (2.0 * torch.rand(12, 6, generator=rng).double() - 1.0)
+    target = chain(q[4:6]).detach().requires_grad_()
+    assert InverseKinematics(chain, **PULLED).solve(target, differentiable=True).converged.all()

@@ -164,7 +164,7 @@ def test_a_step_is_stopped_where_a_plane_turns_it():
         tracker = ik.tracker(torch.zeros(5, dtype=torch.float64))
         tracker.step(target)
         assert (tracker.status is IKStatus.AT_LIMITS) == expected[k]
-        assert tracker.backend == "torch"
+        assert tracker.backend.startswith("torch: ")
         tracker.step(target)
         assert_close(tracker.x, torch.where(target == 9.0, 1e-3, target), rtol=0.0, atol=1e-12)
 
@@ -285,7 +285,7 @@ def test_what_pulls_against_limits_alone_is_blocked():
     assert search._blocked(search._point(q, q + 0.1 * way)).tolist() == blocked
     assert not search._blocked(search._point(q, q - way)).any()
     found = InverseKinematics(model, q_min=-1.0, q_max=1.0).solve(q + way, q, restarts=0)
-    assert (found.status == IKStatus.UNREACHABLE).tolist() == [True, True, True, False]
+    assert (found.status == IKStatus.MAX_ITER).tolist() == [True, True, True, False]
     assert (found.n_iter[:2] == 0).all()
 
 

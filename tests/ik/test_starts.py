@@ -42,7 +42,8 @@ def test_targets_of_corners_are_reached_from_further_starts(rng, name):
     start = low + (high - low) * torch.rand(40, chain.n_actuators, generator=rng).double()
     ik = InverseKinematics(chain, q_min=low, q_max=high)
     once, solution = ik.solve(target, start, restarts=0), ik.solve(target, start)
-    assert (once.status == IKStatus.UNREACHABLE).any()  # although each one can be reached
+    assert (once.status == IKStatus.MAX_ITER).any()
+    assert not (once.status == IKStatus.UNREACHABLE).any()  # each one can be reached
     assert solution.converged.all()
     assert ((solution.q >= low) & (solution.q <= high)).all()
     assert (chain(solution.q) - target).norm(dim=-1).max() <= 1e-4
@@ -55,7 +56,7 @@ def test_targets_of_corners_are_reached_from_further_starts(rng, name):
 
 
 @pytest.mark.slow
-def test_unreachable_is_said_after_all_starts_at_a_bounded_cost():
+def test_a_miss_is_said_after_all_starts_at_a_bounded_cost():
     model = Counted(TRUNK)
     ik = InverseKinematics(model, q_min=[0.1] * 9, q_max=0.4)
     target = torch.tensor([[0.0, 0.0, 1.5], [0.9, 0.9, 0.9]]).double()
@@ -64,7 +65,7 @@ def test_unreachable_is_said_after_all_starts_at_a_bounded_cost():
     assert "starts" not in repr(once)
     model.rows = 0
     solution = ik.solve(target)
-    assert (solution.status == IKStatus.UNREACHABLE).all()
+    assert (solution.status == IKStatus.MAX_ITER).all()
     assert solution.n_starts.tolist() == [1 + RESTARTS] * 2
     assert f"up to {1 + RESTARTS} starts" in repr(solution)
     assert (solution.error <= once.error).all()

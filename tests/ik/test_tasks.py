@@ -433,7 +433,7 @@ def test_derivatives_with_held_actuators_and_by_the_models_parameters(rng):
     assert_close(by_radii, expected / 2e-6, rtol=1e-5, atol=1e-5)
 
 
-def test_rows_that_have_not_converged_get_no_derivatives(rng):
+def test_rows_that_have_not_converged_get_no_derivatives():
     far = torch.tensor([[0.0, 0.0, 9.0]], dtype=torch.float64, requires_grad=True)
     solution = InverseKinematics(CHAIN, **LIMITS).solve(far, differentiable=True)
     (slope,) = torch.autograd.grad(solution.q.sum(), far)
