@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from hybridkin._core.version import __version__
 
 if TYPE_CHECKING:
-    from hybridkin import datasets, native, paper, plots, simulation, workflow
+    from hybridkin import datasets, native, plots, workflow
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.calibration.play_fit import PlayFit, fit_play
@@ -52,11 +52,9 @@ __all__ = [
     "jacobian",
     "load_model",
     "native",
-    "paper",
     "plots",
     "robots",
     "save_model",
-    "simulation",
     "tasks",
     "trajectories",
     "workflow",

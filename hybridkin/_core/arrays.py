@@ -60,7 +60,7 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
         if array.dtype.kind in "biufO":
             kind = np.float32 if array.dtype == np.float32 else np.float64
             return np.require(array, kind, ["C", "W"])
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         kind = TypeError if isinstance(error, TypeError) else ValueError
         raise kind(f"`{name}` must be numeric, got {value!r:.200} ({error}).") from error
     hint = " Complex data not supported." if array.dtype.kind == "c" else ""
@@ -86,6 +86,15 @@ def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
         need = f"at least {least}" if most == math.inf else f"{least} to {most}"
         raise ValueError(f"`{name}` must be {need}, a whole number, got {value!r:.80}.")
     return int(value)
+
+
+def random_generator(random_state: int | np.random.Generator | None) -> np.random.Generator:
+    """Return the caller's generator, or a new one with the caller's seed."""
+    if isinstance(random_state, np.random.Generator):
+        return random_state
+    if random_state is not None:
+        random_state = whole(random_state, "random_state", 0)
+    return np.random.default_rng(random_state)
 
 
 def one_of(value: Any, name: str, known: Collection[str], hint: str = "") -> str:

@@ -54,8 +54,9 @@ def write_files(folder: str | Path, files: Mapping[str, Writer]) -> None:
     with _staged(folder, home) as staging:
         staging.mkdir()
         for name, write in files.items():
-            write(staging / name)
-            _flush(staging / name)
+            with _named(folder / name, staging):
+                write(staging / name)
+                _flush(staging / name)
         _flush(staging)
         late, new = None, folder / _NEW if home == folder else folder
         while staging.exists() or (folder / _NEW).exists():
@@ -124,14 +125,31 @@ def _staged(path: Path, home: Path) -> Iterator[Path]:
                     _remove(left)
             with suppress(OSError):
                 fcntl.flock(handle, fcntl.LOCK_SH)
-        yield staging
+        with _named(path, staging):
+            yield staging
     finally:
         _remove(staging)
         os.close(handle)
 
 
+@contextmanager
+def _named(path: Path, staging: Path) -> Iterator[None]:
+    """Give a system's error the path that was to be written, if it names none or a temporary one.
+
+    A full disk is found by calls that know no name.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None or staging.name in str(error):
+            reason = error.strerror or str(error)
+            raise OSError(error.errno or errno.EIO, reason, str(path)) from error
+        raise
+
+
 def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+    with suppress(OSError):  # one on a read-only disk, or with too long a name, is not there
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

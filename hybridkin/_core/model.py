@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from numpy.typing import NDArray
@@ -35,12 +36,12 @@ class Portable:
     """An object whose pickle and joblib hash are the same in every process.
 
     Tensors, also those in dicts, are pickled as plain arrays. They are restored on their device,
-    or on the CPU if that device does not exist. The compiled program is not pickled.
+    or on the CPU if that device does not exist. What belongs to the process is not pickled.
     """
 
     def __getstate__(self) -> dict[str, Any]:
         own = vars(self).copy()  # one copy: another thread may add its program
-        return _closed({key: value for key, value in own.items() if key != "_program"})
+        return _closed({k: value for k, value in own.items() if "_program" != k != "_lock"})
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(_opened(state))
@@ -148,6 +149,11 @@ class ForwardModel(PortableModule):
         return False
 
     @property
+    def pulls(self) -> Tensor | float:
+        """Sign of q in which an actuator can only pull, () or (n,); 0 if it can also push."""
+        return 0.0
+
+    @property
     def robot(self) -> ForwardModel:
         """The model with the geometry: the mechanical model of a hybrid, else the model itself."""
         return self
@@ -167,6 +173,13 @@ class ForwardModel(PortableModule):
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if tips (..., 3) lie too far from the base to be in metres."""
         return []
+
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return lower bounds (...) of the distances [m] from targets x (..., m) to all tips.
+
+        All tips of q with ``|q| <= largest``, shape () or (n,). Default: 0, no bound is known.
+        """
+        return x.new_zeros(x.shape[:-1])
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., n_outputs) for q of shape (..., n_actuators)."""
@@ -194,6 +207,15 @@ class ForwardModel(PortableModule):
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies inside the domain of the model, shape (...), bool."""
         return self.domain_distance(q) <= 1.0
+
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """A point (n,) and orthonormal normals (n, k) of the plane of q to keep to, if any."""
+        return None
+
+    def frozen(self) -> Self:
+        """Return a copy, which does not change with this model."""
+        return copy.deepcopy(self)
 
     # Serial coupling corrects a model at inner coordinates z between q and x. By default z is q.
 
@@ -259,6 +281,10 @@ class FunctionModel(ForwardModel):
         self.own_jacobian, self.own_pair = (own, pair) if jacobian is None else (jacobian, None)
         self.n_actuators = int(n or 0)
 
+    def frozen(self) -> Self:
+        """Return this model: a function is called as it is, and may not have copies."""
+        return self
+
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m)."""
         return _checked(self.function(q))
@@ -277,6 +303,13 @@ class FunctionModel(ForwardModel):
             return super().domain_distance(q)
         inside = torch.as_tensor(self.own_domain(q), device=q.device)
         return torch.where(inside, 0.0, 2.0).to(q)
+
+
+@runtime_checkable
+class Fitted(Protocol):
+    """A fitted estimator. Every fit sets another module; none changes."""
+
+    module_: nn.Module
 
 
 def as_forward_model(model: Any) -> ForwardModel:
@@ -316,9 +349,8 @@ def as_forward_model(model: Any) -> ForwardModel:
                 f"`model` must be two callables, q -> x and its Jacobian, got {model!r}."
             )
         return FunctionModel(*model)
-    fitted = getattr(model, "module_", None)
-    if fitted is not None:
-        return as_forward_model(fitted)
+    if isinstance(model, Fitted):
+        return as_forward_model(model.module_)
     if not callable(model):
         if isinstance(model, BaseEstimator):
             check_is_fitted(model)

@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
+from hybridkin._core.model import ForwardModel
 from hybridkin.calibration._least_squares import LOSSES, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration._unidentified import few_terms
 from hybridkin.calibration.calibrate import check_data
-from hybridkin.calibration.measured import folds, inner_and_outer
+from hybridkin.calibration.measured import folds, inner_and_outer, moved_directions
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -31,7 +32,6 @@ _USUAL = ((), ("base",), ("radii", "base"))  # sets that are also calibrated fro
 _EQUAL = 0.007  # of the score: within it the smaller set is taken
 _ALIKE = 0.01  # of the error: within it the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
-_TIED = 0.01  # of the largest spread of q: below it a direction is not excited
 _MOVES = 0.05  # of the largest motion of the tip
 
 _RIVAL = "elastic tendons: "  # prefix of sets that replace those of a plain chain
@@ -158,7 +158,7 @@ def choose_geometry(
     rows = Rows(q[kept], x[kept], counts[kept])
     with torch.no_grad():
         rungs = _rungs(chain, q, parameters)
-        tied = () if parameters is not None else _tied(chain, q)
+        tied = () if parameters is not None else unmoved(chain, q)
     starts = _starts(rungs, rows, loss)
     best, errors = 0, {}
     if len(rungs) > 1:
@@ -308,25 +308,51 @@ def _errors(
     return Errors(cv, io)
 
 
-def _tied(chain: Chain, q: Tensor) -> tuple[str, ...]:
-    """Return a warning if q does not excite directions that move the tip."""
-    n = chain.n_actuators
-    if len(q) <= n:
+def unmoved(model: ForwardModel | None, q: Tensor) -> tuple[str, ...]:
+    """Return a warning if rows q (N, n) do not move directions that move the tip of the model.
+
+    N rows move at most N - 1 directions; that they are few is no reason for this warning. Without a
+    model, what moves the tip is not known.
+    """
+    directions = moved_directions(q.numpy())
+    if not directions.moved.size:
+        return (
+            "the log holds a single configuration: nothing is learned about others, and "
+            "`in_domain` is false for them. Record rows that move every actuator.",
+        )
+    if model is None or directions.moved.shape[1] >= min(q.shape[1], len(q) - 1):
         return ()
-    _, spread, axes = torch.linalg.svd(q - q.mean(dim=0), full_matrices=False)
-    still = axes[spread <= _TIED * spread[0]]
-    J = chain.forward_and_jacobian(q[:: max(1, len(q) // 50)])[1].flatten(0, 1)
-    if not len(still):
+    normals = directions.normals()
+    still = normals @ split_by_effect(model, q, normals)[0]
+    if not still.size:
         return ()
-    _, moves, turned = torch.linalg.svd(J @ still.mT, full_matrices=False)
-    moving = moves > _MOVES * torch.linalg.svdvals(J)[0]
-    if not moving.any():
-        return ()
-    words = []
-    for move in few_terms((turned[moving] @ still).numpy()):
-        move = move / move[np.argmax(np.abs(move))]
-        words.append(" ".join(f"{at:+.2g} q[{k}]" for k, at in enumerate(move) if abs(at) > 0.05))
+    names = [f"q[{k}]" for k in range(q.shape[1])]
     return (
-        f"the log has no motion along {'; '.join(words)} (directions of q that move the tip): "
-        "predictions there are extrapolation. Record rows that move the actuators independently.",
+        f"the log has no motion along {in_terms(still, names)} (directions of q that move the "
+        "tip): a learned correction is constant there, and `in_domain` is false beyond a tenth of "
+        "the range. Record rows that move the actuators independently.",
     )
+
+
+def split_by_effect(model: ForwardModel, q: Tensor, directions: NDArray) -> tuple[NDArray, NDArray]:
+    """Return combinations (k, a) and (k, k - a) of directions of q (n, k).
+
+    Along the first ones the tip of the model moves at some of the rows q (N, n), along the others
+    it hardly moves.
+    """
+    with torch.enable_grad():
+        some = model.forward_and_jacobian(q[:: max(1, len(q) // 50)])[1]
+    J = some.detach().flatten(0, 1).numpy()
+    effects, turned = np.linalg.eigh((J @ directions).T @ (J @ directions))
+    moving = effects > (_MOVES * np.linalg.norm(J, 2)) ** 2
+    return turned[:, moving], turned[:, ~moving]
+
+
+def in_terms(directions: NDArray, names: Sequence[str]) -> str:
+    """Return directions of q (n, k) in words, each by few of the named actuators."""
+    words = []
+    for move in few_terms(directions.T):
+        lead = np.argmax(np.abs(move) > 0.5 * np.abs(move).max())
+        terms = zip(names, move / move[lead], strict=True)
+        words.append(" ".join(f"{at:+.2g} {name}" for name, at in terms if abs(at) > 0.05))
+    return "; ".join(words)

@@ -43,10 +43,11 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
     """Return the arguments of a `RigidChain`, with fixed joints merged into the other poses."""
     moving: list[Joint] = []
     pending = np.eye(4)
+    named = {joint.name for joint in path}
     for joint in path:
         pending = pending @ joint.origin
         if joint.kind != "fixed":
-            name = joint.name or f"joint_{len(moving) + 1}"
+            name = joint.name or unused(f"joint_{len(moving) + 1}", named)
             moving.append(joint._replace(origin=pending, name=name))
             pending = np.eye(4)
     if len(moving) > _MOST:
@@ -66,6 +67,13 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
         "dq_max": [joint.speed for joint in drivers.values()],
         "tip": pending,
     }
+
+
+def unused(name: str, names: Collection[str]) -> str:
+    """Return a name that none of the others has: joints of equal names move together."""
+    while name in names:
+        name += "_"
+    return name
 
 
 def _limits(joint: Joint) -> tuple[float, float]:
@@ -216,7 +224,8 @@ def chain_path(chain: Chain) -> list[Joint]:
             if offset is not None:
                 origin = origin @ offset.get_matrix()[0].detach().cpu().double().numpy()
         joint = frame.joint
+        joint_name = "" if joint.name in (earlier.name for earlier in path) else joint.name
         axis = joint.axis.detach().cpu().double().numpy()
         limits = joint.limits if any(joint.limits or ()) else None  # two zeros mean none
-        path.append(Joint(origin, joint.joint_type, axis, joint.name, limits))
+        path.append(Joint(origin, joint.joint_type, axis, joint_name, limits))
     return path

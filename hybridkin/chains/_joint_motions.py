@@ -115,14 +115,21 @@ class JointChain(Chain):
     def reach(self) -> Tensor:
         """Size of the arm, shape () [m]: the sum of links, finite strokes and tool."""
         strokes = torch.maximum(self.q_min.abs(), self.q_max.abs())
-        strokes = torch.where(torch.isfinite(strokes), strokes, 0.0)
-        if self.couplings is not None:
-            strokes = self.couplings.abs() @ strokes
-        strokes = torch.where(self.slides, strokes, 0.0)
+        strokes = self._strokes(torch.where(torch.isfinite(strokes), strokes, 0.0))
         links = torch.linalg.vector_norm(self.origins[:, :3, 3], dim=1).sum()
         ends = torch.linalg.vector_norm(torch.stack([self.tip[:3, 3], self.tool]), dim=1).sum()
         reach = links + strokes.sum() + ends
         return torch.where(reach > 0, reach, 1.0)
+
+    def longest(self, largest: Tensor) -> Tensor:
+        """Return the reach plus the strokes of prismatic joints within ``|q| <= largest``."""
+        return self.reach + self._strokes(largest + self.joint_zeros.abs()).sum()
+
+    def _strokes(self, largest: Tensor) -> Tensor:
+        """Return the strokes of all joints for ``|q| <= largest``; 0 for revolute joints."""
+        if self.couplings is not None:
+            largest = self.couplings.abs() @ largest
+        return torch.where(self.slides, largest, 0.0)
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name.
@@ -312,7 +319,7 @@ class JointChain(Chain):
         columns = torch.linalg.cross(axes, tip - points, dim=1)
         if "prismatic" in self.kinds:
             slides = self.slides.to(z.device)[:, None, None]
-            columns = torch.where(slides, axes, columns)
+            columns = torch.where(slides, axes + (tip - tip), columns)  # NaN in a row of NaN
         return tip, columns, axes, frame
 
     def _in_measuring_frame(self, columns: Tensor, q: Tensor) -> Tensor:

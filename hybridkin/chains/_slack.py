@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from hybridkin._core.arrays import identity
+
 MOST = 62  # a set of tendons is the bits of one integer
 _WHOLE_STEPS = 8  # then one tendon at a time, which always terminates
 _MOST_TURNS = 12  # 2 to this power bounds the steps if rounding prevents the end
@@ -48,9 +50,12 @@ def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
     pulling = readings.T * taut[:, None]  # (M, 3 S, n)
     hessian = torch.diag(stiffness) + pulling @ readings
     scaled = units[:, None] * hessian * units
-    compliance = units[:, None] * torch.linalg.inv_ex(scaled).inverse * units
     force = torch.cat([pulling * gains, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1)
-    shape = compliance @ force
+    # Solved for the forces: a product with the inverse loses digits of a soft backbone.
+    unit_forces = identity(len(stiffness), force).expand(len(force), -1, -1)
+    forces = units[:, None] * torch.cat([force, unit_forces], dim=-1)
+    solved = units[:, None] * torch.linalg.solve_ex(scaled, forces).result
+    shape, compliance = solved.split([force.shape[-1], len(stiffness)], dim=-1)
     given = torch.cat([torch.diag(gains), -zeros[:, None]], dim=-1)
     return Responses(shape, readings @ shape - given, compliance)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin.chains._arm_files import UNLIMITED, Joint, in_robot, matrix_of, source_of
+from hybridkin.chains._arm_files import UNLIMITED, Joint, in_robot, matrix_of, source_of, unused
 
 _MISSING = (
     "have no <limit>, which URDF requires; they are treated as unlimited. Add <limit>, or set "
@@ -167,12 +167,13 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
     origin, name = _origin(element), element["joint"].get("name", "")
     kind = element["joint"].get("type", "")
     if kind in _FREE and not element["mimic"]:
-        moves = [
-            ("prismatic" if len(part) == 1 else "revolute", np.eye(3)[_AXES[part]], part)
-            for part in _FREE[kind]
-        ]
-        free = [Joint(matrix_of(), *move[:2], f"{name}_{move[2]}", UNLIMITED) for move in moves]
-        return [Joint(origin), *free]
+        path = [Joint(origin)]
+        names = {*by_name, *(other["mimic"].get("joint") for other in by_name.values())}
+        for part in _FREE[kind]:
+            move = "prismatic" if len(part) == 1 else "revolute"
+            actuator = unused(f"{name}_{part}", names)
+            path.append(Joint(matrix_of(), move, np.eye(3)[_AXES[part]], actuator, UNLIMITED))
+        return path
     driver, factor, offset = element, 1.0, 0.0
     followed = [name]
     while mimic := driver["mimic"]:

@@ -66,6 +66,12 @@ class ArcChain(MarkedChain):
         return 10.0 * self.radii.mean() if self.lengths is None else self.lengths.sum()
 
     @property
+    def rigid_length(self) -> Tensor:
+        """Upper bound of the length of rigid offsets and of the way to a marker, shape () [m]."""
+        beside = self.offsets.new_tensor(self.markers)[:, 1:]
+        return self.offsets.abs().sum() + beside.abs().sum()
+
+    @property
     def absolute(self) -> Tensor:
         """Which actuators (n,) have absolute lengths: those of extensible segments, bool."""
         own = np.repeat(self.extensible, self.actuators_per_segment)

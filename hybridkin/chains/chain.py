@@ -185,6 +185,15 @@ class Chain(PoseModel):
         message = span_message(name, points, float(self.reach.detach()), _FAR)
         return [] if message is None else [message]
 
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return how much farther points are from the base than the stretched robot is long."""
+        away = x.unflatten(-1, (-1, 3)) - self.base[:3, 3]
+        return away.norm(dim=-1).amax(-1) - self.longest(largest)
+
+    def longest(self, largest: Tensor) -> Tensor | float:
+        """Return an upper bound of the distance from base to tip for ``|q| <= largest`` [m]."""
+        return torch.inf
+
     def contradiction(self, q: Tensor, name: str = "q") -> str | None:
         """Return a warning if the actuators of q (..., n) contradict each other, else None.
 

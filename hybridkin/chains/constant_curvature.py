@@ -247,6 +247,11 @@ class ConstantCurvatureChain(ArcChain):
         high = torch.where(self.absolute & (self.gains < 0), self.actuator_zeros, torch.inf)
         return super().limits | {"q_min": low, "q_max": high}
 
+    def longest(self, largest: Tensor) -> Tensor:
+        """Return the sum of the largest lengths of arcs and of the rigid parts."""
+        arcs = (self.arc_matrix.abs() * largest).sum(1) + self.arc_offset.abs()
+        return arcs[: self.n_segments].sum() + self.rigid_length
+
     def _check_rows(self, rows: Tensor, name: str) -> None:
         lengths = torch.where(self.absolute.to(rows.device), self.metres(rows), 1.0)
         if (lengths <= 0).any():

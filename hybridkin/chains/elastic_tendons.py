@@ -185,6 +185,15 @@ class ElasticTendonChain(ArcChain):
         geometry = ("radii", "turns", "rest_bends", "lengths", "tool", "base")
         return (*geometry, *stiffness, "tendon_zeros", *(() if self.in_metres else ("gain",)))
 
+    @property
+    def pulls(self) -> Tensor:
+        """Sign of q in which a tendon pulls, shape (n,)."""
+        return -self.gains.sign()
+
+    def longest(self, largest: Tensor) -> Tensor:
+        """Return the length of the robot; tendons only compress it."""
+        return self.reach + self.rigid_length
+
     def tensions(self, q: Tensor) -> Tensor:
         """Return the stretch of every tendon, which is proportional to its force.
 

@@ -172,9 +172,10 @@ class RigidChain(JointChain):
             Its actuators are the moving joints of the path, in order. A mimic joint is replaced by
             the joint it mimics, on the path or not, with that joint's limits. A floating joint
             becomes six (x, y, z, yaw, pitch, roll), a planar one three (x, y, yaw, in the frame of
-            the joint). Equal limits lock a joint. Continuous joints have infinite limits, and so
-            have, with a warning, joints without <limit>. A velocity of 0 means no speed limit.
-            Without moving joints the tip is constant. Tags that are not part of URDF are ignored.
+            the joint); their names end in "_" where another joint has the name. Equal limits lock
+            a joint. Continuous joints have infinite limits, and so have, with a warning, joints
+            without <limit>. A velocity of 0 means no speed limit. Without moving joints the tip is
+            constant. Tags that are not part of URDF are ignored.
 
         Raises
         ------

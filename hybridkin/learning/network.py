@@ -23,15 +23,6 @@ READOUT = ("output_weights", "intercept")
 READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
 
 
-def seen_through(W, b, center, scale, mean, M):
-    """Return W and b of ``W u + b`` changed so that q is replaced by ``mean + (q - mean) @ M``.
-
-    ``u = (q - center) / scale`` is the scaled q; W (h, n) are weights, b (h,) is a bias.
-    """
-    shift = ((mean - center) - (mean - center) @ M) / scale
-    return (W / scale) @ M.T * scale, b + W @ shift
-
-
 class LeverageModule(ForwardModel):
     """A model that can return the leverage of any row with respect to its training rows."""
 
@@ -88,18 +79,6 @@ class ELM(LeverageModule):
         # J = T @ sigma' with T = w_out (x) w_in
         w_in, w_out = self.input_weights / self.input_scale, self.output_weights[:n_hidden]
         self.register_buffer("tangent", (w_out.T[:, None] * w_in.T).flatten(0, 1))
-
-    def seen_through(self, mean, M):
-        """Return the network with its input q replaced by ``mean + (q - mean) @ M``, M (n, n)."""
-        arrays = {name: self.get_buffer(name) for name in LAYER + READOUT}
-        through = self.input_center, self.input_scale, mean.to(self.input_scale), M.to(self.tangent)
-        W, b = seen_through(self.input_weights, self.input_bias, *through)
-        arrays |= {"input_weights": W, "input_bias": b}
-        if len(self.output_weights) > len(W):  # a direct link
-            hidden, direct = self.output_weights.tensor_split([len(W)])
-            direct, arrays["intercept"] = seen_through(direct.T, self.intercept, *through)
-            arrays["output_weights"] = torch.cat([hidden, direct.T])
-        return ELM(self.activation, **arrays)
 
     def extra_repr(self):
         """Return the layer sizes and the activation, for printing."""

@@ -23,6 +23,7 @@ from hybridkin._core.stored import Layout
 
 _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
 _MOST_POWER = 100
+_LARGEST = float(np.finfo(np.float32).max)
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
 
 
@@ -253,9 +254,12 @@ class RegressorModule(ForwardModel):
         return (torch.stack(changes, dim=-1) / (2 * steps.diag())).to(q)
 
     def evaluate(self, q: Tensor) -> Tensor:
-        """Return the prediction without a graph, shape (..., m)."""
-        rows = q.detach().cpu().double().numpy().reshape(-1, q.shape[-1])
-        x = copied(self.regressor.predict(rows), q.device, np.float64)
+        """Return the prediction without a graph, shape (..., m).
+
+        Trees compute in float32, so numbers that it cannot hold are replaced by its largest.
+        """
+        rows = q.detach().cpu().double().clamp(-_LARGEST, _LARGEST).numpy()
+        x = copied(self.regressor.predict(rows.reshape(-1, q.shape[-1])), q.device, np.float64)
         return x.to(q).reshape(*q.shape[:-1], -1)
 
 

@@ -516,7 +516,7 @@ def test_wrong_urdf_limits_name_the_joint(limits):
         RigidChain.from_urdf(one_joint(*limits), "b")
 
 
-def test_equal_urdf_limits_lock_the_joint(rng):
+def test_equal_urdf_limits_lock_the_joint():
     arm = RigidChain.from_urdf(one_joint(0.3, 0.3), "b")
     assert (float(arm.q_min), float(arm.q_max)) == (0.3, 0.3)
     with pytest.warns(UserWarning, match=r"\['j'\] are locked at 0"):
@@ -704,6 +704,84 @@ def test_joints_that_mimic_others_are_one_actuator(rng):
         assert ik.solve(arm(q[:1]), q0=q[:1] + 0.05).converged.all()
 
 
+def serial_urdf(*joints):
+    """A URDF of joints in a row, each as name, type and more tags."""
+    links = "".join(f'<link name="l{i}"/>' for i in range(len(joints) + 1))
+    tags = "".join(
+        f'<joint name="{name}" type="{kind}"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        '<origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>'
+        f'<limit lower="-1" upper="1" effort="1" velocity="1"/>{more}</joint>'
+        for i, (name, kind, more) in enumerate(joints)
+    )
+    return f'<robot name="r">{links}{tags}</robot>', f"l{len(joints)}"
+
+
+@pytest.mark.parametrize(
+    ("joints", "names"),
+    [
+        (
+            [("base", "planar", ""), ("base_x", "prismatic", "")],
+            ("base_x_", "base_y", "base_yaw", "base_x"),
+        ),
+        (
+            [("base_yaw", "revolute", ""), ("base", "planar", "")],
+            ("base_yaw", "base_x", "base_y", "base_yaw_"),
+        ),
+        (
+            [("base", "planar", ""), ("base_x", "planar", ""), ("base_x_y", "revolute", "")],
+            (
+                *("base_x_", "base_y", "base_yaw"),
+                *("base_x_x", "base_x_y_", "base_x_yaw", "base_x_y"),
+            ),
+        ),
+        ([("joint_2", "revolute", ""), ("", "revolute", "")], ("joint_2", "joint_2_")),
+    ],
+)
+def test_joints_whose_names_would_be_equal_are_actuators_of_their_own(joints, names):
+    arm = RigidChain.from_urdf(*serial_urdf(*joints))
+    assert arm.names == names
+    assert arm.n_actuators == len(arm.kinds)
+    q = torch.zeros(len(names), dtype=torch.float64)
+    assert arm.pose_jacobian(q).abs().sum(0).min() > 0.5
+
+
+def test_a_mimic_joint_follows_a_joint_and_no_part_of_a_planar_one():
+    mimic = '<mimic joint="base_x"/>'
+    joints = [("base", "planar", ""), ("base_x", "revolute", ""), ("j", "revolute", mimic)]
+    arm = RigidChain.from_urdf(*serial_urdf(*joints))
+    assert arm.names == ("base_x_", "base_y", "base_yaw", "base_x")
+    assert arm.couplings.nonzero().tolist() == [[0, 0], [1, 1], [2, 2], [3, 3], [4, 3]]
+    missing = [("base", "planar", ""), ("j", "prismatic", mimic)]  # the file has no joint base_x
+    with pytest.warns(UserWarning, match="base_x.* have no <limit>"):
+        assert RigidChain.from_urdf(*serial_urdf(*missing)).n_actuators == 4
+
+
+def test_an_unnamed_joint_of_an_mjcf_is_an_actuator_of_its_own():
+    pytest.importorskip("mujoco")
+    text = """<mujoco><worldbody><body name="a"><joint type="hinge" axis="0 0 1" name="joint_2"/>
+    <geom size=".1"/><body name="b" pos="1 0 0"><joint type="hinge" axis="0 0 1"/>
+    <geom size=".1"/><body name="c" pos="1 0 0"><geom size=".1"/></body></body></body></worldbody>
+    </mujoco>"""
+    arm = RigidChain.from_mjcf(text, "c")
+    assert arm.names == ("joint_2", "joint_2_")
+    q = torch.tensor([0.3, -0.8], dtype=torch.float64)
+    a, b = q[0], q.sum()
+    expected = torch.stack([a.cos() + b.cos(), a.sin() + b.sin(), 0 * a])
+    torch.testing.assert_close(arm(q), expected)
+
+
+def test_joints_of_equal_names_in_a_chain_are_actuators_of_their_own():
+    pk = pytest.importorskip("pytorch_kinematics")
+    chain = pk.build_serial_chain_from_urdf(
+        *serial_urdf(("first", "revolute", ""), ("second", "revolute", ""))
+    )
+    for name in chain.get_frame_names():
+        chain.find_frame(name).joint.name = "same"
+    arm = RigidChain.from_chain(chain)
+    assert arm.n_actuators == 2
+    assert len({*arm.names}) == 2
+
+
 def test_a_mimicked_joint_may_be_fixed_or_missing():
     fixed = COUPLED.replace('name="m" type="prismatic"', 'name="m" type="fixed"')
     arm = RigidChain.from_urdf(fixed, "f")
@@ -718,7 +796,7 @@ def test_a_mimicked_joint_may_be_fixed_or_missing():
 
 
 @pytest.mark.parametrize("end", ["base", "world"])
-def test_an_arm_of_fixed_joints_is_a_constant(end, rng):
+def test_an_arm_of_fixed_joints_is_a_constant(end):
     arm = RigidChain.from_urdf(URDF, end, tool=[0.1, 0.2, 0.3])
     q = torch.zeros(4, 5, 0, dtype=torch.float64)
     x, J = arm.forward_and_jacobian(q)
@@ -833,7 +911,7 @@ def test_only_the_urdf_of_the_arm_is_changed():
             chain.to_urdf(other, "c")
 
 
-def test_a_pitch_of_ninety_degrees_is_written_exactly(rng):
+def test_a_pitch_of_ninety_degrees_is_written_exactly():
     """Beside it too, where roll and yaw nearly turn about the same axis."""
     text = LINKS.format(joint("j", "a", "b", "continuous", "<origin/>"))
     for off in (0.0, 1e-15, -1e-9, 1e-7, 1e-4):
