@@ -88,9 +88,9 @@ def _likeliest_change(
     if "base" in parameters:
         theta = problem.registered(noise)
     for k in range(_ROUNDS):
-        residual, A = (_whitened(a, groups) / noise for a in problem.linearised(theta))
-        A = A.reshape(-1, len(theta))
-        target = residual.ravel() + A @ theta
+        both = problem.linearised(theta)
+        residual, A = (_whitened(a, groups)[problem.measured] / noise for a in both)
+        target = residual + A @ theta
         if k < _CHOOSING:
             std, misfit = _likeliest_scales(A, target, parameters)
         system = std[:, None] * (A.T @ A) * std + misfit * np.eye(len(std))
@@ -130,7 +130,7 @@ def held_out_noise(error: Any, cv_results: dict[str, Any] | None) -> float:
     NaN if neither the fitted error model nor the scores of candidates give it.
     """
     if cv_results is not None:
-        return float(np.min(cv_results["mean_distance"])) / _MEAN_LENGTH
+        return float(cv_results["expected_distance"]) / _MEAN_LENGTH
     if isinstance(error, ReadoutFit):
         return error.rmse / points(error.residual).shape[2] ** 0.5
     if type(error) is tuple:  # one for each marker
@@ -164,6 +164,7 @@ class _Problem:
 
     def __init__(self, fitted: HybridModule, rows: Rows, scale: NDArray) -> None:
         self.fitted, self.q, self.y = fitted, rows.q, torch.from_numpy(rows.tips)
+        self.measured = ~np.isnan(rows.tips)
         robot, self.pivot, self.reach = fitted.robot, self.q.new_zeros(3), 1.0
         if isinstance(robot, Chain):
             self.pivot, self.reach = robot.base[:3, 3].to(self.q), float(robot.reach)
@@ -185,7 +186,8 @@ class _Problem:
         """
         x = torch.from_numpy(evaluate(self.fitted, self.q.numpy())[0])
         y, theta = self.y[:, : x.shape[1]].reshape(-1, 3), self.q.new_zeros(6 + len(self.scale))
-        x = x.reshape(-1, 3)
+        measured = ~y.isnan().any(1)
+        x, y = x.reshape(-1, 3)[measured], y[measured]
         moments = (y - y.mean(0)).mT @ (x - x.mean(0)) + noise**2 * identity(3, x)
         left, _, right = torch.linalg.svd(moments)
         left[:, 2] *= torch.linalg.det(left @ right).sign()
@@ -197,7 +199,8 @@ class _Problem:
     def linearised(self, theta: NDArray) -> tuple[NDArray, NDArray]:
         """Return the residual (k, m) at a change, and the derivative (k, m, 6 + n) of the model.
 
-        Orientation errors of poses are in metres: one radian counts as the reach of the robot.
+        Both are zero for missing markers. Orientation errors of poses are in metres: one radian
+        counts as the reach of the robot.
         """
         model = self.model(theta).rows()
         x, J = map(torch.from_numpy, evaluate(model, self.q.numpy(), jacobian=True))
@@ -214,6 +217,7 @@ class _Problem:
             residual[:, 3:] = self.reach * rotation_vector(turn)
             A[:, 3:, :3], A[:, 3:, 3:6] = spin, 0.0
             A[:, 3:] *= self.reach
+        A[~self.measured] = residual[~self.measured] = 0.0
         return residual.numpy(), A.numpy()
 
 

@@ -111,6 +111,19 @@ class AdaptedModel(ForwardModel):
         """Return the error weight, shape (...)."""
         return self.fitted.error_weight(self._then(q))
 
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """The plane of the log, where it lies after the change."""
+        if self.fitted.plane is None:
+            return None
+        point, normals = self.fitted.plane
+        return point - self.shift, normals
+
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return by how much targets before T are out of reach of f, shape (...) [m]."""
+        before = self._moved(x, torch.linalg.inv(self.motion))
+        return self.fitted.misses(before, largest + self.shift.abs())
+
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the distance of q + shift from the training rows, shape (...)."""
         return self.fitted.domain_distance(self._then(q))

@@ -35,8 +35,8 @@ class Drift(NamedTuple):
     ----------
     center, scale : ndarray of shape (n,)
         Map of the training range to [-1, 1] [unit of q].
-    gram : ndarray of shape (n + 1, n + 1)
-        Weighted products of [1, u].
+    gram : ndarray of shape (m, n + 1, n + 1)
+        Weighted products of [1, u] over the rows in which each output was measured.
     moment : ndarray of shape (n + 1, m)
         Their weighted products with the residuals [m].
     squares : ndarray of shape ()
@@ -54,22 +54,26 @@ class Drift(NamedTuple):
         """Return the drift before any measurement, for training rows q (N, n)."""
         center, scale = center_and_scale(q)
         n = len(scale) + 1
-        none = np.zeros((n, n)), np.zeros((n, n_outputs)), np.zeros(())
+        none = np.zeros((n_outputs, n, n)), np.zeros((n, n_outputs)), np.zeros(())
         return cls(center.numpy(), scale.numpy(), *none)
 
     def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.
 
-        Each row multiplies the weights of all earlier rows by `decay`, once per repetition.
+        Each row multiplies the weights of all earlier rows by `decay`, once per repetition. The
+        residual of a missing marker is NaN; every row has at least one.
         """
-        if not np.isfinite(residual).all():
+        measured = ~np.isnan(residual)
+        residual = np.where(measured, residual, 0.0)
+        if not (measured.any(axis=1).all() and np.isfinite(residual).all()):
             raise too_far()
         phi = np.column_stack([np.ones(len(q)), (q - self.center) / self.scale])
         later = weights[::-1].cumsum()[::-1] - weights
         own = weights if decay == 1.0 else (1.0 - decay**weights) / (1.0 - decay)
         weighed = (own * decay**later)[:, None] * phi
         kept = decay ** weights.sum()
-        gram, moment = kept * self.gram + weighed.T @ phi, kept * self.moment + weighed.T @ residual
+        gram = kept * self.gram + np.einsum("nk,ni,nj->kij", measured, weighed, phi)
+        moment = kept * self.moment + weighed.T @ residual
         squares = kept * self.squares + weighed[:, 0] @ (residual**2).sum(1)
         return self._replace(gram=gram, moment=moment, squares=squares)
 
@@ -89,12 +93,12 @@ class Drift(NamedTuple):
         if np.isnan(noise):
             return 1.0
         sizes, axes = np.linalg.eigh(self.gram)
-        along = ((axes.T @ self.moment) ** 2).sum(1)
-        n_outputs, alphas, misfits = self.moment.shape[1], _ALPHAS[:, None], MISFITS[:, None]
+        along = (self.moment.T[:, None] @ axes).ravel() ** 2
+        sizes, alphas, misfits = sizes.ravel(), _ALPHAS[:, None], MISFITS[:, None]
         explained = (along / (sizes + alphas)).sum(1)
-        spread = n_outputs * np.log1p(sizes.clip(min=0.0) / alphas).sum(1)
+        spread = np.log1p(sizes.clip(min=0.0) / alphas).sum(1)
         left = (self.squares - explained) / (misfits * noise**2)
-        count = n_outputs * self.gram[0, 0]
+        count = self.gram[:, 0, 0].sum()
         evidence = -0.5 * (left + spread + count * np.log(misfits)) - np.log2(misfits)
         evidence -= 2.0 * SWITCH * (_ALPHAS < inf)  # offset and slope
         return float(_ALPHAS[evidence.max(0).argmax()])
@@ -103,8 +107,9 @@ class Drift(NamedTuple):
         """Return the correction as a torch module q (..., n) -> (..., m)."""
         readout = 0.0 * self.moment
         if alpha < inf:
-            least = np.finfo(float).eps * self.gram.trace() + np.finfo(float).tiny
-            system = self.gram + max(alpha, least) * np.eye(len(self.gram))
-            readout = np.linalg.solve(system, self.moment)
+            largest = self.gram.trace(axis1=1, axis2=2).max()
+            least = np.finfo(float).eps * largest + np.finfo(float).tiny
+            system = self.gram + max(alpha, least) * np.eye(len(readout))
+            readout = np.linalg.solve(system, self.moment.T[..., None])[..., 0].T
         coef = readout[1:].T / self.scale
         return AffineModule(coef, readout[0] - coef @ self.center)

@@ -13,7 +13,7 @@ from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.stored import Layout
 from hybridkin.chains.arc_chain import ArcChain, Frames
-from hybridkin.learning.network import ACTIVATIONS, seen_through
+from hybridkin.learning.network import ACTIVATIONS
 
 _POSE_BLOCK = 2048  # rows of pose features, whose temporaries stay in the cache
 _BLOCK = 2**18  # numbers in the features of a block of rows, which stay in the cache
@@ -144,12 +144,6 @@ class HiddenFeatures(Features):
         self.activation = activation
         self.register_buffer("input_weights", input_weights)
         self.register_buffer("input_bias", input_bias)
-
-    def seen_through(self, mean: Tensor, M: Tensor) -> HiddenFeatures:
-        """Return the features whose hidden layer gets ``mean + (q - mean) @ M`` instead of q."""
-        layer = self.input_weights, self.input_bias, self.center, self.scale
-        W, b = seen_through(*layer, mean, M)
-        return HiddenFeatures(self.center, self.scale, W, b, self.activation)
 
     def _bent(self, u: Tensor) -> tuple[Tensor, ...]:
         return (self._hidden(u)[1],)
@@ -297,3 +291,39 @@ class Readout(ForwardModel):
         readout = partial(self.features.readout, weights=self.weights.to(q))
         value, slope = in_blocks(readout, q, rows)
         return value, slope
+
+
+class Projected(ForwardModel):
+    """A model of the part of q that its rows moved: model(q @ matrix + offset).
+
+    It is constant along the other directions, in which the rows show nothing.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Maps q (..., n) to (..., m).
+    matrix, offset : Tensor of shape (n, n) and (n,)
+        See `Directions.projection`.
+    """
+
+    layout = Layout("projected", {"matrix": "nn", "offset": "n"}, parts=("model",))
+
+    def __init__(self, model: ForwardModel, matrix: Tensor, offset: Tensor) -> None:
+        super().__init__()
+        self.model = model
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("offset", offset)
+        self.n_actuators, self.n_outputs = len(offset), model.n_outputs
+
+    def moved(self, q: Tensor) -> Tensor:
+        """Return the part of q (..., n) along the directions that the rows moved."""
+        return q @ self.matrix.to(q) + self.offset.to(q)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the output of the model, shape (..., m)."""
+        return self.model(self.moved(q))
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the output of the model (..., m) and its derivative by q (..., m, n)."""
+        x, J = self.model.forward_and_jacobian(self.moved(q))
+        return x, J @ self.matrix.to(q).mT

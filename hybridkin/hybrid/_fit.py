@@ -23,13 +23,19 @@ from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.turns import TURNS
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
-from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry, unmoved
 from hybridkin.calibration.measured import moved_directions, points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._drift import too_far
-from hybridkin.hybrid._features import Features, HiddenFeatures, PoseFeatures, QuadraticFeatures
-from hybridkin.hybrid._guards import GroupDistance, fit_guard
+from hybridkin.hybrid._features import (
+    Features,
+    HiddenFeatures,
+    PoseFeatures,
+    Projected,
+    QuadraticFeatures,
+)
+from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
 from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._linearised import Pair
 from hybridkin.hybrid._marked import MarkedHybridModule
@@ -38,9 +44,9 @@ from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
 from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
 from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import error_module
 
+_NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
 
 
@@ -75,14 +81,19 @@ class Rows(NamedTuple):
         """Return the rows in which marker k was measured, with only its positions as tips."""
         tips = self.tips[:, 3 * k : 3 * k + 3]
         measured = np.flatnonzero(~np.isnan(tips[:, 0]))
-        if len(measured) < 2:
-            raise ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")
+        if not len(measured):
+            raise _rare_marker(k)
         return self._replace(y=tips).take(measured)
 
     def distinct(self, runs: bool = False) -> tuple[Rows, NDArray]:
         """Return the different rows, and the place of every row in them, see `distinct_rows`."""
         first, weights, place = distinct_rows(self.X, self.y, self.weights, self.groups, runs)
         return self.take(first)._replace(weights=weights), place
+
+
+def _rare_marker(k: int) -> ValueError:
+    """Return the error for a marker that too few rows hold."""
+    return ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")
 
 
 class NamedFeatures(NamedTuple):
@@ -161,10 +172,15 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     shares = [w for w, (_, found) in zip(weights, fits, strict=True) if found is not None]
     corrections = [found for _, found in fits if found is not None]
     kind = PoseHybridModule if spec.output == "pose" else HybridModule
-    tested = None
-    if errors.groups is not None and any(found.guard is not None for found in corrections):
-        tested = GroupDistance.fit(errors.q, errors.groups)
-    module = kind(spec.mechanical, corrections, rows.q.new_tensor(shares), None, tested)
+    tested = plane = None
+    directions = moved_directions(errors.X)
+    if not directions.moved.size or any(part.error_model != "drop" for part in spec.parts):
+        guarded = any(found.guard is not None for found in corrections)
+        plane = Plane.of_log(spec.mechanical, errors.q, directions)
+        groups = errors.groups if guarded else None
+        tested = GroupDistance.of_log(errors.q, groups, directions, plane)
+    weights = rows.q.new_tensor(shares)
+    module = kind(spec.mechanical, corrections, weights, None, tested, plane)
     return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
 
 
@@ -199,7 +215,7 @@ def _of_marker(error_model: Any, k: int, tip: ArcChain | None = None) -> Any:
 
 
 def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
-    """Return a warning for too few different rows; raise an error below the least number.
+    """Return warnings for rows that are too few or alike; raise an error below the least number.
 
     The rms of 20 held-out errors has a relative standard error of about one sixth.
     """
@@ -217,13 +233,23 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
             f"`sample_weight` must lie within a factor of {_COUNTS:g} of the other weights and "
             f"of 1, or be 0 (row not used), got {low:g} to {high:g}; scale the weights."
         )
-    if not learned or n_rows >= max(20, 2 * (n + 1)):
+    measured = (~np.isnan(points(rows.tips)[:, :, 0])).sum(axis=0)
+    if measured.min() < min(2, n_rows):
+        raise _rare_marker(int(measured.argmin()))
+    if not learned:
         return []
+    moved = moved_directions(rows.X).moved
+    # Tendons that are commanded in balance leave some directions out, which is usual.
+    usual = 2 * moved.shape[1] >= n and (np.linalg.norm(moved, axis=1) > _NEVER).all()
+    still = () if usual else unmoved(spec.mechanical, rows.q)
+    if n_rows >= max(20, 2 * (n + 1)):
+        return [*still]
     return [
+        *still,
         f"`X` holds {n_rows} different rows of {n} actuators, too few to rely on: an affine "
         f"function alone has {n + 1} coefficients for each output, and held-out errors of so few "
         f"rows do not predict the error on new ones. Record at least {10 * (n + 1)}, in several "
-        "motions."
+        "motions.",
     ]
 
 
@@ -307,31 +333,34 @@ def _fit_part(
 ) -> tuple[Any, Correction | None]:
     """Return the fitted error model and its guarded correction."""
     model, mechanical, q = part.error_model, spec.mechanical, errors.q
-    if isinstance(model, str) and model == "drop":
+    if model == "drop":
         return None, None
+    directions = moved_directions(errors.X)
+    if mechanical is not None and not directions.moved.size:
+        return None, None
+    matrix, offset = directions.projection()
     serial = part.coupling == "serial"
     if mechanical is not None and (serial or isinstance(model, NamedFeatures)):
         known = model if isinstance(model, ReadoutFit) else None  # of several markers
         fitted = known or _fit_features(part, mechanical, rows, q, spec.left_out)
-        readout = fitted.readout
-        correction = InnerCorrection(mechanical, readout) if serial else TipCorrection(readout)
+        module: ForwardModel = fitted.readout
     else:
-        mean, M = moved_directions(errors.X)
-        if not isinstance(model, (ELMRegressor, ELMRegressorCV)) or M is None:
-            fitted = _fit_regressor(model, rows, errors, place)
-            module = error_module(fitted, q)
-        else:  # else random weights give it a slope in directions without data
-            seen = (mean + (errors.X - mean) @ M).astype(errors.X.dtype)
-            fitted = _fit_regressor(model, rows, errors._replace(X=seen), place)
-            module = cast(ELM, fitted.module_).seen_through(*map(torch.from_numpy, (mean, M)))
-        correction = TipCorrection(module)
+        seen = errors  # as the model sees them; random weights have a slope in all directions
+        if directions.still.size:
+            X = errors.X @ matrix + offset
+            seen = errors._replace(X=X.astype(errors.X.dtype))
+        fitted = _fit_regressor(model, rows, seen, place)
+        module = error_module(fitted, seen.q)
+    if directions.still.size:
+        module = Projected(module, torch.from_numpy(matrix), torch.from_numpy(offset))
     if mechanical is None:
-        return fitted, correction  # no guard: no mechanical model remains where eps fades out
+        # No guard: no mechanical model remains where eps fades out.
+        return fitted, TipCorrection(module)
+    correction = InnerCorrection(mechanical, module) if serial else TipCorrection(module)
     alone = HybridModule(mechanical, [correction], q.new_ones(1))
     with torch.no_grad():
-        own = correction.module if isinstance(correction, TipCorrection) else None
         (found,) = in_blocks(lambda rows: (alone.error_part(rows),), q)
-        correction.guard = fit_guard(spec.guard, found, own, q, errors.counts)
+        correction.guard = fit_guard(spec.guard, found, module, q, errors.counts)
     return fitted, correction
 
 
@@ -400,10 +429,7 @@ def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, 
         alphas = float(model.alpha), float(model.alpha)
     layer = draw_layer(params, q.numpy(), None)
     inner = layer.input_weights, layer.input_bias, layer.activation
-    features, (mean, M) = HiddenFeatures.of_range(q, *inner), moved_directions(q.numpy())
-    if M is not None:
-        features = features.seen_through(torch.from_numpy(mean), torch.from_numpy(M))
-    return features, alphas
+    return HiddenFeatures.of_range(q, *inner), alphas
 
 
 def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:

@@ -9,18 +9,20 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import PortableModule, reverse_jacobian
+from hybridkin._core.model import ForwardModel, PortableModule, reverse_jacobian
 from hybridkin._core.stored import Layout
+from hybridkin.calibration.choice import split_by_effect
+from hybridkin.calibration.measured import Directions, moved_directions
 from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.network import LeverageModule
 
 GUARDS = ("leverage", "box", None)
-_STILL = 1e-3  # relative to the largest spread: below it, the log does not move in a direction
-_AS_IF = 0.1  # relative to the range: the spread that is assumed in such a direction
+_AS_IF = 0.1  # of half the range: the spread assumed in a direction that the log does not move
 _ROWS = 128  # number of rows that represent the training rows
 _BLOCK = 4096  # training rows whose distances are computed at once
 _TESTED = 0.98  # share of these rows whose distances from other groups count as tested
-_STEP = 0.2  # least tested distance; the range of an actuator is 2
+_STEP = 0.2  # least tested distance, and the domain without data; the range of an actuator is 2
+_OFF, _AS_LOGGED = 0.02, 3.0  # domain off the plane of a log: in this unit, and in its rms there
 
 
 class Guard(PortableModule):
@@ -50,7 +52,7 @@ class Guard(PortableModule):
     def forward(self, q: Tensor) -> Tensor:
         """Return g(q), shape (..., 1)."""
         excess = (self.domain_distance(q) / self.FULL - 1.0).clamp(min=0.0)
-        return (1.0 / (1.0 + excess**3))[..., None]
+        return (1.0 / (1.0 + excess**3)).nan_to_num()[..., None]  # 0 where the distance overflows
 
     def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return g(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
@@ -181,12 +183,12 @@ class QuadraticLeverage(LeverageModule):
     @classmethod
     def fit(cls, q: Tensor, alpha: float = 0.1) -> QuadraticLeverage:
         """Return the leverage of training rows q (N, n)."""
-        n = q.shape[1]
-        found = cls(*center_and_scale(q), identity(2 * n + 1, q))
+        n, directions = q.shape[1], moved_directions(q.numpy())
+        scale, still = map(torch.from_numpy, (directions.scale, directions.still))
+        found = cls(center_and_scale(q)[0], scale, identity(2 * n + 1, q))
         features = found.forward(q)
         gram = features.mT @ features
         gram.diagonal().add_(alpha)
-        still = _unexcited(q)
         gram[1 : n + 1, 1 : n + 1] += _AS_IF**2 * len(q) * still @ still.mT
         found.factor = torch.linalg.cholesky(gram)
         return found
@@ -227,7 +229,7 @@ def fit_guard(
         return BoxGuard(q.amin(0), q.amax(0), largest)
     times = torch.from_numpy(counts)
     with torch.no_grad():
-        if not isinstance(model, LeverageModule) or _unexcited(q).numel():
+        if not isinstance(model, LeverageModule):
             # Every configuration counts once, even if the log repeats it.
             model, times = QuadraticLeverage.fit(torch.unique(q, dim=0)), torch.ones_like(times)
         return LeverageGuard.fit(model, q, largest, times)
@@ -264,7 +266,8 @@ class GroupDistance(PortableModule):
         of = torch.from_numpy(np.unique(groups, return_inverse=True)[1])
         if not of.any():
             return None
-        axes = _directions(q)[0] / center_and_scale(q)[1][:, None]
+        directions = moved_directions(q.numpy())
+        axes = torch.from_numpy(directions.moved / directions.scale[:, None])
         y = (q - q.mean(0)) @ axes
         # Each added row is the farthest from the rows before.
         picked, gap = [y.square().sum(1).argmax()], y.new_full((len(y),), torch.inf)
@@ -284,6 +287,28 @@ class GroupDistance(PortableModule):
         # If every motion was repeated, the clamp keeps the domain from being empty.
         return cls(q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP))
 
+    @classmethod
+    def of_log(
+        cls, q: Tensor, groups: NDArray | None, directions: Directions, plane: Plane | None
+    ) -> GroupDistance | None:
+        """Return the distance from the groups, and across the directions that no row moves.
+
+        Where mechanics predict what happens there, steps of a tenth of the range stay in the
+        domain; off the plane, only steps of a hundredth. None if there is nothing to measure.
+        """
+        tested = None if groups is None else cls.fit(q, groups)
+        if not directions.still.size:
+            return tested
+        if tested is None:
+            tested = cls(q.mean(0)[None], q[:0].mT, q.new_tensor(_STEP))
+        axes = torch.from_numpy(directions.still / directions.scale[:, None])
+        axes = [tested.axes, axes * (tested.farthest / _STEP)]
+        if plane is not None:
+            half_ranges = (torch.from_numpy(directions.scale)[:, None] * plane.normals).norm(dim=0)
+            off = half_ranges * _OFF + _AS_LOGGED * plane.distances(q).square().mean(0).sqrt()
+            axes.append(plane.normals * (tested.farthest / off))
+        return cls(tested.rows, torch.cat(axes, 1), tested.farthest)
+
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the squared relative distance of rows q (N, n) from the nearest row, (N,)."""
         rows, axes = self.rows.to(q), self.axes.to(q) / self.farthest.to(q)
@@ -292,19 +317,39 @@ class GroupDistance(PortableModule):
         return ((q - rows[nearest]) @ axes).square().sum(1)
 
 
-def _unexcited(q: Tensor) -> Tensor:
-    """Return the directions (n, k) of q, over its range, in which rows (N, n) do not move.
+class Plane(PortableModule):
+    """The plane of q in which a log lies; outside it neither log nor mechanics say what happens.
 
-    For example, balanced tendons never change the common pull of a segment. The log does not
-    identify its effect, but the mechanical model predicts one. If small steps in this direction
-    left the domain, inverse kinematics could move the tip by fading the error model out.
+    For example, the balanced tendons of a log do not show what happens when all of them are pulled,
+    and kinematics of constant length predict that nothing happens.
+
+    Parameters
+    ----------
+    point : Tensor of shape (n,)
+        A point of the plane.
+    normals : Tensor of shape (n, k)
+        Orthonormal columns.
     """
-    return _directions(q)[1]
 
+    layout = Layout("plane", {"point": "n", "normals": "nk"})
 
-def _directions(q: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the directions of q, over its range, in which rows (N, n) move, and the others."""
-    spread = (q - q.mean(0)) / center_and_scale(q)[1]
-    axes, variances, _ = torch.linalg.svd(spread.mT @ spread)
-    still = variances < _STILL**2 * variances[0]
-    return axes[:, ~still], axes[:, still]
+    def __init__(self, point: Tensor, normals: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("point", point)
+        self.register_buffer("normals", normals)
+
+    @classmethod
+    def of_log(
+        cls, mechanical: ForwardModel | None, q: Tensor, directions: Directions
+    ) -> Plane | None:
+        """Return the plane of rows q (N, n), None if mechanics move the tip in all directions."""
+        normals = directions.normals()
+        if mechanical is not None and normals.size:
+            normals = normals @ split_by_effect(mechanical, q, normals)[1]
+        if not normals.size:
+            return None
+        return cls(q.mean(0), torch.from_numpy(normals))
+
+    def distances(self, q: Tensor) -> Tensor:
+        """Return the distances (N, k) of rows q (N, n) from the plane, along each normal."""
+        return (q - self.point) @ self.normals

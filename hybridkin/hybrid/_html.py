@@ -63,9 +63,8 @@ def _error_model(model: Any) -> str:
 def _error(model: Any) -> dict[str, str]:
     """Return the error on held-out rows or, where it is not known, on training rows."""
     if (results := model.cv_results_) is not None:
-        means = dict(zip(results["candidate"], results["mean_distance"], strict=True))
-        alone = f", mechanical model alone {_mm(means['mechanical'])}"
-        return {"held-out error": f"mean {_mm(means[str(results['chosen'])])}{alone}"}
+        alone = f", mechanical model alone {_mm(results['mean_distance'][0])}"
+        return {"held-out error": f"mean {_mm(results['expected_distance'])}{alone}"}
     error = model.error_model_
     held_out = isinstance(error[0] if type(error) is tuple else error, _HELD_OUT)
     words = f"standard deviation of a coordinate {_mm(model._noise)}"

@@ -39,6 +39,16 @@ class MarkedHybridModule(HybridModule):
         """The hybrid of the last marker alone."""
         return cast(HybridModule, self.tips[-1])
 
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """The plane of the log, which is that of the tip."""
+        return self.tip_model.plane
+
+    @property
+    def longest_correction(self) -> Tensor | float:
+        """Upper bound of the distance from f(q) to x of any marker [m]."""
+        return max(tip.longest_correction for tip in cast("list[HybridModule]", self.tips))
+
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this model does not change."""
         moved = []

@@ -13,8 +13,7 @@ from typing_extensions import Self
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.stored import Layout
-from hybridkin.hybrid._features import Readout
-from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard
+from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule
 from hybridkin.native.plan import ROUNDING
 
@@ -50,7 +49,7 @@ class TipCorrection(PortableModule):
     Parameters
     ----------
     module : ForwardModel
-        eps, q (..., n) -> (..., m) [m]: the torch module of a regressor, or a `Readout`.
+        eps, q (..., n) -> (..., m) [m]: the torch module of a regressor, or a readout of features.
     guard : Guard or None
         Its weight and largest length. None: no limits.
     """
@@ -91,7 +90,7 @@ class InnerCorrection(PortableModule):
     ----------
     mechanical : ForwardModel
         f, the same object as that of the hybrid.
-    readout : Readout
+    readout : ForwardModel
         W phi(q), the change of the inner coordinates [unit of z].
     guard : Guard or None
         Its weight and largest length. None: no limits.
@@ -100,7 +99,7 @@ class InnerCorrection(PortableModule):
     layout = Layout("inner_correction", {}, parts=("mechanical", "readout", "guard"))
 
     def __init__(
-        self, mechanical: ForwardModel, readout: Readout, guard: Guard | None = None
+        self, mechanical: ForwardModel, readout: ForwardModel, guard: Guard | None = None
     ) -> None:
         super().__init__()
         self.mechanical = mechanical
@@ -158,10 +157,14 @@ class HybridModule(ForwardModel):
         d, the change of the robot since the fit.
     tested : GroupDistance or None
         Distance up to which held-out groups have tested the corrections, if the rows have groups.
+    log_plane : Plane or None
+        The plane of q to keep to, if the rows lie in one.
     """
 
     layout = Layout(
-        "hybrid_module", {"weights": "k"}, parts=("mechanical", "corrections", "drift", "tested")
+        "hybrid_module",
+        {"weights": "k"},
+        parts=("mechanical", "corrections", "drift", "tested", "log_plane"),
     )
 
     def __init__(
@@ -171,6 +174,7 @@ class HybridModule(ForwardModel):
         weights: Tensor,
         drift: AffineModule | None = None,
         tested: GroupDistance | None = None,
+        log_plane: Plane | None = None,
     ) -> None:
         super().__init__()
         self.mechanical = mechanical
@@ -178,8 +182,10 @@ class HybridModule(ForwardModel):
         self.register_buffer("weights", weights)
         self.drift = drift
         self.tested = tested
-        if mechanical is not None:
-            self.n_actuators, self.n_outputs = mechanical.n_actuators, mechanical.n_outputs
+        self.log_plane = log_plane
+        learned = [c.module for c in corrections if isinstance(c, TipCorrection)]
+        for model in learned[:1] if mechanical is None else [mechanical]:
+            self.n_actuators, self.n_outputs = model.n_actuators, model.n_outputs
 
     @property
     def robot(self) -> ForwardModel:
@@ -209,10 +215,35 @@ class HybridModule(ForwardModel):
         """Return rows q (N, n) and y (N, m) as they were before the change."""
         return q, y
 
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """The plane of the log, see `Plane`."""
+        plane = self.log_plane
+        return None if plane is None else (plane.point, plane.normals)
+
+    @property
+    def longest_correction(self) -> Tensor | float:
+        """Upper bound of the distance from f(q) to x, infinite without guards, () [m]."""
+        longest = 0.0 if self.drift is None else torch.inf
+        for weight, correction in self._parts():
+            guard = correction.guard
+            longest = longest + (
+                torch.inf if guard is None else weight * guard.MOST * guard.largest
+            )
+        return longest
+
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return how much farther targets are than f reaches with the longest correction."""
+        if self.mechanical is None:
+            return super().misses(x, largest)
+        return self.mechanical.misses(x, largest) - self.longest_correction
+
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this model does not change."""
         corrections = [c for _, c in self._parts()]
-        return type(self)(self.mechanical, corrections, self.weights, drift, self.tested)
+        return type(self)(
+            self.mechanical, corrections, self.weights, drift, self.tested, self.log_plane
+        )
 
     def rows(self) -> HybridModule:
         """Return the module whose outputs are the columns of measured y; for tips this module."""

@@ -27,7 +27,7 @@ class PoseHybridModule(HybridModule, PoseModel):
         p_mech and R_mech.
     corrections : sequence of TipCorrection
         Corrections whose modules map q (..., n) to (..., 6) [m].
-    weights, drift, tested
+    weights, drift, tested, log_plane
         As for `HybridModule`.
     """
 
@@ -38,7 +38,9 @@ class PoseHybridModule(HybridModule, PoseModel):
     def rows(self) -> HybridModule:
         """Return the same model with poses as rows of six numbers."""
         corrections = [correction for _, correction in self._parts()]
-        return PoseRows(self.mechanical, corrections, self.weights, self.drift, self.tested)
+        return PoseRows(
+            self.mechanical, corrections, self.weights, self.drift, self.tested, self.log_plane
+        )
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""

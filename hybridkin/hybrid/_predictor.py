@@ -53,7 +53,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         x : ndarray of shape (N, m), or (N,) as in `fit`
-            Tips [m]; for poses also rotation vectors with a length of at most pi [rad].
+            Tips [m]; for poses also rotation vectors with a length of at most pi [rad]. NaN where
+            numbers overflow.
         radius : ndarray of shape (N,)
             Only if `return_radius`: estimated error radius [m]. It covers a share `coverage` of
             the tips if the groups of the fit and the new ones are exchangeable. Infinite outside
@@ -107,7 +108,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return whether each row lies in the domain, close to the training rows (see `guard`).
 
         After a fit with groups, a row must also be as close to the nearest training row as 98 % of
-        these are to rows of other groups: held-out groups have tested the model only so far. The
+        these are to rows of other groups: held-out groups have tested the model only so far. Along
+        directions that no training row moved, the domain ends after a tenth of the range. The
         errors of rows outside the domain are not known, even where eps has its full weight.
 
         Parameters
@@ -120,7 +122,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         inside : ndarray of bool of shape (N,)
-            Without a guard and groups all True.
+            Without a guard all True, except along those directions.
         """
         return self._evaluated(partial(_with_domain, value=False), X, groups, warn=False)[0]
 

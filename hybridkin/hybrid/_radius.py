@@ -48,6 +48,7 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
     Lee, Barber & Willett, Distribution-free inference with hierarchical data (2023), the rank by
     groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
+    spec = replace(spec, left_out=False)
     given = rows.take(rows.counts > 0)
     rows, place = given.distinct()
     X, y = rows.X, rows.tips
@@ -55,8 +56,10 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
     inside, errors = np.zeros(len(y), dtype=bool), np.full(len(y), np.nan)
     for train, test in folds(X, rows.groups):
         part = given.take(np.isin(place, train))
+        if part.groups is not None and len(np.unique(part.groups)) == 1:
+            part = part._replace(groups=None)  # of a single motion, rows are held out
         chosen = spec if spec.parts else select(with_geometry_chosen(spec, part), part, part)[0]
-        module = fit_hybrid(replace(chosen, left_out=False), part).module
+        module = fit_hybrid(chosen, part).module
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():
             inside[test] = module.in_domain(q).numpy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -25,6 +25,8 @@ _PICKS = 10  # picks of a blend; each is a weight of 0.1
 _EQUAL = 1e-8  # scores this close are equal: readouts end at 1e-9 of their gradient
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their number
+_FEW_MOTIONS, _FEW_ROWS = 40, 100  # with fewer, penalties that were chosen on all rows suit them
+_ANEW = 5  # folds without which penalties are then chosen once more
 
 
 def select(
@@ -38,7 +40,8 @@ def select(
     Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
     but one, and to the inner rows, each time with the mechanical model calibrated on the same rows.
     The predictions for the held-out and the outer rows give the weights of the blend. It can be a
-    single candidate.
+    single candidate. With few motions its penalties are then chosen once more without each fold:
+    penalties that suit the held-out rows would make the error to expect too small.
 
     Parameters
     ----------
@@ -73,11 +76,11 @@ def select(
     settled: list[Part] = []
     tests = np.concatenate([test for _, test in splits])
     predicted = np.empty((len(candidates), len(tests), y.shape[1]))
-    for i, (coupling, error_model) in enumerate(candidates.values()):
+    for i, candidate in enumerate(candidates.values()):
         if progress is not None:
             progress(i, len(candidates))
-        fitted = fit_hybrid(replace(spec, parts=(Part(1.0, coupling, error_model),)), by_fold)
-        part = Part(1.0, coupling, _settled(error_model, fitted.error_model))
+        fitted = fit_hybrid(replace(spec, parts=(candidate,)), by_fold)
+        part = candidate._replace(error_model=_settled(candidate.error_model, fitted.error_model))
         settled.append(part)
         predicted[i] = np.concatenate(
             [
@@ -89,12 +92,29 @@ def select(
     order = np.concatenate([np.argsort(tests[: len(y)]), np.arange(len(y), len(tests))])
     held_out = _HeldOut.of(predicted[:, order], rows, fold_of, splits[-1][1])
     shares, results = _chosen([*candidates], held_out, rows)
+    few = len(y) < _FEW_ROWS
+    if rows.groups is not None:
+        few = len(np.unique(rows.groups)) < _FEW_MOTIONS
+    if spec.left_out and few and len(folds) > 2 and shares[0] < 1.0:
+        without_penalties = _blend(candidates.values(), shares)
+        known = np.tensordot(shares, held_out.predicted, 1)
+        before = after = 0.0
+        for one, (train, test) in zip(alone[:_ANEW], folds, strict=False):
+            anew = fit_hybrid(replace(one, parts=without_penalties), by_fold.take(train))
+            before += counts[test] @ distance(known[test], y[test])
+            after += counts[test] @ distance(anew.predict(rows.X[test]), y[test])
+        results["expected_distance"] *= float(after / before)
     name, errors = ("nothing", {}) if geometry is None else (geometry.name, geometry.errors)
     own = {name: Errors(*(float(results[key][0]) for key in ("mean_distance", "io_distance")))}
     results["parameters"] = name
     results["mechanical_model"] = {n: one.known() for n, one in (errors or own).items()}
-    blend = [part._replace(weight=float(w)) for w, part in zip(shares, settled, strict=True)]
-    return replace(spec, parts=tuple(part for part in blend if part.weight > 0.0)), results
+    return replace(spec, parts=_blend(settled, shares)), results
+
+
+def _blend(parts: Iterable[Part], shares: NDArray) -> tuple[Part, ...]:
+    """Return the parts of positive weight."""
+    weighed = zip(parts, shares.tolist(), strict=True)
+    return tuple(part._replace(weight=share) for part, share in weighed if share > 0.0)
 
 
 class _HeldOut(NamedTuple):
@@ -161,6 +181,7 @@ def _chosen(names: list[str], found: _HeldOut, rows: Rows) -> tuple[NDArray, dic
     return shares, {
         "candidate": [*names, "blend"],
         "mean_distance": means,
+        "expected_distance": float(means[0 if shares[0] == 1.0 else -1]),
         "std_distance": by_fold.std(axis=1, ddof=1),
         "fold_distance": by_fold,
         "io_distance": np.average(outer, axis=1, weights=counts[n:]),
@@ -176,18 +197,19 @@ def _means_by(labels: NDArray, distances: NDArray, counts: NDArray) -> NDArray:
     return np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in parts]).T
 
 
-def _candidates(spec: Spec) -> dict[str, tuple[str, Any]]:
-    """Return coupling and error model by name; of equal candidates the first, simplest one wins."""
+def _candidates(spec: Spec) -> dict[str, Part]:
+    """Return the error models by name; of equal candidates the first, simplest one wins."""
     inside = ("linear", "quadratic", *(("pose",) if isinstance(spec.mechanical, ArcChain) else ()))
     network = ELMRegressorCV(250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state))
-    candidates: dict[str, tuple[str, Any]] = {
-        "mechanical": ("parallel", "drop"),
-        "parallel linear": ("parallel", NamedFeatures("linear")),
+    candidates = {
+        "mechanical": Part(1.0, "parallel", "drop"),
+        "parallel linear": Part(1.0, "parallel", NamedFeatures("linear")),
     }
-    candidates |= {f"serial {kind}": ("serial", NamedFeatures(kind)) for kind in inside}
-    candidates |= {f"parallel {kind}": ("parallel", NamedFeatures(kind)) for kind in inside}
-    candidates["parallel ELM"] = ("parallel", network)
-    candidates["parallel kernel"] = ("parallel", "kernel")
+    for coupling in ("serial", "parallel"):
+        for kind in inside:
+            candidates[f"{coupling} {kind}"] = Part(1.0, coupling, NamedFeatures(kind))
+    candidates["parallel ELM"] = Part(1.0, "parallel", network)
+    candidates["parallel kernel"] = Part(1.0, "parallel", "kernel")
     return candidates
 
 
@@ -197,6 +219,6 @@ def _settled(error_model: Any, fitted: Any) -> Any:
         return tuple(_settled(error_model, one) for one in fitted)
     if isinstance(fitted, ReadoutFit):
         return error_model._replace(alphas=fitted.alphas, noise_ratio=fitted.noise_ratio)
-    if isinstance(error_model, ELMRegressorCV):
+    if isinstance(fitted, ELMRegressorCV):
         return ELMRegressor(**fitted.best_params_)
     return clone(fitted) if isinstance(fitted, KernelRidge) else error_model

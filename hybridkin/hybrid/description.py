@@ -41,9 +41,9 @@ _MODULES: dict[str, type[PortableModule]] = {
         *(ConstantCurvatureChain, ElasticTendonChain, RigidChain),
         *(ELM, AffineModule, PolynomialModule, KernelModule, _features.Readout),
         *(_features.Features, _features.QuadraticFeatures),
-        *(_features.HiddenFeatures, _features.PoseFeatures),
+        *(_features.HiddenFeatures, _features.PoseFeatures, _features.Projected),
         *(_guards.BoxGuard, _guards.LeverageGuard, _guards.QuadraticLeverage),
-        _guards.GroupDistance,
+        *(_guards.GroupDistance, _guards.Plane),
         *(_module.TipCorrection, _module.InnerCorrection),
         *(_module.HybridModule, PoseHybridModule, MarkedHybridModule),
         *(AdaptedModel, AdaptedPoseModel),
@@ -128,9 +128,11 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
     stored.arrays.setdefault("drift_squares", np.zeros(()))  # not in files of earlier versions
-    shapes = ((n,), (n,), (n + 1, n + 1), (n + 1, x.shape[1]), ())
-    names = [f"drift_{name}" for name in Drift._fields]
-    model._drift = Drift(*(stored.array(*pair) for pair in zip(names, shapes, strict=True)))
+    none, gram = Drift.of_range(center[None], x.shape[1]), stored.array("drift_gram")
+    if gram.ndim == 2:  # in files of earlier versions, every row has all markers
+        stored.arrays["drift_gram"] = gram[None].repeat(len(none.gram), axis=0)
+    arrays = none._asdict().items()
+    model._drift = Drift(*(stored.array(f"drift_{name}", a.shape) for name, a in arrays))
     if not (model._drift.scale > 1.0 / LARGEST).all():
         raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
@@ -146,6 +148,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     known = "fitted_rows" in stored.arrays  # not in files of earlier versions
     model._fitted_rows = stored.array("fitted_rows", "N") if known else None
     results = training.get("cv_results") if isinstance(training, dict) else None
+    if results:  # files of earlier versions do not state the error to expect
+        results = {"expected_distance": min(results["mean_distance"]), **results}
     model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
     known = "noise" in stored.settings
     noise = stored.value("noise", (float, None)) if known else None

@@ -109,7 +109,7 @@ class HybridForwardModel(HybridPredictor):
         as the reach of the chain, p = p_mech + eps_p and R = exp(eps_r / reach) R_mech. It needs a
         ``PoseModel``, a regressor, parallel coupling and no `coverage`. Positions calibrate it.
     random_state : int, RandomState or None, default=None
-        Seed of the named error models; a given regressor has its own.
+        Seed of the named error models, and of an ELM without one; other regressors have their own.
 
     Attributes
     ----------
@@ -128,8 +128,9 @@ class HybridForwardModel(HybridPredictor):
         distance on the outer 35 % of the rows after a fit to the inner 40 % [m]. ``weights`` of the
         blend; ``chosen``: "blend", or the only candidate with a weight. ``parameters``: the set
         that was calibrated; ``mechanical_model``: the same two errors of every set, "cv" and "io",
-        without backlash [m]. On each fold the blend has weights chosen without that fold. New
-        motions unlike all in the log have larger errors than held-out ones.
+        without backlash [m]. On each fold the blend has weights chosen without that fold.
+        ``expected_distance``: the mean distance to expect on new motions like those of the log [m].
+        With few groups or rows, the penalties are for this chosen without each fold, too.
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator or None
@@ -228,9 +229,10 @@ class HybridForwardModel(HybridPredictor):
         UserWarning
             If there are fewer different rows than 20, or than twice the coefficients of an affine
             function of q; if tendons of a ConstantCurvatureChain contradict each other, as slack
-            tendons do (`predict` and the Jacobians warn too); if calibrate="auto" finds directions
-            of X that move the tip but do not vary in the log; if numbers look like millimetres; if
-            there are too few groups for `coverage`; and the warnings of `calibrate`.
+            tendons do (`predict` and the Jacobians warn too); if no row moves along directions of X
+            that move the tip, in which corrections are then constant; if numbers look like
+            millimetres; if there are too few groups for `coverage`; and the warnings of
+            `calibrate`.
         """
         for message in self.fit_with_messages(X, y, sample_weight, groups):
             warnings.warn(message, stacklevel=2)
@@ -276,7 +278,7 @@ class HybridForwardModel(HybridPredictor):
             used = given if asked.parts else rows
             self.radius_, message = conformal_radius(asked, used, self.coverage)
             said += [] if message is None else [message]
-        return [*few, *said, *fit_messages(fitted, given)]
+        return [*dict.fromkeys([*few, *said, *fit_messages(fitted, given)])]
 
     def partial_fit(
         self,
@@ -418,7 +420,7 @@ class HybridForwardModel(HybridPredictor):
     ) -> Rows:
         """Return the measured rows, checked."""
         X, y = table(X, "X"), table(y, "y")
-        missing = missing_markers(self, y) if reset else np.zeros(np.shape(y), dtype=bool)
+        missing = missing_markers(self, y)
         y = y if y is None else np.where(missing, 0.0, y)
         check_finite(X=X, y=y)
         X, y, weights = check_rows(self, X, y, weights, reset)

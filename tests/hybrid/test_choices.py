@@ -134,10 +134,10 @@ def test_a_gain_in_one_motion_alone_is_not_sure():
 
 
 def few_candidates(_):
-    linear = "parallel", NamedFeatures("linear")
-    kernel = "parallel", "kernel"
-    return {"mechanical": ("parallel", "drop"), "parallel linear": linear} | {
-        "parallel kernel": kernel
+    return {
+        "mechanical": Part(1.0, "parallel", "drop"),
+        "parallel linear": Part(1.0, "parallel", NamedFeatures("linear")),
+        "parallel kernel": Part(1.0, "parallel", "kernel"),
     }
 
 
@@ -165,9 +165,9 @@ def test_penalties_are_settled_by_folds_of_motions(groups, monkeypatch):
     monkeypatch.setattr(_selection, "fit_hybrid", fit)
     rows = Rows(*log(30), groups=groups)
     select(Spec(CHAIN, ()), rows, rows)
-    given = [one for one in seen if one is not None]
-    assert len(given) == (0 if groups is None else 3)  # once for each candidate
-    for labels in given:
+    of_all_rows = [labels for labels in seen if labels is not None and len(labels) == len(rows.X)]
+    assert len(of_all_rows) == (0 if groups is None else 3)  # once for each candidate
+    for labels in of_all_rows:
         for k, (_, test) in enumerate(folds_of(rows.X, groups)):
             assert_array_equal(labels[test], k)
 

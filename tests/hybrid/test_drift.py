@@ -171,5 +171,5 @@ def test_a_change_needs_a_gain_of_two_for_offset_and_slope_each(gain, changed):
     offset = noise * np.sqrt(r / n)
     gram, moment = np.diag([n, 0.0]), np.array([[n * offset], [0.0]])
     squares = np.array(n * noise**2 + n * offset**2)
-    drift = Drift(np.zeros(1), np.ones(1), gram, moment, squares)
+    drift = Drift(np.zeros(1), np.ones(1), gram[None], moment, squares)
     assert (drift.likeliest_alpha(noise) < np.inf) == changed

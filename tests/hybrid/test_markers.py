@@ -1,5 +1,7 @@
 """Hybrids of several markers: one fit inside the robot, missing markers, steering, files."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -158,7 +160,7 @@ def test_inverse_kinematics_steers_the_tip_or_all_markers():
     assert found.converged.all()
     np.testing.assert_allclose(model.predict(found.q)[:, 6:], target[:, 6:], atol=1e-4)
     tracker = ik.tracker(q[0])
-    assert tracker.backend == ("compiled" if program_of(CHAIN.tip_model) else "torch")
+    assert (tracker.backend == "compiled") == (program_of(CHAIN.tip_model) is not None)
     every = InverseKinematics(tasks.PositionTask(model, size=9), q_min=0.2, q_max=0.3)
     found = every.solve(target, q0=q[:3] + 0.003)
     assert found.converged.all()
@@ -209,6 +211,74 @@ def test_data_alone_may_miss_markers():
         rows = ~np.isnan(missing[:, 3 * k])
         alone = LinearRegression().fit(q[rows], missing[rows, 3 * k : 3 * k + 3])
         np.testing.assert_allclose(model.predict(q)[:, 3 * k : 3 * k + 3], alone.predict(q))
+
+
+@pytest.mark.parametrize("data_alone", [False, True])
+def test_new_rows_may_miss_markers(data_alone):
+    """What the other markers learn is that of whole rows, and a missing one has no effect."""
+    error_model = LinearRegression() if data_alone else "linear"
+    model = HybridForwardModel(None if data_alone else CHAIN, error_model, random_state=0)
+    model.fit(*log(80))
+    q, x = log(40, 3)
+    x = x + np.repeat([0.01, -0.02, 0.03], 3)
+    missing, measured = x.copy(), np.arange(40) % 3 > 0
+    missing[~measured, 3:5] = np.nan  # an incomplete marker is missing
+    whole = copy.deepcopy(model).partial_fit(q, x, decay=1.0, alpha=1e-6)
+    some = copy.deepcopy(model).partial_fit(q, missing, decay=1.0, alpha=1e-6)
+    rows = copy.deepcopy(model).partial_fit(q[measured], x[measured], decay=1.0, alpha=1e-6)
+    found, expected = some.predict(q), whole.predict(q)
+    np.testing.assert_allclose(found[:, [0, 1, 2, 6, 7, 8]], expected[:, [0, 1, 2, 6, 7, 8]])
+    np.testing.assert_allclose(found[:, 3:6], rows.predict(q)[:, 3:6], rtol=0, atol=1e-9)
+    assert np.abs(found[:, 3:6] - expected[:, 3:6]).max() > 1e-6
+
+
+@pytest.mark.parametrize("groups", [None, np.arange(12) // 4])
+def test_adapt_to_rows_that_miss_markers(groups):
+    """Of the changed robot: nothing but the measured markers counts."""
+    model = HybridForwardModel(CHAIN, "linear", random_state=0).fit(*log(80))
+    q, x = log(12, 5)
+    x = x + np.tile([0.02, -0.01, 0.03], 3)
+    missing = x.copy()
+    missing[::2, 3:6] = np.nan
+    found = copy.deepcopy(model).adapt(q, missing, groups=groups).module_.motion
+    expected = copy.deepcopy(model).adapt(q, x, groups=groups).module_.motion
+    torch.testing.assert_close(found, expected, rtol=0, atol=3e-3)
+    torch.testing.assert_close(
+        found[:3, 3], torch.tensor([0.02, -0.01, 0.03]).to(found), rtol=0, atol=4e-3
+    )
+    lost = np.where(np.isnan(missing), 1e3, missing)
+    with pytest.warns(UserWarning, match="`y`"):
+        far = copy.deepcopy(model).adapt(q, lost, groups=groups).module_.motion
+    assert (far - expected).abs().max() > 0.01
+
+
+def test_a_missing_marker_survives_a_file(tmp_path):
+    model = HybridForwardModel(CHAIN, "linear", random_state=0).fit(*log(80))
+    q, x = log(10, 3)
+    x[:5, :3] = np.nan
+    save_model(model.partial_fit(q, x + 0.01), tmp_path / "model")
+    twin = load_model(tmp_path / "model")
+    np.testing.assert_array_equal(twin._drift.gram, model._drift.gram)
+    more = log(10, 4)
+    np.testing.assert_array_equal(
+        twin.partial_fit(*more).predict(q), model.partial_fit(*more).predict(q)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_auto_takes_few_rows_of_several_markers(n):
+    q, x = log(n)
+    with pytest.warns(UserWarning, match="too few to rely on"):
+        model = HybridForwardModel(CHAIN, "auto", calibrate=(), random_state=0).fit(q, x)
+    assert np.isfinite(model.predict(q)).all()
+
+
+def test_a_marker_in_a_single_row_is_refused():
+    q, x = log(10)
+    x[1:, 3:6] = np.nan
+    with pytest.raises(ValueError, match="`y` must hold marker 1 in at least 2 rows"):
+        HybridForwardModel(CHAIN, "linear").fit_with_messages(q, x)
 
 
 @pytest.mark.slow

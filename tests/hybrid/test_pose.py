@@ -354,14 +354,22 @@ def test_shapes_lead_and_rows_stand_alone(fitted):
     assert module.n_actuators == 9
 
 
-def test_the_guard_bounds_position_and_orientation(fitted, log):
+def test_the_guard_bounds_position_and_orientation(fitted, log, monkeypatch):
     q = actuators(3000, seed=10, spread=0.6)
-    reach, largest = float(bha().reach), float(fitted.module_.corrections[0].guard.largest)
-    errors = fitted.predict_error(q) * np.repeat([1.0, reach], 3)
-    assert np.linalg.norm(errors, axis=1).max() <= 1.5 * largest
     away = q[fitted.error_weight(q) < 1e-6]
     assert len(away)
     assert_allclose(fitted.predict(away), fitted.predict_mechanical(away), rtol=0, atol=1e-5)
+    guard = fitted.module_.corrections[0].guard
+    largest, units = float(guard.largest), np.repeat([1.0, float(bha().reach)], 3)
+
+    def longest(model):
+        return np.linalg.norm(model.predict_error(q) * units, axis=1).max()
+
+    monkeypatch.setattr(
+        type(guard), "FULL", 1e9
+    )  # no error model fades out: the length alone counts
+    assert longest(pose_model(quadratic(), guard=None).fit(*log)) > 10.0 * largest
+    assert longest(fitted) == pytest.approx(1.5 * largest)
 
 
 def test_single_precision(fitted, log):

@@ -11,6 +11,7 @@ from sklearn.model_selection import GroupShuffleSplit
 
 from hybridkin import (
     ConstantCurvatureChain,
+    ELMRegressorCV,
     HybridForwardModel,
     load_model,
     robots,
@@ -201,3 +202,20 @@ def test_clear_errors():
         HybridForwardModel(chain).fit(q, x).predict(q, return_radius=True)
     with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
         HybridForwardModel(chain, coverage=0.9).fit(q, x, groups=np.zeros(len(q)))
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize(
+    "error_model", ["linear", ELMRegressorCV(8, cv=2, relevance_rounds=0, max_hidden=0), "kernel"]
+)
+def test_a_radius_of_two_motions_holds_out_one_and_then_rows(n, error_model):
+    """Without one of two motions a single one is left, whose rows are then held out."""
+    q, x, motion = motions(0, n, 12)
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(
+        chain, error_model, calibrate=["radii"], coverage=0.5, random_state=0
+    )
+    messages = model.fit_with_messages(q, x, groups=motion)
+    assert (model.radius_.inside < 0.2) == (not any("`coverage`" in text for text in messages))
+    with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
+        model.fit_with_messages(q[:12], x[:12], groups=motion[:12])

@@ -77,6 +77,7 @@ def test_a_blend_is_taken_where_it_gains(groups):
     assert_allclose(results["mean_distance"], [*off[:, :N].mean(1), 0.0], atol=1e-15)
     assert_allclose(results["io_distance"], [*off[:, N:].mean(1), 0.0], atol=1e-15)
     assert_array_equal(results["rank"][[0, -1]], [4, 1])
+    assert results["expected_distance"] == results["mean_distance"][-1]
     by_fold = [off[0, :N][np.arange(N) % 5 == k].mean() for k in range(5)]
     assert_allclose(results["fold_distance"][0], by_fold)
     assert_allclose(results["std_distance"][0], np.std(by_fold, ddof=1))
@@ -93,6 +94,7 @@ def test_a_blend_without_a_sure_gain_is_left_alone():
     errors[1:] *= 5.0
     shares, results = _chosen(NAMES, *held_out(errors))
     assert_array_equal(shares, [1.0, 0.0, 0.0])
+    assert results["expected_distance"] == results["mean_distance"][0]
     assert results["chosen"] == "mechanical"
 
 

@@ -79,6 +79,29 @@ def test_it_says_what_it_chose(chosen):
     assert_allclose(results["fold_distance"].std(1, ddof=1), results["std_distance"])
     assert results["rank"][results["mean_distance"].argmin()] == 1
     assert results["mean_distance"][-1] < 1.01 * results["mean_distance"].min()
+    # Penalties chosen on 50 motions hardly suit one of them more than new ones.
+    assert results["expected_distance"] == results["mean_distance"][-1]
+    assert chosen._noise == pytest.approx(results["expected_distance"] / 1.596)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grouped", [False, True], ids=["rows", "motions"])
+def test_penalties_of_few_motions_make_held_out_errors_too_small(grouped):
+    chain = ConstantCurvatureChain([0.05])
+    scores, expected, new = [], [], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        q = rng.uniform(0.2, 0.3, (420, 3))
+        off = 0.01 * np.sin(q @ rng.uniform(-30.0, 30.0, (3, 3)))
+        x = chain(torch.from_numpy(q)).numpy() + off + 2e-3 * rng.standard_normal(q.shape)
+        groups = np.arange(20) if grouped else None
+        model = HybridForwardModel(chain, "auto", calibrate=(), random_state=0)
+        model.fit(q[:20], x[:20], groups=groups)
+        scores.append(model.cv_results_["mean_distance"][-1])
+        expected.append(model.cv_results_["expected_distance"])
+        new.append(np.linalg.norm(model.predict(q[20:]) - x[20:], axis=1).mean())
+    assert np.sum(expected) > 1.05 * np.sum(scores)
+    assert 0.9 < np.sum(expected) / np.sum(new) < 1.3
 
 
 @pytest.mark.slow
@@ -101,7 +124,7 @@ def test_clone_refit_and_file(chosen, trunk, tmp_path):
 
 
 @pytest.mark.slow
-def test_slack_tendons_get_elastic_ones(tmp_path):
+def test_slack_tendons_get_elastic_ones():
     plain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], routing="base")
     stiffness = {"bending_stiffness": 4e-6, "axial_stiffness": 8.0}
     robot = ElasticTendonChain.from_chain(plain, **stiffness)
@@ -198,3 +221,15 @@ def test_clear_errors(trunk):
         HybridForwardModel(bha(), "auto").fit(q, x, groups=np.zeros(len(q)))
     with pytest.raises(ValueError, match="`mechanical_model` must be given"):
         HybridForwardModel(None, "auto").fit(q, x)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("groups", [None, [0, 1]])
+def test_auto_takes_two_rows(groups):
+    """Each is the inner row, or the training row, of the other."""
+    data = datasets.load_trunk()
+    model = HybridForwardModel(bha(), "auto", calibrate=(), random_state=0)
+    with pytest.warns(UserWarning, match="too few to rely on"):
+        model.fit(data.q[:2], data.x[:2], groups=groups)
+    assert np.isfinite(model.predict(data.q[:50])).all()
+    assert sum(model.cv_results_["weights"].values()) == pytest.approx(1.0)
