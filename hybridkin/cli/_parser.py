@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="hybridkin", **_help(parser))
     top.add_argument("--version", action="version", version=f"hybridkin {hybridkin.__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    adders = (_demo, _init, _describe, _fit, _evaluate, _track, _animate, _next, _export, _paper)
+    adders = (_demo, _init, _describe, _fit, _evaluate, _track, _animate, _next, _export)
     for add_options in adders:
         text = _help(add_options)
         line = text["description"].partition("\n")[0].rstrip(".")
@@ -120,20 +120,6 @@ def _init(command: argparse.ArgumentParser) -> None:
         add(option, type=question.parse, metavar=value, help=question.text)
     add("--delimiter", metavar="CHAR", help=_DELIMITER)
     add("--force", action="store_true", help="replace the file if it exists")
-
-
-def _paper(command: argparse.ArgumentParser) -> None:
-    """Reproduce the paper on the simulated trunk.
-
-    Writes Table 1, the error histogram, the workspace, a figure eight and a spiral tracked with the
-    mechanical and with the hybrid model, and how well the paper's samples identify the trunk's
-    geometry. Needs the extra `sim` (MuJoCo).
-    """
-    add = command.add_argument
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder (results)")
-    add("--splits", type=count, default=20, metavar="N", help="number of random test sets (20)")
-    add("--points", type=count, default=151, metavar="N", help="time steps of each path (151)")
-    _add_work(command)
 
 
 def _next(command: argparse.ArgumentParser) -> None:
@@ -229,7 +215,8 @@ def _fit(command: argparse.ArgumentParser) -> None:
     few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
     number = between(-1, float("inf"), int)
     add("--max-rows", type=number, default=2000, metavar="N", help=few)
-    _add_work(command)
+    add("--seeds", type=count, default=5, dest="n_seeds", metavar="N", help="random networks (5)")
+    add("--jobs", type=int, default=-1, metavar="N", help="processes; -1: one per core (-1)")
 
 
 def _evaluate(command: argparse.ArgumentParser) -> None:
@@ -288,7 +275,7 @@ def _track(command: argparse.ArgumentParser) -> None:
     size = "figure eight: width W,H; spiral: radii R0,R1; line: vector X,Y,Z from end to end"
     add("--size", type=numbers, metavar="A,B", help=size)
     add("--scale", type=positive, default=1.0, metavar="F", help="factor of the size (1)")
-    add("--normal", type=numbers, metavar="X,Y,Z", help="normal of its plane (z axis of base)")
+    add("--normal", type=numbers, metavar="X,Y,Z", help="normal of its plane (of that of the tips)")
     add("--turns", type=float, default=3.0, metavar="N", help="turns of a spiral (3)")
     add("--rise", type=float, default=0.0, metavar="H", help="height of a spiral (0)")
     add("--duration", type=positive, default=10.0, metavar="S", help="time for the shape [s] (10)")
@@ -299,7 +286,8 @@ def _track(command: argparse.ArgumentParser) -> None:
     where = "where the robot stands before the path (rest)"
     stand: Any = {"default": "rest", "dest": "start", "metavar": "rest|path|A,B,..."}
     add("--from", type=start, help=where, **stand)
-    add("--force", action="store_true", help="go as near as the tip can if out of reach")
+    near = f"go as near as the tip can if out of reach; {_REPLACE_OTHERS}"
+    add("--force", action="store_true", help=near)
 
 
 def _animate(command: argparse.ArgumentParser) -> None:
@@ -362,12 +350,6 @@ def _add_limits(command: argparse.ArgumentParser) -> None:
     add("--ddq-max", type=numbers, metavar="A,...", help="largest acceleration, per second squared")
 
 
-def _add_work(command: argparse.ArgumentParser) -> None:
-    add = command.add_argument
-    add("--seeds", type=count, default=5, dest="n_seeds", metavar="N", help="random networks (5)")
-    add("--jobs", type=int, default=-1, metavar="N", help="processes; -1: one per core (-1)")
-
-
 def _add_model(
     command: argparse.ArgumentParser,
     name: str = "model",
@@ -379,6 +361,7 @@ def _add_model(
     command.add_argument("--robot", type=Path, metavar="ROBOT.toml", help=known)
 
 
+_REPLACE_OTHERS = "in --out, replace files that another command or program wrote"
 _DELIMITER = "separator of a text file (comma, semicolon or tab, by the header)"
 
 
@@ -397,4 +380,5 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     add("--exclude", action="append", default=[], metavar="PATTERN", help=some)
     add("--drop-invalid", action="store_true", help="leave out rows with missing values or NaN")
     add("--drop-frozen", action="store_true", help="leave out rows with a frozen tip")
-    add("--force", action="store_true", help="go on despite errors in the log")
+    despite = f"go on despite errors in the log; {_REPLACE_OTHERS}"
+    add("--force", action="store_true", help=despite)

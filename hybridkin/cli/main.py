@@ -21,6 +21,7 @@ import numpy as np
 
 import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin._core.files import write_file
+from hybridkin._core.turns import one_thread
 from hybridkin._core.units import METRES
 from hybridkin.cli import _demo as demo
 from hybridkin.cli._init import answered, description
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits
 
 _DT = 0.02
+_INSIDE = 0.8  # least share of a path in the domain, else the exit code is 1
 # What the user can correct is printed without a traceback.
 _OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
 
@@ -51,7 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     before = _stamps(arguments)
     try:
         stages = Stages(arguments.quiet)
-        with contextlib.closing(stages), warnings.catch_warnings(), _interruptible():
+        # Several threads cost many times the CPU time: the matrices are small.
+        _ = hybridkin.workflow  # loads the libraries whose threads are limited
+        with contextlib.closing(stages), warnings.catch_warnings(), _interruptible(), one_thread():
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
             outcome = _RUN[arguments.command](arguments, stages)
@@ -59,17 +63,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         fate = "nothing was written" if _stamps(arguments) == before else "all was written"
         code = 143 if isinstance(stop, _Terminated) else 130
         return failed(f"interrupted; {fate}", code, arguments.json)
-    except (*_OF_INPUT, hybridkin.simulation.NotSettledError) as error:
+    except _OF_INPUT as error:
         return failed(f"error: {error}", 2, arguments.json)
-    written = "\n  ".join(["\n\nWrote", *map(str, outcome.paths)]) if outcome.paths else ""
-    text = outcome.text + written
+    text, paths = outcome.text, [*map(str, outcome.paths)]
     if arguments.json:
-        more = {"written": [*map(str, outcome.paths)]} if outcome.paths else {}
-        text = hybridkin.workflow.json_text({**outcome.record, **more})
+        written = {"written": paths} if paths else {}
+        text = hybridkin.workflow.json_text({**outcome.record, **written})
+    elif paths:
+        text = "\n  ".join([f"{text}\n\nWrote", *paths])
     try:
         print(text, flush=True)
-    except BrokenPipeError:  # the reader, `head` for example, has what it wants
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        if not isinstance(error, BrokenPipeError):  # `head`, for example, has what it wants
+            return failed(f"error: the result cannot be printed: {error}", 2, as_json=False)
     return outcome.code
 
 
@@ -112,18 +119,6 @@ def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:
     return {file: (file.stat().st_ino, file.stat().st_mtime_ns) for file in files}
 
 
-def _paper(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
-    report, paths = hybridkin.paper.run_paper(
-        arguments.out,
-        n_splits=arguments.splits,
-        n_seeds=arguments.n_seeds,
-        n_points=arguments.points,
-        n_jobs=arguments.jobs,
-        progress=stages,
-    )
-    return _Outcome(report.record, shown(report), paths)
-
-
 def _next(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
@@ -136,9 +131,16 @@ def _next(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     if arguments.path is not None:
         unit = arguments.unit or loaded.log_format().x_unit
         path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
-    options = {"n": arguments.n, "measured": measured, "path": path, "progress": stages}
-    limits = _limits(arguments, loaded, within_fit=False)
-    report, paths = workflow.next_rows(loaded, arguments.out, limits=limits, **options)
+    report, paths = workflow.next_rows(
+        loaded,
+        arguments.out,
+        n=arguments.n,
+        limits=_limits(arguments, loaded, within_fit=False),
+        measured=measured,
+        path=path,
+        force=arguments.force,
+        progress=stages,
+    )
     return _Outcome(report.record, shown(report), paths)
 
 
@@ -218,8 +220,10 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         force=arguments.force,
         progress=stages,
     )
-    code = 0 if report.record["reached"] == report.record["n"] else 1
-    return _Outcome(report.record, shown(report), paths, code)
+    record = report.record
+    known = arguments.force or record["in_domain"] is None or record["in_domain"] > _INSIDE
+    code = 0 if known and record["reached"] == record["n"] else 1
+    return _Outcome(record, shown(report), paths, code)
 
 
 def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
@@ -314,7 +318,7 @@ def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     return _Outcome(report.record, shown(report), [out / "log.csv", *paths], code)
 
 
-_COMMANDS = (_paper, _next, _fit, _evaluate, _track, _animate, _export, _describe, _init, _demo)
+_COMMANDS = (_next, _fit, _evaluate, _track, _animate, _export, _describe, _init, _demo)
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 

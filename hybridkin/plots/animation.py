@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
+from hybridkin._core.files import write_file
 from hybridkin.plots._arrays import distance, plain, shaped, times
 from hybridkin.plots._canvas import COLORS, Display, decimals, scale_of, space_or_new, steps_of
 from hybridkin.plots._models import Model, predicted
@@ -230,7 +231,8 @@ class TrackAnimation(Display):
             raise ValueError(f"`speed` must be positive, got {speed!r}.")
         scene, fps = self._scene(unit), speed * self.fps
         if kind == ".html":
-            path.write_text(page(scene, fps, view, progress), encoding="utf-8")
+            text = page(scene, fps, view, progress)
+            write_file(path, lambda staging: staging.write_text(text, encoding="utf-8"))
             return path
         writer, figure = _writer(kind, fps), Figure(figsize=_SIZE, layout="constrained")
         grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
@@ -240,12 +242,16 @@ class TrackAnimation(Display):
         stage.show(0)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # keeps the axes in place
-        with writer.saving(figure, str(path), _DPI[kind] if dpi is None else dpi):
-            for k in range(len(self.rows)):
-                stage.show(k)
-                writer.grab_frame()
-                if progress is not None:
-                    progress(k + 1, len(self.rows))
+
+        def draw(staging: Path) -> None:
+            with writer.saving(figure, str(staging), _DPI[kind] if dpi is None else dpi):
+                for k in range(len(self.rows)):
+                    stage.show(k)
+                    writer.grab_frame()
+                    if progress is not None:
+                        progress(k + 1, len(self.rows))
+
+        write_file(path, draw)
         return path
 
     def lines(self) -> list[Line]:

@@ -116,7 +116,8 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
     dict
         "chosen"; "weights" of the parts; "mechanical_models": for each set of parameters the mean
         error on held-out motions, "cv", and outside the fitted rows, "io" [m]; the "taken" set;
-        "candidates" with their held-out error [m]; "play" of every actuator [m] or None; "words".
+        "candidates" with their held-out error [m]; the error "expected" on new motions [m]; "play"
+        of every actuator [m] or None; "words".
     """
     found = model.cv_results_ or {}
     entry = {
@@ -130,6 +131,7 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "candidates": dict(
             zip(found["candidate"], map(float, found["mean_distance"]), strict=True)
         ),
+        "expected": float(found["expected_distance"]),
         "play": play_widths(model),
         "play_asked": model.play is not None,
     }
@@ -191,7 +193,7 @@ def _in_words(entry: dict[str, Any]) -> list[str]:
             f"{1e3 * candidates['blend']:.2f} mm on held-out motions, {best} with the best of them "
             f"alone ({alone}), {without}"
         )
-    sentences.append(text)
+    sentences += [text, f"Expected on new motions like these: {1e3 * entry['expected']:.2f} mm."]
     if entry["play"] is not None:
         width = millimetres(entry["play"])
         order = "Predictions depend on the order of the rows in a motion."

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow._domain import Domain
+from hybridkin.workflow._places import solver, some_rows
 from hybridkin.workflow.path import scaled_path
 from hybridkin.workflow.report import Progress, in_millimetres
 
-_POINTS = 13  # of the path, evenly in time; the farthest points in each direction are added
 _HALVINGS = 7
 _OTHER_UNIT = 100.0  # a path this many times larger than the workspace is in another unit
 
@@ -20,7 +19,7 @@ def check_reach(
     domain: Domain, path: Trajectory, tol: float, force: bool, progress: Progress
 ) -> None:
     """Raise if a path is in another unit or, unless `force` is set, leaves the robot's reach."""
-    loaded, limits, (commands, tips) = domain.loaded, domain.limits, domain.sample
+    limits, (commands, tips) = domain.limits, domain.sample
     far, reach = (float(np.linalg.norm(x, axis=1).max()) for x in (path.x, tips))
     if far > _OTHER_UNIT * reach:
         raise ValueError(
@@ -29,10 +28,7 @@ def check_reach(
         )
     if force:
         return
-    low, high = limits.q_min, limits.q_max
-    ik = InverseKinematics(loaded.module, q_min=low, q_max=high, q_pref=domain.preferred)
-    ends = [f(column) for column in path.x.T for f in (np.argmin, np.argmax)]
-    rows = np.unique([*np.linspace(0, len(path) - 1, _POINTS).astype(int), *ends])
+    ik, rows = solver(domain), some_rows(path)
 
     def missed_by(scale: float, rows: NDArray) -> NDArray:
         progress("checking the reach", 0, 1)

@@ -38,7 +38,8 @@ def evaluate_log(
     out : str or Path, optional
         Folder to write into. Default: nothing is written.
     force : bool, default=False
-        Continue if the check of the log finds errors.
+        Continue if the check of the log finds errors, and replace files of `out` that `evaluate`
+        did not write.
 
     Returns
     -------
@@ -57,7 +58,7 @@ def evaluate_log(
         If the log does not pass its check.
     """
     if out is not None:
-        check_out(out)
+        check_out(out, "evaluate", ["error_histogram.png", "workspace.png"], force=force)
     if log.q.shape[1] != loaded.n_actuators:
         raise ValueError(
             f"`q` must name {loaded.n_actuators} columns, one for each actuator of the model, got "
@@ -85,6 +86,7 @@ def evaluate_log(
     some = {} if fitted is None else {"new": ~fitted, "fitted": fitted}
     parts = {name: _entry(columns, rows) for name, rows in some.items() if rows.any()}
     report.record.update(
+        command="evaluate",
         model=str(loaded.path),
         log=log.source,
         all=_entry(columns, slice(None)),

@@ -26,6 +26,7 @@ from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
@@ -41,7 +42,9 @@ from hybridkin.workflow._fit_report import (
     write_markers,
     write_model,
 )
+from hybridkin.workflow._promise import Promise
 from hybridkin.workflow.log import MeasuredLog, checked
+from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, linear, quadratic, quiet
 
 ALPHAS = tuple(10.0**k for k in range(-5, 4))
@@ -58,6 +61,7 @@ _MODELS = (
     *("mechanical, nominal", CALIBRATED, _DATA_LINEAR, "data-driven, quadratic", _DATA_ELM),
     *(LINEAR, "hybrid, quadratic", ELM, AUTO),
 )
+_FILES = ("model.safetensors", "robot.toml", "held_out.png", "error_histogram.png")
 _N_HIDDEN, _INNER_FOLDS = 100, 4
 _ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto; fewer are not worth a start
 
@@ -114,6 +118,8 @@ class Comparison(NamedTuple):
         Error of every marker [m], NaN if it was not measured.
     fold : ndarray of shape (N,)
         Fold in which a row was held out.
+    distance : ndarray of shape (N,)
+        Distance of each row from the rows of the other folds [half ranges of an actuator].
     choices : list of dict
         Settings that were chosen in each fold.
     """
@@ -121,6 +127,7 @@ class Comparison(NamedTuple):
     errors: dict[str, NDArray]
     markers: dict[str, NDArray]
     fold: NDArray
+    distance: NDArray
     choices: list[dict[str, str]]
 
 
@@ -218,18 +225,21 @@ def compare_by_group(
     parts = folds(log.q, log.motions, settings.n_folds)
     rows = _Rows(log.q, log.x, log.motions, robot, settings)
     jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in parts)
-    found = Comparison({}, {}, np.empty(len(log.q), dtype=int), [])
+    fold, distance = np.empty(len(log.q), dtype=int), np.empty(len(log.q))
+    found = Comparison({}, {}, fold, distance, [])
     most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
     most = min(effective_n_jobs(n_jobs or 1), len(parts), most)
     # Otherwise torch and BLAS start threads in every process, which wait for each other.
     workers = Parallel(n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator")
     results: Any = workers(jobs)
     progress("cross-validation by motion", 0, len(parts))
-    for i, ((_, test), (errors, chosen)) in enumerate(zip(parts, results, strict=True)):
+    for i, ((train, test), (errors, chosen)) in enumerate(zip(parts, results, strict=True)):
         for name, values in errors.items():
             empty = np.empty((len(log.q), values.shape[1]))
             found.markers.setdefault(name, empty)[test] = values
         found.fold[test] = i
+        held_out = held_out_distances(log.q[train], log.motions[train], log.q[test])
+        found.distance[test] = held_out
         found.choices.append(chosen)
         progress("cross-validation by motion", i + 1, len(parts))
     found.errors.update((name, np.nanmean(values, 1)) for name, values in found.markers.items())
@@ -263,7 +273,8 @@ def fit_log(
     settings : FitSettings, optional
         Settings of the fit and of the comparison.
     force : bool, default=False
-        Fit even if the check of the log finds errors.
+        Fit even if the check of the log finds errors, and replace files of `out` that `fit` did
+        not write.
     n_jobs, progress
         As in `compare_by_group`.
 
@@ -281,7 +292,7 @@ def fit_log(
     ValueError
         If the log or the settings do not allow the comparison.
     """
-    check_out(out)
+    check_out(out, "fit", _FILES, force=force)
     if robot.chain is None and settings.play is not None:
         raise ValueError("`play` requires a robot with segments: its width is a length.")
     complete = checked(log, robot.chain, robot.base_is_free)
@@ -308,6 +319,7 @@ def fit_log(
     progress("writing the report", 0, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
     report.record.update(
+        command="fit",
         n=len(data.q),
         saved=saved,
         chosen=_chosen(model),
@@ -320,10 +332,14 @@ def fit_log(
         loss=settings.loss,
         choices_by_fold=compared.choices,
     )
+    promise = Promise.of(compared.errors[saved], compared.distance)
+    report.record["promise"] = vars(promise)
     write_check(report, complete)
     write_comparison(report, compared.errors, compared.fold, data)
     write_markers(report, compared.markers[saved], f"{saved}, on held-out motions")
     write_model(report, model)
+    if plane := LoadedModel(robot.name, Path(out), model, robot).plane_in_words():
+        report.text(plane)
     if rows.geometry is not None:
         write_choice(report, rows.geometry)
     if start is not None and result is not None:
@@ -359,7 +375,7 @@ def _add_model(
 ) -> None:
     """Add the model and the description of its robot to the files of the report."""
     kept = ("log", "robot", "n_whole", "n_motions", "excluded", "loss", "saved", "chosen")
-    training = {key: report.record[key] for key in (*kept, "held_out")}
+    training = {key: report.record[key] for key in (*kept, "held_out", "promise")}
     training |= {"rows": report.record["n"], "split": log.split}
     model._fitted_rows = np.unique(row_digests(log.q, log.x))  # with those dropped by thinning
     report.file("model.safetensors", lambda path: save_model(model, path, training=training))

@@ -13,14 +13,17 @@ from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.digests import row_digests
 from hybridkin._core.files import newest
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin.calibration.choice import in_terms
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.hybrid.log_distance import distances
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import load_model, model_header
+from hybridkin.workflow._promise import Promise
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
@@ -142,15 +145,47 @@ class LoadedModel:
         nominal = "data-driven" if self.chain is None else "mechanical, nominal"
         return self._training.get("saved") or (nominal if self.hybrid is None else "hybrid")
 
+    def promised_errors(self, q: NDArray) -> dict[str, NDArray]:
+        """Return the "mean" errors and their "p95" (N,) [m] to expect where the actuators do q.
+
+        They are those of held-out motions at the same distance from the log. Empty if the file
+        does not have them.
+        """
+        known = self.held_out
+        if known is None:
+            return {}
+        constant = {
+            "at_rows": known["mean"],
+            "per_distance": 0.0,
+            "p95": known["p95"] / known["mean"],
+        }
+        promise, far = Promise(**self._training.get("promise", constant)), np.zeros(len(q))
+        tested = None if self.hybrid is None else self.hybrid.module_.fitted.tested
+        if self.hybrid is not None and tested is not None:
+            far = distances(tested, q + as_array(self.hybrid.module_.shift))
+        mean = promise.mean(far)
+        return {"mean": mean, "p95": promise.p95 * mean}
+
     def expected_errors(self, q: NDArray) -> dict[str, NDArray]:
         """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""
-        known = self.held_out or {}
         words = {"mean": "held-out motions, mean", "p95": "held-out motions, 95 %"}
-        found = {words[k]: np.full(len(q), known[k]) for k in words if k in known}
+        found = {words[k]: errors for k, errors in self.promised_errors(q).items()}
         if self.hybrid is not None and (radius := self.hybrid.radius_) is not None:
             name = f"estimated error radius, {100 * radius.coverage:g} %"
             found[name] = radius.at(self.domain_distance(q) <= 1.0)
         return found
+
+    def plane_in_words(self) -> str:
+        """Return which motions the log lacks and no command makes, in its names; "" if none."""
+        if self.module.plane is None:
+            return ""
+        log = self.log_format()
+        normals = as_array(self.module.plane[1]) * np.reshape(log.q_factor, (-1, 1))
+        motions = in_terms(normals / np.abs(normals).max(axis=0), log.q)
+        return (
+            f"The log has no motion along {motions}, and the mechanical model knows no effect of "
+            "it: commands keep to what the log has."
+        )
 
     def log_format(self) -> robots.LogFormat:
         """Return the format of the robot's logs, or plain names in SI units."""

@@ -31,6 +31,7 @@ def next_rows(
     limits: PathLimits | None = None,
     measured: MeasuredLog | None = None,
     path: Trajectory | None = None,
+    force: bool = False,
     progress: Progress = quiet,
 ) -> tuple[Report, list[Path]]:
     """Choose the configurations to measure next, see `choose_rows`, and write them.
@@ -55,6 +56,8 @@ def next_rows(
     path : Trajectory, optional
         Path along which the error must be small [m]; its configurations are candidates, too.
         Default: everywhere within the limits.
+    force : bool, default=False
+        Replace files of `out` that `next` did not write.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -72,7 +75,7 @@ def next_rows(
         If the range of the actuators is not known, or fewer than `n` balanced configurations lie
         within it.
     """
-    check_out(out)
+    check_out(out, "next", ["next.csv"], force=force)
     n = whole(n, "n")
     limits = path_limits(loaded, within_fit=False) if limits is None else limits
     domain, log = Domain(loaded, limits), loaded.log_format()
@@ -89,7 +92,7 @@ def next_rows(
     report = Report(f"{loaded.name}: {n} configurations to measure next")
     n_measured = 0 if known is None else len(known)
     report.record.update(model=str(loaded.path), n=n, n_measured=n_measured, where=where)
-    report.record.update(limits=dict(vars(limits)), expected_errors=errors)
+    report.record.update(limits=dict(vars(limits)), expected_errors=errors, command="next")
     shown = sorted({k for k in _SHOWN if k < n} | {n})
     table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
     report.table(["rows", "expected error [mm]"], table)

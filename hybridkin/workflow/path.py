@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridkin._core.arrays import as_path, number, one_of, real_array
+from hybridkin._core.arrays import as_array, as_path, number, one_of, real_array
 from hybridkin.ik import trajectories
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow._domain import Domain, PathLimits
+from hybridkin.workflow._places import placed
 from hybridkin.workflow.model import LoadedModel
 
+_TOL = 1e-4  # of a point that lies in the domain [m]
 _SHAPES = ("figure-eight", "spiral", "line")
 
 
@@ -110,9 +112,10 @@ def shape_path(
         Width and height of a figure eight; first and last radius of a spiral; x, y and z from end
         to end of a line [m].
     center : array-like of shape (3,), optional
-        Centre of the shape [m]. Default: a tip in the middle of the workspace.
+        Centre of the shape [m]. Default: near the middle of the tips in the domain of the model,
+        where the whole shape lies in the domain, if possible.
     normal : array-like of shape (3,), optional
-        Normal of its plane. Default: the z axis of the base.
+        Normal of its plane. Default: that of the plane nearest to these tips.
     turns : float, default=3.0
         Number of turns of a spiral.
     rise : float, default=0.0
@@ -135,16 +138,20 @@ def shape_path(
     if np.shape(extent) != (n_sizes,):
         need = f"--size must be {n_sizes} numbers for a {shape}"
         raise ValueError(f"`size` does not fit: {need}, got {size!r:.80}.")
-    if center is None:
-        # The tip nearest to the mean of all tips in the domain: some robots reach only a surface.
-        tips = Domain(loaded, limits).sample[1]
-        center = tips[np.linalg.norm(tips - tips.mean(axis=0), axis=1).argmin()]
+    domain = Domain(loaded, limits)
+    tips = domain.sample[1]
+    middle = tips.mean(axis=0) if center is None else real_array(center, "center")
+    across: Any = normal
     if normal is None:
-        normal = (0.0, 0.0, 1.0) if loaded.chain is None else loaded.chain.base[:3, 2].tolist()
+        across = np.linalg.svd(tips - tips.mean(axis=0), full_matrices=False)[2][2]
+        ahead = across if loaded.chain is None else as_array(loaded.chain.base)[:3, 2]
+        across = across if across @ ahead > 0.0 else -across
     timing: Any = {"duration": duration, "dt": dt}
+    half = 0.5 * np.array(extent)
     if shape == "figure-eight":
-        return trajectories.figure_eight(center, extent, normal=normal, **timing)
-    if shape == "spiral":
-        return trajectories.spiral(center, extent, normal=normal, turns=turns, rise=rise, **timing)
-    half, center = 0.5 * np.array(extent), real_array(center, "center")
-    return trajectories.line(center - half, center + half, **timing)
+        path = trajectories.figure_eight(middle, extent, normal=across, **timing)
+    elif shape == "spiral":
+        path = trajectories.spiral(middle, extent, normal=across, turns=turns, rise=rise, **timing)
+    else:
+        path = trajectories.line(middle - half, middle + half, **timing)
+    return placed(domain, path, _TOL)[0] if center is None else path

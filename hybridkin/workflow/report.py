@@ -22,7 +22,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin._core.arrays import as_path
-from hybridkin._core.files import write_files
+from hybridkin._core.files import newest, write_files
 from hybridkin._core.stored import plain
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.arc_chain import ArcChain
@@ -242,14 +242,27 @@ def _wrapped(text: str) -> str:
     return "\n".join(lines)
 
 
-def check_out(out: str | Path) -> None:
-    """Raise, before any work, if `out` cannot be used as a folder for results."""
+def check_out(out: str | Path, command: str, files: Sequence[str] = (), *, force: bool) -> None:
+    """Raise, before any work, if `out` cannot be used as a folder for results.
+
+    `files` and a report are replaced only if the report is one of the same command, or by `force`.
+    """
     path = as_path(out, "out")
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"`out` must be a folder, got the file {path}; name another one.")
     home = next(parent for parent in [path, *path.absolute().parents] if parent.exists())
     if not os.access(home, os.W_OK):
         raise PermissionError(f"`out` must be writable, but {home} is not; name another folder.")
+    report = newest(path / "report.json")
+    entry = f'"command": "{command}"'
+    if force or (report.is_file() and entry in report.read_text(errors="replace")):
+        return
+    there = [name for name in (*files, report.name, "report.md") if newest(path / name).exists()]
+    if there:
+        raise FileExistsError(
+            f"`out` {path} has {', '.join(there)}, not written by `hybridkin {command}`; name "
+            "another folder, or replace them with --force."
+        )
 
 
 def quiet(label: str, done: int, total: int) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.files import newest, write_file
+from hybridkin._core.files import newest
 from hybridkin._core.units import METRES
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
@@ -24,6 +24,7 @@ from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.plots import ActuatorDisplay, TrackAnimation, TrackingDisplay, new_figure
 from hybridkin.workflow._domain import Domain, PathLimits, path_limits
+from hybridkin.workflow._places import better_place
 from hybridkin.workflow._reach import check_reach
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, millimetres, quiet
@@ -34,6 +35,7 @@ _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
 _GUESSES = 16
 _PEAK, _PUSH = 1.875, 10.0 / math.sqrt(3.0)  # largest speed and acceleration of `min_jerk`
+_MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
 _SLOW, _DT = 0.1, 0.02  # without known limits: share of the range per second; period [s]
 _PULLS = (0.2, 0.0, 0.0, 0.2)  # pull to the preferred configuration, in each attempt
 
@@ -76,7 +78,8 @@ def track_path(
     tol : float, default=1e-4
         As for `InverseKinematics.track` [m].
     force : bool, default=False
-        If points of the path are out of reach, track them as closely as possible.
+        If points of the path are out of reach, track them as closely as possible; and replace files
+        of `out` that `track` did not write.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -94,7 +97,7 @@ def track_path(
     ValueError
         If points of the path are out of reach; the message gives the largest scale in reach.
     """
-    check_out(out)
+    check_out(out, "track", ["track.csv", "track.png", "commands.png"], force=force)
     log_format = loaded.log_format()
     limits = path_limits(loaded) if limits is None else limits
     domain = Domain(loaded, limits)
@@ -105,16 +108,19 @@ def track_path(
     whole, n_lead = _with_lead_in(track, stands, domain)
     sent = whole.q if loaded.play is None else loaded.play.command(whole.q)[0]
     speeds = np.abs(np.diff(whole.q, axis=0) / np.diff(whole.t)[:, None])
-    inside = (loaded.domain_distance(track.q) <= 1.0).mean()
+    inside = loaded.domain_distance(track.q) <= 1.0
+    promised = loaded.promised_errors(track.q[inside])
     report = Report(f"{loaded.name}: a path of {len(path)} points")
     report.record.update(
+        command="track",
         model=str(loaded.path),
         n=len(path),
         duration_s=path.duration,
         reached=_score(track)[1],
         errors={"mean": track.mean_error, "p95": track.p95_error, "max": track.max_error},
         tol=tol,
-        in_domain=None if loaded.hybrid is None else float(inside),
+        in_domain=None if loaded.hybrid is None else float(inside.mean()),
+        expected={name: errors.mean() for name, errors in promised.items() if len(errors)},
         play=loaded.play_width,
         statuses=dict(Counter(names)),
         lead_in={"rows": n_lead, "duration_s": whole.t[n_lead] - whole.t[0], "start": stands},
@@ -122,7 +128,10 @@ def track_path(
         largest_speed=speeds.max(initial=0.0),
         columns=dict(vars(log_format)),
     )
-    _write_summary(report)
+    outside = None
+    if loaded.hybrid is not None and inside.mean() < 1.0 - _MOST_OUTSIDE:
+        outside = better_place(domain, path, tol)
+    _write_summary(report, loaded.plane_in_words(), outside)
     _add_path(report, loaded, track)
     shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
     _add_commands(report, domain, whole.t, shown, n_lead)
@@ -277,15 +286,12 @@ def animate_track(
         file = newest(file / "track.csv")
     log = _read_track(file, loaded.log_format())
     out = Path(out)
-    if not out.absolute().parent.is_dir():
-        raise FileNotFoundError(f"`out` must lie in a folder that exists, got {out}.")
     q, target = loaded.effective(log.q), log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
         loaded.chain, q, target=target, t=log.time, tips=loaded.tips(q), n_frames=n_frames
     )
-    options = {"unit": unit, "speed": speed, "progress": partial(progress, "drawing frames")}
     try:
-        write_file(out, partial(film.save, **options))
+        film.save(out, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
     return {
@@ -362,18 +368,16 @@ def _add_commands(
     report.figure("commands", figure, caption)
 
 
-def _write_summary(report: Report) -> None:
+def _write_summary(report: Report, plane: str, better: str | None) -> None:
     record = report.record
     columns, source = record["columns"], record["limits"]["source"]
     mean, most, largest = (f"{1e3 * record['errors'][key]:.3g}" for key in ("mean", "p95", "max"))
     report.text(
         f"In the model, {record['reached']} of {record['n']} points are reached within "
-        f"{1e3 * record['tol']:g} mm. Solver error in mm: mean {mean}, 95 % quantile {most}, max "
-        f"{largest}; the error of the robot is larger. Limits: {source}."
+        f"{1e3 * record['tol']:g} mm. Error of the solver in mm: mean {mean}, 95 % quantile "
+        f"{most}, max {largest}. Limits: {source}."
     )
     report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
-    if record["in_domain"] is not None:
-        report.text(f"{100 * record['in_domain']:.0f} % of the points lie in the model's domain.")
     if record["lead_in"]["rows"]:
         report.text(
             "Rows with the status LEAD_IN move from the start of the robot to the path: {rows} in "
@@ -387,3 +391,18 @@ def _write_summary(report: Report) -> None:
             f"Backlash (play) {millimetres(record['play'])}: a command jumps by it when its "
             "actuator reverses. Send q; effective_... is the motion of the actuators."
         )
+    if plane:
+        report.text(plane)
+    report.text(_promise_in_words(record, better))
+
+
+def _promise_in_words(record: dict[str, Any], better: str | None) -> str:
+    """Return what to expect of the robot, and where the path would lie better."""
+    expected, inside = record["expected"], record["in_domain"]
+    words = "The error of the robot is not known: the model has no held-out errors"
+    if expected:
+        mean, most = (f"{1e3 * expected[name]:.2g} mm" for name in ("mean", "p95"))
+        words = f"Expect {mean} (95 % below {most}) of the robot inside the log"
+    if inside is not None and inside < 1.0:
+        words += f"; {100 * (1.0 - inside):.0f} % of the path is outside, where nothing is known"
+    return f"{words}: {better}." if better else f"{words}."

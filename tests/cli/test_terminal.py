@@ -2,7 +2,6 @@
 
 import io
 import re
-import time
 
 import pytest
 from rich.console import Console
@@ -72,13 +71,12 @@ def test_quiet_leaves_warnings_and_what_is_important(clock, capsys):
     ]
 
 
-def test_a_terminal_shows_a_bar_and_the_time_left(monkeypatch):
+def test_a_terminal_shows_a_bar_and_the_time_left(clock):
     text = io.StringIO()
     stages = Stages()
     stages._console = Console(file=text, force_terminal=True, width=100)
-    started = time.monotonic()
     stages("tracking", 0, 4)
-    monkeypatch.setattr(_terminal.time, "monotonic", lambda: started + 40.0)
+    clock[0] += 40.0
     stages("tracking", 1, 4)
     stages._bar.refresh()
     stages.warn("far [mm]")

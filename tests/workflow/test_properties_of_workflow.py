@@ -1,6 +1,5 @@
-"""Hostile values in any argument of what takes its time: fits, tracks, simulation, reports."""
+"""Hostile values in any argument of what takes its time: fits, tracks, reports."""
 
-import numpy as np
 import pytest
 from entry_points import (
     DESCRIPTION,
@@ -15,13 +14,11 @@ from entry_points import (
     fuzz,
 )
 
-from hybridkin import ConstantCurvatureChain, datasets, fit_play, simulation, workflow
+from hybridkin import ConstantCurvatureChain, fit_play, workflow
 
 SETTINGS = {"n_folds": 2, "n_seeds": 1, "auto": False, "loss": "linear", "coverage": None}
 SETTINGS |= {"play": None, "max_rows": None}
 OUT = FOLDER / "out"
-PLANT = {"tilt": 0.6, "gravity": 9.8, "max_force": 150.0}
-PLANT |= {"base_error": np.zeros(6), "cable_noise": 1e-3, "mocap_noise": 1e-3, "max_iter": 50}
 TENDONS = ConstantCurvatureChain([0.005], lengths=[0.1])
 
 
@@ -33,10 +30,6 @@ def with_settings(function):
         return function(**given, settings=workflow.FitSettings(**own), n_jobs=n_jobs)
 
     return call
-
-
-def settled(q, **given):
-    return simulation.TrunkPlant(**given).settle(q)
 
 
 ENTRIES = {
@@ -53,14 +46,6 @@ ENTRIES = {
             "parameters": ["radii"],
         },
     ),
-    "make_trunk": (
-        datasets.make_trunk,
-        {
-            **{"q_target": np.full((1, 9), 0.25), "n_segment": 0, "n_random": 1, "random_state": 0},
-            **{"cable_noise": 1e-3, "mocap_noise": 1e-3, "return_X_y": False},
-        },
-    ),
-    "TrunkPlant.settle": (settled, {"q": np.full(9, 0.25), **PLANT}),
     "evaluate_log": (
         workflow.evaluate_log,
         {"loaded": LOADED, "log": LOG, "out": None, "force": True},

@@ -1,0 +1,121 @@
+"""Files that another command or program wrote are replaced only by --force."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import robots
+from hybridkin.cli.main import main
+from hybridkin.workflow import Report
+from hybridkin.workflow.report import check_out
+
+ROBOT = """calibrate = []
+[[segment]]
+radius = 0.005
+length = 0.1
+[log]
+q = ["a", "b", "c"]
+x = ["x", "y", "z"]
+groups = "motion"
+[limits]
+q_min = -0.006
+q_max = 0.006
+"""
+FAST = ["--seeds", "1", "--folds", "2", "--no-auto", "--jobs", "1"]
+SHAPE = "--shape line --size 0.001,0.001,0 --unit m --duration 1 --dt 0.1".split()
+COMMANDS = {
+    "fit": ["log.csv", "--robot", "data.toml", *FAST],  # without a chain it takes a second
+    "evaluate": ["robot.toml", "log.csv"],
+    "track": ["robot.toml", *SHAPE],
+    "next": ["robot.toml", "-n", "3"],
+}
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """A folder with a robot and a log, in which commands run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot.toml").write_text(ROBOT)
+    (tmp_path / "data.toml").write_text(ROBOT[ROBOT.index("[log]") : ROBOT.index("[limits]")])
+    turns = np.linspace(0, 6, 20)[:, None] + np.arange(3)
+    q = np.concatenate([0.004 * size * np.sin(turns) for size in (1.0, 0.8, 0.6, 0.5)])
+    x = robots.from_toml(tmp_path / "robot.toml")(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(
+        300 * q
+    )
+    table = np.column_stack([q, x, np.arange(80) // 20])
+    header = "a,b,c,x,y,z,motion"
+    np.savetxt("log.csv", table, "%.9g", ",", header=header, comments="")
+    return tmp_path
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_file_of_another_command_is_replaced(home, capsys, command):
+    out = home / "out"
+    run = [command, *COMMANDS[command], "--out", "out"]
+    assert main(run) == 0
+    record = json.loads((out / "report.json").read_text())
+    assert record["command"] == command
+    (out / "report.json").write_text(json.dumps({**record, "command": "other"}))
+    before = content(out)
+    capsys.readouterr()
+    assert main(run) == 2
+    _, err = capsys.readouterr()
+    assert all(name in err for name in before)  # those of every file that the command writes
+    assert "--force" in err
+    assert content(out) == before
+
+
+@pytest.mark.slow
+def test_a_command_replaces_its_earlier_files_and_by_force_those_of_others(home):
+    run = ["next", *COMMANDS["next"], "--out", "out"]
+    assert main(run) == 0
+    first = (home / "out" / "next.csv").read_text()
+    assert main([*run, "--q-max", "0.004"]) == 0
+    assert (home / "out" / "next.csv").read_text() != first
+    (home / "out" / "report.json").unlink()
+    assert main(run) == 2
+    assert main([*run, "--force"]) == 0
+    assert (home / "out" / "next.csv").read_text() == first
+
+
+def test_fit_keeps_the_description_of_another_robot(home, capsys):
+    out = home / "arm"
+    out.mkdir()
+    (out / "robot.toml").write_text("mine")
+    assert main(["fit", *COMMANDS["fit"], "--out", "arm"]) == 2
+    assert "arm has robot.toml, not written by `hybridkin fit`" in capsys.readouterr().err
+    assert content(out) == {"robot.toml": b"mine"}
+
+
+def test_a_folder_with_other_files_is_used(home):
+    (home / "log.txt").write_text("mine")
+    assert main(["next", *COMMANDS["next"], "--out", "."]) == 0
+    assert (home / "log.txt").read_text() == "mine"
+    assert (home / "next.csv").is_file()
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", '{"command": 3}', "[" * 100_000, "\xff"])
+def test_a_report_of_another_program_is_not_replaced(tmp_path, text):
+    (tmp_path / "report.json").write_text(text, encoding="latin-1")
+    with pytest.raises(FileExistsError, match=r"has report\.json, not written by `hybridkin next`"):
+        check_out(tmp_path, "next", ["next.csv"], force=False)
+    check_out(tmp_path, "next", ["next.csv"], force=True)
+
+
+def test_files_of_a_killed_command_count(tmp_path):
+    waiting = tmp_path / ".hybridkin-new"
+    waiting.mkdir()
+    report = Report("plan")
+    report.record["command"] = "next"
+    shutil.move(report.write(tmp_path / "new")[0], waiting / "report.json")
+    check_out(tmp_path, "next", ["next.csv"], force=False)
+    with pytest.raises(FileExistsError, match=r"has report\.json"):
+        check_out(tmp_path, "track", ["track.csv"], force=False)

@@ -1,0 +1,67 @@
+"""What tracks promise: errors that grow with the distance from the log, and where paths lie."""
+
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, workflow
+from hybridkin.hybrid.log_distance import held_out_distances
+from hybridkin.ik import trajectories
+from hybridkin.workflow._domain import Domain
+from hybridkin.workflow._places import better_place, placed
+from hybridkin.workflow._promise import Promise
+
+rng = np.random.default_rng(0)
+
+
+def test_errors_that_grow_with_the_distance_are_found():
+    far = rng.uniform(0.0, 2.0, 4000)
+    errors = (2e-3 + 3e-3 * far) * rng.exponential(size=4000)
+    promise = Promise.of(errors, far)
+    assert promise.at_rows == pytest.approx(2e-3, rel=0.1)
+    assert promise.per_distance == pytest.approx(3e-3, rel=0.1)
+    assert promise.p95 == pytest.approx(-np.log(0.05), rel=0.1)
+    assert np.mean(errors < promise.p95 * promise.mean(far)) == pytest.approx(0.95, abs=0.01)
+
+
+def test_errors_that_do_not_grow_are_promised_as_they_are():
+    errors, far = rng.uniform(1e-3, 3e-3, 100), rng.uniform(0.0, 2.0, 100)
+    promise = Promise.of(errors, np.zeros(100))
+    assert promise.mean(far) == pytest.approx(errors.mean())
+
+
+def test_distances_are_zero_at_rows_of_the_log():
+    q, groups = rng.uniform(0.2, 0.3, (60, 6)), np.arange(60) // 10
+    assert held_out_distances(q, groups, q).min() == 0.0
+    assert held_out_distances(q, groups, q + 0.05).mean() > 0.5
+    assert not held_out_distances(q, np.zeros(60), q + 0.05).any()
+
+
+@pytest.fixture(scope="module")
+def domain(tmp_path_factory):
+    chain = ConstantCurvatureChain([0.05, 0.05])
+    q = 0.25 + 0.05 * rng.uniform(-1.0, 1.0, (300, 6))
+    x = chain(torch.from_numpy(q)).numpy()
+    model = HybridForwardModel(chain, "linear").fit(q, x + 1e-3 * q[:, :3])
+    loaded = workflow.LoadedModel("robot", tmp_path_factory.mktemp("m") / "m", model)
+    return Domain(loaded, workflow.path_limits(loaded))
+
+
+def test_a_path_outside_is_moved_to_where_it_lies_inside(domain):
+    tips = domain.sample[1]
+    center = tips.mean(axis=0) + np.array([0.6, 0.0, 0.0])
+    far = trajectories.figure_eight(center, [0.04, 0.02], dt=0.1)
+    moved, share = placed(domain, far, 1e-4)
+    assert share == 1.0
+    np.testing.assert_allclose(np.diff(moved.x, axis=0), np.diff(far.x, axis=0), atol=1e-12)
+    assert "move its centre to (" in better_place(domain, far, 1e-4)
+    stays, share = placed(domain, moved, 1e-4)
+    assert share == 1.0
+    np.testing.assert_array_equal(stays.x, moved.x)
+
+
+def test_a_path_that_is_too_large_is_to_be_made_smaller(domain):
+    tips = domain.sample[1]
+    wide = trajectories.figure_eight(tips.mean(axis=0), [3.0, 2.0], dt=0.1)
+    assert placed(domain, wide, 1e-4)[1] < 0.5
+    assert better_place(domain, wide, 1e-4).startswith("make it smaller (--scale)")
