@@ -106,7 +106,8 @@ def hostile(draw, good):
 
 def fuzz(function, right, share=1):
     """Call with one or two hostile arguments; `share`: one in how many examples is tried."""
-
+    _, error = answer(function, **right)
+    assert error is None, "where the right arguments are refused, each other one is"
     tried = []
 
     @settings(max_examples=max(2, settings.default.max_examples // share))

@@ -13,19 +13,17 @@ FILES = sorted(path for path in ROOT.rglob("*.py") if path.parent != ROOT)
 # A folder may import from folders further down only; those on one line do not know each other.
 FLOORS = [
     {"cli"},
-    {"paper"},
     {"workflow"},
     {"saving"},
     {"hybrid"},
     {"calibration"},
     {"chains", "learning", "ik"},
     {"native"},
-    {"_core", "datasets", "plots", "simulation"},
+    {"_core", "datasets", "plots"},
 ]
 BESIDE = {
-    "datasets": {"simulation", "_core"},
+    "datasets": {"_core"},
     "plots": {"_core", "chains"},
-    "simulation": set(),
     "_core": set(),
 }
 

@@ -19,10 +19,8 @@ DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 MODULES = (
     "datasets",
-    "paper",
     "plots",
     "robots",
-    "simulation",
     "tasks",
     "trajectories",
     "workflow",

@@ -19,7 +19,7 @@ from hybridkin import (
 )
 from hybridkin import trajectories as paths
 from hybridkin.calibration.choice import choose_geometry
-from hybridkin.datasets import Log, check_log, paper_protocol, paper_split
+from hybridkin.datasets import Log, check_log, paper_split
 from hybridkin.workflow import FitSettings
 
 Q, X, GROUPS = trunk_log(24)
@@ -70,7 +70,6 @@ META = ROWS.to("meta")
         ("t", lambda: InverseKinematics(trunk(), beta=0.0).track(X[:2], [0.0, 1e300])),
         ("groups", lambda: Log(Q, X, NAN_GROUPS)),
         ("time", lambda: Log(Q, X, time=[0.0])),
-        ("random_state", lambda: paper_protocol(np.nan)),
         ("random_state", lambda: paper_split(np.full(5, 3), -1, n_test=2)),
         ("x", lambda: calibrate(trunk(), Q, HUGE, ("radii",))),
         ("groups", lambda: calibrate(trunk(), Q, X, ("radii",), groups=NAN_GROUPS)),

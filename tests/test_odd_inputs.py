@@ -27,7 +27,7 @@ from hybridkin import (
     tasks,
     trajectories,
 )
-from hybridkin.datasets import Log, check_log, make_trunk
+from hybridkin.datasets import Log, check_log
 from hybridkin.plots import ErrorHistogramDisplay, TrackingDisplay
 
 Q, X, GROUPS = trunk_log(24)
@@ -410,7 +410,6 @@ def test_inputs_are_not_changed():
         ("input_scaling", lambda value: ELMRegressor(4, input_scaling=[value] * 2).fit(Q, X)),
         ("radii", lambda value: trunk().with_geometry(radii=value)),
         ("q", lambda value: jacobian(torch.sin, value)),
-        ("q_target", lambda value: make_trunk(value)),
     ],
 )
 @pytest.mark.parametrize("value", ["a", ["a", "b"], 1j, {}])

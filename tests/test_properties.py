@@ -215,10 +215,6 @@ ENTRIES = {
             **{"base_is_free": True, "drop_invalid": True},
         },
     ),
-    "datasets.paper_protocol": (
-        datasets.paper_protocol,
-        {"random_state": 0, "n_segment": 2, "n_random": 3},
-    ),
     "datasets.paper_split": (
         datasets.paper_split,
         {"data": np.arange(12) % 4, "random_state": 0, "n_test": 2},

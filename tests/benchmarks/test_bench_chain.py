@@ -90,7 +90,7 @@ def test_one_configuration(race, chain, draw, arm):
     )
 
 
-def test_rigid_chain(race, urdf, arm, draw, batch):
+def test_rigid_chain(race, urdf, arm, batch):
     ours = RigidChain.from_urdf(urdf, "link9")
     q = torch.randn(batch, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert_close(ours.forward_and_jacobian(q)[1], arm.jacobian(q)[:, :3])

@@ -14,7 +14,7 @@ from pathlib import Path
 import atheris
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent / "saving")]
+sys.path[:0] = [str(HERE), str(HERE.parent / "saving"), str(HERE.parents[1] / "examples")]
 with atheris.instrument_imports(include=["hybridkin"]):
     from _readers import READERS, outcome
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Line:
-    """What was examined, the figure found, and whether the claim holds."""
+    """What was examined, the figure found, and whether the claim holds: None if it was not run."""
 
     what: str
     figure: str
-    holds: bool
+    holds: bool | None

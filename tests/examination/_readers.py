@@ -17,8 +17,8 @@ from saved_models import FOLDER, predictions
 from hybridkin import RigidChain, load_model, robots
 from hybridkin.datasets import load_armlab, load_asl_trunk, load_log
 from hybridkin.ik import trajectories
-from hybridkin.simulation._mjcf import trunk_mjcf
 from hybridkin.workflow import open_model, read_path
+from paper.mjcf import trunk_mjcf
 
 URDF = b"""<robot name="arm"><link name="base"/><link name="upper"/><link name="hand"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>

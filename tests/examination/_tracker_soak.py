@@ -1,15 +1,16 @@
 """A robot that is commanded for long: what it did, checked tick by tick, as JSON.
 
-    python _tracker_soak.py TICKS SECONDS ROBOT ...
+    python _tracker_soak.py TICKS ROBOT ...
 
-Each robot ends after so many ticks, or seconds of CPU time. Each block of ticks has other targets:
+Each robot makes so many ticks. Each block of ticks has other targets:
 reachable ones along a path or in jumps, unreachable ones, huge ones, and some that are not finite;
 measured tips with an offset that grows, noise and gaps. The hybrid robot is updated by these
-measurements block by block.
+measurements block by block. In the end static targets within reach show whether it arrives.
 """
 
 from __future__ import annotations
 
+import copy
 import gc
 import hashlib
 import json
@@ -19,14 +20,18 @@ import time
 import numpy as np
 import psutil
 import torch
+from _pace import Pace
+from arrival import is_local_minimum
 from saved_models import arm, elastic_chain
 from tqdm import tqdm
 
 from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics, datasets, robots
 from hybridkin.native import available
 
-BLOCK = 500 if available() else 100
-DT, PROBE = 0.01, 50 if available() else 10  # period [s]; ticks whose time counts
+BLOCK = 500 if available() else 50
+STATIC = 20 if available() else 2  # targets, with ARRIVAL ticks for each
+ARRIVAL, CLOSE = 600, 1e-4  # [m]
+DT, PROBE = 0.01, 500 if available() else 10  # period [s]; ticks whose time counts
 FAR = (3.0, 1e3, 1e100, 1e160, 1.7e308)
 
 
@@ -93,6 +98,9 @@ class Checked:
         self.most = settings.dq_max.expand(n).numpy() * DT
         self.change = settings.ddq_max.expand(n).numpy() * DT**2
         self.found = {"not_finite": 0, "position": 0, "speed": 0.0, "acceleration": 0.0, "tip": 0.0}
+        self.found["moved"] = 0  # ticks
+        if settings.tip_limits is not None:
+            self.found["within"] = 0  # ticks whose tip must stay within its half-spaces
         self.digest, self.digests = hashlib.sha256(), []
 
     def start(self, q):
@@ -104,6 +112,7 @@ class Checked:
         found, settings = self.found, self.settings
         steps = np.diff(np.vstack([self.q, commands]), axis=0)
         found["not_finite"] += int((~np.isfinite(commands)).sum())
+        found["moved"] += int((steps != 0.0).any(axis=1).sum())
         found["position"] += int(((commands < self.low) | (commands > self.high)).sum())
         ulp = np.spacing(np.maximum(abs(self.low), abs(self.high)))
         changes = np.diff(np.vstack([self.dq, steps]), axis=0)
@@ -115,6 +124,7 @@ class Checked:
         if settings.tip_limits is not None:
             margin = settings.tip_limits.margin(self.chain(torch.from_numpy(commands))).amin(-1)
             inside = np.logical_or.accumulate(np.append(self.was_inside, margin.numpy() >= 0.0))
+            found["within"] += int(inside[:-1].sum())
             beyond = -margin.numpy()[inside[:-1]]
             found["tip"] = max(found["tip"], float(beyond.max(initial=0.0)))
             self.was_inside = bool(inside[-1])
@@ -123,16 +133,38 @@ class Checked:
         self.digests.append(self.digest.hexdigest()[:12])  # of all until now
 
 
-def probed(ik, home, way):
-    """Return the CPU time of a tick [s], of the same ticks in every call."""
-    tracker = ik.tracker(home)
+def probed(tracker, way):
+    """Return the CPU time [s] of a tick of a copy of the tracker, with all that it has gathered."""
+    twin = copy.deepcopy(tracker)
+    twin.step(way[0])
     begin = time.process_time()
     for target in way:
-        tracker.step(target)
+        twin.step(target)
     return (time.process_time() - begin) / len(way)
 
 
-def soak(robot, ticks, seed, seconds):
+def missed(ik, chain, checked, rng):
+    """Return how many static targets were missed, those at a local minimum of the error apart."""
+    elsewhere, minima = 0, 0
+    tracker = ik.tracker(0.5 * checked.low + 0.5 * checked.high)
+    limits = ik.settings.tip_limits
+    for _ in range(STATIC):
+        inside = False
+        while not inside:
+            q = torch.from_numpy(rng.uniform(checked.low, checked.high))
+            x = chain(q)
+            inside = limits is None or bool((limits.margin(x[None]) > 0.0).all())
+        tracker.reset(0.5 * checked.low + 0.5 * checked.high)
+        for _ in range(ARRIVAL):
+            end = tracker.step(x.numpy())
+        if not tracker.error <= CLOSE:
+            at_minimum = is_local_minimum(ik, end, x.numpy())
+            minima += at_minimum
+            elsewhere += not at_minimum
+    return {"targets": STATIC, "minima": minima, "elsewhere": elsewhere}
+
+
+def soak(robot, ticks, seed):
     """Return what was found."""
     make, settings = ROBOTS[robot]
     rng, model = np.random.default_rng(seed), make()
@@ -145,11 +177,9 @@ def soak(robot, ticks, seed, seconds):
     )
     tracker, offset, home = ik.tracker(checked.q, memory=0.5), np.zeros(3), checked.q
     way = chain(torch.from_numpy(home)).numpy() + 0.05 * np.linspace(0.0, 1.0, PROBE)[:, None]
-    times, memory, objects, start = [], [], [], time.process_time()
+    pace, memory, objects = Pace(), [], []
     every = max(1, ticks // BLOCK // 40)
     for block in tqdm(range(ticks // BLOCK), desc=robot, mininterval=20.0, file=sys.stderr):
-        if time.process_time() - start > seconds:
-            break
         if block % 20 == 19:  # somewhere else, at rest
             checked.start(rng.uniform(checked.low, checked.high))
             tracker.reset(checked.q)
@@ -162,7 +192,7 @@ def soak(robot, ticks, seed, seconds):
         commands, step = np.empty((BLOCK, len(checked.q))), tracker.step
         for i, (target, speed, tip) in enumerate(zip(x, feed, seen, strict=True)):
             commands[i] = step(target, speed, x_measured=tip)
-        times.append(probed(ik, home, way))
+        pace.add(probed(tracker, way))
         checked.take(commands)
         if learns:
             q = commands[::50]
@@ -175,13 +205,16 @@ def soak(robot, ticks, seed, seconds):
             gc.collect()
             memory.append(psutil.Process().memory_info().rss / 2**20)
             objects.append(len(gc.get_objects()))
-    tenth, few = max(1, len(times) // 10), max(1, len(memory) // 10)
+    few = max(1, len(memory) // 10)
+    model_now = ik.settings.task.models[0]
     return checked.found | {
+        **missed(ik, model_now, checked, rng),
         "backend": tracker.backend,
-        "ticks": len(times) * BLOCK,
+        "ticks": len(checked.digests) * BLOCK,
         "digests": checked.digests,
-        "us": 1e6 * np.median(times),
-        "slower": np.median(times[-tenth:]) / np.median(times[:tenth]),
+        "us": 1e6 * np.median(pace.seconds),
+        "slower": pace.slowdown(),
+        "steady": pace.is_steady(),
         # After a first tenth, in which memory is taken that stays.
         "mb": np.median(memory[-few:]) - np.median(memory[few : 2 * few + 1]),
         "objects": np.median(objects[-few:]) - np.median(objects[few : 2 * few + 1]),
@@ -190,5 +223,5 @@ def soak(robot, ticks, seed, seconds):
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    ticks, seconds, *names = sys.argv[1:]
-    print(json.dumps([soak(name, int(ticks), 0, float(seconds)) for name in names]))
+    ticks, *names = sys.argv[1:]
+    print(json.dumps([soak(name, int(ticks), 0) for name in names]))

@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def examine(full: bool) -> Iterator[Line]:
 
 
 def line_of(file: Path, examples: int) -> Line:
-    """Run one file; it holds where all its properties do, and at least one was tested."""
+    """Run one file; it holds where all its properties do, each in at least one example."""
     command = [sys.executable, "-m", "pytest", str(file), "-q", "--tb=short", "-rP"]
     command += ["--hypothesis-profile=examination", f"--hypothesis-seed={SEED}"]
     command += ["--hypothesis-show-statistics"]
@@ -40,14 +41,17 @@ def line_of(file: Path, examples: int) -> Line:
         command, cwd=TESTS.parent, env=environment, capture_output=True, text=True, check=False
     )
     seconds = time.perf_counter() - start
-    tested = sum(map(int, re.findall(r"generate phase.*?(\d+) passing", run.stdout, re.DOTALL)))
-    counts = {what: int(n) for n, what in re.findall(r"(\d+) (passed|failed|errors?)", run.stdout)}
-    failed = sum(n for what, n in counts.items() if what != "passed")
+    examples_of = re.findall(r"generate phase.*?(\d+) passing", run.stdout, re.DOTALL)
+    tested = [int(n) for n in examples_of if int(n)]
+    counts = Counter()
+    for n, what in re.findall(r"(\d+) (passed|failed|error|skipped)", run.stdout):
+        counts[what] += int(n)
+    failed = counts["failed"] + counts["error"]
     if run.returncode:
         print(run.stdout.split("= PASSES =")[0], run.stderr[-2000:], file=sys.stderr)
     return Line(
         f"{file.stem}: an answer or an error that names the argument",
-        f"{counts.get('passed', 0) + failed} properties, {tested} examples (at most {examples} "
-        f"each, seed {SEED}), {failed} failures, {seconds:.0f} s",
-        run.returncode == 0 and tested > 0,
+        f"{counts['passed'] + failed} properties, {sum(tested)} examples (at most {examples} "
+        f"each, seed {SEED}), {failed} failures, {counts['skipped']} not run, {seconds:.0f} s",
+        run.returncode == 0 and 0 < counts["passed"] <= len(tested) and not counts["skipped"],
     )

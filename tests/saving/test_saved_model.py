@@ -359,7 +359,9 @@ def test_the_header_describes_the_model(tmp_path, fitted):
 def test_a_column_that_does_not_vary_has_no_range(tmp_path):
     q, x, _ = trunk_log()
     q[:, 1] = 0.25
-    model = HybridForwardModel(trunk(), ELMRegressor(4, random_state=0)).fit(q, x)
+    model = HybridForwardModel(trunk(), ELMRegressor(4, random_state=0))
+    with pytest.warns(UserWarning, match=r"no motion along \+1 q\[1\] "):
+        model.fit(q, x)
     save_model(model, tmp_path / "model")
     domain = model_header(tmp_path / "model")["domain"]
     assert [value is None for value in domain["q_low"]] == [False, True, False]
