@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_ext")]
+sys.path[:0] = [str(ROOT), str(ROOT / "examples"), str(ROOT / "docs" / "_ext")]
 os.environ.setdefault("MPLBACKEND", "agg")
 
 import hybridkin  # noqa: E402
