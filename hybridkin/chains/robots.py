@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import as_path
 from hybridkin._core.units import METRES, UNITS
@@ -93,9 +94,20 @@ class LogFormat:
     time: str | None = None
 
     @property
-    def q_factor(self) -> np.ndarray:
+    def q_factor(self) -> NDArray:
         """Units of the model per unit of the log, including the sign, shape () or (n,)."""
         return np.multiply(self.q_sign, UNITS.get(self.q_unit, 1.0))
+
+    def to_log(self, q: ArrayLike) -> NDArray:
+        """Return actuator vectors (..., n) of the model in the unit and with the sign of the log.
+
+        The columns are those of `q`; commands for the robot that wrote the log are such numbers.
+        """
+        return np.divide(q, self.q_factor) + 0.0  # no -0
+
+    def from_log(self, q: ArrayLike) -> NDArray:
+        """Return actuator vectors (..., n) of the log in unit and sign of the model."""
+        return np.multiply(q, self.q_factor)
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -184,6 +196,21 @@ class RobotDescription:
         if self.chain is not None:
             return self.chain.n_actuators
         return 0 if self.log is None else len(self.log.q)
+
+    def to_log(self, q: ArrayLike) -> NDArray:
+        """Return actuator vectors (..., n) in unit and sign of the logs, see `LogFormat`."""
+        return self._known_log().to_log(q)
+
+    def from_log(self, q: ArrayLike) -> NDArray:
+        """Return actuator vectors (..., n) of a log as the model takes them."""
+        return self._known_log().from_log(q)
+
+    def _known_log(self) -> LogFormat:
+        if self.log is None:
+            raise ValueError(
+                f"{self.path or self.name} must have a table [log] with the unit of q."
+            )
+        return self.log
 
     @property
     def base_is_free(self) -> bool:

@@ -183,9 +183,9 @@ def _fit(command: argparse.ArgumentParser) -> None:
     The check of the log comes first. Errors (a frozen sensor, wrong units, NaN) stop the fit with
     advice and exit code 2. Warnings are printed and stand in the report.
 
-    With --play auto the fit looks for backlash (also called play) and dry friction: the tip then
-    depends on where the tendons came from. Backlash is kept only if it lowers the errors on
-    held-out motions. The rows of a motion must be in the order of time.
+    The fit looks for backlash (also called play) and dry friction: the tip then depends on where
+    the tendons came from. Backlash is kept only if it lowers the errors on held-out motions. Its
+    motions must have names, and their rows must be in the order of time. --play 0: no backlash.
     """
     add = command.add_argument
     add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
@@ -208,9 +208,10 @@ def _fit(command: argparse.ArgumentParser) -> None:
     add(
         "--play",
         type=play,
+        default="detect",
         metavar="auto|WIDTH",
         help='backlash (play) of the actuators in the "auto" hybrid: its total width in the unit '
-        "of q, or auto (none)",
+        "of q; auto: estimated in every fold (auto if the log shows backlash)",
     )
     few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
     number = between(-1, float("inf"), int)

@@ -215,7 +215,7 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         workflow.scaled_path(path, arguments.scale),
         arguments.out,
         limits=limits,
-        start=start if isinstance(start, str) else np.multiply(start, log_format.q_factor),
+        start=start if isinstance(start, str) else log_format.from_log(start),
         tol=1e-3 * arguments.tol,
         force=arguments.force,
         progress=stages,

@@ -127,6 +127,6 @@ def better_way(chain: Any, q: NDArray, x: NDArray, base_is_free: bool) -> tuple[
         kept = [ways[i] for i in np.argsort(missed)[:_KEPT]]
         if missed.min() > _GAIN * least:
             break
-        first = int(np.flatnonzero(missed < _SIMPLE * missed.min())[0])
+        first = int(np.flatnonzero(missed <= _SIMPLE * missed.min())[0])
         best, least = ways[first], float(missed[first])
     return best, least

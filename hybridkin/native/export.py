@@ -50,7 +50,12 @@ class _Controller(Protocol):
 
 
 def export_c(
-    model: object, folder: str | Path, *, name: str = "model", dtype: str = "float64"
+    model: object,
+    folder: str | Path,
+    *,
+    name: str = "model",
+    dtype: str = "float64",
+    about_q: str = "q in metres, or in radians for revolute joints, as in the model.",
 ) -> list[Path]:
     """Write a model or inverse kinematics as C99 code for a controller; return the files.
 
@@ -67,6 +72,8 @@ def export_c(
         Name of the files and prefix of all functions.
     dtype : {"float64", "float32"}, default="float64"
         Floating-point type of the code.
+    about_q : str
+        Unit and sign of q in sentences, for README.md and the header.
 
     Returns
     -------
@@ -112,6 +119,7 @@ def export_c(
             raise FileExistsError(f"`folder` has a {path.name} of another origin; use another.")
     entries = {
         **dict(NAME=name, GUARD=name.upper(), TITLE=type(model).__name__, VERSION=__version__),
+        "ABOUT_Q": about_q.replace("*/", "* /"),
         **dict(REAL=_REAL[dtype], N=plan.n_inputs, M=plan.n_outputs, TOL=_TOLERANCE[dtype]),
         **_code(plan, controller is not None, dtype),
         **_vectors(module, plan, controller, dtype),

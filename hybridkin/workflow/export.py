@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.native.export import export_c
 from hybridkin.workflow._domain import Domain, PathLimits, path_limits
@@ -48,7 +50,7 @@ def export_model(
     """
     report, model = Report("C code"), loaded.module
     report.record.update(n_actuators=loaded.n_actuators, dtype=dtype, dt=dt)
-    report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}, SI units.")
+    report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
     if dt is not None:
         limits = path_limits(loaded) if limits is None else limits
         settings: dict[str, Any] = {k: v for k, v in vars(limits).items() if k != "source"}
@@ -56,9 +58,23 @@ def export_model(
         model = InverseKinematics(loaded.module, dt=dt, **settings)
         report.record["limits"] = vars(limits)
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
-    if loaded.play is not None:
-        report.text(
-            "This robot has backlash (play), and q in the code is the motion of the actuators. "
-            "`PlayOperator.command` gives the commands to send."
-        )
-    return report, export_c(model, out, name=name, dtype=dtype)
+    about_q = _about_q(loaded)
+    report.text(about_q)
+    return report, export_c(model, out, name=name, dtype=dtype, about_q=about_q)
+
+
+def _about_q(loaded: LoadedModel) -> str:
+    """Return unit, sign and backlash of q in sentences, as a controller must know them."""
+    log = loaded.log_format()
+    factors = np.broadcast_to(log.q_factor, len(log.q))
+    rows = zip(factors, log.q, strict=True)
+    terms = ", ".join(f"q[{i}] = {factor:g} * {name}" for i, (factor, name) in enumerate(rows))
+    unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
+    about_q = f"q from the columns of the log{unit}: {terms}."
+    if loaded.play is None:
+        return about_q
+    return (
+        f"{about_q} The robot has backlash (play) of {loaded.play.width.tolist()}, in the unit of "
+        "q, for which this code does not compensate: q is the motion of the actuators, and "
+        "`PlayOperator.command` in Python shows the commands to send."
+    )

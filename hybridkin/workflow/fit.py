@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,9 +83,10 @@ class FitSettings:
         Number of random hidden layers of an ELM; the errors of each row are averaged over them.
     auto : bool
         Whether ``error_model="auto"`` is among the models; it takes most of the time.
-    play : float, "auto" or None
+    play : float, "auto", "detect" or None
         Backlash (also called play) of the actuators [m] in that hybrid, see `HybridForwardModel`.
-        It requires `auto`, and named motions in order of time.
+        It requires `auto`, and named motions in order of time. "detect": "auto" if the log allows
+        it and backlash lowers the held-out errors of a network, else None.
     max_rows : int or None
         Largest number of rows; of a longer log every k-th row is used. None: all rows.
     """
@@ -95,7 +96,7 @@ class FitSettings:
     n_folds: int = 5
     n_seeds: int = 5
     auto: bool = True
-    play: float | str | None = None
+    play: float | str | None = "detect"
     max_rows: int | None = 2000
 
     def __post_init__(self) -> None:
@@ -173,6 +174,19 @@ class _Rows(NamedTuple):
             return error_module(linear().fit(self.q, self.x), torch.from_numpy(self.q))
         return chain if result is None else result.chain
 
+    def with_play_detected(self, log: MeasuredLog, calibrated: ForwardModel | None) -> _Rows:
+        """Return the rows with a setting `play` that is not "detect"."""
+        settings = self.settings
+        if settings.play != "detect":
+            return self
+        play = None
+        complete = not np.isnan(self.x).any()
+        if calibrated is not None and settings.auto and log.named and not log.n_late and complete:
+            model = HybridForwardModel(calibrated, "drop", play="auto")
+            model.fit_with_messages(self.q, self.x, groups=self.groups)
+            play = None if model.play_ is None else "auto"
+        return self._replace(settings=replace(settings, play=play))
+
     def auto_model(self, calibrated: ForwardModel) -> HybridForwardModel:
         """Return the hybrid with error_model="auto".
 
@@ -224,6 +238,9 @@ def compare_by_group(
     log = checked(log, robot.chain, robot.base_is_free)
     parts = folds(log.q, log.motions, settings.n_folds)
     rows = _Rows(log.q, log.x, log.motions, robot, settings)
+    if settings.play == "detect":
+        chain = None if robot.chain is None else rows.with_geometry_chosen().mechanical()
+        rows = rows.with_play_detected(log, chain)
     jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in parts)
     fold, distance = np.empty(len(log.q), dtype=int), np.empty(len(log.q))
     found = Comparison({}, {}, fold, distance, [])
@@ -293,7 +310,7 @@ def fit_log(
         If the log or the settings do not allow the comparison.
     """
     check_out(out, "fit", _FILES, force=force)
-    if robot.chain is None and settings.play is not None:
+    if robot.chain is None and settings.play not in (None, "detect"):
         raise ValueError("`play` requires a robot with segments: its width is a length.")
     complete = checked(log, robot.chain, robot.base_is_free)
     _check(complete, settings, force)
@@ -304,7 +321,9 @@ def fit_log(
     messages += [] if result is None else complete.misread(result.chain)
     for message in messages:
         warnings.warn(message, stacklevel=2)
-    compared = compare_by_group(data, robot, settings, n_jobs=n_jobs, progress=progress)
+    chain = start if result is None else result.chain
+    rows = rows.with_play_detected(complete, chain)
+    compared = compare_by_group(data, robot, rows.settings, n_jobs=n_jobs, progress=progress)
     savable = _SAVED if robot.chain is not None else (_DATA_LINEAR, ELM, AUTO)
     errors = {name: values.mean() for name, values in compared.errors.items() if name in savable}
     saved = min(errors, key=lambda name: (errors[name], name))
@@ -358,7 +377,7 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
             "`groups` must name at least 2 motions to hold one out, but the log has "
             f"{n_motions}; name another column: --groups COLUMN."
         )
-    if settings.play is not None:
+    if settings.play not in (None, "detect"):
         if not settings.auto:
             raise ValueError("`play` requires `auto=True`; remove --no-auto.")
         if not log.named:

@@ -63,17 +63,21 @@ class MeasuredLog(Log):
             return "motions"
         return f"parts of the log (cut into {_BLOCKS}; name a column of motions with `--groups`)"
 
-    def check_order(self, why: str) -> None:
-        """Raise if rows of a motion are not in order of time; `why` begins the message."""
+    @property
+    def n_late(self) -> int:
+        """Number of rows that are earlier than the row above of the same motion."""
         if self.time is None:
-            return
+            return 0
         order = np.argsort(self.motions, kind="stable")
         same = self.motions[order][1:] == self.motions[order][:-1]
-        late = int((same & (np.diff(self.time[order]) < 0)).sum())
-        if late:
+        return int((same & (np.diff(self.time[order]) < 0)).sum())
+
+    def check_order(self, why: str) -> None:
+        """Raise if rows of a motion are not in order of time; `why` begins the message."""
+        if self.n_late:
             raise ValueError(
-                f"{why} needs the rows of a motion in order of time, but {late} rows are earlier "
-                "than the row above; sort the log by motion and time."
+                f"{why} needs the rows of a motion in order of time, but {self.n_late} rows are "
+                "earlier than the row above; sort the log by motion and time."
             )
 
     def check(self, force: bool) -> None:

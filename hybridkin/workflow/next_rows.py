@@ -101,7 +101,7 @@ def next_rows(
         f"little, not how large the error will be. {n_measured} rows are already measured. Limits: "
         f"{limits.source}."
     )
-    cells = np.column_stack([sent / log.q_factor, errors / METRES[log.x_unit]]) + 0.0  # no -0
+    cells = np.column_stack([log.to_log(sent), errors / METRES[log.x_unit]])
     head = ",".join([*log.q, "expected_error"])
     written = {"fmt": "%.9g", "delimiter": ",", "header": head, "comments": ""}
     report.file("next.csv", partial(np.savetxt, X=cells, encoding="utf-8", **written))

@@ -321,7 +321,7 @@ def _write_track(
 ) -> None:
     """Write commands, and with backlash the motion of the actuators, point by point."""
     scale = 1 / METRES[log.x_unit]
-    sent, *effective = (_text(q / log.q_factor) for q in shown.values())
+    sent, *effective = (_text(log.to_log(q)) for q in shown.values())
     rest = _text(scale * np.column_stack([track.x, track.target, track.error]))
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
     head += [f"effective_{name}" for name in log.q for _ in effective]

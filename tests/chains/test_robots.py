@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
@@ -103,6 +104,17 @@ def test_description_is_the_chain_it_describes(write):
     assert robot.calibrate == ("radii", "base")
     log = robots.LogFormat(tuple("abcdefghij"), ("x", "y", "z"), "mm", "m", -1, "", "motion", "t")
     assert robot.log == log
+
+
+def test_actuator_vectors_go_to_logs_and_back(write):
+    robot = robots.read_description(write(TENDONS))
+    q = 1e-3 * np.arange(20.0).reshape(2, 10)
+    assert_allclose(robot.to_log(q), -np.arange(20.0).reshape(2, 10), rtol=1e-14)
+    assert not np.signbit(robot.to_log(q)[0, 0])
+    assert_allclose(robot.from_log(robot.to_log(q)), q, rtol=1e-14)
+    plain = robots.read_description(write("[[segment]]\nradius = 0.1"))
+    with pytest.raises(ValueError, match=r"robot.toml must have a table \[log\]"):
+        plain.to_log(q)
 
 
 def test_columns_of_motions_and_time_and_limits(write):

@@ -781,6 +781,19 @@ def test_evaluate_knows_where_the_motions_of_play_begin(playful, tmp_path, capsy
     )
 
 
+def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, capsys):
+    code, printed, _ = run(capsys, "export", playful, "--out", tmp_path / "c", "--name", "robot")
+    assert code == 0
+    for text in (printed, *((tmp_path / "c" / n).read_text() for n in ("README.md", "robot.h"))):
+        text = " ".join(text.split())
+        assert f"log in mm: q[0] = -0.001 * {COLUMNS[0]}, q[1] = -0.001 * {COLUMNS[1]}" in text
+        assert "backlash (play) of 0.0004" in text
+    model = load_model(playful / "model.safetensors")
+    ik = hybridkin.InverseKinematics(model, q_min=-0.005, q_max=0.005)
+    with pytest.warns(UserWarning, match=r"backlash \(play\) of 0.0004.*play_.command"):
+        ik.tracker(np.zeros(6))
+
+
 @pytest.mark.slow
 def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, capsys):
     out = tmp_path / "track"

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import re
 from dataclasses import replace
@@ -293,7 +294,9 @@ def test_words_about_auto_are_those_of_what_it_took(weights, sentence):
     assert entry["expected"] == 2.6e-3
 
 
-def test_play_lowers_the_errors_of_auto_on_held_out_motions():
+@pytest.fixture(scope="module")
+def playful():
+    """A robot whose tendons have 0.4 mm of backlash, and a log of it."""
     rng = np.random.default_rng(0)
     chain = ConstantCurvatureChain([0.005], lengths=[0.1])
     groups = np.repeat(np.arange(8), 20)
@@ -302,12 +305,40 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions():
     with torch.no_grad():
         x = chain(torch.from_numpy(PlayOperator(4e-4).apply_by_group(q, groups))).numpy()
     robot = robots.RobotDescription("playful", chain, ("radii",), None)
+    return robot, datasets.Log(q, x, groups, time=np.tile(np.arange(20.0), 8))
+
+
+def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
+    robot, log = playful
     settings = workflow.FitSettings(n_folds=2, n_seeds=1, play=4e-4)
-    log = datasets.Log(q, x, groups)
     compared = workflow.compare_by_group(log, robot, settings, n_jobs=1)
     errors, choices = compared.errors, compared.choices
     assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
     assert all(choice["hybrid, auto"].endswith("backlash 0.4 mm") for choice in choices)
+
+
+def test_play_is_tried_by_itself_where_the_order_of_the_rows_matters(playful, monkeypatch):
+    robot, log = playful
+    tried = []
+    monkeypatch.setattr(
+        "hybridkin.workflow.fit._one_fold", lambda train, test: tried.append(train.settings.play)
+    )
+
+    def play_of(log, **settings):
+        tried.clear()
+        settings = workflow.FitSettings(n_folds=2, n_seeds=1, **settings)
+        with contextlib.suppress(TypeError):  # a fold returns no errors
+            workflow.compare_by_group(log, robot, settings, n_jobs=1)
+        return tried[0]
+
+    assert play_of(log) == "auto"
+    assert play_of(log, play=0.0) == 0.0
+    assert play_of(log, auto=False) is None
+    assert play_of(replace(log, groups=None)) is None
+    assert play_of(replace(log, time=-log.time)) is None
+    with torch.no_grad():
+        x = robot.chain(torch.from_numpy(log.q)).numpy()
+    assert play_of(replace(log, x=x)) is None
 
 
 def test_an_actuator_that_never_moved_is_held_where_it_was():

@@ -1,4 +1,6 @@
-/* @TITLE@: written by hybridkin @VERSION@. Units and limits: README.md. */
+/* @TITLE@: written by hybridkin @VERSION@. Limits: README.md.
+
+   @ABOUT_Q@ */
 #ifndef @GUARD@_H
 #define @GUARD@_H
 
