@@ -370,7 +370,8 @@ def test_the_domain_of_few_lines_is_found_from_its_rows():
     assert model.in_domain(domain.preferred[None])
     commands = domain.sample[0]
     assert model.in_domain(commands).all()
-    assert (np.ptp(commands, axis=0) > 0.05).all()
+    # How far the walks come on other lines depends on the preferred row: rounding decides which.
+    assert (np.ptp(commands, axis=0) > 0.03).all()
 
 
 @pytest.mark.slow
