@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -104,13 +104,17 @@ def examine(full: bool) -> Iterator[Line]:
         for way, settings in kind.ways.items():
             ik = InverseKinematics(kind.model, q_min=kind.low, q_max=kind.high, dt=DT, **settings)
             targets = _targets(ik, kind, 1000 if full else 20)
+            start = np.full(ik.settings.n_actuators, kind.low + kind.start * (kind.high - kind.low))
+            yield _arrives(
+                f"{name}, {way}, torch", ik, kind, targets, _in_batch(ik, start, targets)
+            )
             for backend, tracker in _trackers(ik):
-                few = targets[: (3 if full else 1)] if backend == "torch" else targets
                 line = f"{name}, {way}, {backend}"
                 if tracker is None:
                     yield Line(line, "not available here", None)
                 else:
-                    yield _arrives(line, ik, kind, tracker, few)
+                    motions = _one_by_one(tracker, start, targets)
+                    yield _arrives(line, ik, kind, targets, motions)
 
 
 def _targets(ik: InverseKinematics, kind: Kind, count: int) -> NDArray:
@@ -121,9 +125,8 @@ def _targets(ik: InverseKinematics, kind: Kind, count: int) -> NDArray:
 
 
 def _trackers(ik: InverseKinematics) -> Iterator[tuple[str, Any]]:
-    """Yield the ways to take steps, each a tracker, or None if it is not there."""
+    """Yield the compiled ways to take steps, each a tracker, or None if it is not there."""
     n = ik.settings.n_actuators
-    yield "torch", ik.tracker(torch.zeros(n, dtype=torch.float64))
     yield "core", ik.tracker(np.zeros(n)) if available() else None
     if shutil.which("cc") is None:
         yield "exported C", None
@@ -174,28 +177,51 @@ class Exported:
         return self._state.error
 
 
-def _arrives(line: str, ik: InverseKinematics, kind: Kind, tracker: Any, targets: NDArray) -> Line:
-    n, as_torch = ik.settings.n_actuators, line.endswith("torch")
-    start = np.full(n, kind.low + kind.start * (kind.high - kind.low))
-    errors, ends, ticks, beyond = [], [], [], -math.inf
-    for x in targets:
-        place = torch.from_numpy(x) if as_torch else x
-        tracker.reset(torch.from_numpy(start) if as_torch else start)
-        commands, distances = [start, start], []
-        for _ in range(TICKS + HELD):
-            commands.append(np.asarray(tracker.step(place)))
-            distances.append(tracker.error)
-        beyond = max(beyond, _beyond(ik, np.array(commands)))
-        errors.append(max(distances[-HELD:]))
-        ends.append(commands[-1])
-        if errors[-1] <= TOL:
-            ticks.append(int(np.argmax(np.array(distances) <= TOL)))
-    missed = [i for i, error in enumerate(errors) if not error <= TOL]
-    minima = sum(is_local_minimum(ik, ends[i], targets[i]) for i in missed)
-    figure = f"{len(targets) - len(missed):,} of {len(targets):,} reached, the median one in "
+class Motions(NamedTuple):
+    """Motions from rest to the targets."""
+
+    commands: NDArray  # (T + 2, N, n), the start twice before all ticks
+    distances: NDArray  # (T, N) before each tick [m]
+
+
+def _one_by_one(tracker: Any, start: NDArray, targets: NDArray) -> Motions:
+    """Return the motions of a tracker to targets (N, 3), one after the other."""
+    commands = np.tile(start, (TICKS + HELD + 2, len(targets), 1))
+    distances = np.empty((TICKS + HELD, len(targets)))
+    for i, x in enumerate(targets):
+        tracker.reset(start)
+        for tick in range(TICKS + HELD):
+            commands[tick + 2, i] = tracker.step(x)
+            distances[tick, i] = tracker.error
+    return Motions(commands, distances)
+
+
+def _in_batch(ik: InverseKinematics, start: NDArray, targets: NDArray) -> Motions:
+    """Return the motions to targets (N, 3), all at once in torch."""
+    rows = torch.from_numpy(np.tile(start, (len(targets), 1)))
+    places = torch.from_numpy(targets)
+    commands, distances, dq = [rows, rows], [], torch.zeros_like(rows)
+    for _ in range(TICKS + HELD):
+        step = ik.step(commands[-1], places, dq=dq)
+        dq = step.dq
+        commands.append(commands[-1] + dq)
+        distances.append(step.error)
+    return Motions(torch.stack(commands).numpy(), torch.stack(distances).numpy())
+
+
+def _arrives(
+    line: str, ik: InverseKinematics, kind: Kind, targets: NDArray, motions: Motions
+) -> Line:
+    errors = motions.distances[-HELD:].max(axis=0)
+    reached = errors <= TOL
+    ticks = (motions.distances[:, reached] <= TOL).argmax(axis=0)
+    missed = np.flatnonzero(~reached)
+    minima = sum(is_local_minimum(ik, motions.commands[-1, i], targets[i]) for i in missed)
+    beyond = max(_beyond(ik, motions.commands[:, i]) for i in range(len(targets)))
+    figure = f"{reached.sum():,} of {len(targets):,} reached, the median one in "
     figure += f"{np.median(ticks):.0f} ticks; {len(missed)} missed"
-    if missed:
-        figure += f", {minima} of them at a local minimum, largest {1e3 * max(errors):.2g} mm"
+    if len(missed):
+        figure += f", {minima} of them at a local minimum, largest {1e3 * errors.max():.2g} mm"
     figure += f"; limits exceeded by {max(beyond, 0.0):.2g} ulp of q"
     most = math.ceil(MISSED * len(targets))
     elsewhere = len(missed) - minima
