@@ -32,8 +32,8 @@ def names(text: str) -> Sequence[str]:
 
 
 def play(text: str) -> float | str:
-    """Return a width of backlash, or "auto"."""
-    if text == "auto":
+    """Return a width of backlash, "auto" or "detect"."""
+    if text in ("auto", "detect"):
         return text
     value = float(text)
     if not 0.0 <= value < float("inf"):

@@ -818,7 +818,9 @@ def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, 
     assert "Backlash (play) of the actuators: 0.4 mm" in printed
 
 
-@pytest.mark.parametrize(("given", "play"), [("auto", "auto"), ("0.4", 4e-4), ("0", 0.0)])
+@pytest.mark.parametrize(
+    ("given", "play"), [("auto", "auto"), ("0.4", 4e-4), ("0", 0.0), (None, "detect")]
+)
 def test_play_reaches_the_fit_in_metres(log, robot, tmp_path, monkeypatch, given, play):
     given_settings = {}
 
@@ -827,7 +829,8 @@ def test_play_reaches_the_fit_in_metres(log, robot, tmp_path, monkeypatch, given
         raise ValueError("enough")
 
     monkeypatch.setattr(workflow, "fit_log", fit_log)
-    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m", "--play", given]
+    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m"]
+    arguments += [] if given is None else ["--play", given]
     assert main([str(argument) for argument in arguments]) == 2
     assert given_settings["settings"].play == play
     assert type(given_settings["settings"].play) is type(play)
