@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
+from hybridkin._core.directions import few_terms
 from hybridkin.calibration._least_squares import Fit
 from hybridkin.calibration._parameters import Problem
 
@@ -16,7 +16,6 @@ _SLIGHT = 0.01  # of the largest motion of the tips by one parameter alone
 _ALIKE = 0.02
 _STILL = 1e-6  # [mm]
 _NO_EFFECT = "does not move the tips"
-_INSIDE = 0.05  # part of a unit vector outside a span that counts as zero
 _DETERMINED = 0.05  # largest standard error of the logarithm
 _STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%"), "q": (1.0, "of q")}
 
@@ -92,33 +91,3 @@ def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float
             terms.append((not leads, -abs(at), (label, float(at), row + i)))
         row += part.size
     return [term for *_, term in sorted(terms)]
-
-
-def few_terms(directions: NDArray) -> NDArray:
-    """Return a sparse basis (K, P) of the span of orthonormal rows (K, P).
-
-    For each entry, fixed to 1, minimise the sum of absolute entries; take the shortest independent.
-    """
-    K, P = directions.shape
-    if K < 2:
-        return directions
-    cost = np.concatenate([np.zeros(K), np.ones(P)])
-    eye = np.eye(P)
-    above = np.block([[directions.T, -eye], [-directions.T, -eye]])
-
-    def shortest(held: NDArray) -> NDArray:
-        equal = np.concatenate([held, np.zeros(P)])[None]
-        found = linprog(cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)).x
-        a = held if found is None else found[:K]  # if it fails, the nearest vector
-        return a / np.linalg.norm(a)
-
-    columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
-    candidates = [shortest(held) for held in columns]
-    candidates.sort(key=lambda a: np.abs(a @ directions).sum() / np.abs(a @ directions).max())
-    chosen: list[NDArray] = []
-    while len(chosen) < K:
-        taken = np.array(chosen).reshape(-1, K)
-        rest = np.linalg.svd(taken)[2][len(chosen) :]  # spans the remaining directions
-        free = [a for a in candidates if np.linalg.norm(rest @ a) > _INSIDE]
-        chosen.append(free[0] if free else shortest(rest[0]))
-    return np.array(chosen) @ directions

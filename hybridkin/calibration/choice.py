@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
+from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration._least_squares import LOSSES, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
-from hybridkin.calibration._unidentified import few_terms
 from hybridkin.calibration.calibrate import check_data
-from hybridkin.calibration.measured import folds, inner_and_outer, moved_directions
+from hybridkin.calibration.measured import folds, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -346,13 +346,3 @@ def split_by_effect(model: ForwardModel, q: Tensor, directions: NDArray) -> tupl
     effects, turned = np.linalg.eigh((J @ directions).T @ (J @ directions))
     moving = effects > (_MOVES * np.linalg.norm(J, 2)) ** 2
     return turned[:, moving], turned[:, ~moving]
-
-
-def in_terms(directions: NDArray, names: Sequence[str]) -> str:
-    """Return directions of q (n, k) in words, each by few of the named actuators."""
-    words = []
-    for move in few_terms(directions.T):
-        lead = np.argmax(np.abs(move) > 0.5 * np.abs(move).max())
-        terms = zip(names, move / move[lead], strict=True)
-        words.append(" ".join(f"{at:+.2g} {name}" for name, at in terms if abs(at) > 0.05))
-    return "; ".join(words)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sized
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,10 +13,6 @@ from hybridkin._core.turns import TURNS
 
 _INNER, _BEYOND = 0.4, 0.65  # fractions of rows by distance: end of the inner, start of the outer
 _EXCITED = 0.01  # of the largest spread
-_ROUNDING = 4.0 * np.finfo(np.float64).eps  # of the largest value: a range below it is none
-_POINT = 1e-6  # of the largest value: the range of rows of a single configuration
-_COUNTS = 1e-4  # of a step: numbers this close to multiples of a step are whole counts
-_AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished from it
 
 
 def check_finite(**arrays: ArrayLike) -> None:
@@ -94,54 +89,6 @@ def folds(
     splitter = GroupKFold(n_folds, shuffle=shuffle, random_state=0 if shuffle else None)
     with TURNS.filters:
         return [*splitter.split(X, groups=groups)]
-
-
-class Directions(NamedTuple):
-    """The directions of q that rows move, and those that they do not, in units of `scale`."""
-
-    mean: NDArray  # (n,)
-    scale: NDArray  # (n,), half the range; for an actuator that never moves the largest of all
-    moved: NDArray  # (n, k), orthonormal columns
-    still: NDArray  # (n, n - k), orthonormal columns
-
-    def projection(self) -> tuple[NDArray, NDArray]:
-        """Return M (n, n) and c (n,): q @ M + c is the part of q along the moved directions."""
-        M = (self.moved @ self.moved.T) * self.scale / self.scale[:, None]
-        return M, self.mean - self.mean @ M
-
-    def normals(self) -> NDArray:
-        """Return orthonormal columns (n, n - k), normal to the plane in which the rows lie."""
-        return np.linalg.qr(self.still / self.scale[:, None])[0]
-
-
-def moved_directions(X: NDArray) -> Directions:
-    """Return the directions that rows X (N, n) move; nothing can be learned along the others.
-
-    For example, tendons that are commanded in balance never move together: in that direction the
-    rows contain only rounding errors. These have a known variance if X holds whole counts; else a
-    direction that moves by less than 1 % of the largest motion counts as still.
-    """
-    X = X.astype(np.float64)
-    mean, half, size = X.mean(axis=0), 0.5 * np.ptp(X, axis=0), np.abs(X).max(axis=0)
-    moves = half > _ROUNDING * size
-    scale = np.where(moves, half, max(half.max(), _POINT * size.max(), _POINT**2))
-    rows = np.where(moves, (X - mean) / scale, 0.0)
-    squares, axes = np.linalg.eigh(rows.T @ rows)
-    rounding = len(X) / 12.0 * (axes.T**2 @ (_steps(X) / scale) ** 2)
-    least = np.maximum(_AS_ROUNDED * rounding, _EXCITED**2 * squares[-1])
-    excited = squares > least
-    return Directions(mean, scale, axes[:, excited], axes[:, ~excited])
-
-
-def _steps(X: NDArray) -> NDArray:
-    """Return the step (n,) to which each column is rounded, 0 for columns of other numbers."""
-    steps = np.zeros(X.shape[1])
-    for j, column in enumerate(X.T):
-        gaps = np.diff(np.unique(column))
-        if len(gaps) > 1:
-            counts = gaps / gaps.min()
-            steps[j] = gaps.min() * (np.abs(counts - counts.round()) < _COUNTS).all()
-    return steps
 
 
 def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import countable
+from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin.datasets._log_geometry import geometry_findings, in_metres
 from hybridkin.datasets._log_report import MISREAD, SEVERITIES, LogFinding, LogReport, named_rows
 from hybridkin.datasets._log_residual import residual_findings
@@ -88,7 +89,7 @@ def check_log(
     findings = [*_invalid(log, complete, drop_invalid)]
     if valid.any():
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))
-        for check in (_frozen, _constant, _same, _duplicates, _jumps, _times, _motions):
+        for check in (_frozen, _constant, _balanced, _same, _duplicates, _jumps, _times, _motions):
             findings += check(rows)
         read, chain = in_metres(rows.log, chain)
         found = [] if chain is None else geometry_findings(read, chain, base_is_free)
@@ -233,6 +234,21 @@ def _constant(rows: _Rows) -> Iterator[LogFinding]:
             severity = "error" if len(flat) == len(columns) else "warning"
             message = f"{what}: {', '.join(flat)}."
             yield rows.finding("constant", message, advice, severity=severity)
+
+
+def _balanced(rows: _Rows) -> Iterator[LogFinding]:
+    q = rows.log.q
+    if len(q) <= q.shape[1] or not np.ptp(q, axis=0).all():
+        return
+    directions = moved_directions(q)
+    if directions.still.size:
+        still = in_terms(directions.normals(), [name for name, _ in rows.columns("q")])
+        message = f"the log has no motion along {still}, or only by rounding or less than 1 %."
+        advice = (
+            "nothing is learned there. Commands keep to the log where the mechanical model knows "
+            "no effect; record rows that move the actuators independently if you need such motions."
+        )
+        yield rows.finding("no motion", message, advice, severity="note")
 
 
 def _same(rows: _Rows) -> Iterator[LogFinding]:

@@ -18,13 +18,14 @@ from torch import Tensor
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.directions import moved_directions
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.turns import TURNS
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry, unmoved
-from hybridkin.calibration.measured import moved_directions, points
+from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._drift import too_far

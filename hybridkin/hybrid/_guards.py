@@ -9,10 +9,10 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.model import ForwardModel, PortableModule, reverse_jacobian
 from hybridkin._core.stored import Layout
 from hybridkin.calibration.choice import split_by_effect
-from hybridkin.calibration.measured import Directions, moved_directions
 from hybridkin.hybrid._features import center_and_scale
 from hybridkin.learning.network import LeverageModule
 

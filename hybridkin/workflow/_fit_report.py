@@ -216,11 +216,11 @@ def write_choice(report: Report, geometry: GeometryChoice) -> None:
     report.record["parameters"] = {"taken": geometry.name, "tried": tried}
     report.text(
         "## What is calibrated",
-        f"Calibrated: **{geometry.name}**. The table has mean tip errors in mm: on held-out motions, "
-        "and outside, on the outer 35 % of the rows after a fit to the inner 40 %. Sets with more "
-        "than 1.1 times the least held-out error are excluded. The score of the others is the "
-        "held-out error times the square of the error outside. Of the sets with nearly the least "
-        "score, the one with the fewest parameters is calibrated.",
+        f"Calibrated: **{geometry.name}**. The table has mean tip errors in mm: on held-out "
+        "motions, and outside, on the outer 35 % of the rows after a fit to the inner 40 %. Sets "
+        "with more than 1.1 times the least held-out error are excluded. The score of the others "
+        "is the held-out error times the square of the error outside. Of the sets with nearly the "
+        "least score, the one with the fewest parameters is calibrated.",
     )
     rows = [[n, *(f"{1e3 * e:.2f}" for e in errors)] for n, errors in geometry.errors.items()]
     report.table(["parameters", "held-out motions", "outside"], rows)

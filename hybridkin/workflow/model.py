@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.digests import row_digests
+from hybridkin._core.directions import in_terms
 from hybridkin._core.files import newest
 from hybridkin._core.model import ForwardModel, as_forward_model
-from hybridkin.calibration.choice import in_terms
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain

@@ -1,16 +1,23 @@
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
-from hybridkin.datasets import Log, check_log, load_armlab, load_ftdcr
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, datasets, robots
+from hybridkin.datasets import Log, load_armlab, load_ftdcr
 
 CHAIN = ConstantCurvatureChain([0.0055, 0.005, 0.006], lengths=[0.06, 0.065, 0.06], routing="base")
 ANGLES = 2 * np.pi / 3 * np.arange(3)
 NAMES = tuple("abcdefghi")
+
+
+def check_log(log, **options):
+    """Return the check without the note that tendons are in balance, as all of them are here."""
+    report = datasets.check_log(log, **options)
+    return replace(report, findings=tuple(f for f in report.findings if f.kind != "no motion"))
 
 
 def balanced(n_motions=12, n=20, seed=0):

@@ -19,7 +19,7 @@ from hybridkin import (
     load_model,
     save_model,
 )
-from hybridkin.calibration.measured import moved_directions
+from hybridkin._core.directions import moved_directions
 from hybridkin.native.library import backend, evaluate
 
 CHAIN = ConstantCurvatureChain([0.05, 0.05])
