@@ -273,7 +273,7 @@ def _track(command: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="folder for commands and figure")
     add("--shape", choices=("figure-eight", "spiral", "line"), help="shape instead of a file")
     add("--center", type=numbers, metavar="X,Y,Z", help="centre of the shape (mid-workspace)")
-    size = "figure eight: width W,H; spiral: radii R0,R1; line: vector X,Y,Z from end to end"
+    size = "figure eight: width W along x, height H; spiral: radii R0,R1; line: vector X,Y,Z from end to end"
     add("--size", type=numbers, metavar="A,B", help=size)
     add("--scale", type=positive, default=1.0, metavar="F", help="factor of the size (1)")
     add("--normal", type=numbers, metavar="X,Y,Z", help="normal of its plane (of that of the tips)")
