@@ -7,7 +7,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, calibrate, fit_play
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    HybridForwardModel,
+    calibrate,
+    fit_play,
+)
 from hybridkin.calibration._parameters import Problem
 
 TRUE = np.array([2.7e-5, -2.5e-5, 3.0e-5, 2.2e-5, 2.9e-5, -2.6e-5])
@@ -138,3 +144,17 @@ def test_default_widths_of_play_are_in_the_unit_of_q():
     fit = fit_play(tendon_robot(), q, x, np.arange(60) // 20, parameters=("radii",))
     mean = np.abs(TRUE).mean()
     assert_close(fit.widths, np.array([0.0, 0.05, 0.1, 0.2, 0.4]) * 1e-3 / mean)
+
+
+@pytest.mark.parametrize("gains", [2e-5, TRUE])
+@pytest.mark.parametrize("elastic", [False, True])
+def test_one_gain_from_rows_as_tensors(gains, elastic):
+    """Its standard error is a tensor (), as the gain is."""
+    make = ElasticTendonChain.from_chain if elastic else lambda chain: chain
+    truth, start = make(tendon_robot(gains)), make(tendon_robot(1.1 * torch.tensor(gains)))
+    q, x = measured(truth, 6, n=20)
+    result = calibrate(start, torch.from_numpy(q), torch.from_numpy(x), ["gain"])
+    assert result.std_errors["gain"].shape == result.values["gain"].shape == ()
+    assert abs(result.values["gain"] - truth.gains[0]) < 4 * result.std_errors["gain"]
+    hybrid = HybridForwardModel(start, "drop", calibrate=("gain",)).fit(q, x)
+    assert_close(hybrid.calibration_.values["gain"], result.values["gain"])
