@@ -15,6 +15,8 @@ from hybridkin import (
     fit_play,
 )
 from hybridkin.calibration._parameters import Problem
+from hybridkin.calibration.calibrate import fit_geometry
+from hybridkin.calibration.choice import choose_geometry
 
 TRUE = np.array([2.7e-5, -2.5e-5, 3.0e-5, 2.2e-5, 2.9e-5, -2.6e-5])
 RADII, NOISE = (0.008, 0.006), 2e-4
@@ -158,3 +160,22 @@ def test_one_gain_from_rows_as_tensors(gains, elastic):
     assert abs(result.values["gain"] - truth.gains[0]) < 4 * result.std_errors["gain"]
     hybrid = HybridForwardModel(start, "drop", calibrate=("gain",)).fit(q, x)
     assert_close(hybrid.calibration_.values["gain"], result.values["gain"])
+
+
+def test_auto_calibrates_the_gain_beside_the_radii():
+    """A gain off by 27 % is not hidden in radii that count as identified."""
+    q, x = measured(tendon_robot(), 0)
+    start = tendon_robot(1.27 * TRUE)
+    choice = choose_geometry(start, q, x)
+    assert choice.name == "radii + base + gain"
+    assert all(("gain" in name) == ("radii" in name) for name in choice.errors)
+    result, _ = fit_geometry(start, q, x, choice.parameters, start=choice.start)
+    assert not result.identifiable["radii"].any()
+    ratio = result.values["gain"] / result.values["radii"][0]
+    assert abs(ratio / (TRUE[0] / RADII[0]) - 1) < 0.01
+    assert "The data identify gain / radii[0]" in result.unidentified[0]
+
+
+def test_few_rows_calibrate_the_gain_with_the_radii():
+    q, x = measured(tendon_robot(), 0, n=12)
+    assert choose_geometry(tendon_robot(1.27 * TRUE), q, x).name == "radii + base + gain"
