@@ -31,6 +31,7 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import save_model
+from hybridkin.workflow._deviations import deviations
 from hybridkin.workflow._fit_report import (
     auto_entry,
     auto_in_short,
@@ -318,7 +319,8 @@ def fit_log(
     progress("calibration", 0, 1)
     rows = _Rows(data.q, data.x, data.motions, robot, settings).with_geometry_chosen()
     start, result, messages = rows.calibrated()
-    messages += [] if result is None else complete.misread(result.chain)
+    if start is not None and result is not None:
+        messages += [*complete.misread(result.chain), *deviations(start, result)]
     for message in messages:
         warnings.warn(message, stacklevel=2)
     chain = start if result is None else result.chain
