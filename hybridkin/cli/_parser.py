@@ -106,10 +106,11 @@ def _init(command: argparse.ArgumentParser) -> None:
       hybridkin init robot.toml --log log.csv
       hybridkin init --kind tendons --segments 2 --radius 8 --length 80 --q-sign -1
       hybridkin init --kind chambers --segments 3 --radius 100,93,79 --q-unit m --x-unit m
+      hybridkin init --kind tendons --q-unit counts --spool-radius 6 --counts-per-turn 4096
 
     Rough values of the geometry are enough: `fit` calibrates them. Default: 3 actuators in each
-    segment, units mm, and the columns q1, q2, ..., x, y, z or those of the log. Motors and
-    pressures: write the file, then set spool_radius or gain and q_unit in it.
+    segment, units mm, and the columns q1, q2, ..., x, y, z or those of the log. Actuators whose
+    unit is no length need --spool-radius (motors) or --gain.
     """
     add = command.add_argument
     name = "robot.toml"

@@ -27,7 +27,8 @@ def deviations(start: Chain, result: CalibrationResult) -> Iterator[str]:
     if far:
         yield (
             f"the calibration moved {', '.join(far)}: if a ruler contradicts, `gain`, "
-            "`spool_radius`, `zeros` or `routing` may be wrong, or the marker is not at the tip."
+            "`spool_radius` or `routing` may be wrong, the marker is not at the tip, or tendons "
+            "are slack."
         )
     if not isinstance(start, ArcChain) or not isinstance(result.chain, ArcChain):
         return
