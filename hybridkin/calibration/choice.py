@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +83,8 @@ class GeometryChoice:
         Errors of all sets that were tried; empty if there was no choice.
     messages : tuple of str
         Warnings about the log.
+    rivals : tuple of GeometryChoice
+        The other sets whose errors are at most a tenth above those of the chosen one.
     """
 
     chain: Chain
@@ -91,6 +93,7 @@ class GeometryChoice:
     name: str
     errors: dict[str, Errors]
     messages: tuple[str, ...] = ()
+    rivals: tuple[GeometryChoice, ...] = ()
 
 
 class _Rung(NamedTuple):
@@ -161,7 +164,7 @@ def choose_geometry(
         rungs = _rungs(chain, q, parameters)
         tied = () if parameters is not None else unmoved(chain, q)
     starts = _starts(rungs, rows, loss)
-    best, errors = 0, {}
+    best, errors, near = 0, {}, []
     if len(rungs) > 1:
         motions = None if groups is None else groups[kept]
         splits = [(1, *split) for split in _splits(rows, motions)]
@@ -173,12 +176,18 @@ def choose_geometry(
         free = np.array([0 if at is None else at.theta.size for at in starts])
         sure = (free <= len(kept) / _ROWS) | [rung.name in _USUAL for rung in rungs]
         enough = free <= len(splits[-1][1]) / _ROWS
-        best = _best(np.maximum(found, _EXACT * float(chain.reach)), sure, enough)
+        table = np.maximum(found, _EXACT * float(chain.reach))
+        best = _best(table, sure, enough)
         errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
-    name, chosen, names = rungs[best]
-    return GeometryChoice(
-        given if chosen is chain else chosen, names, starts[best], name, errors, tied
-    )
+        near = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
+
+    def choice(k: int) -> GeometryChoice:
+        name, chosen, names = rungs[k]
+        chosen = given if chosen is chain else chosen
+        return GeometryChoice(chosen, names, starts[k], name, errors, tied)
+
+    rivals = tuple(choice(k) for k in near if k != best and rungs[k].parameters)
+    return replace(choice(best), rivals=rivals)
 
 
 def _best(errors: NDArray, sure: NDArray, enough: NDArray) -> int:
