@@ -331,9 +331,9 @@ def _result(
     pieces = (problem.parts(part) for part in (std, std < _IDENTIFIED * prior_std))
     for part, error, identified in zip(problem.parameters, *pieces, strict=True):
         value = part.value(geometry[part.entry])
-        error = part.std_errors(error, value.numpy())
+        error = np.asarray(part.std_errors(error, value.numpy()))  # for one gain a plain number
         values[part.name] = value if torch_given else value.numpy()
-        std_errors[part.name] = torch.from_numpy(error) if torch_given else np.asarray(error)
+        std_errors[part.name] = torch.from_numpy(error) if torch_given else error
         identifiable[part.name] = np.asarray(part.flags(identified))
     unidentified = directions[narrowed * _IDENTIFIED < 1.0]
     return CalibrationResult(

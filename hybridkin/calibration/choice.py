@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ _MOST, _FOLDS = 400, 3  # rows and folds for the scores
 _FEW = 40  # with fewer rows `io` is not used
 _ROWS, _CLEARLY = 7, 0.7  # rows per parameter; with fewer rows a set must be clearly better
 _WORSE = 1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
-_USUAL = ((), ("base",), ("radii", "base"))  # sets that are also calibrated from few rows
+_USUAL = ("nothing", "base", "radii + base", "radii + base + gain")  # also from few rows
 _EQUAL = 0.007  # of the score: within it the smaller set is taken
 _ALIKE = 0.01  # of the error: within it the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
@@ -83,6 +83,8 @@ class GeometryChoice:
         Errors of all sets that were tried; empty if there was no choice.
     messages : tuple of str
         Warnings about the log.
+    rivals : tuple of GeometryChoice
+        The other sets whose errors are at most a tenth above those of the chosen one.
     """
 
     chain: Chain
@@ -91,6 +93,7 @@ class GeometryChoice:
     name: str
     errors: dict[str, Errors]
     messages: tuple[str, ...] = ()
+    rivals: tuple[GeometryChoice, ...] = ()
 
 
 class _Rung(NamedTuple):
@@ -114,7 +117,8 @@ def choose_geometry(
 ) -> GeometryChoice:
     """Return the parameters with the smallest calibration error on new motions and extrapolation.
 
-    The sets grow from nothing, the base and the radii to the whole geometry. If tendons of a
+    The sets grow from nothing, the base and the radii to the whole geometry; for a chain with gains
+    their common factor is free wherever the radii are. If tendons of a
     `ConstantCurvatureChain` contradict each other, elastic tendons of the same geometry follow.
     The score of a set is ``(cv * io**2)**(1/3)``: `cv` is the mean tip distance on held-out
     motions, `io` that on the outer 35 % of the rows after a fit to the inner 40 %. Among sets with
@@ -160,7 +164,7 @@ def choose_geometry(
         rungs = _rungs(chain, q, parameters)
         tied = () if parameters is not None else unmoved(chain, q)
     starts = _starts(rungs, rows, loss)
-    best, errors = 0, {}
+    best, errors, near = 0, {}, []
     if len(rungs) > 1:
         motions = None if groups is None else groups[kept]
         splits = [(1, *split) for split in _splits(rows, motions)]
@@ -170,14 +174,20 @@ def choose_geometry(
             _errors(rung, at, rows, splits, loss) for rung, at in zip(rungs, starts, strict=True)
         ]
         free = np.array([0 if at is None else at.theta.size for at in starts])
-        sure = (free <= len(kept) / _ROWS) | [rung.parameters in _USUAL for rung in rungs]
+        sure = (free <= len(kept) / _ROWS) | [rung.name in _USUAL for rung in rungs]
         enough = free <= len(splits[-1][1]) / _ROWS
-        best = _best(np.maximum(found, _EXACT * float(chain.reach)), sure, enough)
+        table = np.maximum(found, _EXACT * float(chain.reach))
+        best = _best(table, sure, enough)
         errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
-    name, chosen, names = rungs[best]
-    return GeometryChoice(
-        given if chosen is chain else chosen, names, starts[best], name, errors, tied
-    )
+        near = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
+
+    def choice(k: int) -> GeometryChoice:
+        name, chosen, names = rungs[k]
+        chosen = given if chosen is chain else chosen
+        return GeometryChoice(chosen, names, starts[k], name, errors, tied)
+
+    rivals = tuple(choice(k) for k in near if k != best and rungs[k].parameters)
+    return replace(choice(best), rivals=rivals)
 
 
 def _best(errors: NDArray, sure: NDArray, enough: NDArray) -> int:
@@ -224,13 +234,22 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
     elif isinstance(chain, ElasticTendonChain):
         sets = ((), ("base",), *_ELASTIC)
     else:
-        gain = () if chain.in_metres else ("gain",)  # for tendons the radii include it
-        extensible = [(*names, *gain) for names in _EXTENSIBLE]
-        sets = ((), ("base",), *(extensible if chain.lengths is None else _TENDONS))
-    rungs = [_Rung(_name(names), chain, names) for names in sets]
+        sets = ((), ("base",), *(_EXTENSIBLE if chain.lengths is None else _TENDONS))
+    rungs = [_Rung(_name(names), chain, names) for names in _with_gain(sets, chain)]
     if elastic is not None:
-        rungs += [_Rung(_RIVAL + _name(names), elastic, names) for names in _ELASTIC]
+        sets = _with_gain(_ELASTIC, chain)
+        rungs += [_Rung(_RIVAL + _name(names), elastic, names) for names in sets]
     return rungs
+
+
+def _with_gain(sets: Sequence[tuple[str, ...]], chain: Chain) -> Sequence[tuple[str, ...]]:
+    """Return the sets with the gain beside the radii, if the chain has gains.
+
+    Tips of tendons determine only their ratio: without the gain, its error moves into the radii.
+    """
+    if not isinstance(chain, ArcChain) or chain.in_metres:
+        return sets
+    return [(*names, "gain") if "radii" in names else names for names in sets]
 
 
 def _name(names: tuple[str, ...]) -> str:

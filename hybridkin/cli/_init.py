@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import math
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 
 import hybridkin
 from hybridkin._core.units import METRES
-from hybridkin.cli._values import count, existing, in_millimetres, names, one_of
+from hybridkin.cli._values import count, existing, in_millimetres, names, numbers, one_of, positive
 
 _NEEDED = object()  # the default of what must be given
 _Answers = dict[str, Any]
@@ -33,7 +34,10 @@ class _Question(NamedTuple):
 
 
 _KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length)"
+_SIZES = ("radius", "length", "angle", "gain", "spool_radius")
 _EACH = "[mm]; one value, or one for each segment"
+_LENGTHS = ", ".join(METRES)
+_UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad of motors; another name, such as counts"
 _SIGN = "-1: a pulled tendon counts as positive in the log; 1: as negative"
 QUESTIONS = (
     _Question("log", "log file: CSV, npz or parquet", existing, None),
@@ -42,8 +46,12 @@ QUESTIONS = (
     _Question("actuators", "number of actuators in each segment", count, 3),
     _Question("radius", f"radius of the circle on which the actuators lie {_EACH}", in_millimetres),
     _Question("length", f"length of the backbone of a segment {_EACH}", in_millimetres),
-    _Question("q_unit", f"unit of the actuators: {', '.join(METRES)}", one_of(*METRES), "mm"),
-    _Question("x_unit", "unit of the tip, one of the same", one_of(*METRES), "mm"),
+    _Question("angle", "angle of the first actuator of a segment [degrees]", numbers, (0,)),
+    _Question("q_unit", _UNIT, str, "mm"),
+    _Question("spool_radius", f"radius of the spools of motors {_EACH}", in_millimetres, None),
+    _Question("counts_per_turn", "q of a whole turn of a spool, in its unit", positive),
+    _Question("gain", "change of length for a q of 1, if not from spools [mm]", in_millimetres),
+    _Question("x_unit", f"unit of the tip: {_LENGTHS}", one_of(*METRES), "mm"),
     _Question("q_sign", _SIGN, one_of(1, -1)),
     _Question("q", "columns of the actuators from base to tip, as A,B,...", names),
     _Question("x", "columns of the tip, as X,Y,Z", names),
@@ -62,10 +70,11 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
     An answer is that of an option, else that of the user if `ask` is set, else the default. The
     defaults of columns come from the header of the log.
     """
-    answers, missing, columns = {"length": (None,), "q_sign": 1}, [], {}
+    answers: _Answers = {"q_sign": 1}
+    missing, columns = [], {}
     for question in QUESTIONS:
         name = question.name
-        if name in ("length", "q_sign") and answers["kind"] == "chambers":
+        if _is_needless(name, answers, given):
             continue
         if name == "q":
             columns = {"q": (), "x": ()} if missing else _proposed(answers, given["delimiter"])
@@ -79,10 +88,22 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
     return answers, missing
 
 
+def _is_needless(name: str, answers: _Answers, given: _Answers) -> bool:
+    """Return whether the earlier answers leave no need to answer a question."""
+    if name in ("length", "q_sign"):
+        return answers["kind"] == "chambers"
+    unit, spools = answers.get("q_unit"), answers.get("spool_radius")
+    if name == "counts_per_turn":
+        return spools is None or unit in ("deg", "rad")
+    if name not in ("spool_radius", "gain") or given[name] is not None:
+        return False
+    return unit in METRES or (name == "gain" and spools is not None)
+
+
 def _asked(question: _Question) -> Any:
     """Return what the user answers to a question on standard error; empty: the default."""
     name, text, parse, default = question
-    known = ",".join(default) if isinstance(default, tuple | list) else default
+    known = ",".join(map(str, default)) if isinstance(default, tuple | list) else default
     hint = "" if default is _NEEDED else f" [{known or 'none'}]"
     while True:
         print(f"{name}: {text}{hint}: ", end="", file=sys.stderr, flush=True)
@@ -127,21 +148,25 @@ def description(answers: _Answers, name: str) -> str:
     """Return the robot description of the answers, every key with a comment."""
     template = (files("hybridkin.cli") / "robot.toml").read_text(encoding="utf-8")
     head, segment, tail = re.split(r"(?=\[\[segment|# The logs)", template)
-    sizes = [_of_segments(answers, key) for key in ("radius", "length")]
+    if per_turn := answers.get("counts_per_turn"):
+        gains = [float(f"{math.tau * r / per_turn:.9g}") for r in answers["spool_radius"]]
+        answers = {**answers, "gain": gains, "spool_radius": None}
+    sizes = [_of_segments(answers, key) for key in _SIZES]
     segments = [
-        _filled(segment, {**answers, "radius": radius, "length": length, "repeat": len([*alike])})
-        for (radius, length), alike in itertools.groupby(zip(*sizes, strict=True))
+        _filled(segment, {**answers, "repeat": len([*alike]), **dict(values)})
+        for values, alike in itertools.groupby(zip(*sizes, strict=True))
     ]
     values = {**answers, **_MODELS[answers["kind"]], "name": name}
     return "".join([_filled(head, values), *segments, _filled(tail, values)])
 
 
-def _of_segments(answers: _Answers, key: str) -> Sequence[float | None]:
-    """Return a size of every segment."""
-    values, n = answers[key], answers["segments"]
+def _of_segments(answers: _Answers, key: str) -> Sequence[tuple[str, float | None]]:
+    """Return a key and its value for every segment."""
+    values, n = answers.get(key) or (None,), answers["segments"]
     if len(values) not in (1, n):
-        raise ValueError(f"--{key} must be one value, or one for each segment, got {len(values)}.")
-    return [*values] * (n // len(values))
+        option = f"--{key.replace('_', '-')}"
+        raise ValueError(f"{option} must be one value, or one for each segment, got {len(values)}.")
+    return [(key, value) for value in values] * (n // len(values))
 
 
 def _filled(block: str, values: _Answers) -> str:

@@ -106,10 +106,11 @@ def _init(command: argparse.ArgumentParser) -> None:
       hybridkin init robot.toml --log log.csv
       hybridkin init --kind tendons --segments 2 --radius 8 --length 80 --q-sign -1
       hybridkin init --kind chambers --segments 3 --radius 100,93,79 --q-unit m --x-unit m
+      hybridkin init --kind tendons --q-unit counts --spool-radius 6 --counts-per-turn 4096
 
     Rough values of the geometry are enough: `fit` calibrates them. Default: 3 actuators in each
-    segment, units mm, and the columns q1, q2, ..., x, y, z or those of the log. Motors and
-    pressures: write the file, then set spool_radius or gain and q_unit in it.
+    segment, units mm, and the columns q1, q2, ..., x, y, z or those of the log. Actuators whose
+    unit is no length need --spool-radius (motors) or --gain.
     """
     add = command.add_argument
     name = "robot.toml"
@@ -273,7 +274,7 @@ def _track(command: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="folder for commands and figure")
     add("--shape", choices=("figure-eight", "spiral", "line"), help="shape instead of a file")
     add("--center", type=numbers, metavar="X,Y,Z", help="centre of the shape (mid-workspace)")
-    size = "figure eight: width W along x, height H; spiral: radii R0,R1; line: vector X,Y,Z from end to end"
+    size = "figure eight: width along x, height; spiral: two radii; line: X,Y,Z from end to end"
     add("--size", type=numbers, metavar="A,B", help=size)
     add("--scale", type=positive, default=1.0, metavar="F", help="factor of the size (1)")
     add("--normal", type=numbers, metavar="X,Y,Z", help="normal of its plane (of that of the tips)")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import in_terms, moved_directions
-from hybridkin.datasets._log_geometry import geometry_findings, in_metres
+from hybridkin.datasets._log_geometry import geometry_findings, in_metres, zero_findings
 from hybridkin.datasets._log_report import MISREAD, SEVERITIES, LogFinding, LogReport, named_rows
 from hybridkin.datasets._log_residual import residual_findings
 from hybridkin.datasets._logs import Log, column_names
@@ -91,8 +91,10 @@ def check_log(
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))
         for check in (_frozen, _constant, _balanced, _same, _duplicates, _jumps, _times, _motions):
             findings += check(rows)
+        found = [] if chain is None else [*zero_findings(rows.log, chain)]
         read, chain = in_metres(rows.log, chain)
-        found = [] if chain is None else geometry_findings(read, chain, base_is_free)
+        if chain is not None and not found:
+            found = geometry_findings(read, chain, base_is_free)
         findings += found
         if not any(f.kind in MISREAD for f in found):
             findings += residual_findings(read, chain, rows.same_motion())

@@ -28,6 +28,7 @@ _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 # rad) and chamber lengths over radii: too small, usual, too large.
 _REACH, _USUAL_REACH = 5.0, 0.7
 _BEND, _LONG = (0.02, 1.0, 15.0), (0.05, 3.0, 100.0)
+_LONGEST = 10.0  # [m] a longer robot, or one with radii of a tenth, is described in millimetres
 _SMALL_SHARE = 0.04  # range of the tip relative to that of the model
 _FAR_BETTER, _GOOD = 0.6, 0.55  # missed motion of another reading: relative to declared; absolute
 _ENOUGH = 0.85  # explained share of the variance
@@ -106,6 +107,18 @@ def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFindi
     return found or [*_orientation_findings(log, robot, base_is_free)]
 
 
+def zero_findings(log: Log, chain: Any) -> Iterator[LogFinding]:
+    """Yield a finding if no row is near the zeros of tendons, but rows are near their negatives."""
+    tendons = (~chain.absolute & (chain.rest != 0.0)).cpu().numpy()
+    rest, q = chain.rest.detach().cpu().numpy()[tendons], log.q[:, tendons]
+    low, high = q.min(axis=0), q.max(axis=0)
+    beyond = np.maximum(low - rest, rest - high) > 0.5 * (high - low)
+    if tendons.any() and (beyond & (low <= -rest) & (-rest <= high)).all():
+        message = "no row is near the `zeros` of the tendons, but rows are near their negatives."
+        advice = "negate `zeros` (`actuator_zeros` of a chain): their sign is that after `q_sign`."
+        yield LogFinding("sign", "error", message, advice)
+
+
 def _kind_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
     """Yield a finding if q holds no lengths, lengths instead of changes, or the reverse."""
     low, high = log.q.min(axis=0), log.q.max(axis=0)
@@ -149,6 +162,16 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         tips = robot.tips(q[:: max(1, len(q) // _ROWS)] / (q_factor or 1.0))
         share = spread / max(float(np.linalg.norm(np.ptp(tips, axis=0))), np.finfo(float).tiny)
         x_factor = _factor(share, 1.0) if 0.0 < share < _SMALL_SHARE else None
+    if max(robot.length, 10.0 * radii.max()) > _LONGEST and (q_factor or x_factor):
+        message = (
+            f"the robot is described with a length of {robot.length:g} m and radii up to "
+            f"{radii.max():g} m, which look like millimetres; q and x do not fit to them."
+        )
+        advice = (
+            "give radii, lengths and offsets of the description in metres: divide them by 1000."
+        )
+        yield LogFinding("units", "error", message, advice)
+        return
     if q_factor is not None:
         what = "the chambers are" if robot.extensible else "the longest stroke is"
         what = f"{what} {1e3 * size:.4g} mm, {stroke:.3g} times the radii ({1e3 * radius:.4g} mm)"

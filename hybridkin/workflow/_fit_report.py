@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -233,18 +234,26 @@ def write_calibration(
     warnings: list[str],
     title: str = "Calibration on all motions",
     key: str = "calibration",
+    others: Sequence[dict[str, Any]] = (),
 ) -> None:
-    """Add the result of the calibration, and what the log does not identify."""
+    """Add the result of the calibration, and what the log does not identify.
+
+    `others` are entries of other calibrations with nearly the same errors.
+    """
     report.text(
         f"## {title}",
         f"Root mean square tip error {1000 * result.rmse:.2f} mm (training rows). Standard errors "
         "assume independent rows and are too small for rows close in time. A parameter is "
-        f"identified if the data narrow its prior at least {IDENTIFIED:.0f} times; other values "
-        'are assumptions. "Not physical": this parameter, or another of its kind, has an '
-        "impossible value, because it compensates an effect that the model does not describe. "
+        f"identified if the data narrow its prior at least {IDENTIFIED:.0f} times, and if sets of "
+        "parameters with nearly the same errors give values that differ by less than a tenth of "
+        'the prior; other values are assumptions. "Not physical": this parameter, or another of '
+        "its kind, has an impossible value, because it compensates an effect that the model does "
+        "not describe. "
         "The base is given by its rotation from the start and its position.",
     )
     entries = geometry_entries(chain, result)
+    for entry in entries:
+        entry["identified"] &= _agrees(entry, others)
     report.geometry(entries)
     report.text(*(f"Warning: {message}" for message in warnings))
     if result.unidentified:
@@ -253,6 +262,15 @@ def write_calibration(
     names = ("values", "std_errors", "rmse", "identifiable", "unidentified")
     report.record[key] = {name: vars(result)[name] for name in names}
     report.record[key] |= {"warnings": warnings, "entries": entries}
+
+
+def _agrees(entry: dict[str, Any], others: Sequence[dict[str, Any]]) -> bool:
+    """Return whether other calibrations change a value by less than a tenth of its prior."""
+    prior = entry["narrowing"] * entry["std_error"]
+    jumps = [abs(one["value"] - entry["value"]) for one in others if one["name"] == entry["name"]]
+    if entry["unit"] == "deg":
+        jumps = [min(jump, abs(360.0 - jump)) for jump in jumps]  # angles repeat
+    return bool(IDENTIFIED * max(jumps, default=0.0) <= prior)
 
 
 def write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:

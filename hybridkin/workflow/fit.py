@@ -31,6 +31,7 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import save_model
+from hybridkin.workflow._deviations import deviations
 from hybridkin.workflow._fit_report import (
     auto_entry,
     auto_in_short,
@@ -45,7 +46,15 @@ from hybridkin.workflow._fit_report import (
 from hybridkin.workflow._promise import Promise
 from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.model import LoadedModel
-from hybridkin.workflow.report import Progress, Report, check_out, linear, quadratic, quiet
+from hybridkin.workflow.report import (
+    Progress,
+    Report,
+    check_out,
+    geometry_entries,
+    linear,
+    quadratic,
+    quiet,
+)
 
 ALPHAS = tuple(10.0**k for k in range(-5, 4))
 """Ridge penalties to choose from."""
@@ -166,6 +175,15 @@ class _Rows(NamedTuple):
             return chain, None, messages
         result, more = fit_geometry(chain, self.q, self.x, names, self.settings.loss, start=start)
         return chain, result, messages + more
+
+    def rival_entries(self) -> list[dict[str, Any]]:
+        """Return the `geometry_entries` of all sets of parameters with nearly the same errors."""
+        entries = []
+        for rival in () if self.geometry is None else self.geometry.rivals:
+            chain, result, _ = self._replace(geometry=rival).calibrated()
+            if chain is not None and result is not None:
+                entries += geometry_entries(chain, result)
+        return entries
 
     def mechanical(self) -> ForwardModel:
         """Return the calibrated chain; for a robot without segments a linear model of the rows."""
@@ -318,7 +336,8 @@ def fit_log(
     progress("calibration", 0, 1)
     rows = _Rows(data.q, data.x, data.motions, robot, settings).with_geometry_chosen()
     start, result, messages = rows.calibrated()
-    messages += [] if result is None else complete.misread(result.chain)
+    if start is not None and result is not None:
+        messages += [*complete.misread(result.chain), *deviations(start, result)]
     for message in messages:
         warnings.warn(message, stacklevel=2)
     chain = start if result is None else result.chain
@@ -362,7 +381,7 @@ def fit_log(
     if rows.geometry is not None:
         write_choice(report, rows.geometry)
     if start is not None and result is not None:
-        write_calibration(report, start, result, messages)
+        write_calibration(report, start, result, messages, others=rows.rival_entries())
     if robot.chain is not None and rows.geometry is None:
         write_elastic_calibration(report, robot.chain, model)
     _add_model(report, model, robot, complete)

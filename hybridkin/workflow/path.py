@@ -109,8 +109,8 @@ def shape_path(
     shape : {"figure-eight", "spiral", "line"}
         Name of the shape.
     size : sequence of float
-        Width (along the x-axis of the tips) and height of a figure eight; first and last radius of a spiral; x, y and z from end
-        to end of a line [m].
+        Width (along the x-axis of the tips) and height of a figure eight; first and last radius of
+        a spiral; x, y and z from end to end of a line [m].
     center : array-like of shape (3,), optional
         Centre of the shape [m]. Default: near the middle of the tips in the domain of the model,
         where the whole shape lies in the domain, if possible.

@@ -7,8 +7,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, calibrate, fit_play
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    HybridForwardModel,
+    calibrate,
+    fit_play,
+)
 from hybridkin.calibration._parameters import Problem
+from hybridkin.calibration.calibrate import fit_geometry
+from hybridkin.calibration.choice import choose_geometry
 
 TRUE = np.array([2.7e-5, -2.5e-5, 3.0e-5, 2.2e-5, 2.9e-5, -2.6e-5])
 RADII, NOISE = (0.008, 0.006), 2e-4
@@ -138,3 +146,36 @@ def test_default_widths_of_play_are_in_the_unit_of_q():
     fit = fit_play(tendon_robot(), q, x, np.arange(60) // 20, parameters=("radii",))
     mean = np.abs(TRUE).mean()
     assert_close(fit.widths, np.array([0.0, 0.05, 0.1, 0.2, 0.4]) * 1e-3 / mean)
+
+
+@pytest.mark.parametrize("gains", [2e-5, TRUE])
+@pytest.mark.parametrize("elastic", [False, True])
+def test_one_gain_from_rows_as_tensors(gains, elastic):
+    """Its standard error is a tensor (), as the gain is."""
+    make = ElasticTendonChain.from_chain if elastic else lambda chain: chain
+    truth, start = make(tendon_robot(gains)), make(tendon_robot(1.1 * torch.tensor(gains)))
+    q, x = measured(truth, 6, n=20)
+    result = calibrate(start, torch.from_numpy(q), torch.from_numpy(x), ["gain"])
+    assert result.std_errors["gain"].shape == result.values["gain"].shape == ()
+    assert abs(result.values["gain"] - truth.gains[0]) < 4 * result.std_errors["gain"]
+    hybrid = HybridForwardModel(start, "drop", calibrate=("gain",)).fit(q, x)
+    assert_close(hybrid.calibration_.values["gain"], result.values["gain"])
+
+
+def test_auto_calibrates_the_gain_beside_the_radii():
+    """A gain off by 27 % is not hidden in radii that count as identified."""
+    q, x = measured(tendon_robot(), 0)
+    start = tendon_robot(1.27 * TRUE)
+    choice = choose_geometry(start, q, x)
+    assert choice.name == "radii + base + gain"
+    assert all(("gain" in name) == ("radii" in name) for name in choice.errors)
+    result, _ = fit_geometry(start, q, x, choice.parameters, start=choice.start)
+    assert not result.identifiable["radii"].any()
+    ratio = result.values["gain"] / result.values["radii"][0]
+    assert abs(ratio / (TRUE[0] / RADII[0]) - 1) < 0.01
+    assert "The data identify gain / radii[0]" in result.unidentified[0]
+
+
+def test_few_rows_calibrate_the_gain_with_the_radii():
+    q, x = measured(tendon_robot(), 0, n=12)
+    assert choose_geometry(tendon_robot(1.27 * TRUE), q, x).name == "radii + base + gain"

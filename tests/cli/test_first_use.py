@@ -72,6 +72,34 @@ def test_init_of_other_kinds(tmp_path, capsys, kind, found):
     assert (robot.log.q_unit, robot.log.q_sign) == ("cm", 1)
 
 
+MOTORS = [*TENDONS, "--q-sign", "1"]
+
+
+@pytest.mark.parametrize(
+    ("options", "metres"),
+    [
+        (["--q-unit", "counts", "--spool-radius", "6", "--counts-per-turn", "4096"], 9.20388e-6),
+        (["--q-unit", "counts", "--gain", "0.0092"], 9.2e-6),
+        (["--q-unit", "deg", "--spool-radius", "6"], 0.006),  # per radian
+    ],
+)
+def test_init_of_motors(tmp_path, capsys, options, metres):
+    path = tmp_path / "r.toml"
+    assert run(capsys, "init", path, *MOTORS, *options, "--angle=-30,90")[0] == 0
+    robot = robots.read_description(path)
+    assert robot.chain.gains.tolist() == pytest.approx([metres] * 6, rel=1e-5)
+    degrees = [-30, 90, 210, 90, 210, 330]
+    assert np.degrees(robot.chain.angles.tolist()) == pytest.approx(degrees)
+    assert robot.log.q_unit == options[1]
+
+
+def test_sizes_of_motors_may_differ_by_segment(tmp_path, capsys):
+    options = ["--q-unit", "ticks", "--spool-radius", "6,3", "--counts-per-turn", "100"]
+    run(capsys, "init", tmp_path / "r.toml", *MOTORS, *options)
+    gains = robots.from_toml(tmp_path / "r.toml").gains.numpy()
+    assert gains == pytest.approx(np.repeat([6e-5, 3e-5], 3) * 2 * np.pi)
+
+
 def test_every_key_of_the_file_has_a_comment(tmp_path, capsys):
     run(capsys, "init", tmp_path / "r.toml", *TENDONS, "--q-sign", "1")
     lines = (tmp_path / "r.toml").read_text().splitlines()
@@ -124,6 +152,12 @@ def test_columns_are_proposed_by_their_names(tmp_path, header, q, x):
         (TENDONS, "needs --q-sign where"),
         ([*TENDONS, "--q-sign", "1", "--q", "a,b"], "error: `q` in [log] must name 6 columns"),
         ([*TENDONS, "--q-sign", "1", "--radius", "1,2,3"], "--radius must be one value, or one"),
+        ([*TENDONS, "--q-sign", "1", "--q-unit", "counts"], "needs --gain where"),
+        ([*TENDONS, "--q-sign", "1", "--gain", "1"], "needs a `q_unit` in [log] that is not a"),
+        (
+            [*TENDONS, "--q-sign", "1", "--q-unit", "counts", "--spool-radius", "6"],
+            "needs --counts-per-turn where",
+        ),
     ],
 )
 def test_init_without_what_it_needs_writes_nothing(tmp_path, capsys, options, message):
@@ -169,6 +203,7 @@ def test_init_asks_on_a_terminal(log, tmp_path, capsys, monkeypatch):
         "",
         "5",
         "100",
+        "",
         "",
         "",
         "-1",

@@ -174,3 +174,41 @@ def test_an_actuator_and_a_tip_column_that_are_exchanged():
     q[:, 3], x[:, 2] = x[:, 2], q[:, 3].copy()
     found = {f.kind: f for f in check_log(Log(q, x), chain=chain, base_is_free=True).findings}
     assert "columns 'q[3]' and 'x[2]' exchanged" in found["exchanged"].message
+
+
+@pytest.mark.parametrize(("radius", "length"), [(1, 1e3), (1e3, 1e3), (1e3, 1)])
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_millimetres_in_the_description_are_named_instead_of_the_log(radius, length, unit):
+    radii, lengths = radius * CHAIN.radii, length * CHAIN.lengths
+    with pytest.warns(UserWarning, match="looks like millimetres"):
+        chain = ConstantCurvatureChain(radii, lengths=lengths, routing="base")
+    log = measured(file_units={"q": unit, "x": unit})
+    (finding,) = check_log(log, chain=chain).errors
+    assert finding.kind == "units"
+    assert "the description in metres" in finding.advice
+    assert "_unit" not in finding.advice
+
+
+def test_zeros_of_the_wrong_sign_are_named():
+    """Counts about 2050 at rest; their zeros have the sign of q after `q_sign`."""
+    gain, zeros = 2.7e-5, 2050.0 + 20.0 * np.arange(9)
+    log = measured()
+    for sign in (1.0, -1.0):
+        counts = measured(x=log.x, q=log.q / gain + sign * zeros, units={"q": "1", "x": "m"})
+        chains = [
+            CHAIN.with_geometry(
+                gains=CHAIN.gains * gain, actuator_zeros=torch.from_numpy(way * zeros)
+            )
+            for way in (sign, -sign)
+        ]
+        assert check_log(counts, chain=chains[0]).findings == ()
+        (finding,) = check_log(counts, chain=chains[1]).findings
+        assert (finding.kind, finding.severity) == ("sign", "error")
+        assert finding.advice.startswith("negate `zeros`")
+
+
+def test_zeros_of_chambers_may_be_far_from_all_rows():
+    chain = ConstantCurvatureChain([0.05], actuator_zeros=-0.2)
+    q = 0.2 + 0.02 * np.random.default_rng(0).standard_normal((50, 3))
+    x = chain(torch.from_numpy(q)).numpy()
+    assert check_log(Log(q, x), chain=chain).misread == ()
