@@ -226,6 +226,17 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     return _Outcome(record, shown(report), paths, code)
 
 
+def _verify(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    log_format = _log_format(arguments, loaded.log_format(), arguments.model)
+    log = _read(arguments, replace(log_format, groups=None), None, False, stages)
+    report, paths = hybridkin.workflow.verify_track(
+        loaded, arguments.track, log, arguments.out, force=arguments.force
+    )
+    code = 1 if report.record["kept"] is False else 0
+    return _Outcome(report.record, shown(report), paths, code)
+
+
 def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     record = hybridkin.workflow.animate_track(
         hybridkin.workflow.open_model(arguments.model, arguments.robot),
@@ -318,7 +329,7 @@ def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     return _Outcome(report.record, shown(report), [out / "log.csv", *paths], code)
 
 
-_COMMANDS = (_next, _fit, _evaluate, _track, _animate, _export, _describe, _init, _demo)
+_COMMANDS = (_next, _fit, _evaluate, _track, _verify, _animate, _export, _describe, _init, _demo)
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 

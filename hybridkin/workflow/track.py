@@ -31,6 +31,7 @@ from hybridkin.workflow.report import Progress, Report, check_out, millimetres, 
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
+LEAD_IN = "LEAD_IN"  # status of the rows before the path
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
 _GUESSES = 16
@@ -135,7 +136,7 @@ def track_path(
     _add_path(report, loaded, track)
     shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
     _add_commands(report, domain, whole.t, shown, n_lead)
-    statuses = [*["LEAD_IN"] * n_lead, *names]
+    statuses = [*[LEAD_IN] * n_lead, *names]
     report.file("track.csv", partial(_write_track, whole, shown, statuses, log_format))
     return report, report.write(out)
 
@@ -281,10 +282,7 @@ def animate_track(
             f"`model` {loaded.path} has no body to draw; give a model with a chain as its "
             "mechanical model."
         )
-    file = Path(path)
-    if file.is_dir():
-        file = newest(file / "track.csv")
-    log = _read_track(file, loaded.log_format())
+    log = read_track(path, loaded.log_format())
     out = Path(out)
     q, target = loaded.effective(log.q), log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
@@ -303,13 +301,21 @@ def animate_track(
     }
 
 
-def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
-    """Return commands and times of a file; its tips are the targets if it has them."""
+def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
+    """Return commands and times of a file or its folder, and the statuses as groups.
+
+    The tips are the targets if the file has them.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = newest(file / "track.csv")
     if not file.is_file():
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
     columns: dict[str, Any] = {**log_format.reading, "groups": None}
+    if "status" in header:
+        columns["groups"] = "status"
     columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
     if {*TARGET} <= {*header}:
         columns["x"] = TARGET
