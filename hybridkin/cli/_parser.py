@@ -316,6 +316,8 @@ def _verify(command: argparse.ArgumentParser) -> None:
 def _animate(command: argparse.ArgumentParser) -> None:
     """Make a film (mp4, gif) or an interactive page (html) of a track.
 
+    It begins where the path begins, after the lead-in.
+
     Some examples:
       hybridkin animate model track --out track.mp4
       hybridkin animate model track/track.csv --out track.html --frames 80

@@ -260,7 +260,8 @@ def animate_track(
     loaded : LoadedModel
         A model with a chain as its mechanical model.
     path : str or Path
-        ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format.
+        ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format. The
+        film begins where the path begins, after the lead-in.
     out : str or Path
         File that ends in ".mp4", ".gif" or ".html".
     unit : {"m", "cm", "mm"}, default="cm"
@@ -283,8 +284,11 @@ def animate_track(
             "mechanical model."
         )
     log = read_track(path, loaded.log_format())
-    out = Path(out)
-    q, target = loaded.effective(log.q), log.x if tuple(log.x_names) == TARGET else None
+    out, q = Path(out), loaded.effective(log.q)
+    if log.groups is not None:  # the way to the path is no part of it
+        on_path = log.groups != LEAD_IN
+        log, q = log.rows(on_path), q[on_path]
+    target = log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
         loaded.chain, q, target=target, t=log.time, tips=loaded.tips(q), n_frames=n_frames
     )
@@ -302,9 +306,9 @@ def animate_track(
 
 
 def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
-    """Return commands and times of a file or its folder, and the statuses as groups.
+    """Return commands and times of a file, or of the track in a folder.
 
-    The tips are the targets if the file has them.
+    The tips of a track are its targets, and its groups are the statuses.
     """
     file = Path(path)
     if file.is_dir():
@@ -314,11 +318,9 @@ def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
     columns: dict[str, Any] = {**log_format.reading, "groups": None}
-    if "status" in header:
-        columns["groups"] = "status"
     columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
     if {*TARGET} <= {*header}:
-        columns["x"] = TARGET
+        columns |= {"x": TARGET, "groups": "status"}
     return load_log(file, **columns)
 
 

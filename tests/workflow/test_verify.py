@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, PlayOperator, save_model, workflow
 from hybridkin.cli.main import main
 from hybridkin.datasets import Log
+from hybridkin.plots import TrackAnimation
+from hybridkin.workflow.track import TARGET
 
 CHAIN = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
 NOISE, SIZE = 2e-4, 0.004
 COMMON = np.repeat(np.eye(2), 3, axis=1)  # all tendons of a segment together
-HEAD = ["t", *(f"q{i + 1}" for i in range(6)), "x", "y", "z", "status"]
+HEAD = ["t", *(f"q{i + 1}" for i in range(6)), "x", "y", "z", *TARGET, "status"]
 TRAINING = {"saved": "h", "held_out": {"h": {"mean": 1.6 * NOISE, "p95": 2.8 * NOISE}}}
 
 
@@ -50,7 +52,7 @@ def loaded(tmp_path_factory):
 def written(path, q, x):
     """Write a track of commands and tips."""
     states = np.where(np.arange(len(q)) < 10, "LEAD_IN", "CONVERGED")
-    cells = np.column_stack([0.1 * np.arange(len(q)), q, x]).astype(str)
+    cells = np.column_stack([0.1 * np.arange(len(q)), q, x, x]).astype(str)
     lines = [",".join([*row, state]) for row, state in zip(cells, states, strict=True)]
     path.write_text("\n".join([",".join(HEAD), *lines]))
     return path
@@ -170,7 +172,7 @@ def test_the_command_leaves_out_rows_without_a_tip(loaded, tmp_path, capsys):
     track = written(tmp_path / "track.csv", q, truth(q))
     measured = written(tmp_path / "measured.csv", q, x)
     lines = measured.read_text().splitlines()
-    lines[51] = lines[51].replace(str(x[50, 2]), "nan")
+    lines[51] = lines[51].replace(str(x[50, 2]), "nan", 1)
     measured.write_text("\n".join(lines))
     command = ["verify", loaded.path, track, measured, "--out", tmp_path / "out", "--json"]
     assert main([*map(str, command)]) == 1
@@ -178,3 +180,19 @@ def test_the_command_leaves_out_rows_without_a_tip(loaded, tmp_path, capsys):
     assert record["cause"] == "moved base"
     assert record["parts"]["path"]["rows"] == len(q) - 11
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.md", "report.json"}
+
+
+def test_a_film_begins_where_the_path_begins(loaded, tmp_path, monkeypatch):
+    films = []
+
+    def save(film, path, **_):
+        films.append(film)
+        path.touch()
+
+    monkeypatch.setattr(TrackAnimation, "save", save)
+    q = loops(0.6 * SIZE)
+    written(tmp_path / "track.csv", q, truth(q))
+    record = workflow.animate_track(loaded, tmp_path, tmp_path / "film.gif")
+    np.testing.assert_allclose(films[0].target, truth(q)[10:])
+    np.testing.assert_allclose(films[0].x, loaded.tips(q[10:]))
+    assert record["duration_s"] == pytest.approx(0.1 * (len(q) - 11))
