@@ -19,7 +19,7 @@ from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.datasets import Log, load_log
 from hybridkin.ik import trajectories
-from hybridkin.ik.results import IKStatus, Track
+from hybridkin.ik.results import IKStatus, Track, score
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.plots import ActuatorDisplay, TrackAnimation, TrackingDisplay, new_figure
@@ -32,13 +32,11 @@ from hybridkin.workflow.report import Progress, Report, check_out, millimetres, 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
 LEAD_IN = "LEAD_IN"  # status of the rows before the path
-_REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
-_GUESSES = 16
 _PEAK, _PUSH = 1.875, 10.0 / math.sqrt(3.0)  # largest speed and acceleration of `min_jerk`
 _MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
 _SLOW, _DT = 0.1, 0.02  # without known limits: share of the range per second; period [s]
-_PULLS = (0.2, 0.0, 0.0, 0.2)  # pull to the preferred configuration, in each attempt
+_PULLS = (0.2, 0.0)  # pull to the preferred configuration, in each attempt
 
 
 def track_path(
@@ -117,7 +115,7 @@ def track_path(
         model=str(loaded.path),
         n=len(path),
         duration_s=path.duration,
-        reached=_score(track)[1],
+        reached=score(track)[1],
         errors={"mean": track.mean_error, "p95": track.p95_error, "max": track.max_error},
         tol=tol,
         in_domain=None if loaded.hybrid is None else float(inside.mean()),
@@ -198,14 +196,13 @@ def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress)
         def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
             progress(what, done + 1, total)
 
-        first = _initial_guesses(ik, path.x[0], commands, tips, 0.1 * tol)[attempt % 2]
-        found: Any = ik.track(fine, q0=first, tol=tol, progress=report)
+        found: Any = ik.track(fine, q0=commands, tol=tol, progress=report)
         # Only the points are kept, not the steps between them.
         rows = {k: v[::every] for k, v in vars(found).items() if v is not None}
         tracks.append(replace(found, **rows))
-        if _score(tracks[-1]) == (len(path), len(path)):
+        if score(tracks[-1]) == (len(path), len(path)):
             break
-    return max(tracks, key=_score)  # of equal tracks the first
+    return max(tracks, key=score)  # of equal tracks the first
 
 
 def _in_steps(path: Trajectory, n: int) -> Trajectory:
@@ -214,33 +211,6 @@ def _in_steps(path: Trajectory, n: int) -> Trajectory:
     columns = np.column_stack([path.t, path.x])
     t, *x = (np.interp(places, np.arange(len(path)), column) for column in columns.T)
     return Trajectory(t, np.stack(x, axis=1))
-
-
-def _initial_guesses(
-    ik: InverseKinematics, target: NDArray, commands: NDArray, tips: NDArray, tol: float
-) -> list[NDArray]:
-    """Return two start configurations (n,) at the target.
-
-    The first is solved from the first of the commands, which is near the preferred one. The second
-    is the best of those solved from commands whose tips are nearest to the target: in the domain if
-    possible, with the largest singular value sigma_min.
-    """
-    near = np.argsort(np.linalg.norm(tips[1:] - target, axis=1))[:_GUESSES] + 1
-    near = np.concatenate([[0], near])
-    targets = np.broadcast_to(target, (len(near), 3)).copy()
-    found = ik.solve(targets, q0=commands[near], tol=tol, max_iter=200)
-    for wanted in _REACHED:
-        rows = np.flatnonzero(found.status[1:] == wanted) + 1
-        if len(rows):
-            return [found.q[0], found.q[rows[found.sigma_min[rows].argmax()]]]
-    free = ik.solve(target, tol=tol, max_iter=200, restarts=_GUESSES)
-    return [found.q[0], free.q]
-
-
-def _score(track: Track) -> tuple[int, int]:
-    """Return the number of points reached in the domain, and the number reached at all."""
-    statuses = np.asarray(track.status)
-    return int((statuses == IKStatus.CONVERGED).sum()), int(np.isin(statuses, _REACHED).sum())
 
 
 def animate_track(
