@@ -171,9 +171,25 @@ def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
     for name, mean, spread, place in zip(names, means, spreads, places, strict=True):
         look = {"fmt": "o", "capsize": 3, "color": model_color(name)}
         ax.errorbar(mean, place, xerr=[[min(mean, spread)], [spread]], **look)
+    published = [paper_test_error(entry) for entry in table]
+    means, spreads = 100 * np.array(published).T
+    look = {"fmt": "x", "capsize": 3, "color": "black", "elinewidth": 0.8}
+    below = [np.minimum(means, spreads), spreads]
+    ax.errorbar(means, places - 0.3, xerr=below, label="paper, real robot", **look)
     ax.set_yticks(places, names)
     ax.set(xlabel="test error [cm]", xlim=(0.0, None))
-    report.figure("table1", figure, "Mean test error ± standard deviation over configurations.")
+    ax.legend(frameon=False, loc="lower right")
+    caption = (
+        "Mean test error ± standard deviation over configurations: dots on the simulated trunk"
+    )
+    report.figure("table1", figure, f"{caption}, crosses the paper's, on the real robot.")
+
+
+def paper_test_error(entry: dict[str, Any]) -> tuple[float, float]:
+    """Return mean and standard deviation [m] of the paper's test error, NaN where it has none."""
+    _, text = PAPER_TABLE_1.get((entry["model"], entry["learner"]), ("", "nan"))
+    mean, spread, *_ = *text.partition(" (")[0].split(" ± "), "nan", "nan"
+    return 0.01 * float(mean), 0.01 * float(spread)
 
 
 def mechanical_over_hybrid(means: dict[str, float]) -> dict[str, float]:

@@ -21,8 +21,8 @@ from hybridkin.cli._values import between, count, names, numbers, play, positive
 
 EXIT_CODES = """\
 exit codes: 0 success; 1 the result is not as requested (points not reached, errors above
---fail-above, or `describe` and `init` found errors in a log); 2 invalid input, a log with errors
-before a fit, or a path out of reach; 130 interrupted; 143 terminated."""
+--fail-above or a promise, or `describe` and `init` found errors in a log); 2 invalid input, a log
+with errors before a fit, or a path out of reach; 130 interrupted; 143 terminated."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -43,8 +43,8 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="hybridkin", **_help(parser))
     top.add_argument("--version", action="version", version=f"hybridkin {hybridkin.__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    adders = (_demo, _init, _describe, _fit, _evaluate, _track, _animate, _next, _export)
-    for add_options in adders:
+    begin, use = (_demo, _init, _describe, _fit, _evaluate), (_track, _verify, _animate)
+    for add_options in (*begin, *use, _next, _export):
         text = _help(add_options)
         line = text["description"].partition("\n")[0].rstrip(".")
         command = commands.add_parser(add_options.__name__[1:], help=line, **text)
@@ -292,8 +292,32 @@ def _track(command: argparse.ArgumentParser) -> None:
     add("--force", action="store_true", help=near)
 
 
+def _verify(command: argparse.ArgumentParser) -> None:
+    """Compare what a track promised with what the robot did.
+
+    Compares the error that the model promised with that of the measured tips, in parts of the path,
+    and says how much of the mean squared error each likely cause explains: backlash, a moved base,
+    commands outside the log or off its plane.
+
+    Some examples:
+      hybridkin verify model track measured.csv
+      hybridkin verify model track measured.csv --time stamp --out verification
+
+    MEASURED has the columns of the log of the model, one row for each row of the track. With other
+    rows, --time names the column of the time: its first row is the first row of the track.
+    """
+    add = command.add_argument
+    _add_model(command)
+    add("track", type=Path, metavar="TRACK", help="track.csv or its folder")
+    add("log", type=Path, metavar="MEASURED", help="commands and measured tips")
+    add("--out", type=Path, metavar="DIR", help="folder for the report (none)")
+    _add_log(command)
+
+
 def _animate(command: argparse.ArgumentParser) -> None:
     """Make a film (mp4, gif) or an interactive page (html) of a track.
+
+    It begins where the path begins, after the lead-in.
 
     Some examples:
       hybridkin animate model track --out track.mp4

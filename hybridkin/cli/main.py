@@ -13,6 +13,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 import hybridkin  # its folders are opened when used: help comes at once
-from hybridkin._core.files import write_file
+from hybridkin._core.files import newest, write_file
 from hybridkin._core.turns import one_thread
 from hybridkin._core.units import METRES
 from hybridkin.cli import _demo as demo
@@ -154,6 +155,7 @@ def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
         max_rows=arguments.max_rows or None,
     )
+    before = _model_before(arguments)
     log = _read(arguments, log_format, robot.chain, robot.base_is_free, stages)
     _note(log.report, stages)
     report, paths = hybridkin.workflow.fit_log(
@@ -165,7 +167,22 @@ def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         n_jobs=arguments.jobs,
         progress=stages,
     )
+    if before:
+        stages.note(f"Replaced {before}.", important=True)
     return _Outcome(report.record, shown(report), paths)
+
+
+def _model_before(arguments: argparse.Namespace) -> str:
+    """Return the model that a fit replaces, in words; raise if the user refuses on a terminal."""
+    model = newest(arguments.out / "model.safetensors")
+    if not model.is_file():
+        return ""
+    words = f"the model of {datetime.fromtimestamp(model.stat().st_mtime):%Y-%m-%d %H:%M}"
+    if sys.stdin.isatty() and not arguments.force and not arguments.json:
+        print(f"Replace {words} in {arguments.out}? [y/N]: ", end="", file=sys.stderr, flush=True)
+        if input().strip().lower() not in ("y", "yes"):
+            raise FileExistsError(f"{arguments.out} keeps {words}; name another folder by --out.")
+    return words
 
 
 def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
@@ -224,6 +241,17 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     known = arguments.force or record["in_domain"] is None or record["in_domain"] > _INSIDE
     code = 0 if known and record["reached"] == record["n"] else 1
     return _Outcome(record, shown(report), paths, code)
+
+
+def _verify(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    log_format = _log_format(arguments, loaded.log_format(), arguments.model)
+    log = _read(arguments, replace(log_format, groups=None), None, False, stages)
+    report, paths = hybridkin.workflow.verify_track(
+        loaded, arguments.track, log, arguments.out, force=arguments.force
+    )
+    code = 1 if report.record["kept"] is False else 0
+    return _Outcome(report.record, shown(report), paths, code)
 
 
 def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
@@ -318,7 +346,7 @@ def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     return _Outcome(report.record, shown(report), [out / "log.csv", *paths], code)
 
 
-_COMMANDS = (_next, _fit, _evaluate, _track, _animate, _export, _describe, _init, _demo)
+_COMMANDS = (_next, _fit, _evaluate, _track, _verify, _animate, _export, _describe, _init, _demo)
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 

@@ -26,7 +26,7 @@ _UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing name of a moti
 _MOST_COLUMNS, _LONGEST = 10_000, 256  # columns of a file; characters of a motion's name
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Log:
     """A measured log: actuator vectors and tip positions, row by row, in SI units.
 
@@ -83,6 +83,20 @@ class Log:
         for name in ("time", "line"):
             if vars(self)[name] is not None:
                 check_shape(np.asarray(vars(self)[name]), name, [q[0]], "one for each row")
+
+    def __repr__(self) -> str:
+        """Return a summary of a few lines."""
+        tips = self.x[:, -3:]
+        sides = np.fmax.reduce(tips) - np.fmin.reduce(tips)
+        span = " x ".join(f"{side:.3g}" for side in sides)
+        motions = "" if self.groups is None else f", {len(np.unique(self.groups))} motions"
+        lines = [f"{type(self).__name__} of {self.source}: {len(self.q)} rows{motions}"]
+        lines += [f"{self.q.shape[1]} actuators: {', '.join(column_names(self, 'q'))}"]
+        lines[-1] += f"; {self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
+        lines += [f"tips within {span} {self.units['x']}"]
+        if self.time is not None:
+            lines += [f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s"]
+        return "\n  ".join(lines)
 
     def rows(self, kept: NDArray | slice) -> Self:
         """Return a log of some of the rows."""

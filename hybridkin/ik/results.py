@@ -21,7 +21,8 @@ class IKStatus(IntEnum):
     """Outcome for one target.
 
     In `InverseKinematics.track`, a step that misses its target is AT_LIMITS if a limit restricted
-    the motion, SINGULAR if damping did, else MAX_ITER (one step was not enough).
+    the motion, SINGULAR if damping did, else MAX_ITER (one step was not enough). With
+    feedback="measured" the measured error counts, by default with a `tol` of 1 mm.
     """
 
     CONVERGED = 0
@@ -240,6 +241,15 @@ class Track(Generic[ArrayT]):
             "commands": {"": ("least", "largest"), **commands},
         }
         return html_table("Track", rows)
+
+
+def score(track: Track) -> tuple[int, int]:
+    """Return the number of points reached in the domain, and the number reached at all."""
+    status = as_array(track.status)
+    inside, outside = (
+        int((status == wanted).sum()) for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
+    )
+    return inside, inside + outside
 
 
 def _tally(status: np.ndarray | Tensor) -> str:

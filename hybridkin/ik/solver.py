@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
 
 import numpy as np
@@ -35,11 +35,15 @@ from hybridkin.ik._settings import (
     limits_of,
     require,
 )
+from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import control_step
-from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
-from hybridkin.ik.tasks import as_task
+from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, score, statuses
+from hybridkin.ik.tasks import Tolerance, as_task
 from hybridkin.ik.tracker import Plant, Tracker
 from hybridkin.ik.trajectories import Trajectory
+
+_TOL, _MEASURED = 1e-4, 1e-3  # of points of a path, by the model and measured [m]
+_GUESSES = 16  # configurations from which the first point of a path is solved
 
 
 class InverseKinematics:
@@ -385,7 +389,7 @@ class InverseKinematics:
         plant: Plant | None = None,
         feedback: str | None = "model",
         memory: float | None = None,
-        tol: float = 1e-4,
+        tol: float | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Track:
         """Return the motion that follows a path, one step per point, eq. (1).
@@ -399,8 +403,12 @@ class InverseKinematics:
             Points to follow [m]; a `Trajectory` includes its times.
         t : array-like of shape (T,), optional
             Times of the points [s], increasing. Default: multiples of `dt`.
-        q0 : array-like of shape (n,), optional
-            Start. Default: the solution for the first point.
+        q0 : array-like of shape (n,) or (K, n), optional
+            Start; or configurations, e.g. rows of the log, from which the first point is solved.
+            Then two solutions are tried on the model: that of the first row, and, if it misses
+            points or leaves the domain, the most regular one in the domain of the rows with the
+            nearest tips. The track that reaches most points in the domain is kept. Default: as with
+            `q_pref` and an even sample of the limits.
         plant : callable, optional
             The robot: maps a commanded q (n,) to the measured tip (3,) [m]; NumPy or torch as path.
         feedback : {"model", "measured"} or None, default="model"
@@ -410,8 +418,10 @@ class InverseKinematics:
             Time constant [s] with which the last measured offset between tip and model decays while
             measurements are NaN; make it several times longer than the gaps. Default: feed-forward
             only while there is no measurement, which can be better than a short memory.
-        tol : float, default=1e-4
-            Largest error of a CONVERGED point [m].
+        tol : float, optional
+            Largest error of a CONVERGED point [m], with feedback="measured" of its measured error.
+            Default: 1e-4, with feedback="measured" 1e-3, because a step removes neither the noise
+            of its measurement nor the change of the model's error during the step.
         progress : callable, optional
             Called as ``progress(i, T)`` before point i.
 
@@ -421,7 +431,7 @@ class InverseKinematics:
             If the plant raises, the point is NaN in `x_measured` with status INVALID_INPUT, a
             warning is given, and the motion continues with feed-forward only.
         """
-        settings, task = self.settings, self.settings.task
+        settings = self.settings
         good = feedback in ("model", "measured", None)
         require(good, f'`feedback` must be "model", "measured" or None, got {feedback!r}.')
         good = feedback != "measured" or plant is not None
@@ -431,24 +441,73 @@ class InverseKinematics:
         points = path.x if isinstance(path, Trajectory) else path
         if isinstance(path, Trajectory) and t is None:
             t = path.t
+        if tol is None:
+            tol = _MEASURED if feedback == "measured" else _TOL
         as_numpy, tolerance = is_numpy(points), settings.tolerance(tol)
         target = settings.points(points, "path", lead="T")
         require(len(target) > 0, f"`path` must hold at least one point, got {tuple(target.shape)}.")
-        for message in [] if q0 is None else settings.far_messages(target, "path"):
-            warnings.warn(message, stacklevel=3)
-        times, periods = settings.times(t, target)
-        start = self.solve(target[0], tol=tol).q if q0 is None else q0
-        q = settings.configurations(start, "q0", target)
+        starts = None if q0 is None else settings.configurations(q0, "q0", target)
+        t, periods = settings.times(t, target)
+        way, loop = (target, t, periods, tolerance), (plant, feedback, memory)
+        if starts is not None and starts.ndim == 1:
+            for message in settings.far_messages(target, "path"):
+                warnings.warn(message, stacklevel=3)
+            return self._followed(starts, *way, *loop, as_numpy, progress)
+        tracks: list[Track] = []
+        dry = plant is not None or feedback != "model"  # the robot moves once
+        shown = None if dry else progress
+        for start in self._starts(target[:1], starts):
+            tracks.append(self._followed(start, *way, None, "model", None, as_numpy, shown))
+            if score(tracks[-1]) == (len(target), len(target)):
+                break
+        best = max(tracks, key=score)  # of equal tracks the first
+        return self._followed(best.q[0], *way, *loop, as_numpy, progress) if dry else best
+
+    def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
+        """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
+        settings, given = self.settings, q0 is not None
+        if q0 is None:
+            start = settings.start(target)[None]
+            q0 = nearest_starts(settings, start, start[:, 0], target, _GUESSES)[0]
+            yield self.solve(target[0]).q
+        away = settings.task.distances(settings.evaluate(q0)[0][None], target)[0]
+        away[0] = -1.0  # stays the first
+        q0 = q0[away.argsort()[: _GUESSES + 1]]
+        found = self.solve(target[0], q0, max_iter=200)
+        if given:
+            yield found.q[0]
+        for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN):
+            regular = torch.where(found.status == wanted, found.sigma_min, -1.0)
+            if regular.max() >= 0.0:
+                yield found.q[regular.argmax()]
+                return
+
+    def _followed(
+        self,
+        q0: Array,
+        target: Tensor,
+        t: Tensor,
+        periods: list[float],
+        tol: Tolerance,
+        plant: Plant | None,
+        feedback: str | None,
+        memory: float | None,
+        as_numpy: bool,
+        progress: Callable[[int, int], None] | None,
+    ) -> Track:
+        """Return the track from one start (n,)."""
+        settings, task = self.settings, self.settings.task
+        q = settings.configurations(q0, "q0", target)
         target = target.to(q.dtype)
-        tracker = Tracker(settings, as_array(q) if as_numpy else q, tolerance, memory)
+        tracker = Tracker(settings, as_array(q) if as_numpy else q, tol, memory)
         parts = tracker.follow(target, periods, plant, feedback, progress)
         q, x, measured, sigma_min, held, damped = parts
         e_model, e = (task.difference(a, target) for a in (x, measured))
         judged, error = e if feedback == "measured" else e_model, e.norm(dim=-1)
-        reached = task.reached(judged, tolerance)
+        reached = task.reached(judged, tol)
         status = statuses(task, q, judged.norm(dim=-1), reached, held, damped)
         status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
-        results = (times, q, x, measured, target, error, status, sigma_min, settings.margin(q))
+        results = (t, q, x, measured, target, error, status, sigma_min, settings.margin(q))
         results = give_back(results, (len(target),), as_numpy)
         if plant is None:
             results[3] = None

@@ -234,7 +234,7 @@ class Tracker(Portable):
         try:
             return self._settings.points(plant(self.q), "tip", self._like, lead="")[None]
         except Exception as error:
-            warnings.warn(f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=6)
+            warnings.warn(f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7)
             return self._like.new_full((1, *self._settings.task.shape), math.nan)
 
 

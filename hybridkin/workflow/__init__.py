@@ -11,6 +11,7 @@ from hybridkin.workflow.next_rows import next_rows
 from hybridkin.workflow.path import read_path, scaled_path, shape_path
 from hybridkin.workflow.report import Report, json_text
 from hybridkin.workflow.track import animate_track, track_path
+from hybridkin.workflow.verify import verify_track
 
 __all__ = [
     "LOG_SUFFIXES",
@@ -36,4 +37,5 @@ __all__ = [
     "scaled_path",
     "shape_path",
     "track_path",
+    "verify_track",
 ]

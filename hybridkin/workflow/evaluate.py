@@ -13,7 +13,7 @@ from hybridkin.datasets import Log
 from hybridkin.plots import BackboneDisplay, ErrorHistogramDisplay, WorkspaceDisplay, new_figure
 from hybridkin.workflow._fit_report import radius_entry, write_check, write_markers
 from hybridkin.workflow.log import MeasuredLog, checked
-from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.model import LoadedModel, check_columns
 from hybridkin.workflow.report import Report, check_out, statistics
 
 _PARTS = {"new rows": "new", "fitted rows": "fitted", "held out in the fit": "held_out"}
@@ -59,11 +59,7 @@ def evaluate_log(
     """
     if out is not None:
         check_out(out, "evaluate", ["error_histogram.png", "workspace.png"], force=force)
-    if log.q.shape[1] != loaded.n_actuators:
-        raise ValueError(
-            f"`q` must name {loaded.n_actuators} columns, one for each actuator of the model, got "
-            f"{log.q.shape[1]}."
-        )
+    check_columns(log.q, loaded)
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
     if loaded.play is not None:

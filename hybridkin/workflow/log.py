@@ -33,7 +33,7 @@ class LogError(ValueError):
         self.report = report
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class MeasuredLog(Log):
     """A checked log in which every row belongs to a motion.
 

@@ -196,6 +196,15 @@ class LoadedModel:
         return robots.LogFormat(names, ("x", "y", "z"), "m" if plain else "1")
 
 
+def check_columns(q: NDArray, loaded: LoadedModel) -> None:
+    """Raise if the rows q (N, n) of a log do not have one column for each actuator."""
+    if q.shape[1] != loaded.n_actuators:
+        raise ValueError(
+            f"`q` must name {loaded.n_actuators} columns, one for each actuator of the model, got "
+            f"{q.shape[1]}."
+        )
+
+
 def play_widths(model: HybridForwardModel) -> list[float] | None:
     """Return the backlash of every actuator [m], None without."""
     if model.play_ is None:

@@ -39,6 +39,8 @@ _UNITS = {
 
 _COLUMNS = {  # of tables of errors: heading, factor, format; others in mm
     "rows": ("rows", 1, ".0f"),
+    "promised": ("promised mean", 1e3, ".2f"),
+    "promised_p95": ("promised 95 %", 1e3, ".2f"),
     "std": ("std over rows", 1e3, ".2f"),
     "p95": ("95 %", 1e3, ".2f"),
     "std_folds": ("std over folds", 1e3, ".2f"),

@@ -19,7 +19,7 @@ from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.datasets import Log, load_log
 from hybridkin.ik import trajectories
-from hybridkin.ik.results import IKStatus, Track
+from hybridkin.ik.results import IKStatus, Track, score
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.plots import ActuatorDisplay, TrackAnimation, TrackingDisplay, new_figure
@@ -31,13 +31,12 @@ from hybridkin.workflow.report import Progress, Report, check_out, millimetres, 
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
-_REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
+LEAD_IN = "LEAD_IN"  # status of the rows before the path
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
-_GUESSES = 16
 _PEAK, _PUSH = 1.875, 10.0 / math.sqrt(3.0)  # largest speed and acceleration of `min_jerk`
 _MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
 _SLOW, _DT = 0.1, 0.02  # without known limits: share of the range per second; period [s]
-_PULLS = (0.2, 0.0, 0.0, 0.2)  # pull to the preferred configuration, in each attempt
+_PULLS = (0.2, 0.0)  # pull to the preferred configuration, in each attempt
 
 
 def track_path(
@@ -116,7 +115,7 @@ def track_path(
         model=str(loaded.path),
         n=len(path),
         duration_s=path.duration,
-        reached=_score(track)[1],
+        reached=score(track)[1],
         errors={"mean": track.mean_error, "p95": track.p95_error, "max": track.max_error},
         tol=tol,
         in_domain=None if loaded.hybrid is None else float(inside.mean()),
@@ -135,7 +134,7 @@ def track_path(
     _add_path(report, loaded, track)
     shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
     _add_commands(report, domain, whole.t, shown, n_lead)
-    statuses = [*["LEAD_IN"] * n_lead, *names]
+    statuses = [*[LEAD_IN] * n_lead, *names]
     report.file("track.csv", partial(_write_track, whole, shown, statuses, log_format))
     return report, report.write(out)
 
@@ -197,14 +196,13 @@ def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress)
         def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
             progress(what, done + 1, total)
 
-        first = _initial_guesses(ik, path.x[0], commands, tips, 0.1 * tol)[attempt % 2]
-        found: Any = ik.track(fine, q0=first, tol=tol, progress=report)
+        found: Any = ik.track(fine, q0=commands, tol=tol, progress=report)
         # Only the points are kept, not the steps between them.
         rows = {k: v[::every] for k, v in vars(found).items() if v is not None}
         tracks.append(replace(found, **rows))
-        if _score(tracks[-1]) == (len(path), len(path)):
+        if score(tracks[-1]) == (len(path), len(path)):
             break
-    return max(tracks, key=_score)  # of equal tracks the first
+    return max(tracks, key=score)  # of equal tracks the first
 
 
 def _in_steps(path: Trajectory, n: int) -> Trajectory:
@@ -213,33 +211,6 @@ def _in_steps(path: Trajectory, n: int) -> Trajectory:
     columns = np.column_stack([path.t, path.x])
     t, *x = (np.interp(places, np.arange(len(path)), column) for column in columns.T)
     return Trajectory(t, np.stack(x, axis=1))
-
-
-def _initial_guesses(
-    ik: InverseKinematics, target: NDArray, commands: NDArray, tips: NDArray, tol: float
-) -> list[NDArray]:
-    """Return two start configurations (n,) at the target.
-
-    The first is solved from the first of the commands, which is near the preferred one. The second
-    is the best of those solved from commands whose tips are nearest to the target: in the domain if
-    possible, with the largest singular value sigma_min.
-    """
-    near = np.argsort(np.linalg.norm(tips[1:] - target, axis=1))[:_GUESSES] + 1
-    near = np.concatenate([[0], near])
-    targets = np.broadcast_to(target, (len(near), 3)).copy()
-    found = ik.solve(targets, q0=commands[near], tol=tol, max_iter=200)
-    for wanted in _REACHED:
-        rows = np.flatnonzero(found.status[1:] == wanted) + 1
-        if len(rows):
-            return [found.q[0], found.q[rows[found.sigma_min[rows].argmax()]]]
-    free = ik.solve(target, tol=tol, max_iter=200, restarts=_GUESSES)
-    return [found.q[0], free.q]
-
-
-def _score(track: Track) -> tuple[int, int]:
-    """Return the number of points reached in the domain, and the number reached at all."""
-    statuses = np.asarray(track.status)
-    return int((statuses == IKStatus.CONVERGED).sum()), int(np.isin(statuses, _REACHED).sum())
 
 
 def animate_track(
@@ -259,7 +230,8 @@ def animate_track(
     loaded : LoadedModel
         A model with a chain as its mechanical model.
     path : str or Path
-        ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format.
+        ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format. The
+        film begins where the path begins, after the lead-in.
     out : str or Path
         File that ends in ".mp4", ".gif" or ".html".
     unit : {"m", "cm", "mm"}, default="cm"
@@ -281,12 +253,12 @@ def animate_track(
             f"`model` {loaded.path} has no body to draw; give a model with a chain as its "
             "mechanical model."
         )
-    file = Path(path)
-    if file.is_dir():
-        file = newest(file / "track.csv")
-    log = _read_track(file, loaded.log_format())
-    out = Path(out)
-    q, target = loaded.effective(log.q), log.x if tuple(log.x_names) == TARGET else None
+    log = read_track(path, loaded.log_format())
+    out, q = Path(out), loaded.effective(log.q)
+    if log.groups is not None:  # the way to the path is no part of it
+        on_path = log.groups != LEAD_IN
+        log, q = log.rows(on_path), q[on_path]
+    target = log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
         loaded.chain, q, target=target, t=log.time, tips=loaded.tips(q), n_frames=n_frames
     )
@@ -303,8 +275,14 @@ def animate_track(
     }
 
 
-def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
-    """Return commands and times of a file; its tips are the targets if it has them."""
+def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
+    """Return commands and times of a file, or of the track in a folder.
+
+    The tips of a track are its targets, and its groups are the statuses.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = newest(file / "track.csv")
     if not file.is_file():
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:
@@ -312,7 +290,7 @@ def _read_track(file: Path, log_format: robots.LogFormat) -> Log:
     columns: dict[str, Any] = {**log_format.reading, "groups": None}
     columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
     if {*TARGET} <= {*header}:
-        columns["x"] = TARGET
+        columns |= {"x": TARGET, "groups": "status"}
     return load_log(file, **columns)
 
 

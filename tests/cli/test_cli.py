@@ -895,7 +895,7 @@ def test_track_of_a_calibrated_model_without_a_learned_part(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "command", ["init", "fit", "evaluate", "track", "animate", "describe", "demo"]
+    "command", ["init", "fit", "evaluate", "track", "verify", "animate", "describe", "demo"]
 )
 def test_every_command_has_help_with_exit_codes(command, capsys):
     with pytest.raises(SystemExit) as left:

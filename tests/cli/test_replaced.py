@@ -119,3 +119,31 @@ def test_files_of_a_killed_command_count(tmp_path):
     check_out(tmp_path, "next", ["next.csv"], force=False)
     with pytest.raises(FileExistsError, match=r"has report\.json"):
         check_out(tmp_path, "track", ["track.csv"], force=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("answer", "code"), [("y", 0), ("", 2)])
+def test_a_fit_asks_on_a_terminal_before_it_replaces_a_model(
+    home, capsys, monkeypatch, answer, code
+):
+    run = ["fit", *COMMANDS["fit"], "--out", "out"]
+    assert main(run) == 0
+    assert "Replaced" not in capsys.readouterr().err
+    before = (home / "out" / "model.safetensors").stat().st_mtime_ns
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda: answer)
+    assert main(run) == code
+    err = capsys.readouterr().err
+    assert "Replace the model of 20" in err
+    assert ("Replaced the model of 20" in err) == (code == 0)
+    assert ("out keeps the model of 20" in err) == (code == 2)
+    assert ((home / "out" / "model.safetensors").stat().st_mtime_ns > before) == (code == 0)
+
+
+@pytest.mark.slow
+def test_a_fit_elsewhere_says_which_model_it_replaced(home, capsys, monkeypatch):
+    run = ["fit", *COMMANDS["fit"], "--out", "out", "--quiet"]
+    assert main(run) == 0
+    monkeypatch.setattr("builtins.input", pytest.fail)
+    assert main(run) == 0
+    assert "Replaced the model of 20" in capsys.readouterr().err

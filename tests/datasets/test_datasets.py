@@ -556,3 +556,20 @@ def test_data_home_comes_from_the_environment(data_home, monkeypatch, tmp_path):
     shutil.copytree(data_home / "asl_trunk_static", tmp_path / "asl_trunk_static")
     monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
     assert len(load_asl_trunk().q) == 2170
+
+
+def test_a_log_shows_a_summary():
+    q = np.array([[0.1, 0.2], [0.15, 0.3]])
+    x = np.array([[0.0, 0.0, 1.0], [0.03, np.nan, 1.2]])
+    log = Log(q, x, ["a", "b"], np.array([2.0, 4.5]), q_names=("left", "right"), source="log.csv")
+    assert str(log).splitlines() == [
+        "Log of log.csv: 2 rows, 2 motions",
+        "  2 actuators: left, right; 0.1 to 0.3 m",
+        "  tips within 0.03 x 0 x 0.2 m",
+        "  time from 2 to 4.5 s",
+    ]
+    plain = Log(q, x)
+    assert repr(plain) == (
+        "Log of in memory: 2 rows\n  2 actuators: q[0], q[1]; 0.1 to 0.3 m\n"
+        "  tips within 0.03 x 0 x 0.2 m"
+    )

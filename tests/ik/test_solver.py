@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain
+from hybridkin import ConstantCurvatureChain, ForwardModel
 from hybridkin.ik._box import BoxProblem, box_limited_step, strict_box_step
 from hybridkin.ik._gram import (
     adaptive_damping,
@@ -756,3 +756,57 @@ def test_what_cannot_be_known_is_asked_for(A):
         InverseKinematics(Linear(A), q_min=0.0, q_max=1.0).solve(np.zeros(3))
     with pytest.raises(ValueError, match="`model` must map q"):
         InverseKinematics(lambda q: q).step(np.zeros(9), np.zeros(3))
+
+
+class TwoRegions(ForwardModel):
+    """A robot x = ((q1 + q4), (1 + q4^2) q2, (1 + q4^2) q3) that is known in two regions.
+
+    One holds the preferred configuration, but ends at x1 = 0.05; the other does not end.
+    """
+
+    n_actuators, n_outputs = 4, 3
+
+    def forward(self, q):
+        scale = 1.0 + q[..., 3:].square()
+        return torch.cat([q[..., :1] + q[..., 3:], scale * q[..., 1:3]], dim=-1)
+
+    def domain_distance(self, q):
+        near = (q[..., 3].abs() < 0.2) & (q[..., 0] + q[..., 3] < 0.05)
+        return torch.where(near | (q[..., 3] > 0.4), 0.5, 2.0).to(q)
+
+
+@pytest.mark.parametrize("as_numpy", [True, False])
+def test_a_track_without_a_start_stays_in_the_domain(as_numpy):
+    path = torch.linspace(0.0, 0.3, 61)[:, None] * torch.tensor(
+        [1.0, 0.2, 0.0], dtype=torch.float64
+    )
+    path = path.numpy() if as_numpy else path
+    ik = InverseKinematics(TwoRegions(), q_min=-1.0, q_max=1.0, q_pref=0.0, beta=0.0)
+    left = ik.track(path, q0=np.zeros(4) if as_numpy else torch.zeros(4, dtype=torch.float64))
+    assert (left.status == IKStatus.OUT_OF_DOMAIN).sum() > 40
+    seen = []
+    track = ik.track(path, plant=lambda q: seen.append(q) or ik.model(torch.as_tensor(q)))
+    assert (track.status == IKStatus.CONVERGED).all()
+    assert len(seen) == len(path)  # the robot moves once
+    rows = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 4))
+    rows[:, 3] = np.abs(rows[:, 3])
+    track = ik.track(path, q0=rows if as_numpy else torch.from_numpy(rows))
+    assert (track.status == IKStatus.CONVERGED).all()
+
+
+def test_measured_points_are_converged_within_a_millimetre():
+    rng = np.random.default_rng(0)
+
+    def plant(q):
+        tip = CHAIN(torch.from_numpy(q)).numpy()
+        return 1.02 * tip + 1e-4 * rng.standard_normal(3)  # 14 mm from the model
+
+    path = figure_eight((0.0, 0.0, 0.7), (0.2, 0.1), duration=2.0, dt=0.02)
+    track = bha(dt=0.02).track(path, plant=plant, feedback="measured")
+    first = track.status.tolist().index(IKStatus.CONVERGED)
+    assert first <= 3
+    assert (track.status[first:] == IKStatus.CONVERGED).all()
+    assert (track.error[first:] < 1e-3).all()
+    assert track.error[0] > 1e-2
+    strict = bha(dt=0.02).track(path, plant=plant, feedback="measured", tol=1e-4)
+    assert (strict.status == IKStatus.MAX_ITER).mean() > 0.8

@@ -6,6 +6,7 @@ import pytest
 from sklearn.utils import Bunch
 
 from hybridkin import HybridForwardModel, datasets, robots
+from hybridkin.workflow import Report
 from paper import table1, tables, tracks
 from paper.__main__ import main
 from paper.identifiability import ASKED, IDENTIFIABLE, identifiability
@@ -20,6 +21,26 @@ def test_the_kinds_of_spread_differ():
     expected = {"mean": 3.5, "std": 1.0, "max": 7.0, "mean_max": 4.5}
     expected |= {"std_splits": 2.0, "std_seeds": 0.5}
     assert summary(wide) == pytest.approx(expected)
+
+
+def test_the_figure_of_table1_shows_the_values_of_the_paper():
+    known = {"mean": 0.01, "std": 0.005, "max": 0.03, "std_splits": 0.0, "std_seeds": 0.0}
+    models = [("mechanical, nominal", "-"), ("data-driven", "ELM"), ("hybrid on nominal", "ELM")]
+    models += [("mechanical, calibrated", "-"), ("hybrid on calibrated", "ELM")]
+    table = [{"model": m, "learner": k, "train": known, "test": known} for m, k in models]
+    report = Report("table")
+    report.record.update(n_splits=1, n_seeds=1)
+    figures = {}
+    report.figure = lambda name, figure, caption: figures.update({name: figure})
+    tables.write_table1(report, table)
+    ax = figures["table1"].axes[0]
+    crosses, labels = ax.get_legend_handles_labels()
+    assert labels == ["paper, real robot"]
+    x, y = crosses[0].lines[0].get_data()
+    np.testing.assert_allclose(x, [2.5, 3.4, 1.3, np.nan, np.nan])
+    np.testing.assert_allclose(y, np.arange(5)[::-1] - 0.3)
+    assert tables.paper_test_error(table[1]) == pytest.approx((0.034, 0.027))
+    assert tables.paper_test_error(table[0]) == pytest.approx((0.025, np.nan), nan_ok=True)
 
 
 @pytest.mark.slow

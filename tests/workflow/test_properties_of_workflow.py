@@ -1,5 +1,6 @@
 """Hostile values in any argument of what takes its time: fits, tracks, reports."""
 
+import numpy as np
 import pytest
 from entry_points import (
     DESCRIPTION,
@@ -18,7 +19,8 @@ from hybridkin import ConstantCurvatureChain, fit_play, workflow
 
 SETTINGS = {"n_folds": 2, "n_seeds": 1, "auto": False, "loss": "linear", "coverage": None}
 SETTINGS |= {"play": None, "max_rows": None}
-OUT = FOLDER / "out"
+OUT, TRACK = FOLDER / "out", FOLDER / "sent.csv"
+TRACK.write_text("q1,q2,q3,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in np.c_[Q, X]))
 TENDONS = ConstantCurvatureChain([0.005], lengths=[0.1])
 
 
@@ -49,6 +51,10 @@ ENTRIES = {
     "evaluate_log": (
         workflow.evaluate_log,
         {"loaded": LOADED, "log": LOG, "out": None, "force": True},
+    ),
+    "verify_track": (
+        workflow.verify_track,
+        {"loaded": LOADED, "track": TRACK, "log": LOG, "out": None},
     ),
     "next_rows": (
         workflow.next_rows,

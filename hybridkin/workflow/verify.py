@@ -1,0 +1,219 @@
+"""The error that a track promised against the error of the robot, and the likely cause."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
+
+from hybridkin._core.arrays import as_array
+from hybridkin.chains.play import PlayOperator
+from hybridkin.datasets import Log
+from hybridkin.native.library import evaluate
+from hybridkin.workflow.model import LoadedModel, check_columns
+from hybridkin.workflow.report import Report, check_out, statistics
+from hybridkin.workflow.track import LEAD_IN, read_track
+
+_KEPT = 1.5  # largest mean error of a kept promise, relative to the promised one
+_LIKELY = 0.5  # least share of the mean squared error that a likely cause explains
+_OFF = 0.01  # least distance from the plane of the log, as a share of the range of the commands
+_ROUNDS, _NARROW = 3, 1e-3  # of the fit of backlash; its least width, as a share of the range
+_DIFFERENT = 0.1  # of the range: commands of a log that differ from those of the track
+_COLUMNS = ("rows", "promised", "promised_p95", "mean", "p95", "max")
+
+_REMEDIES = {
+    "backlash": "fit a log with reversals of the actuators by `hybridkin fit --play auto`",
+    "moved base": "measure where the base is, or call `model.adapt(q, x)` with this log",
+    "outside the log": "add motions there to the log (`hybridkin next`), or move the path inside",
+    "off the plane of the log": "add motions off the plane to the log, or send commands in it",
+}
+
+
+def verify_track(
+    loaded: LoadedModel,
+    track: str | Path,
+    log: Log,
+    out: str | Path | None = None,
+    *,
+    force: bool = False,
+) -> tuple[Report, list[Path]]:
+    """Compare the error that a track promised with the error of the robot, and find the cause.
+
+    The error is the distance of the measured tip from the tip of the model. Four causes are tried,
+    each alone: backlash (every actuator lags behind its command, by the direction of its motion), a
+    rigid motion of the base, larger errors outside the log than inside, and an error that is linear
+    in the distance of the commands from the plane of the log.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The model that computed the track, as from `open_model`.
+    track : str or Path
+        ``track.csv`` of `track_path`, or its folder.
+    log : Log
+        Tips measured while these commands ran, with the commands. Rows belong to those of the track
+        if there are as many; else by the time since the first row.
+    out : str or Path, optional
+        Folder to write into. Default: nothing is written.
+    force : bool, default=False
+        Replace files of `out` that `verify` did not write.
+
+    Returns
+    -------
+    report : Report
+        Its ``record`` holds "parts" of the path, the first of which is the whole, with "promised"
+        and "promised_p95", mean, p95 and max [m]; "kept", whether the mean is at most 1.5 times the
+        promised one (None without a promise); "causes", the share of the mean squared error that
+        each cause explains; and "cause", the largest above 0.5 if the promise is not kept, or None.
+    paths : list of Path
+        The written files.
+
+    Raises
+    ------
+    ValueError
+        If rows or commands of the log are not those of the track.
+    """
+    if out is not None:
+        check_out(out, "verify", force=force)
+    check_columns(log.q, loaded)
+    sent = read_track(track, loaded.log_format())
+    motion = loaded.effective(sent.q)
+    rows, x = _rows_of(log, sent), log.x[:, -3:]
+    used = np.isfinite(x).all(axis=1)
+    if sent.groups is not None:
+        used &= sent.groups[rows] != LEAD_IN
+    rows, x = rows[used], x[used]
+    if len(rows) < 3:
+        raise ValueError(f"`log` must have at least 3 measured tips of the path, got {len(rows)}.")
+    q = motion[rows]
+    errors = np.linalg.norm(x - loaded.tips(q), axis=1)
+    causes, promised = _explained(loaded, motion, rows, x), loaded.promised_errors(q)
+    parts = {name: _entry(errors, promised, part) for name, part in _parts(loaded, q).items()}
+    path = parts["path"]
+    good = bool(path["mean"] <= _KEPT * path["promised"]) if promised else None
+    likely = max(causes, key=causes.__getitem__)
+    cause = likely if not good and causes[likely] > _LIKELY else None
+    report = Report(f"{loaded.name}: {Path(track).name} against {Path(log.source).name}")
+    report.record.update(command="verify", model=str(loaded.path), track=str(track), log=log.source)
+    report.record.update(parts=parts, kept=good, causes=causes, cause=cause)
+    _write(report)
+    return report, [] if out is None else report.write(out)
+
+
+def _rows_of(log: Log, sent: Log) -> NDArray:
+    """Return the row of the track (N,) that each row of the log belongs to."""
+    lines = np.arange(len(log.q)) if log.line is None else log.line
+    every = np.sort(np.append(lines, log.invalid_lines))
+    rows = np.searchsorted(every, lines)
+    if len(every) != len(sent.q):
+        if log.time is None or sent.time is None:
+            raise ValueError(
+                f"`log` must have as many rows as the track or a column of times, got {len(every)} "
+                f"and {len(sent.q)} rows; name the column by `--time`."
+            )
+        passed = log.time - log.time[0] + sent.time[0]
+        rows = np.rint(np.interp(passed, sent.time, np.arange(len(sent.q)))).astype(int)
+    far = np.abs(log.q - sent.q[rows]).mean() / np.ptp(sent.q, axis=0).max()
+    if not far < _DIFFERENT:
+        raise ValueError(
+            f"`log` must hold the commands of the track, but they differ by {100 * far:.0f} % of "
+            "their range on average; check the files, the unit and the sign."
+        )
+    return rows
+
+
+def _parts(loaded: LoadedModel, q: NDArray) -> dict[str, NDArray]:
+    """Return the rows of the parts of the path: the whole, in and out of the log, quarters."""
+    inside, quarter = loaded.domain_distance(q) <= 1.0, 4 * np.arange(len(q)) // len(q)
+    parts = {"path": np.ones(len(q), dtype=bool), "inside the log": inside}
+    parts["outside the log"] = ~inside
+    parts |= {f"quarter {k + 1}": quarter == k for k in range(4)}
+    return {name: rows for name, rows in parts.items() if rows.any()}
+
+
+def _entry(errors: NDArray, promised: dict[str, NDArray], rows: NDArray) -> dict[str, Any]:
+    names = {"promised": "mean", "promised_p95": "p95"}
+    means = {name: promised[key][rows].mean() for name, key in names.items() if promised}
+    return {"rows": rows.sum(), **means, **statistics(errors[rows])}
+
+
+def _explained(loaded: LoadedModel, motion: NDArray, rows: NDArray, x: NDArray) -> dict[str, float]:
+    """Return the share of the mean squared error that each cause explains."""
+    q = motion[rows]
+    tips, J = evaluate(loaded.module, q, jacobian=True)
+    residual, off = x - tips, _off_plane(loaded, q)
+    linear = off @ np.linalg.lstsq(off, residual)[0]
+    left = {
+        "backlash": _without_backlash(motion, rows, J, residual),
+        "moved base": np.square(x - _moved(tips, x)).sum(),
+        "outside the log": _as_inside(loaded, q - off, residual),
+        "off the plane of the log": np.square(residual - linear).sum(),
+    }
+    whole = max(np.square(residual).sum(), np.finfo(float).tiny)
+    return {cause: max(0.0, 1.0 - float(squares / whole)) for cause, squares in left.items()}
+
+
+def _off_plane(loaded: LoadedModel, q: NDArray) -> NDArray:
+    """Return the part (N, n) of commands off the plane of the log, 0 if they keep to it."""
+    if loaded.module.plane is None:
+        return np.zeros_like(q)
+    point, normals = map(as_array, loaded.module.plane)
+    off = (q - point) @ normals @ normals.T
+    return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
+
+
+def _without_backlash(motion: NDArray, rows: NDArray, J: NDArray, residual: NDArray) -> float:
+    """Return the sum of squares that the most likely backlash of every actuator leaves.
+
+    The tip errors are linear in the widths if the shape of the lag, from -1/2 to 1/2, is known. It
+    is that of the widths of the round before.
+    """
+    least, left = _NARROW * np.ptp(motion, axis=0).max(), 0.0
+    widths = np.zeros(motion.shape[1])
+    for _ in range(_ROUNDS):
+        widths = np.maximum(widths, least)
+        lag = (PlayOperator(widths).apply(motion)[0] - motion) / widths
+        per_width = (J * lag[rows, None]).reshape(-1, len(widths))
+        widths, left = nnls(per_width, residual.ravel())
+    return left**2
+
+
+def _moved(tips: NDArray, x: NDArray) -> NDArray:
+    """Return tips (N, 3) after the rigid motion that brings them nearest to x (Kabsch)."""
+    here, there = tips.mean(axis=0), x.mean(axis=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # points on a line: any turn about it
+        turn = Rotation.align_vectors(x - there, tips - here)[0]
+    return there + turn.apply(tips - here)
+
+
+def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
+    """Return the sum of squares if the errors were everywhere as inside the log."""
+    squares, inside = np.square(residual).sum(axis=1), loaded.domain_distance(q) <= 1.0
+    if inside.any():
+        return len(q) * squares[inside].mean()
+    known = loaded.held_out
+    return squares.sum() if known is None else len(q) * known["mean"] ** 2
+
+
+def _write(report: Report) -> None:
+    parts, kept, cause = (report.record[key] for key in ("parts", "kept", "cause"))
+    path = {key: f"{1e3 * value:.3g} mm" for key, value in parts["path"].items()}
+    promise = "The model promised no error"
+    if kept is not None:
+        promise = "Promised: mean {promised}, 95 % below {promised_p95}".format(**path)
+    report.text(f"{promise}. Robot: mean {{mean}}, 95 % below {{p95}}, max {{max}}.".format(**path))
+    report.errors(parts, _COLUMNS)
+    shares = report.record["causes"].items()
+    report.table(["cause", "explains [%]"], [[name, f"{100 * v:.0f}"] for name, v in shares])
+    if kept:
+        report.text("The promise is kept.")
+    elif cause is None:
+        report.text("None of these explains the error; check load, friction and delay.")
+    else:
+        report.text(f"Likely cause: {cause}. To do: {_REMEDIES[cause]}.")
