@@ -295,7 +295,10 @@ ENTRIES = {
     ),
     "plots.TrackAnimation.from_estimator": (
         plots.TrackAnimation.from_estimator,
-        {"model": FITTED, "q": Q, "target": X, "t": np.arange(24.0), "x": X, "n_frames": 3},
+        {
+            **{"model": FITTED, "q": Q, "target": X, "t": np.arange(24.0), "x": X, "n_frames": 3},
+            **{"names": ["a", "b", "c"], "expected": X[:, 0]},
+        },
     ),
     "workflow.open_model": (workflow.open_model, {"path": SAVED, "robot": ROBOT}),
     "workflow.read_path": (workflow.read_path, {"path": POINTS, "unit": "m", "dt": 0.05}),

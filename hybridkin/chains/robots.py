@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from hybridkin._core.arrays import as_path
+from hybridkin._core.arrays import Numbers, as_path, shaped
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains._robot_files import chain_of, each, read_tables
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
@@ -98,16 +98,16 @@ class LogFormat:
         """Units of the model per unit of the log, including the sign, shape () or (n,)."""
         return np.multiply(self.q_sign, UNITS.get(self.q_unit, 1.0))
 
-    def to_log(self, q: ArrayLike) -> NDArray:
+    def to_log(self, q: Numbers) -> NDArray:
         """Return actuator vectors (..., n) of the model in the unit and with the sign of the log.
 
         The columns are those of `q`; commands for the robot that wrote the log are such numbers.
         """
-        return np.divide(q, self.q_factor) + 0.0  # no -0
+        return shaped(q, "q", ("...", len(self.q))) / self.q_factor + 0.0  # no -0
 
-    def from_log(self, q: ArrayLike) -> NDArray:
+    def from_log(self, q: Numbers) -> NDArray:
         """Return actuator vectors (..., n) of the log in unit and sign of the model."""
-        return np.multiply(q, self.q_factor)
+        return shaped(q, "q", ("...", len(self.q))) * self.q_factor
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -197,11 +197,11 @@ class RobotDescription:
             return self.chain.n_actuators
         return 0 if self.log is None else len(self.log.q)
 
-    def to_log(self, q: ArrayLike) -> NDArray:
+    def to_log(self, q: Numbers) -> NDArray:
         """Return actuator vectors (..., n) in unit and sign of the logs, see `LogFormat`."""
         return self._known_log().to_log(q)
 
-    def from_log(self, q: ArrayLike) -> NDArray:
+    def from_log(self, q: Numbers) -> NDArray:
         """Return actuator vectors (..., n) of a log as the model takes them."""
         return self._known_log().from_log(q)
 

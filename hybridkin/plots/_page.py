@@ -69,8 +69,8 @@ def page(
         # Rounded by its own size, which is far below that of the robot.
         error = _numbers(scene.error, decimals(scene.error) + 2)
         curve = {"type": "scatter", "mode": "lines", "line": {"color": COLORS[0], "width": 2}}
-        name = f"tip error [{scene.unit}]"
-        still.append({**curve, "x": steps, "y": error, "name": name, "showlegend": False})
+        curve |= {"x": steps, "y": error, "name": scene.error_name}
+        still.append({**curve, "showlegend": False})
     frames = []
     for k, row in enumerate(scene.rows):
         parts: list[dict[str, Any]] = [_xyz(line.points[k], digits) for line in scene.moving]
@@ -153,7 +153,7 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
         "uirevision": "kept",  # frames do not reset the view
     }
     if scene.error is not None:
-        error = {"title": {"text": f"tip error [{scene.unit}]"}, "rangemode": "tozero"}
+        error = {"title": {"text": scene.error_name}, "rangemode": "tozero"}
         layout["xaxis"] = {"domain": [width + 0.06, 1.0], "title": {"text": scene.when}}
         layout["yaxis"] = {**error, "domain": [0.15, 0.9]}
     return layout

@@ -36,6 +36,7 @@ class Scene(NamedTuple):
     x: NDArray  # (T, 3) path reached
     target: NDArray | None  # (T, 3)
     error: NDArray | None  # (T,)
+    error_name: str
     steps: NDArray  # (T,) of the time axis
     when: str  # name of the time axis
     rows: NDArray  # (K,) rows that are frames
@@ -62,7 +63,7 @@ class Stage:
         self.cursor = None
         if error_ax is not None and scene.error is not None:
             error_ax.plot(scene.steps, scene.error, color=COLORS[0], linewidth=1.5)
-            error_ax.set(xlabel=scene.when, ylabel=f"tip error [{scene.unit}]")
+            error_ax.set(xlabel=scene.when, ylabel=scene.error_name)
             error_ax.set_ylim(bottom=0.0)
             line = error_ax.axvline(scene.steps[0], color="black", linewidth=1.0)
             self.cursor = (line, error_ax.plot([], [], "o", color=COLORS[0])[0])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import animation
@@ -45,13 +46,15 @@ class TrackAnimation(Display):
         The rows of `x` that become frames, increasing. Default: all.
     name : str, default="tip"
         Name of `x` in the legend.
+    expected : array-like of shape (T,), optional
+        Error of the robot to expect [m]. Default: the distance from the target is shown.
 
     Attributes
     ----------
     x, target : ndarray of shape (T, 3)
         Tips reached and targets [m]; `target` may be None.
     error : ndarray of shape (T,) or None
-        Distance from the target [m].
+        Error that is shown, expected or the distance from the target [m].
     rows : ndarray of shape (K,)
         Rows that are frames.
     fps : float
@@ -84,11 +87,15 @@ class TrackAnimation(Display):
         body: BackboneDisplay | None = None,
         rows: ArrayLike | None = None,
         name: str = "tip",
+        expected: ArrayLike | None = None,
     ) -> None:
         self.x = shaped(x, "x", "T3")
         T = len(self.x)
         self.target = None if target is None else shaped(target, "target", "T3", T)
         self.error = None if self.target is None else distance(self.x, self.target)
+        self.error_name = "error"
+        if expected is not None:
+            self.error, self.error_name = shaped(expected, "expected", "T", T), "expected error"
         self.t = times(t, T)
         shown = np.arange(T) if rows is None else shaped(rows, "rows", "K")
         K = len(shown)
@@ -110,6 +117,8 @@ class TrackAnimation(Display):
         t: ArrayLike | None = None,
         x: ArrayLike | None = None,
         tips: ArrayLike | None = None,
+        expected: ArrayLike | None = None,
+        names: Sequence[str] = (),
         n_frames: int = 150,
     ) -> Self:
         """Return the film of a robot that runs through given configurations.
@@ -129,6 +138,10 @@ class TrackAnimation(Display):
         tips : array-like of shape (T, 3), optional
             Tips that the model predicts [m], where they depend on more than `q`. The body ends
             there. Default: see `BackboneDisplay.from_estimator`.
+        expected : array-like of shape (T,), optional
+            Error of the robot to expect [m].
+        names : sequence of str, optional
+            Names of the actuators, see `BackboneDisplay`.
         n_frames : int, default=150
             Frames at most, evenly in time.
 
@@ -143,13 +156,14 @@ class TrackAnimation(Display):
             raise ValueError(f"`q` must have shape (T, n) with T >= 1, got {q.shape}.")
         rows = _evenly(times(t, len(q)), len(q), n_frames)
         ends = None if tips is None else shaped(tips, "tips", "T3", len(q))[rows]
-        body = BackboneDisplay.from_estimator(model, q[rows], tips=ends)
+        body = BackboneDisplay.from_estimator(model, q[rows], tips=ends, names=names)
         name, x = "tip (model)" if x is None else "tip (measured)", tips if x is None else x
         if x is None:
             known = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
             x[known] = predicted(model, q[known])
-        return cls(x, target=target, t=t, body=body, rows=rows, name=name)
+        shown: Any = {"body": body, "rows": rows, "name": name, "expected": expected}
+        return cls(x, target=target, t=t, **shown)
 
     @property
     def fps(self) -> float:
@@ -287,7 +301,7 @@ class TrackAnimation(Display):
             return when
         error, places = scale_of(unit) * self.error[row], decimals(scale_of(unit) * self.error)
         shown = f"{error:.{places}f} {unit}" if np.isfinite(error) else "not known"
-        return f"{when}, error {shown}"
+        return f"{when}, {self.error_name} {shown}"
 
     def _scene(self, unit: str) -> Scene:
         scale, (low, high) = scale_of(unit), self.limits()
@@ -299,6 +313,7 @@ class TrackAnimation(Display):
             x=scale * self.x,
             target=None if self.target is None else scale * self.target,
             error=None if self.error is None else scale * self.error,
+            error_name=f"{self.error_name} [{unit}]",
             steps=steps,
             when=when,
             rows=self.rows,

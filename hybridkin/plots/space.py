@@ -128,6 +128,8 @@ class BackboneDisplay(Display):
         Points along every chamber or tendon [m].
     segments : sequence of int, optional
         The segment that each actuator bends, from 0; it gives the colour. Default: all one.
+    names : sequence of str, optional
+        Names of the actuators: each has a colour of its own. Default: colours by segment.
     disks : array-like of shape (K, D, C, 3), optional
         Rims of the disks, C points each [m].
     frames : array-like of shape (K, F, 4, 4), optional
@@ -166,6 +168,7 @@ class BackboneDisplay(Display):
         *,
         actuators: Sequence[ArrayLike] = (),
         segments: Sequence[int] | None = None,
+        names: Sequence[str] = (),
         disks: ArrayLike | None = None,
         frames: ArrayLike | None = None,
         tips: ArrayLike | None = None,
@@ -182,6 +185,9 @@ class BackboneDisplay(Display):
         n = len(self.actuators)
         if len(self.segments) != n:
             raise ValueError(f"`segments` must hold {n} numbers, one per actuator.")
+        self.names = tuple(names)
+        if len(self.names) not in (0, n):
+            raise ValueError(f"`names` must hold {n} names, one per actuator, got {names!r:.80}.")
         self.disks = None if disks is None else shaped(disks, "disks", "KDC3", K)
         self.frames = None if frames is None else shaped(frames, "frames", "KF44", K)
         self.tips = self.points[:, -1] if tips is None else shaped(tips, "tips", "K3", K)
@@ -196,6 +202,7 @@ class BackboneDisplay(Display):
         *,
         n_points: int = 12,
         tips: ArrayLike | None = None,
+        names: Sequence[str] = (),
     ) -> Self:
         """Return the body of a chain, or of a fitted hybrid model, in given configurations.
 
@@ -213,13 +220,15 @@ class BackboneDisplay(Display):
         tips : array-like of shape (K, 3), optional
             Where the body ends [m], in the nearest configuration of the mechanical part that
             reaches it. Default: see `model`.
+        names : sequence of str, optional
+            Names of the actuators: each has a colour of its own. Default: colours by segment.
 
         Returns
         -------
         BackboneDisplay
             Not drawn yet.
         """
-        return cls(**body_of(model, q, n_points, tips))
+        return cls(**body_of(model, q, n_points, tips), names=names)
 
     def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw into a 3-D axes and return self.
@@ -271,10 +280,14 @@ class BackboneDisplay(Display):
         """
         name, marker = ("links and joints", "o") if self.rigid else ("backbone", "")
         found = [Line(name, self.points, _BODY, 4.0, marker=marker)]
-        for s in sorted(set(self.segments)) if body else ():
-            own = [p for p, of in zip(self.actuators, self.segments, strict=True) if of == s]
-            label = f"actuators of segment {s + 1}"
-            found.append(Line(label, _joined(own), _SEGMENTS[s % len(_SEGMENTS)], 1.6))
+        if body and self.names:
+            for i, (name, path) in enumerate(zip(self.names, self.actuators, strict=True)):
+                found.append(Line(name, path, COLORS[i % len(COLORS)], 1.6))
+        elif body:
+            for s in sorted(set(self.segments)):
+                own = [p for p, of in zip(self.actuators, self.segments, strict=True) if of == s]
+                label = f"actuators of segment {s + 1}"
+                found.append(Line(label, _joined(own), _SEGMENTS[s % len(_SEGMENTS)], 1.6))
         if body and self.disks is not None and self.disks.size:
             found.append(Line("", _joined(self.disks.swapaxes(0, 1)), "#808080", 1.0))
         if tip:

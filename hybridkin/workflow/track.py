@@ -260,7 +260,14 @@ def animate_track(
         log, q = log.rows(on_path), q[on_path]
     target = log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
-        loaded.chain, q, target=target, t=log.time, tips=loaded.tips(q), n_frames=n_frames
+        loaded.chain,
+        q,
+        target=target,
+        t=log.time,
+        tips=loaded.tips(q),
+        expected=loaded.promised_errors(q).get("mean"),
+        names=loaded.log_format().q if isinstance(loaded.chain, ArcChain) else (),
+        n_frames=n_frames,
     )
     try:
         film.save(out, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))

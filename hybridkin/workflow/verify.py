@@ -27,7 +27,7 @@ _DIFFERENT = 0.1  # of the range: commands of a log that differ from those of th
 _COLUMNS = ("rows", "promised", "promised_p95", "mean", "p95", "max")
 
 _REMEDIES = {
-    "backlash": "fit a log with reversals of the actuators by `hybridkin fit --play auto`",
+    "backlash": "fit named motions in order of time that reverse the actuators",
     "moved base": "measure where the base is, or call `model.adapt(q, x)` with this log",
     "outside the log": "add motions there to the log (`hybridkin next`), or move the path inside",
     "off the plane of the log": "add motions off the plane to the log, or send commands in it",

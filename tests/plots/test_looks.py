@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.colors import to_hex
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, plots
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, plots, robots
 
 NAMES = (
     *("mechanical, nominal", "mechanical, calibrated", "data-driven, ELM"),
@@ -152,6 +152,23 @@ def test_a_serial_body_ends_where_the_model_puts_the_tip(bent_inside):
     film = plots.TrackAnimation.from_estimator(model, q[:5])
     (backbone,) = [line for line in film.lines() if line.label == "backbone"]
     np.testing.assert_allclose(backbone.points[:, -1], film.x, atol=1e-7)
+
+
+def test_films_show_names_of_actuators_and_the_error_to_expect():
+    chain = robots.bionic_handling_assistant()
+    q, names = np.full((4, 9), 0.25), [f"chamber {i}" for i in range(9)]
+    expected = 1e-3 * np.arange(1.0, 5.0)
+    target = np.zeros((4, 3))
+    film = plots.TrackAnimation.from_estimator(
+        chain, q, target=target, expected=expected, names=names
+    )
+    shown = {line.label: line.color for line in film.lines()}
+    assert {*names} <= {*shown}
+    assert len({shown[name] for name in names}) == 8
+    np.testing.assert_array_equal(film.error, expected)
+    assert film.caption(2, "mm") == "step 2, expected error 3.00 mm"
+    with pytest.raises(ValueError, match="`names` must hold 9 names"):
+        plots.TrackAnimation.from_estimator(chain, q, names=names[:3])
 
 
 def test_a_body_is_led_to_given_tips(bent_inside):

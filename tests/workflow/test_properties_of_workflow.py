@@ -37,6 +37,8 @@ def with_settings(function):
 ENTRIES = {
     "LoadedModel.effective": (LOADED.effective, {"q": Q, "groups": GROUPS}),
     "LoadedModel.expected_errors": (LOADED.expected_errors, {"q": Q}),
+    "RobotDescription.to_log": (DESCRIPTION.to_log, {"q": Q}),
+    "RobotDescription.from_log": (DESCRIPTION.from_log, {"q": Q}),
     "fit_play": (
         fit_play,
         {
@@ -86,4 +88,4 @@ def _elsewhere(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_any_argument_gives_an_answer_or_an_error_of_ours(entry):
-    fuzz(*ENTRIES[entry], share=2 if entry.startswith("LoadedModel") else 40)
+    fuzz(*ENTRIES[entry], share=40 if "_" in entry and "." not in entry else 2)

@@ -108,7 +108,7 @@ def off_the_plane(q):
 @pytest.mark.parametrize(
     ("fault", "cause", "remedy"),
     [
-        (with_backlash, "backlash", "fit a log with reversals"),
+        (with_backlash, "backlash", "fit named motions"),
         (on_a_moved_base, "moved base", "model.adapt(q, x)"),
         (partly_outside, "outside the log", "hybridkin next"),
         (off_the_plane, "off the plane of the log", "motions off the plane"),
