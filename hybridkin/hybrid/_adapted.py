@@ -60,7 +60,8 @@ class AdaptedModel(ForwardModel):
             return None
         if isinstance(f, Chain):
             geometry = f.geometry()
-            zeros = {name: geometry[name] - shift for name in geometry if name.endswith("_zeros")}
+            in_unit = {"actuator_zeros": shift, "tendon_zeros": geometry.get("gains", 1.0) * shift}
+            zeros = {name: geometry[name] - in_unit[name] for name in in_unit if name in geometry}
             if zeros or not shift.any():
                 return f.with_geometry(base=self.motion @ geometry["base"], **zeros)
         return self.of(type(self.fitted)(f, [], shift[:0]))

@@ -68,7 +68,7 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     rows : Rows
         The log, with the rows of each motion in order of time.
     """
-    X, y, weights, groups = rows
+    X, y, _, groups = rows
     motions = np.zeros(len(X)) if groups is None else groups
     strokes = np.subtract(*np.percentile(X, (95, 5), axis=0))
     least = _LEAST * float(np.median(strokes[strokes > 0.0])) if strokes.any() else 0.0
@@ -77,19 +77,22 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     widths = [0.0, *doubled[(doubled > 0.0) & (doubled < widest)].tolist(), widest]
     # A motion is one sample, as its rows have similar errors. A single motion is cut into ten.
     parts = motions if len(np.unique(motions)) > 1 else np.arange(len(X)) * 10 // len(X)
-    counted = rows.counts > 0
-    names = np.unique(parts[counted])
+    counted = (rows.counts > 0) & ~np.isnan(rows.tips).any(axis=1)
+    counts, motion = rows.counts[counted], parts[counted]
+    names = np.unique(motion)
+    if len(names) < 2:
+        return None
 
     @cache
     def error_by_motion(width: float) -> NDArray:
-        effective = PlayOperator(width).apply_by_group(X, motions)
+        effective = PlayOperator(width).apply_by_group(X, motions)[counted]
         q = torch.from_numpy(effective.astype(np.float64))
-        error = residuals(spec.mechanical, q, y, spec.output)
+        error = residuals(spec.mechanical, q, y[counted], spec.output)
         network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
-        held_out = network.fit(effective, error, weights, parts).left_out_errors_
-        distance = np.linalg.norm(held_out.reshape(len(y), -1), axis=1)
-        kept = [counted & (parts == a) for a in names]
-        return np.array([np.average(distance[k], weights=rows.counts[k]) for k in kept])
+        held_out = network.fit(effective, error, counts, motion).left_out_errors_
+        distance = np.linalg.norm(held_out.reshape(len(error), -1), axis=1)
+        kept = [motion == a for a in names]
+        return np.array([np.average(distance[k], weights=counts[k]) for k in kept])
 
     def mean_error(width: float) -> float:
         return float(error_by_motion(width).mean())

@@ -103,7 +103,7 @@ class StepSettings(Portable):
     dq_max: Tensor
     ddq_max: Tensor
     q_pref: Tensor | Posture | None
-    beta: float
+    beta: float | None
     gain: float | None
     damping: str | float
     limits: str
@@ -229,7 +229,7 @@ class StepSettings(Portable):
     @property
     def has_posture(self) -> bool:
         """Whether there is a preferred configuration."""
-        return self.posture is not None and self.beta > 0.0
+        return self.posture is not None and (self.beta is None or self.beta > 0.0)
 
     def stored(self) -> Stored:
         """Return the description of the settings, with the model as their part.
@@ -315,7 +315,7 @@ class StepSettings(Portable):
         """Return gain dt and beta dt, both at most 1, and dt, for a period [s], default `dt`."""
         dt = self.dt if period is None else period
         gain = 1.0 if self.gain is None else self.gain * dt
-        beta = self.beta * dt
+        beta = min(dt, 1.0) if self.beta is None else self.beta * dt
         for name, share, good in (("gain", gain, gain > 0.0), ("beta", beta, beta >= 0.0)):
             need = "must lie in [0, 1], and a gain above 0"
             got = f"got {share / dt:.6g} 1/s x {dt:.6g} s = {share:.4g}"

@@ -75,8 +75,8 @@ class InverseKinematics:
         Preferred configuration, or a function that returns it for configurations (..., n), torch
         to torch, e.g. a gradient step. Default: the middle of the limits if they are finite, else
         there is no posture term.
-    beta : float, default=1.0
-        Rate of the posture [1/s], with 0 <= beta dt <= 1.
+    beta : float, optional
+        Rate of the posture [1/s], with 0 <= beta dt <= 1. Default: 1, or 1 / dt if that is less.
     gain : float, optional
         Feedback gain [1/s], with 0 < gain dt <= 1. Default: 1 / dt, the whole error in one period.
     damping : "adaptive" or float, default="adaptive"
@@ -146,7 +146,7 @@ class InverseKinematics:
         dq_max: Array | None = None,
         ddq_max: Array | None = None,
         q_pref: Array | Posture | None = None,
-        beta: float = 1.0,
+        beta: float | None = None,
         gain: float | None = None,
         damping: str | float = "adaptive",
         limits: str = "saturate",
@@ -170,7 +170,7 @@ class InverseKinematics:
             bounds["dq_max"],
             bound(np.inf if ddq_max is None else ddq_max, "ddq_max", positive=True),
             q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
-            number(beta, "beta"),
+            None if beta is None else number(beta, "beta"),
             None if gain is None else number(gain, "gain"),
             damping if isinstance(damping, str) else number(damping, "damping"),
             one_of(limits, "limits", ("saturate", "off")),
@@ -447,6 +447,8 @@ class InverseKinematics:
         target = settings.points(points, "path", lead="T")
         require(len(target) > 0, f"`path` must hold at least one point, got {tuple(target.shape)}.")
         starts = None if q0 is None else settings.configurations(q0, "q0", target)
+        good = starts is None or (starts.ndim < 3 and starts.numel() > 0)
+        require(good, f"`q0` must have shape (n,) or (K, n), got {np.shape(q0)}.")
         t, periods = settings.times(t, target)
         way, loop = (target, t, periods, tolerance), (plant, feedback, memory)
         if starts is not None and starts.ndim == 1:

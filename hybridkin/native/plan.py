@@ -391,6 +391,7 @@ def _inverse_kinematics(plan: Plan, stored: Stored) -> int:
     names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
     vectors = [stored.array(name, [n], finite=False) for name in names]
     gain, beta, dt, damping = (stored.settings[name] for name in ("gain", "beta", "dt", "damping"))
+    beta = 1.0 if beta is None else beta  # steps of more than a second end at the posture
     rates = [-1.0 if gain is None else gain, beta, dt, -1.0 if damping == "adaptive" else damping]
     weights = stored.array("weights", [n])
     flags = (stored.settings["limits"] == "saturate") + 2 * stored.settings["has_posture"]

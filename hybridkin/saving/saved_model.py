@@ -20,6 +20,7 @@ from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import plain
 from hybridkin._core.version import __version__
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.rigid import RigidChain
 from hybridkin.hybrid.description import hybrid_of, restorer, stored_hybrid, training_of
@@ -199,7 +200,11 @@ def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
 def _units(model: object, output: str = "position") -> dict[str, str | list[str]]:
     if not isinstance(model, Chain):
         return {"q": "as in training", "x": "as in training"}
-    q = model.units if isinstance(model, RigidChain) else "m"
+    q: str | list[str] = "as in training"  # of a chain with gains, for example counts
+    if isinstance(model, RigidChain):
+        q = model.units
+    elif isinstance(model, ArcChain) and model.in_metres:
+        q = "m" if model.stage is None else ["rad"] + ["m"] * (model.n_actuators - 1)
     return {"q": q, "x": "m" if output == "position" else ["m"] * 3 + ["rad"] * 3}
 
 

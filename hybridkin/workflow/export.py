@@ -54,7 +54,7 @@ def export_model(
     if dt is not None:
         limits = path_limits(loaded) if limits is None else limits
         settings: dict[str, Any] = {k: v for k, v in vars(limits).items() if k != "source"}
-        settings |= {"q_pref": Domain(loaded, limits).preferred, "beta": min(1.0, 1.0 / dt)}
+        settings |= {"q_pref": Domain(loaded, limits).preferred}
         model = InverseKinematics(loaded.module, dt=dt, **settings)
         report.record["limits"] = vars(limits)
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")

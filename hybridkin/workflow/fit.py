@@ -198,8 +198,7 @@ class _Rows(NamedTuple):
         if settings.play != "detect":
             return self
         play = None
-        complete = not np.isnan(self.x).any()
-        if calibrated is not None and settings.auto and log.named and not log.n_late and complete:
+        if calibrated is not None and settings.auto and log.named and not log.n_late:
             model = HybridForwardModel(calibrated, "drop", play="auto")
             model.fit_with_messages(self.q, self.x, groups=self.groups)
             play = None if model.play_ is None else "auto"

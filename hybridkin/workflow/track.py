@@ -190,7 +190,7 @@ def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress)
     bounds: Any = {k: v for k, v in vars(domain.limits).items() if k != "source"}
     tracks: list[Track] = []
     for attempt, pull in enumerate(_PULLS):
-        options = {"q_pref": domain.posture(pull), "beta": min(1.0, 1.0 / dt), "dt": dt}
+        options = {"q_pref": domain.posture(pull), "dt": dt}
         ik = InverseKinematics(domain.loaded.module, **bounds, **options)
 
         def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:

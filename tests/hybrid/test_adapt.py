@@ -340,3 +340,16 @@ def test_the_warning_of_another_change_names_the_line_of_the_caller():
     with pytest.warns(UserWarning, match="has changed in a way") as caught:
         model.adapt(q, x + 0.1 * np.sin(40.0 * q[:, :3]), parameters=["base"])
     assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("gains", [1.0, -2e-5])
+def test_zeros_of_chains_with_gains_move_in_the_unit_of_q(gains):
+    plain = ConstantCurvatureChain([0.005], lengths=[0.1], gains=gains, actuator_zeros=3e-4)
+    for chain in (plain, ElasticTendonChain.from_chain(plain)):
+        q = np.random.default_rng(0).uniform(-0.003, 0.003, (30, 3)) / gains
+        shift = torch.tensor([2e-4, -1e-4, 3e-4], dtype=torch.float64) / gains
+        module = HybridModule(chain, [], shift[:0])
+        changed = AdaptedModel(module, shift, torch.eye(4, dtype=torch.float64))
+        rows = torch.from_numpy(q)
+        assert_close(changed.mechanical(rows), chain(rows + shift), rtol=0, atol=1e-12)
+        assert_close(changed(rows), chain(rows + shift), rtol=0, atol=1e-12)

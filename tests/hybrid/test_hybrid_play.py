@@ -5,7 +5,14 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from hybridkin import HybridForwardModel, InverseKinematics, PlayOperator, datasets, robots
+from hybridkin import (
+    HybridForwardModel,
+    InverseKinematics,
+    PlayOperator,
+    datasets,
+    fit_play,
+    robots,
+)
 from hybridkin.hybrid import _play
 from hybridkin.hybrid._fit import Rows, Spec
 from hybridkin.hybrid._play import choose_play, play_of
@@ -52,6 +59,21 @@ def test_the_width_is_found_and_used(log, mechanical):
     assert abs(model.play_.width - WIDTH) < (0.05 if mechanical else 0.5) * WIDTH
     without = HybridForwardModel(mechanical, random_state=0).fit(*train[:2], groups=train[2])
     assert rms(model, *test) < (0.1 if mechanical else 0.6) * rms(without, *test)
+
+
+def test_the_width_is_found_where_a_marker_is_missing(log):
+    q, _, groups = log
+    chain = CHAIN.with_markers([(1, 1.0), (2, 1.0)])
+    with torch.no_grad():
+        x = chain(torch.from_numpy(PlayOperator(WIDTH).apply_by_group(q, groups))).numpy()
+    x += 2e-4 * np.random.default_rng(1).standard_normal(x.shape)
+    x[::3, :3] = np.nan
+    rows = Rows(q, x, groups=groups)
+    assert abs(choose_play(Spec(chain, ()), rows).width - WIDTH) < 0.1 * WIDTH
+    nowhere = Rows(q, np.where(np.arange(6) < 3, np.nan, x), groups=groups)
+    assert choose_play(Spec(chain, ()), nowhere) is None
+    fitted = fit_play(chain, q, x, groups, widths=[0.5 * WIDTH, WIDTH], parameters=("radii",))
+    assert fitted.width == WIDTH
 
 
 @pytest.mark.slow

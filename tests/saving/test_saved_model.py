@@ -27,6 +27,7 @@ from torch.testing import assert_close
 
 import hybridkin
 from hybridkin import (
+    ConstantCurvatureChain,
     ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
@@ -350,6 +351,11 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     assert chosen == fitted["blend"][0].cv_results_["chosen"]
     save_model(arm(), path)
     assert model_header(path)["units"] == {"q": ["rad", "m", "rad"], "x": "m"}
+    chambers, tendons = [0.02, 0.01], {"lengths": [None, 0.1], "n_actuators": [1, 3]}
+    save_model(ConstantCurvatureChain(chambers, **tendons, stage="rotation"), path)
+    assert model_header(path)["units"]["q"] == ["rad", "m", "m", "m"]
+    save_model(ConstantCurvatureChain([0.01], lengths=[0.1], gains=2e-5), path)
+    assert model_header(path)["units"]["q"] == "as in training"
     save_model(fitted["pose_output"][0], path)
     assert model_header(path)["units"]["x"] == ["m", "m", "m", "rad", "rad", "rad"]
     with pytest.raises(TypeError, match="`training` must hold numbers"):
