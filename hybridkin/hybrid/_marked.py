@@ -40,6 +40,11 @@ class MarkedHybridModule(HybridModule):
         return cast(HybridModule, self.tips[-1])
 
     @property
+    def corrects_inside(self) -> bool:
+        """Whether a correction of the tip acts inside the robot."""
+        return self.tip_model.corrects_inside
+
+    @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
         """The plane of the log, which is that of the tip."""
         return self.tip_model.plane
@@ -61,6 +66,9 @@ class MarkedHybridModule(HybridModule):
     def _each(self, name: str, *given: object) -> list:
         """Return the result of a method for the module of every marker."""
         return [getattr(tip, name)(*given) for tip in self.tips]
+
+    def _inside(self, q: Tensor) -> None:
+        """Return None: every marker has its own."""
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         return (torch.cat(self._each("forward", q), dim=-1),)

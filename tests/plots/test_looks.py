@@ -154,6 +154,17 @@ def test_a_serial_body_ends_where_the_model_puts_the_tip(bent_inside):
     np.testing.assert_allclose(backbone.points[:, -1], film.x, atol=1e-7)
 
 
+def test_a_serial_body_with_markers_ends_at_the_last_of_them(bent_inside):
+    chain, q, _ = bent_inside
+    chain = chain.with_markers([(0, 1.0), (1, 1.0)])
+    with torch.no_grad():
+        x = chain(torch.from_numpy(1.5 * q)).numpy()
+    model = HybridForwardModel(chain, "quadratic", coupling="serial", guard=None).fit(q, x)
+    assert model.module_.corrects_inside
+    body = plots.BackboneDisplay.from_estimator(model, q[:5])
+    np.testing.assert_allclose(body.points[:, -1], model.predict(q[:5])[:, 3:], atol=1e-7)
+
+
 def test_films_show_names_of_actuators_and_the_error_to_expect():
     chain = robots.bionic_handling_assistant()
     q, names = np.full((4, 9), 0.25), [f"chamber {i}" for i in range(9)]
