@@ -1,6 +1,5 @@
 """Errors of the disk name the file that was to be written, and leave what was there."""
 
-import contextlib
 import errno
 import os
 import shutil
@@ -9,29 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_files import small_files
 
 from hybridkin import native, plots, robots, save_model
 from hybridkin._core.files import write_file, write_files
 from hybridkin.workflow.report import Report
-from paper import trunk_data
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as of a call that knows no name
 
 
 def fails(path):
     raise FULL
-
-
-@contextlib.contextmanager
-def small_files():
-    """Let writes beyond 600 bytes of a file fail, as on a full disk."""
-    resource = pytest.importorskip("resource")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (600, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_a_file_on_a_full_disk(tmp_path):
@@ -113,11 +100,6 @@ def table(out):
     written.write(out)
 
 
-def chunk(folder):
-    made = {"random_state": 0, "plant": {}}
-    trunk_data._kept(folder, np.arange(20), np.zeros((20, 9)), np.zeros(20), made)
-
-
 @pytest.mark.parametrize(
     ("write", "name", "failing"),
     [
@@ -125,16 +107,13 @@ def chunk(folder):
         (partial(native.export_c, CHAIN), "code", "code/model.h"),
         (report, "out", "out/report.md"),
         (table, "out", "out/next.csv"),
-        (chunk, "checkpoint", "checkpoint/rows-"),
         pytest.param(film, "film.gif", "film.gif", marks=pytest.mark.slow),
         pytest.param(film, "film.html", "film.html", marks=pytest.mark.slow),
     ],
 )
-def test_every_writer_names_the_file_that_does_not_fit(tmp_path, monkeypatch, write, name, failing):
+def test_every_writer_names_the_file_that_does_not_fit(tmp_path, write, name, failing):
     if name.endswith("html"):
         pytest.importorskip("plotly")
-    result = np.zeros((20, 9)), np.zeros((20, 3)), np.zeros((20, 9)), []
-    monkeypatch.setattr(trunk_data, "_measure", lambda *_: result)
     with small_files(), pytest.raises(OSError, match="too large") as caught:
         write(tmp_path / name)
     assert caught.value.filename.startswith(str(tmp_path / failing))

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from small_files import small_files
 
 from hybridkin.datasets import load_trunk
 from paper import NotSettledError, TrunkPlant, make_trunk, paper_protocol, trunk_data
@@ -184,3 +185,13 @@ def test_a_damaged_checkpoint_is_made_again_and_runs_nothing(tmp_path):
 def test_commands_that_are_no_numbers_are_refused_by_name(value):
     with pytest.raises((TypeError, ValueError), match="`q_target`"):
         make_trunk(value)
+
+
+def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, monkeypatch):
+    result = np.zeros((20, 9)), np.zeros((20, 3)), np.zeros((20, 9)), []
+    monkeypatch.setattr(trunk_data, "_measure", lambda *_: result)
+    made = {"random_state": 0, "plant": {}}
+    with small_files(), pytest.raises(OSError, match="too large") as caught:
+        trunk_data._kept(tmp_path, np.arange(20), np.zeros((20, 9)), np.zeros(20), made)
+    assert caught.value.filename.startswith(str(tmp_path / "rows-"))
+    assert [*tmp_path.iterdir()] == []
