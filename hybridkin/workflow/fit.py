@@ -233,6 +233,7 @@ def compare_by_group(
     Whole motions are held out. In each fold, a second cross-validation over the training motions,
     with its own calibrations, chooses ridge penalty and guard of the networks, and all settings of
     ``error_model="auto"``. The prediction for a motion therefore never uses data of this motion.
+    With `play` "detect" one choice is made on all motions: whether the folds look for backlash.
 
     Parameters
     ----------
