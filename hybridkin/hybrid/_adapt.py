@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,16 +11,12 @@ from numpy.typing import NDArray
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.rotations import cross_matrix, rotation, rotation_vector
-from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import MISFITS, SWITCH, too_far
-from hybridkin.hybrid._fit import FittedHybrid, Rows, residuals
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
-from hybridkin.hybrid._readout_fit import ReadoutFit
-from hybridkin.learning.elm import ELMRegressor
-from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import evaluate
 
 PARAMETERS = ("base", "actuator_zeros")
@@ -30,10 +25,7 @@ _COMMON = 0.5  # share of the variance of a row that its whole group shares
 _ROUNDS, _CHOOSING = 30, 6  # Gauss-Newton rounds; the first ones also choose the scales
 _SETTLED = 1e-9
 _LARGE = 3.0  # ratio of remaining errors to those of the fit that gives a warning
-_MEAN_LENGTH = 1.596  # mean length of a standard normal vector with three coordinates
-_MOST = 2000  # rows whose errors give the noise of a fit without held-out errors
 _SINGULAR = np.linalg.LinAlgError, torch.linalg.LinAlgError  # pyright: ignore
-_LEAST = 0.2  # assumed lower limit of training errors, as a share of the errors before learning
 
 
 def adapted(
@@ -122,41 +114,6 @@ def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
             f"`parameters` must be ['actuator_zeros'] for this `y`, got {parameters!r}: 'base' "
             "needs tips with three coordinates, or poses."
         )
-
-
-def held_out_noise(error: Any, cv_results: dict[str, Any] | None) -> float:
-    """Return the standard deviation of one error coordinate on held-out rows [m].
-
-    NaN if neither the fitted error model nor the scores of candidates give it.
-    """
-    if cv_results is not None:
-        return float(cv_results["expected_distance"]) / _MEAN_LENGTH
-    if isinstance(error, ReadoutFit):
-        return error.rmse / points(error.residual).shape[2] ** 0.5
-    if type(error) is tuple:  # one for each marker
-        return float(np.sqrt(np.mean([held_out_noise(one, None) ** 2 for one in error])))
-    known = isinstance(error, ELMRegressorCV)
-    return float(np.sqrt(np.nanmean(np.square(error.left_out_errors_)))) if known else np.nan
-
-
-def training_noise(fitted: FittedHybrid, rows: Rows, output: str) -> float:
-    """Return the standard deviation of one error coordinate on training rows [m].
-
-    For an ELMRegressor these are leave-one-out errors. Other regressors may overfit the rows, so
-    their errors count as at least a share of the errors before learning.
-    """
-    error, rows = fitted.error_model, rows.take(np.arange(0, len(rows.X), 1 + len(rows.X) // _MOST))
-    before = residuals(fitted.mechanical, rows.q, rows.y, output).reshape(rows.tips.shape)
-    with torch.no_grad():
-        after = before - fitted.module.error_part(rows.q).numpy()
-        if isinstance(error, ELMRegressor):
-            own = rows.counts * error.module_.leverage(rows.q).numpy()
-            after /= np.maximum(1.0 - own, 1e-3)[:, None]
-    squares = np.ma.masked_invalid(after**2)  # without missing markers
-    mean_squares = [np.ma.average(squares, axis=0, weights=rows.counts).mean()]
-    if error is not None and not isinstance(error, ELMRegressor):
-        mean_squares.append(_LEAST**2 * np.nanvar(before, axis=0).mean())
-    return float(max(mean_squares) ** 0.5)
 
 
 class _Problem:

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from math import inf
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, clone
-from sklearn.kernel_ridge import KernelRidge
-from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 
 from hybridkin._core.arrays import countable
-from hybridkin._core.blocks import in_blocks
-from hybridkin._core.directions import moved_directions
-from hybridkin._core.distinct import at_place, distinct_rows
+from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.model import ForwardModel, PoseModel
-from hybridkin._core.turns import TURNS
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry, unmoved
@@ -29,97 +21,15 @@ from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._drift import too_far
-from hybridkin.hybrid._features import (
-    Features,
-    HiddenFeatures,
-    PoseFeatures,
-    Projected,
-    QuadraticFeatures,
-)
-from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
-from hybridkin.hybrid._kernel import tuned_kernel
-from hybridkin.hybrid._linearised import Pair
+from hybridkin.hybrid._error_models import ErrorModel, FittedError, PerMarker, Residuals
+from hybridkin.hybrid._guards import GroupDistance, Plane
 from hybridkin.hybrid._marked import MarkedHybridModule
-from hybridkin.hybrid._module import Correction, HybridModule, InnerCorrection, TipCorrection
+from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
-from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
-from hybridkin.learning.elm import ELMRegressor, draw_layer
-from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.learning.regressor_modules import error_module
+from hybridkin.hybrid._rows import Rows, rare_marker
 
 _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
-
-
-class Rows(NamedTuple):
-    """Measured rows in the form that an estimator gets."""
-
-    X: NDArray  # (N, n) actuator vectors, float64 or float32
-    y: NDArray  # (N, m) or (N,) [m]
-    weights: NDArray | None = None  # (N,), number of times each row counts
-    groups: NDArray | None = None  # (N,), motion of every row
-
-    @property
-    def q(self) -> Tensor:
-        """Actuator vectors (N, n) in double precision."""
-        return torch.from_numpy(self.X.astype(np.float64))
-
-    @property
-    def tips(self) -> NDArray:
-        """Measured tips as a matrix (N, m) [m]."""
-        return self.y.reshape(len(self.y), -1)
-
-    @property
-    def counts(self) -> NDArray:
-        """Number of times each row counts, (N,)."""
-        return np.ones(len(self.X)) if self.weights is None else self.weights
-
-    def take(self, rows: NDArray) -> Rows:
-        """Return some of the rows."""
-        return Rows(*(None if part is None else part[rows] for part in self))  # pyright: ignore
-
-    def marker(self, k: int) -> Rows:
-        """Return the rows in which marker k was measured, with only its positions as tips."""
-        tips = self.tips[:, 3 * k : 3 * k + 3]
-        measured = np.flatnonzero(~np.isnan(tips[:, 0]))
-        if not len(measured):
-            raise _rare_marker(k)
-        return self._replace(y=tips).take(measured)
-
-    def distinct(self, runs: bool = False) -> tuple[Rows, NDArray]:
-        """Return the different rows, and the place of every row in them, see `distinct_rows`."""
-        first, weights, place = distinct_rows(self.X, self.y, self.weights, self.groups, runs)
-        return self.take(first)._replace(weights=weights), place
-
-
-def _rare_marker(k: int) -> ValueError:
-    """Return the error for a marker that too few rows hold."""
-    return ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")
-
-
-class NamedFeatures(NamedTuple):
-    """An error model by the name of its features, with its penalties if they are chosen."""
-
-    kind: str  # "linear", "quadratic" or "pose"
-    alphas: Pair | None = None
-    noise_ratio: float = inf
-
-
-class Part(NamedTuple):
-    """One error model of a hybrid, its coupling and its weight."""
-
-    weight: float
-    coupling: str  # "parallel" or "serial"
-    # Names are "drop" and "kernel". A fitted readout is used unchanged. With several markers and
-    # parallel coupling, a tuple holds one error model per marker.
-    error_model: NamedFeatures | BaseEstimator | str | ReadoutFit | tuple[Any, ...]
-
-
-class Blend(NamedTuple):
-    """Several fitted error models; the result is the weighted mean of their hybrids."""
-
-    weights: tuple[float, ...]
-    error_models: tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -127,7 +37,7 @@ class Spec:
     """Specification of a fit: the resolved settings of a HybridForwardModel."""
 
     mechanical: ForwardModel | None
-    parts: tuple[Part, ...]  # empty: not chosen yet, see `select`
+    error_model: ErrorModel | None = None  # None: not chosen yet, see `select`
     calibrate: tuple[str, ...] | str = ()  # geometry to calibrate, or "auto"
     guard: str | None = "leverage"
     output: str = "position"
@@ -136,6 +46,12 @@ class Spec:
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
     left_out: bool = True  # whether held-out residuals are computed as well
+    commanded: Directions | None = None  # of the commands, with backlash between them and rows
+
+    @property
+    def learns(self) -> bool:
+        """Whether anything is learned beside the calibration."""
+        return self.error_model is None or self.error_model.learns
 
 
 class FittedHybrid(NamedTuple):
@@ -143,7 +59,7 @@ class FittedHybrid(NamedTuple):
 
     mechanical: ForwardModel | None
     calibration: CalibrationResult | None
-    error_model: Any  # fitted estimator, ReadoutFit, Blend or None
+    error: FittedError
     module: HybridModule
     messages: tuple[str, ...]
 
@@ -154,65 +70,59 @@ class FittedHybrid(NamedTuple):
 
 
 def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
-    """Return the hybrid: the calibrated mechanical model and error models of its residuals.
+    """Return the hybrid: the calibrated mechanical model and the error model of its residual.
 
     A pure function: it does not change its arguments and issues no warning.
+
+    Parameters
+    ----------
+    spec : Spec
+        With an error model.
+    rows : Rows
+        Different rows.
     """
     spec = calibrated(spec, rows, rows.groups)
-    distinct, place = rows.distinct()
-    error = residuals(spec.mechanical, distinct.q, distinct.y, spec.output)
+    error = residuals(spec.mechanical, rows.q, rows.y, spec.output)
+    left = Residuals(rows, error, spec.mechanical, spec.guard, spec.left_out)
     tips = spec.mechanical.tips() if isinstance(spec.mechanical, ArcChain) else []
     if spec.mechanical is None and np.isnan(error).any():
         tips = [None] * points(error).shape[1]
     if len(tips) > 1:
-        return _fit_markers(spec, tips, rows)
-    errors = distinct._replace(y=error)
-    fits = [_fit_part(part, spec, rows, errors, place) for part in spec.parts]
-    weights = tuple(part.weight for part in spec.parts)
-    error_model = fits[0][0] if len(fits) == 1 else Blend(weights, tuple(one for one, _ in fits))
-    shares = [w for w, (_, found) in zip(weights, fits, strict=True) if found is not None]
-    corrections = [found for _, found in fits if found is not None]
-    kind = PoseHybridModule if spec.output == "pose" else HybridModule
+        return _fit_markers(spec, tips, left)
+    assert spec.error_model is not None
+    fitted = spec.error_model.fit(left)
+    corrections = [correction for _, correction in fitted.corrections]
     tested = plane = None
-    directions = moved_directions(errors.X)
-    if not directions.moved.size or any(part.error_model != "drop" for part in spec.parts):
-        guarded = any(found.guard is not None for found in corrections)
-        plane = Plane.of_log(spec.mechanical, errors.q, directions)
-        groups = errors.groups if guarded else None
-        tested = GroupDistance.of_log(errors.q, groups, directions, plane)
-    weights = rows.q.new_tensor(shares)
+    directions = left.directions
+    if spec.learns or not directions.moved.size:
+        guarded = any(correction.guard is not None for correction in corrections)
+        # Backlash moves actuators off the plane of their commands, but only by its width.
+        plane = Plane.of_log(spec.mechanical, rows.q, spec.commanded or directions)
+        groups = rows.groups if guarded else None
+        tested = GroupDistance.of_log(rows.q, groups, directions, plane)
+    kind = PoseHybridModule if spec.output == "pose" else HybridModule
+    weights = rows.q.new_tensor([weight for weight, _ in fitted.corrections])
     module = kind(spec.mechanical, corrections, weights, None, tested, plane)
-    return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
+    return FittedHybrid(spec.mechanical, spec.calibration, fitted, module, spec.messages)
 
 
-def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], rows: Rows) -> FittedHybrid:
-    """Return the hybrid of several markers, each fitted to the rows in which it was measured.
-
-    A serial error model is learned once from all markers, a parallel one for each marker.
-    """
-    joint: list[Part] = []
-    for part in spec.parts:
-        if spec.mechanical is not None and part.coupling == "serial" and part.error_model != "drop":
-            own = part._replace(error_model=_of_marker(part.error_model, 0))
-            q = rows.distinct()[0].q
-            found = _fit_features(own, spec.mechanical, rows, q, spec.left_out)
-            part = part._replace(error_model=found)
-        joint.append(part)
+def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], left: Residuals) -> FittedHybrid:
+    """Return the hybrid of several markers, each fitted to the rows in which it was measured."""
+    assert spec.error_model is not None
+    models = spec.error_model.for_markers(left, tips)
     fits = []
-    for k, tip in enumerate(tips):
-        parts = tuple(p._replace(error_model=_of_marker(p.error_model, k, tip)) for p in joint)
-        fits.append(fit_hybrid(replace(spec, mechanical=tip, parts=parts), rows.marker(k)))
-    errors = tuple(one.error_model for one in fits)
-    module = MarkedHybridModule(spec.mechanical, [one.module for one in fits])
-    error_model = None if errors[0] is None else errors
-    return FittedHybrid(spec.mechanical, spec.calibration, error_model, module, spec.messages)
-
-
-def _of_marker(error_model: Any, k: int, tip: ArcChain | None = None) -> Any:
-    """Return the error model of marker k; a serial one is cut to the arcs of the marker's chain."""
-    if isinstance(error_model, ReadoutFit) and tip is not None:
-        return error_model._replace(readout=error_model.readout.up_to(tip))
-    return error_model[k] if type(error_model) is tuple else error_model
+    for k, (tip, model) in enumerate(zip(tips, models, strict=True)):
+        marker = replace(spec, mechanical=tip, error_model=model)
+        fits.append(fit_hybrid(marker, left.rows.marker(k)))
+    module = MarkedHybridModule(spec.mechanical, [fit.module for fit in fits])
+    results = tuple(fit.error.result for fit in fits)
+    fitted = FittedError(
+        None if results[0] is None else results,
+        (),
+        PerMarker([fit.error.settled for fit in fits]),
+        float(np.sqrt(np.mean([fit.error.noise**2 for fit in fits]))),
+    )
+    return FittedHybrid(spec.mechanical, spec.calibration, fitted, module, spec.messages)
 
 
 def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
@@ -221,7 +131,7 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
     The rms of 20 held-out errors has a relative standard error of about one sixth.
     """
     n_rows, n = rows.X.shape
-    learned = not spec.parts or spec.parts[0].error_model != "drop"
+    learned = spec.learns
     least = 1 + bool(learned or spec.calibrate) + (coverage is not None)
     if n_rows < least:
         raise ValueError(
@@ -236,7 +146,7 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
         )
     measured = (~np.isnan(points(rows.tips)[:, :, 0])).sum(axis=0)
     if measured.min() < min(2, n_rows):
-        raise _rare_marker(int(measured.argmin()))
+        raise rare_marker(int(measured.argmin()))
     if not learned:
         return []
     moved = moved_directions(rows.X).moved
@@ -259,7 +169,7 @@ def with_geometry_chosen(spec: Spec, rows: Rows, geometry: GeometryChoice | None
 
     For a list and error_model="auto", the choice is between a plain chain and elastic tendons.
     """
-    if not spec.calibrate or (spec.parts and spec.calibrate != "auto"):
+    if not spec.calibrate or (spec.error_model is not None and spec.calibrate != "auto"):
         return spec
     if geometry is None:
         geometry = choose_geometry(
@@ -268,7 +178,7 @@ def with_geometry_chosen(spec: Spec, rows: Rows, geometry: GeometryChoice | None
             _positions(spec, rows),
             groups=rows.groups,
             weights=rows.weights,
-            outside=not spec.parts or spec.parts[0].error_model != "drop",
+            outside=spec.learns,
             parameters=None if spec.calibrate == "auto" else spec.calibrate,
         )
     return replace(
@@ -327,110 +237,6 @@ def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: st
             f"shape {y.shape}."
         )
     return y - tips.reshape(y.shape)
-
-
-def _fit_part(
-    part: Part, spec: Spec, rows: Rows, errors: Rows, place: NDArray
-) -> tuple[Any, Correction | None]:
-    """Return the fitted error model and its guarded correction."""
-    model, mechanical, q = part.error_model, spec.mechanical, errors.q
-    if model == "drop":
-        return None, None
-    directions = moved_directions(errors.X)
-    if mechanical is not None and not directions.moved.size:
-        return None, None
-    matrix, offset = directions.projection()
-    serial = part.coupling == "serial"
-    if mechanical is not None and (serial or isinstance(model, NamedFeatures)):
-        known = model if isinstance(model, ReadoutFit) else None  # of several markers
-        fitted = known or _fit_features(part, mechanical, rows, q, spec.left_out)
-        module: ForwardModel = fitted.readout
-    else:
-        seen = errors  # as the model sees them; random weights have a slope in all directions
-        if directions.still.size:
-            X = errors.X @ matrix + offset
-            seen = errors._replace(X=X.astype(errors.X.dtype))
-        fitted = _fit_regressor(model, rows, seen, place)
-        module = error_module(fitted, seen.q)
-    if directions.still.size:
-        module = Projected(module, torch.from_numpy(matrix), torch.from_numpy(offset))
-    if mechanical is None:
-        # No guard: no mechanical model remains where eps fades out.
-        return fitted, TipCorrection(module)
-    correction = InnerCorrection(mechanical, module) if serial else TipCorrection(module)
-    alone = HybridModule(mechanical, [correction], q.new_ones(1))
-    with torch.no_grad():
-        (found,) = in_blocks(lambda rows: (alone.error_part(rows),), q)
-        correction.guard = fit_guard(spec.guard, found, module, q, errors.counts)
-    return fitted, correction
-
-
-def _fit_regressor(model: Any, given_rows: Rows, rows: Rows, place: NDArray) -> Any:
-    """Return the regressor fitted to the residuals of the different rows."""
-    if isinstance(model, str):  # "kernel"
-        model = tuned_kernel(rows.X, rows.y, rows.counts, rows.groups)
-    elif not isinstance(model, (ELMRegressor, ELMRegressorCV)):  # is fitted to the given rows
-        kept = np.flatnonzero(given_rows.counts)
-        rows = rows.take(place[kept])._replace(weights=given_rows.take(kept).weights)
-    given = {} if rows.weights is None else {"sample_weight": rows.weights}
-    if rows.groups is not None and has_fit_parameter(model, "groups"):
-        given["groups"] = rows.groups
-    regressor: Any = clone(model)
-    with TURNS.filters if isinstance(regressor, KernelRidge) else nullcontext():
-        fitted = regressor.fit(rows.X, rows.y, **given)
-    if isinstance(fitted, ELMRegressorCV):
-        fitted.left_out_errors_ = at_place(fitted.left_out_errors_, place)
-    return fitted
-
-
-def _fit_features(
-    part: Part, mechanical: ForwardModel, rows: Rows, q: Tensor, left_out: bool
-) -> ReadoutFit:
-    """Return the readout of named features, or of the hidden layer of an ELM.
-
-    The `alpha` of an ELMRegressor is the penalty; for an ELMRegressorCV the penalties are chosen.
-    """
-    model = part.error_model
-    if isinstance(model, NamedFeatures):
-        features, alphas, noise_ratio = _named(model.kind, mechanical, q), *model[1:]
-    else:
-        features, alphas = _hidden(cast("ELMRegressor | ELMRegressorCV", model), q)
-        noise_ratio = inf
-    x = torch.from_numpy(rows.tips)
-    weight = None if rows.weights is None else torch.from_numpy(rows.weights)
-    given = rows.q, x, part.coupling, weight, rows.groups
-    try:
-        return fit_readout(mechanical, features, *given, alphas, noise_ratio, left_out)
-    except torch.linalg.LinAlgError as error:  # pyright: ignore
-        raise too_far() from error
-
-
-def _named(kind: str, mechanical: ForwardModel, q: Tensor) -> Features:
-    if kind != "pose":
-        return (QuadraticFeatures if kind == "quadratic" else Features).of_range(q)
-    if not isinstance(mechanical, ArcChain):
-        raise TypeError(
-            "`mechanical_model` must be a chain of arcs with error_model='pose', got "
-            f"{type(mechanical).__name__}; use error_model='quadratic'."
-        )
-    return PoseFeatures.of_range(q, mechanical)
-
-
-def _hidden(model: ELMRegressor | ELMRegressorCV, q: Tensor) -> tuple[Features, Pair | None]:
-    params, alphas = model, None
-    if isinstance(model, ELMRegressorCV):
-        n_hidden, seed = int(np.max(model.n_hidden)), model.random_state
-        params = ELMRegressor(n_hidden, activation=model.activation, random_state=seed)
-    elif np.ndim(model.alpha):
-        raise ValueError(
-            "`alpha` of the error model must be one number with coupling='serial', got "
-            f"{model.alpha!r}: coordinates inside the robot do not correspond to single outputs."
-        )
-    else:
-        alphas = float(model.alpha), float(model.alpha)
-    layer = draw_layer(params, q.numpy(), None)
-    inner = layer.input_weights, layer.input_bias, layer.activation
-    return HiddenFeatures.of_range(q, *inner), alphas
 
 
 def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:

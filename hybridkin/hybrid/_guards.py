@@ -297,14 +297,15 @@ class GroupDistance(PortableModule):
         domain; off the plane, only steps of a hundredth. None if there is nothing to measure.
         """
         tested = None if groups is None else cls.fit(q, groups)
-        if not directions.still.size:
+        if not directions.still.size and plane is None:
             return tested
         if tested is None:
             tested = cls(q.mean(0)[None], q[:0].mT, q.new_tensor(_STEP))
-        axes = torch.from_numpy(directions.still / directions.scale[:, None])
-        axes = [tested.axes, axes * (tested.farthest / _STEP)]
+        scale = torch.from_numpy(directions.scale)[:, None]
+        still = torch.from_numpy(directions.still) / scale
+        axes = [tested.axes, still * (tested.farthest / _STEP)]
         if plane is not None:
-            half_ranges = (torch.from_numpy(directions.scale)[:, None] * plane.normals).norm(dim=0)
+            half_ranges = (scale * plane.normals).norm(dim=0)
             off = half_ranges * _OFF + _AS_LOGGED * plane.distances(q).square().mean(0).sqrt()
             axes.append(plane.normals * (tested.farthest / off))
         return cls(tested.rows, torch.cat(axes, 1), tested.farthest)

@@ -18,7 +18,7 @@ _HELD_OUT = (ReadoutFit, ELMRegressor, ELMRegressorCV)  # their errors are those
 def fitted_rows(model: Any) -> dict[str, object]:
     """Return names and values of what the fit of a hybrid found, for `html_table`."""
     mechanical, found, play = model.mechanical_model_, model.calibration_, model.play_
-    known, fitted = model._fitted_rows, model.module_.fitted
+    fitted = model.module_.fitted
     changed = fitted is not model.module_ or fitted.drift is not None
     domain = {None: "everywhere (no guard)", "box": "the training range of q"}
     domain = domain.get(model.guard, "close to the training rows (guard by leverage)")
@@ -28,7 +28,7 @@ def fitted_rows(model: Any) -> dict[str, object]:
         "calibrated": _calibrated(model),
         "error model": _error_model(model),
         **_error(model),
-        "training rows": None if known is None else f"{len(known)} different rows",
+        "training rows": f"{len(model._fitted_rows)} different rows",
         "domain": domain + ", as far as held-out groups tested it" * (fitted.tested is not None),
         "radius": None if model.radius_ is None else _radius(model),
         "backlash": None if play is None else f"{numbers(play.width)} (unit of q)",

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
 
 from hybridkin.chains.play import PlayOperator
-from hybridkin.hybrid._fit import Rows, Spec, calibrated, residuals
+from hybridkin.hybrid._fit import Spec, calibrated, residuals
+from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _LEAST = 0.0025  # first width, relative to the stroke
@@ -68,7 +69,9 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     rows : Rows
         The log, with the rows of each motion in order of time.
     """
-    X, y, _, groups = rows
+    X = rows.X
+    y = rows.y
+    groups = rows.groups
     motions = np.zeros(len(X)) if groups is None else groups
     strokes = np.subtract(*np.percentile(X, (95, 5), axis=0))
     least = _LEAST * float(np.median(strokes[strokes > 0.0])) if strokes.any() else 0.0

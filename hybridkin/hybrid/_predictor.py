@@ -20,10 +20,11 @@ from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapted import AdaptedModel
-from hybridkin.hybrid._fit import Rows, known_tips
+from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._radius import Radius
+from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 

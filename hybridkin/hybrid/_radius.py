@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from hybridkin.calibration.measured import distances, folds
 from hybridkin.hybrid._drift import too_far
-from hybridkin.hybrid._fit import Rows, Spec, fit_hybrid, with_geometry_chosen
+from hybridkin.hybrid._fit import Spec, fit_hybrid, with_geometry_chosen
+from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import select
 
 _ROUNDING = 1e-9  # rounding error of shares
@@ -49,16 +50,16 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
     groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
     spec = replace(spec, left_out=False)
-    given = rows.take(rows.counts > 0)
-    rows, place = given.distinct()
     X, y = rows.X, rows.tips
     groups = np.arange(len(y)) if rows.groups is None else rows.groups
     inside, errors = np.zeros(len(y), dtype=bool), np.full(len(y), np.nan)
     for train, test in folds(X, rows.groups):
-        part = given.take(np.isin(place, train))
+        part = rows.take(train)
         if part.groups is not None and len(np.unique(part.groups)) == 1:
-            part = part._replace(groups=None)  # of a single motion, rows are held out
-        chosen = spec if spec.parts else select(with_geometry_chosen(spec, part), part, part)[0]
+            part = replace(part, groups=None)  # of a single motion, rows are held out
+        chosen = spec
+        if spec.error_model is None:
+            chosen = select(with_geometry_chosen(spec, part), part)[0]
         module = fit_hybrid(chosen, part).module
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():

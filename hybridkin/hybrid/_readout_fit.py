@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
-from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Restore, Stored
 from hybridkin.calibration.measured import points
@@ -22,6 +21,7 @@ from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
+from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import Program, program_of
 from hybridkin.native.plan import Plan
 
@@ -101,11 +101,8 @@ def _at_tip(z: Tensor) -> tuple[Tensor, Tensor]:
 def fit_readout(
     mechanical: ForwardModel,
     features: Features,
-    q: Tensor,
-    x: Tensor,
+    rows: Rows,
     coupling: str = "serial",
-    sample_weight: Tensor | None = None,
-    groups: ArrayLike | None = None,
     alphas: Pair | None = None,
     noise_ratio: float = inf,
     left_out: bool = True,
@@ -127,17 +124,11 @@ def fit_readout(
         f, with inner coordinates z and F(z(q)) = f(q).
     features : Features
         phi; the part of its other features that the linear ones explain is subtracted.
-    q : Tensor of shape (N, n)
-        Actuator vectors.
-    x : Tensor of shape (N, m)
-        Measured tips [m], NaN for missing markers, whose residual is zero.
+    rows : Rows
+        Different rows; tips are NaN for missing markers, whose residual is zero. Whole groups are
+        held out, without groups single rows. The residual of a given row of weight 0 is NaN.
     coupling : {"serial", "parallel"}, default="serial"
         Whether W phi(q) is added to the inner coordinates, or to the tip.
-    sample_weight : Tensor of shape (N,), optional
-        Number of times each row counts; equal rows are held out together. The residual of a row
-        of weight 0 is NaN.
-    groups : array-like of shape (N,), optional
-        Motion of every row; whole motions are held out. Default: single rows.
     alphas : tuple of two floats, optional
         The penalties; infinity: without these features. Default: those with the least held-out
         error, which the linearised problem gives exactly without another fit.
@@ -152,24 +143,33 @@ def fit_readout(
     ReadoutFit
         The readout with its penalties and held-out residuals.
     """
-    q, x = q.detach().double(), x.detach().double()
-    first, counts, place = distinct_rows(q, x, sample_weight, groups)
-    weight = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
-    members = None if groups is None else _linearised.members_of(np.asarray(groups)[first])
-    members = members if left_out or alphas is None else []
+    x = torch.from_numpy(rows.tips.astype(np.float64))
+    weight = torch.from_numpy(rows.counts.astype(np.float64))
+    members: list[Tensor] | None = None
+    if not left_out and alphas is not None:
+        members = []
+    elif rows.groups is not None:
+        members = _linearised.members_of(rows.groups)
     with torch.no_grad():
-        problem = _Problem(mechanical, features, q[first], x[first], weight, coupling == "serial")
+        problem = _Problem(mechanical, features, rows.q, x, weight, coupling == "serial")
         if alphas is not None:
-            found = _fitted(problem.in_noise(noise_ratio), members, alphas)
+            fit = _fitted(problem.in_noise(noise_ratio), members, alphas)
         else:
-            found = _chosen(problem, members)
-            noise_ratio = problem.likeliest_ratio(torch.from_numpy(found.residual))
-            if noise_ratio < inf:
-                other = _chosen(problem.in_noise(noise_ratio), members, found.alphas)
-                if problem.mean_distance(other.residual) < problem.mean_distance(found.residual):
-                    found = other
-    rmse = problem.mean_distance(found.residual, 2) ** 0.5
-    return found._replace(residual=at_place(found.residual, place), rmse=rmse)
+            fit = _chosen_with_noise(problem, members)
+    rmse = problem.mean_distance(fit.residual, 2) ** 0.5
+    return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
+
+
+def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> ReadoutFit:
+    """Return the fit with chosen penalties, in metres or in units of the actuators' noise."""
+    fit = _chosen(problem, members)
+    noise_ratio = problem.likeliest_ratio(torch.from_numpy(fit.residual))
+    if noise_ratio == inf:
+        return fit
+    in_noise = _chosen(problem.in_noise(noise_ratio), members, fit.alphas)
+    if problem.mean_distance(in_noise.residual) < problem.mean_distance(fit.residual):
+        return in_noise
+    return fit
 
 
 def _chosen(

@@ -9,16 +9,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import clone
-from sklearn.kernel_ridge import KernelRidge
 
 from hybridkin.calibration.choice import Errors
 from hybridkin.calibration.measured import distance, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.hybrid._fit import NamedFeatures, Part, Rows, Spec, calibrated, fit_hybrid
+from hybridkin.hybrid._error_models import (
+    ErrorModel,
+    KernelModel,
+    NamedFeatures,
+    NetworkModelCV,
+    NoCorrection,
+    WeightedModels,
+)
+from hybridkin.hybrid._fit import Spec, calibrated, fit_hybrid
 from hybridkin.hybrid._kernel import folds_of
-from hybridkin.hybrid._readout_fit import ReadoutFit
-from hybridkin.learning.elm import ELMRegressor
+from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _PICKS = 10  # picks of a blend; each is a weight of 0.1
@@ -32,7 +37,6 @@ _ANEW = 5  # folds without which penalties are then chosen once more
 def select(
     spec: Spec,
     rows: Rows,
-    given: Rows,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Spec, dict[str, Any]]:
     """Return the specification with the error model of least held-out error, or a blend.
@@ -47,8 +51,8 @@ def select(
     ----------
     spec : Spec
         With the geometry chosen, but not yet calibrated.
-    rows, given : Rows
-        The different rows, and all as they were given.
+    rows : Rows
+        Different rows.
     progress : callable, optional
         Called with (done, total) before every candidate.
 
@@ -63,44 +67,43 @@ def select(
     fold_of = np.empty(len(y), dtype=int)
     for k, (_, test) in enumerate(folds):
         fold_of[test] = k
-    weighed = rows._replace(weights=counts, groups=None)
+    weighed = replace(rows, groups=None)
     # A single held-out motion has similar ones in training; folds of motions are a harder test.
-    by_fold = weighed._replace(groups=None if rows.groups is None else fold_of)
+    by_fold = replace(rows, groups=None if rows.groups is None else fold_of)
     splits = [*folds, inner_and_outer(rows.X)]
     parts = [weighed.take(train) for train, _ in splits]
     alone = [calibrated(replace(spec, left_out=False), part) for part in parts]
-    geometry, spec = spec.geometry, calibrated(spec, given)  # its warnings count the given rows
+    geometry = spec.geometry
+    spec = calibrated(spec, rows)
     candidates = _candidates(spec)
     if len(y) > _MOST:
         del candidates["parallel kernel"]
-    settled: list[Part] = []
+    settled: list[ErrorModel] = []
     tests = np.concatenate([test for _, test in splits])
     predicted = np.empty((len(candidates), len(tests), y.shape[1]))
     for i, candidate in enumerate(candidates.values()):
         if progress is not None:
             progress(i, len(candidates))
-        fitted = fit_hybrid(replace(spec, parts=(candidate,)), by_fold)
-        part = candidate._replace(error_model=_settled(candidate.error_model, fitted.error_model))
-        settled.append(part)
-        predicted[i] = np.concatenate(
-            [
-                fit_hybrid(replace(one, parts=(part,)), known).predict(rows.X[test])
-                for one, known, (_, test) in zip(alone, parts, splits, strict=True)
-            ]
-        )
+        fitted = fit_hybrid(replace(spec, error_model=candidate), by_fold)
+        settled.append(fitted.error.settled)
+        held_out = []
+        for fold_spec, training_rows, (_, test) in zip(alone, parts, splits, strict=True):
+            fold_fit = fit_hybrid(replace(fold_spec, error_model=settled[-1]), training_rows)
+            held_out.append(fold_fit.predict(rows.X[test]))
+        predicted[i] = np.concatenate(held_out)
     # Held-out rows first, in the order of the log; then the outer ones.
     order = np.concatenate([np.argsort(tests[: len(y)]), np.arange(len(y), len(tests))])
-    held_out = _HeldOut.of(predicted[:, order], rows, fold_of, splits[-1][1])
-    shares, results = _chosen([*candidates], held_out, rows)
+    held_out_rows = _HeldOut.of(predicted[:, order], rows, fold_of, splits[-1][1])
+    shares, results = _chosen([*candidates], held_out_rows, rows)
     few = len(y) < _FEW_ROWS
     if rows.groups is not None:
         few = len(np.unique(rows.groups)) < _FEW_MOTIONS
     if spec.left_out and few and len(folds) > 2 and shares[0] < 1.0:
         without_penalties = _blend(candidates.values(), shares)
-        known = np.tensordot(shares, held_out.predicted, 1)
+        known = np.tensordot(shares, held_out_rows.predicted, 1)
         before = after = 0.0
         for one, (train, test) in zip(alone[:_ANEW], folds, strict=False):
-            anew = fit_hybrid(replace(one, parts=without_penalties), by_fold.take(train))
+            anew = fit_hybrid(replace(one, error_model=without_penalties), by_fold.take(train))
             before += counts[test] @ distance(known[test], y[test])
             after += counts[test] @ distance(anew.predict(rows.X[test]), y[test])
         results["expected_distance"] *= float(after / before)
@@ -108,13 +111,18 @@ def select(
     own = {name: Errors(*(float(results[key][0]) for key in ("mean_distance", "io_distance")))}
     results["parameters"] = name
     results["mechanical_model"] = {n: one.known() for n, one in (errors or own).items()}
-    return replace(spec, parts=_blend(settled, shares)), results
+    return replace(spec, error_model=_blend(settled, shares)), results
 
 
-def _blend(parts: Iterable[Part], shares: NDArray) -> tuple[Part, ...]:
-    """Return the parts of positive weight."""
-    weighed = zip(parts, shares.tolist(), strict=True)
-    return tuple(part._replace(weight=share) for part, share in weighed if share > 0.0)
+def _blend(models: Iterable[ErrorModel], shares: NDArray) -> ErrorModel:
+    """Return the models of positive weight as one."""
+    weights = []
+    chosen = []
+    for model, weight in zip(models, shares.tolist(), strict=True):
+        if weight > 0.0:
+            weights.append(weight)
+            chosen.append(model)
+    return chosen[0] if len(chosen) == 1 else WeightedModels(weights, chosen)
 
 
 class _HeldOut(NamedTuple):
@@ -197,28 +205,19 @@ def _means_by(labels: NDArray, distances: NDArray, counts: NDArray) -> NDArray:
     return np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in parts]).T
 
 
-def _candidates(spec: Spec) -> dict[str, Part]:
+def _candidates(spec: Spec) -> dict[str, ErrorModel]:
     """Return the error models by name; of equal candidates the first, simplest one wins."""
-    inside = ("linear", "quadratic", *(("pose",) if isinstance(spec.mechanical, ArcChain) else ()))
-    network = ELMRegressorCV(250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state))
-    candidates = {
-        "mechanical": Part(1.0, "parallel", "drop"),
-        "parallel linear": Part(1.0, "parallel", NamedFeatures("linear")),
+    features = ["linear", "quadratic"]
+    if isinstance(spec.mechanical, ArcChain):
+        features.append("pose")
+    candidates: dict[str, ErrorModel] = {
+        "mechanical": NoCorrection(),
+        "parallel linear": NamedFeatures("linear", "parallel"),
     }
     for coupling in ("serial", "parallel"):
-        for kind in inside:
-            candidates[f"{coupling} {kind}"] = Part(1.0, coupling, NamedFeatures(kind))
-    candidates["parallel ELM"] = Part(1.0, "parallel", network)
-    candidates["parallel kernel"] = Part(1.0, "parallel", "kernel")
+        for name in features:
+            candidates[f"{coupling} {name}"] = NamedFeatures(name, coupling)
+    network = ELMRegressorCV(250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state))
+    candidates["parallel ELM"] = NetworkModelCV(network)
+    candidates["parallel kernel"] = KernelModel()
     return candidates
-
-
-def _settled(error_model: Any, fitted: Any) -> Any:
-    """Return the error model with the settings that were chosen in its fit to all rows."""
-    if type(fitted) is tuple:  # one for each marker
-        return tuple(_settled(error_model, one) for one in fitted)
-    if isinstance(fitted, ReadoutFit):
-        return error_model._replace(alphas=fitted.alphas, noise_ratio=fitted.noise_ratio)
-    if isinstance(fitted, ELMRegressorCV):
-        return ELMRegressor(**fitted.best_params_)
-    return clone(fitted) if isinstance(fitted, KernelRidge) else error_model

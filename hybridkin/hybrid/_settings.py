@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import BaseEstimator
 from torch import nn
 
 from hybridkin._core.arrays import number
@@ -16,29 +16,16 @@ from hybridkin._core.model import PoseModel
 from hybridkin.calibration.measured import with_missing_markers
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.markers import MarkedChain
-from hybridkin.hybrid._fit import NamedFeatures
+from hybridkin.hybrid._error_models import FEATURES
 from hybridkin.hybrid._guards import GUARDS
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 COUPLINGS = ("parallel", "serial")
-FEATURES = ("linear", "quadratic", "pose")  # error models by the name of their features
 _OUTPUTS = ("position", "pose")
 _REGRESSORS = ("elm", "kernel")
 _NETWORKS = (ELMRegressor, ELMRegressorCV)
 _INSIDE = (str, type(None), *_NETWORKS)  # may act inside the robot
-
-
-def resolved_error_model(error_model: Any, seed: int | np.random.RandomState | None) -> Any:
-    """Return a regressor, `NamedFeatures`, "kernel" or "drop" for the setting `error_model`."""
-    if error_model is None or error_model == "elm":
-        return ELMRegressor(random_state=seed)
-    if isinstance(error_model, _NETWORKS) and error_model.random_state is None:
-        seeded: Any = clone(error_model)
-        return seeded.set_params(random_state=seed)
-    if isinstance(error_model, str) and error_model in FEATURES:
-        return NamedFeatures(error_model)
-    return error_model
 
 
 def missing_markers(estimator: BaseEstimator, y: Any) -> NDArray[np.bool_]:

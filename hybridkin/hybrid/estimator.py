@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -15,22 +16,16 @@ from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.digests import row_digests
+from hybridkin._core.directions import moved_directions
 from hybridkin._core.model import as_forward_model
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
-from hybridkin.hybrid._adapt import (
-    PARAMETERS,
-    adapted,
-    check_parameters,
-    held_out_noise,
-    training_noise,
-)
+from hybridkin.hybrid._adapt import PARAMETERS, adapted, check_parameters
 from hybridkin.hybrid._drift import Drift
+from hybridkin.hybrid._error_models import error_model_of
 from hybridkin.hybrid._fit import (
-    Part,
-    Rows,
     Spec,
     few_rows,
     fit_hybrid,
@@ -41,10 +36,13 @@ from hybridkin.hybrid._fit import (
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
+from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import select
-from hybridkin.hybrid._settings import check_settings, missing_markers, resolved_error_model
+from hybridkin.hybrid._settings import check_settings, missing_markers
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
+
+_MEAN_LENGTH = 1.596  # mean length of a standard normal vector with three coordinates
 
 
 class HybridForwardModel(HybridPredictor):
@@ -254,31 +252,34 @@ class HybridForwardModel(HybridPredictor):
         check_settings(self)
         given = self._checked_rows(X, y, sample_weight, groups)
         asked = self._spec(given)
-        rows = given.distinct()[0]
-        few = few_rows(rows, asked, self.coverage)
-        self._fitted_rows: NDArray | None = np.unique(row_digests(rows.X, rows.tips))
+        rows = given.distinct()
+        messages = few_rows(rows, asked, self.coverage)
+        self._fitted_rows: NDArray = np.unique(row_digests(rows.X, rows.tips))
         spec = with_geometry_chosen(asked, rows, geometry)
-        self.play_, said = play_of(self.play, spec, given.distinct(runs=True)[0])
+        self.play_, of_play = play_of(self.play, spec, given.in_runs())
+        messages += of_play
         self._play_state: PlayState | None = None
         if self.play_ is not None:
-            given = given._replace(X=self._effective(given.X, given.groups))
-            rows = given.distinct()[0]
-        found = (spec, None) if asked.parts else select(spec, rows, given, progress)
-        spec, self.cv_results_ = found
-        fitted = fit_hybrid(spec, given)
+            spec = replace(spec, commanded=moved_directions(rows.X))
+            rows = replace(given, X=self._effective(given.X, given.groups)).distinct()
+        self.cv_results_: dict[str, Any] | None = None
+        if spec.error_model is None:
+            spec, self.cv_results_ = select(spec, rows, progress)
+        fitted = fit_hybrid(spec, rows)
         self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
-        self.error_model_, self.module_ = fitted.error_model, fitted.module
+        self.error_model_, self.module_ = fitted.error.result, fitted.module
         self._single_output = rows.y.ndim == 1
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
-        self._noise = held_out_noise(fitted.error_model, self.cv_results_)
-        if np.isnan(self._noise):
-            self._noise = training_noise(fitted, rows, self.output)
+        self._noise = fitted.error.noise
+        if self.cv_results_ is not None:
+            self._noise = float(self.cv_results_["expected_distance"]) / _MEAN_LENGTH
         self.radius_: Radius | None = None
         if self.coverage is not None:
-            used = given if asked.parts else rows
-            self.radius_, message = conformal_radius(asked, used, self.coverage)
-            said += [] if message is None else [message]
-        return [*dict.fromkeys([*few, *said, *fit_messages(fitted, given)])]
+            self.radius_, message = conformal_radius(
+                replace(asked, commanded=spec.commanded), rows, self.coverage
+            )
+            messages += [] if message is None else [message]
+        return [*dict.fromkeys([*messages, *fit_messages(fitted, rows)])]
 
     def partial_fit(
         self,
@@ -325,10 +326,10 @@ class HybridForwardModel(HybridPredictor):
         rows = self._checked_rows(X, y, sample_weight, None, reset=False)
         if self.play_ is not None:
             X, self._play_state = self.play_.apply(rows.X, self._play_state)
-            rows = rows._replace(X=X)
+            rows = replace(rows, X=X)
         self._warn_of_units(rows)
         q, tips = self.module_.before(rows.q, torch.from_numpy(rows.tips))
-        rows = rows._replace(X=q.numpy(), y=tips.numpy().reshape(rows.y.shape))
+        rows = replace(rows, X=q.numpy(), y=tips.numpy().reshape(rows.y.shape))
         fitted = self.module_.fitted.with_drift(None)
         with torch.no_grad():
             error = residuals(fitted.mechanical, rows.q, rows.y, self.output)
@@ -399,14 +400,9 @@ class HybridForwardModel(HybridPredictor):
         """
         check_is_fitted(self, "module_")
         fitted = self.module_.fitted.with_drift(None)
-        if np.isnan(self._noise):
-            raise ValueError(
-                "`adapt` needs the held-out errors of the fit; files of earlier versions do not "
-                "hold them. Fit the model again and save it."
-            )
         rows = self._checked_rows(X, y, None, groups, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
-        rows = rows._replace(X=self._effective(rows.X, rows.groups))
+        rows = replace(rows, X=self._effective(rows.X, rows.groups))
         self._warn_of_units(rows)
         self.module_, message = adapted(fitted, rows, self._noise, self._drift.scale, parameters)
         if message is not None:
@@ -445,8 +441,7 @@ class HybridForwardModel(HybridPredictor):
                 names = mechanical.default_parameters if asked == "default" else asked
             else:
                 names = tuple(asked)
-        parts = ()
+        error_model = None
         if self.error_model != "auto":
-            model = resolved_error_model(self.error_model, self.random_state)
-            parts = (Part(1.0, self.coupling, model),)
-        return Spec(mechanical, parts, names, self.guard, self.output, self.random_state)
+            error_model = error_model_of(self.error_model, self.coupling, self.random_state)
+        return Spec(mechanical, error_model, names, self.guard, self.output, self.random_state)

@@ -2,7 +2,6 @@
 
 import dataclasses
 from math import inf
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,15 +14,24 @@ from sklearn.model_selection import GroupKFold
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, load_model, save_model
 from hybridkin.hybrid import _radius, _selection
-from hybridkin.hybrid._adapt import _LEAST, _Problem, training_noise
+from hybridkin.hybrid._adapt import _Problem
 from hybridkin.hybrid._drift import MISFITS, SWITCH, Drift
+from hybridkin.hybrid._error_models import (
+    _LEAST,
+    KernelModel,
+    NamedFeatures,
+    NoCorrection,
+    RegressorModel,
+    Residuals,
+)
 from hybridkin.hybrid._features import Features
-from hybridkin.hybrid._fit import FittedHybrid, NamedFeatures, Part, Rows, Spec, fit_hybrid
+from hybridkin.hybrid._fit import Spec, fit_hybrid
 from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
 from hybridkin.hybrid._linearised import choose
 from hybridkin.hybrid._pose import PoseHybridModule
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
 from hybridkin.hybrid._readout_fit import fit_readout
+from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import _chosen, _HeldOut, select
 from hybridkin.hybrid._settings import check_settings
 
@@ -135,9 +143,9 @@ def test_a_gain_in_one_motion_alone_is_not_sure():
 
 def few_candidates(_):
     return {
-        "mechanical": Part(1.0, "parallel", "drop"),
-        "parallel linear": Part(1.0, "parallel", NamedFeatures("linear")),
-        "parallel kernel": Part(1.0, "parallel", "kernel"),
+        "mechanical": NoCorrection(),
+        "parallel linear": NamedFeatures("linear", "parallel"),
+        "parallel kernel": KernelModel(),
     }
 
 
@@ -146,10 +154,10 @@ def test_the_kernel_is_tried_on_logs_that_are_not_large(monkeypatch):
     rows = Rows(*log(30))
     candidates = [*few_candidates(None), "blend"]
     monkeypatch.setattr(_selection, "_MOST", 31)
-    assert select(Spec(CHAIN, ()), rows, rows)[1]["candidate"] == candidates
+    assert select(Spec(CHAIN), rows)[1]["candidate"] == candidates
     monkeypatch.setattr(_selection, "_MOST", 29)
     candidates.remove("parallel kernel")
-    assert select(Spec(CHAIN, ()), rows, rows)[1]["candidate"] == candidates
+    assert select(Spec(CHAIN), rows)[1]["candidate"] == candidates
 
 
 @pytest.mark.parametrize("groups", [None, np.arange(30) // 2])
@@ -164,7 +172,7 @@ def test_penalties_are_settled_by_folds_of_motions(groups, monkeypatch):
     monkeypatch.setattr(_selection, "_candidates", few_candidates)
     monkeypatch.setattr(_selection, "fit_hybrid", fit)
     rows = Rows(*log(30), groups=groups)
-    select(Spec(CHAIN, ()), rows, rows)
+    select(Spec(CHAIN), rows)
     of_all_rows = [labels for labels in seen if labels is not None and len(labels) == len(rows.X)]
     assert len(of_all_rows) == (0 if groups is None else 3)  # once for each candidate
     for labels in of_all_rows:
@@ -173,16 +181,18 @@ def test_penalties_are_settled_by_folds_of_motions(groups, monkeypatch):
 
 
 def test_the_radius_chooses_the_error_model_without_the_held_out_rows(monkeypatch):
-    lengths, spec = [], Spec(CHAIN, (Part(1.0, "parallel", "drop"),))
+    lengths, spec = [], Spec(CHAIN, NoCorrection())
 
-    def chosen(_, part, given):
-        lengths.append((len(part.X), len(given.X)))
+    def chosen(_, part):
+        lengths.append(len(part))
         return spec, {}
 
     monkeypatch.setattr(_radius, "select", chosen)
     rows = Rows(*log(30))
-    found, message = _radius.conformal_radius(dataclasses.replace(spec, parts=()), rows, 0.5)
-    assert lengths == [(24, 24)] * 5
+    found, message = _radius.conformal_radius(
+        dataclasses.replace(spec, error_model=None), rows, 0.5
+    )
+    assert lengths == [24] * 5
     assert (found, message) == _radius.conformal_radius(spec, rows, 0.5)
     assert 0.0 < found.inside < inf
 
@@ -221,11 +231,11 @@ def test_several_markers_have_an_error_model_each_or_none():
 
 
 def test_residuals_of_rows_left_out_are_computed_unless_they_are_not_wanted():
-    spec = Spec(CHAIN, (Part(1.0, "parallel", NamedFeatures("linear", (1.0, 1.0))),))
+    spec = Spec(CHAIN, NamedFeatures("linear", "parallel", (1.0, 1.0)))
     rows = Rows(*log(30))
-    assert np.isfinite(fit_hybrid(spec, rows).error_model.residual).all()
+    assert np.isfinite(fit_hybrid(spec, rows).error.result.residual).all()
     spec = dataclasses.replace(spec, left_out=False)
-    assert np.isnan(fit_hybrid(spec, rows).error_model.residual).all()
+    assert np.isnan(fit_hybrid(spec, rows).error.result.residual).all()
 
 
 @pytest.mark.parametrize(
@@ -302,16 +312,30 @@ def test_the_likeliest_noise_is_that_of_the_normal_density():
         assert found == pytest.approx(max([inf, *ratios], key=density))
 
 
+class Memory(RegressorMixin, BaseEstimator):
+    """Predicts the targets of the rows it was fitted to, all of them off by a length."""
+
+    def __init__(self, off):
+        self.off = off
+
+    def fit(self, X, y):
+        self.X_, self.y_ = X, y
+        return self
+
+    def predict(self, X):
+        nearest = ((X[:, None] - self.X_) ** 2).sum(-1).argmin(1)
+        return self.y_[nearest] + self.off
+
+
 def test_a_regressor_that_knows_its_rows_by_heart_has_some_noise():
     """Its errors are no less than a share of the spread before learning."""
     rng = np.random.default_rng(0)
     y = rng.standard_normal((50, 3)) * [1.0, 2.0, 3.0] + 5.0
     rows = Rows(rng.standard_normal((50, 2)), y)
     for off in (0.0, 10.0):
-        module = SimpleNamespace(error_part=lambda q, off=off: torch.from_numpy(y + off))
-        fitted = FittedHybrid(None, None, Ridge(), module, ())
+        fitted = RegressorModel(Memory(off)).fit(Residuals(rows, y, None))
         expected = max(off, _LEAST * y.var(axis=0).mean() ** 0.5)
-        assert training_noise(fitted, rows, "position") == pytest.approx(expected)
+        assert fitted.noise == pytest.approx(expected)
 
 
 def test_the_derivative_of_a_pose_by_a_change_of_the_robot():
@@ -324,7 +348,7 @@ def test_the_derivative_of_a_pose_by_a_change_of_the_robot():
     scale = np.full(3, 0.01)
     with torch.no_grad():
         y = _Problem(fitted, rows, scale).model(theta).rows()(q).numpy()
-    problem = _Problem(fitted, rows._replace(y=y), scale)
+    problem = _Problem(fitted, dataclasses.replace(rows, y=y), scale)
     residual, A = problem.linearised(theta)
     assert_allclose(residual, 0.0, atol=1e-9)
     for k in range(9):
@@ -352,7 +376,8 @@ def test_noise_of_the_actuators_alone_is_found_and_allowed_for(seed):
     off, noise = 0.1 * (q - 0.22), 1e-3 * torch.from_numpy(rng.standard_normal((100, 3)))
     features, x = Features.of_range(q), chain(q + off + noise)
     moved = chain.coordinates(q + off)[0] - chain.coordinates(q)[0]
-    found = fit_readout(chain, features, q, x)
-    ignored = fit_readout(chain, features, q, x, alphas=found.alphas)
+    rows = Rows(q.numpy(), x.numpy())
+    found = fit_readout(chain, features, rows)
+    ignored = fit_readout(chain, features, rows, alphas=found.alphas)
     assert found.noise_ratio < inf == ignored.noise_ratio
     assert (found.readout(q) - moved).norm() < (ignored.readout(q) - moved).norm()

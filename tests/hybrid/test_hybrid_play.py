@@ -14,8 +14,9 @@ from hybridkin import (
     robots,
 )
 from hybridkin.hybrid import _play
-from hybridkin.hybrid._fit import Rows, Spec
+from hybridkin.hybrid._fit import Spec
 from hybridkin.hybrid._play import choose_play, play_of
+from hybridkin.hybrid._rows import Rows
 
 WIDTH = 0.02
 CHAIN = robots.bionic_handling_assistant()
@@ -69,9 +70,9 @@ def test_the_width_is_found_where_a_marker_is_missing(log):
     x += 2e-4 * np.random.default_rng(1).standard_normal(x.shape)
     x[::3, :3] = np.nan
     rows = Rows(q, x, groups=groups)
-    assert abs(choose_play(Spec(chain, ()), rows).width - WIDTH) < 0.1 * WIDTH
+    assert abs(choose_play(Spec(chain), rows).width - WIDTH) < 0.1 * WIDTH
     nowhere = Rows(q, np.where(np.arange(6) < 3, np.nan, x), groups=groups)
-    assert choose_play(Spec(chain, ()), nowhere) is None
+    assert choose_play(Spec(chain), nowhere) is None
     fitted = fit_play(chain, q, x, groups, widths=[0.5 * WIDTH, WIDTH], parameters=("radii",))
     assert fitted.width == WIDTH
 
@@ -249,21 +250,21 @@ def test_the_width_lies_between_the_tried_ones(affine, rng_of_play, one_group):
     for share in (0.14, 0.28):
         width = share * np.ptp(q)
         x = tip_of(PlayOperator(width).apply(q)[0], 1e-6, rng_of_play)
-        found = choose_play(Spec(None, ()), Rows(q, x, None, groups))
+        found = choose_play(Spec(None), Rows(q, x, None, groups))
         assert found.width == pytest.approx(width, rel=0.02)
 
 
 def test_a_tip_that_follows_the_commands_has_no_play(affine, rng_of_play):
     q = swinging()
     x = tip_of(q, 1e-5, rng_of_play)
-    assert choose_play(Spec(None, ()), Rows(q, x)) is None
+    assert choose_play(Spec(None), Rows(q, x)) is None
 
 
 def test_noise_alone_is_play_in_at_most_half_of_the_logs(affine, rng_of_play):
     """By chance some width is best, but its gain is within the standard error."""
     q = swinging(40)
     logs = [rng_of_play.standard_normal((40, 3)) for _ in range(6)]
-    found = [choose_play(Spec(None, ()), Rows(q, x)) is not None for x in logs]
+    found = [choose_play(Spec(None), Rows(q, x)) is not None for x in logs]
     assert sum(found) <= 3
 
 
@@ -272,7 +273,7 @@ def test_commands_without_effect_are_play_of_the_whole_range(affine, rng_of_play
     starts = np.linspace(0.0, 0.1, 6)
     q = (starts[:, None] + 0.1 * np.sin(np.linspace(0.0, 6.0, 20))).reshape(-1, 1)
     x = tip_of(np.repeat(starts, 20)[:, None], 1e-6, rng_of_play)
-    found, messages = play_of("auto", Spec(None, ()), Rows(q, x, None, np.repeat(range(6), 20)))
+    found, messages = play_of("auto", Spec(None), Rows(q, x, None, np.repeat(range(6), 20)))
     assert found.width == pytest.approx(np.ptp(q))
     assert "no upper limit" in messages[0]
 

@@ -10,6 +10,7 @@ from hybridkin.hybrid._features import Features, PoseFeatures, Readout
 from hybridkin.hybrid._linearised import basis
 from hybridkin.hybrid._module import HybridModule, InnerCorrection
 from hybridkin.hybrid._readout_fit import fit_readout
+from hybridkin.hybrid._rows import Rows
 
 TURNED = torch.tensor(
     [[0.0, -1.0, 0.0, 0.3], [0.6, 0.0, -0.8, 0.1], [0.8, 0.0, 0.6, -0.2], [0.0, 0.0, 0.0, 1.0]],
@@ -166,7 +167,9 @@ def test_planted_correction_is_found(robot, rng):
     kept = basis(features(q[:500]), features.n_linear, 1000)
     weights = 0.003 * uniform(rng, len(moved), kept.shape[1]) @ kept.mT / (0.1 + moved[:, None])
     truth = hybrid(chain, Readout(features, weights))
-    fit = fit_readout(chain, features, q[:500], truth(q[:500]), alphas=(1e-10, 1e-10))
+    fit = fit_readout(
+        chain, features, Rows(q[:500].numpy(), truth(q[:500]).numpy()), alphas=(1e-10, 1e-10)
+    )
     module = hybrid(chain, fit.readout)
     size = (truth(q) - chain(q)).norm(dim=1).mean()
     assert size > 1e-3

@@ -20,6 +20,7 @@ from hybridkin.hybrid._linearised import (
 )
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
 from hybridkin.hybrid._readout_fit import _Problem, _tips, fit_readout
+from hybridkin.hybrid._rows import Rows
 
 ARM = """
 <robot name="arm">
@@ -46,6 +47,14 @@ class Wave(ForwardModel):
         return torch.stack(
             [q[..., 0].sin() + q[..., 3], q[..., 1] * q[..., 2], q.square().sum(-1)], -1
         )
+
+
+def read_out(chain, features, q, x, sample_weight=None, groups=None, **options):
+    """Return the readout that is fitted to the different ones of rows q and x."""
+    weights = None if sample_weight is None else sample_weight.numpy()
+    labels = None if groups is None else groups.numpy()
+    rows = Rows(q.detach().numpy(), x.detach().numpy(), weights, labels).distinct()
+    return fit_readout(chain, features, rows, **options)
 
 
 def hybrid(chain, readout, coupling="serial"):
@@ -165,7 +174,7 @@ def test_jacobian(robot, kind, coupling, rng):
 def test_planted_correction_is_recovered(robot, rng):
     chain, q = rows_of(robot, rng, 500)
     truth, x = disturbed(chain, q, rng)
-    fit = fit_readout(chain, QuadraticFeatures.of_range(q), q, x, alphas=(1e-9, 1e-9))
+    fit = read_out(chain, QuadraticFeatures.of_range(q), q, x, alphas=(1e-9, 1e-9))
     q_new = rows_of(robot, rng, 200)[1].clamp(q.amin(0), q.amax(0))
     assert (chain(q_new) - truth(q_new)).norm(dim=1).mean() > 1e-3
     assert_close(hybrid(chain, fit.readout)(q_new), truth(q_new), atol=1e-5, rtol=0)
@@ -176,7 +185,7 @@ def test_planted_linear_correction_is_recovered_by_linear_features(rng):
     features = Features.of_range(q)
     weights = 0.01 * uniform(rng, 9, 10)
     truth = hybrid(chain, Readout(features, weights))
-    fit = fit_readout(chain, features, q, truth(q), alphas=(1e-10, 1e-10))
+    fit = read_out(chain, features, q, truth(q), alphas=(1e-10, 1e-10))
     assert fit.gradient < 1e-6
     assert_close(fit.readout.weights, weights, atol=1e-6, rtol=0)
 
@@ -188,7 +197,7 @@ def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
     chain, q = rows_of(robot, rng, 80)
     x = disturbed(chain, q, rng, noise=0.003)[1]
     weight = torch.rand(80, generator=rng, dtype=torch.float64)
-    fit = fit_readout(
+    fit = read_out(
         chain, some_features(kind, q, rng), q, x, sample_weight=weight, alphas=(0.03, 0.3)
     )
     assert fit.gradient < 1e-7
@@ -279,8 +288,8 @@ def test_fit_without_residuals_of_rows_left_out(rng):
     chain, q = rows_of("trunk", rng, 40)
     x = disturbed(chain, q, rng, noise=0.003)[1]
     features = QuadraticFeatures.of_range(q)
-    whole = fit_readout(chain, features, q, x, alphas=(0.1, 1.0))
-    brief = fit_readout(chain, features, q, x, alphas=(0.1, 1.0), left_out=False)
+    whole = read_out(chain, features, q, x, alphas=(0.1, 1.0))
+    brief = read_out(chain, features, q, x, alphas=(0.1, 1.0), left_out=False)
     assert torch.equal(brief.readout.weights, whole.readout.weights)
     assert torch.isnan(torch.from_numpy(brief.residual)).all()
 
@@ -289,11 +298,11 @@ def test_rows_left_out_of_the_whole_fit(rng):
     chain, q = rows_of("trunk", rng, 60)
     x = disturbed(chain, q, rng, size=0.002, noise=0.002)[1]
     features = QuadraticFeatures.of_range(q)
-    fit = fit_readout(chain, features, q, x, alphas=(0.3, 3.0))
+    fit = read_out(chain, features, q, x, alphas=(0.3, 3.0))
     weight = torch.ones(60, dtype=torch.float64)
     for row in (0, 17):
         weight[row] = 0.0
-        other = fit_readout(chain, features, q, x, alphas=(0.3, 3.0), sample_weight=weight)
+        other = read_out(chain, features, q, x, alphas=(0.3, 3.0), sample_weight=weight)
         weight[row] = 1.0
         left = x[row] - hybrid(chain, other.readout)(q[row])
         # Scales of the coordinates and the basis change a little with the row.
@@ -306,14 +315,14 @@ def test_no_correction_is_the_mechanical_model(coupling, rng):
     chain, q = rows_of("trunk", rng, 40)
     x = disturbed(chain, q, rng, noise=0.003)[1]
     features = QuadraticFeatures.of_range(q)
-    fit = fit_readout(chain, features, q, x, coupling=coupling, alphas=(inf, inf))
+    fit = read_out(chain, features, q, x, coupling=coupling, alphas=(inf, inf))
     assert_close(hybrid(chain, fit.readout, coupling)(q), chain(q))
     assert_close(hybrid(chain, fit.readout, coupling).jacobian(q), chain.jacobian(q))
     assert_close(torch.from_numpy(fit.residual), x - chain(q))
-    near = fit_readout(chain, features, q, x, coupling=coupling, alphas=(1e12, 1e12))
+    near = read_out(chain, features, q, x, coupling=coupling, alphas=(1e12, 1e12))
     assert_close(hybrid(chain, near.readout, coupling)(q), chain(q), atol=1e-9, rtol=0)
-    linear = fit_readout(chain, features, q, x, coupling=coupling, alphas=(0.1, inf))
-    plain = fit_readout(chain, Features.of_range(q), q, x, coupling=coupling, alphas=(0.1, 1.0))
+    linear = read_out(chain, features, q, x, coupling=coupling, alphas=(0.1, inf))
+    plain = read_out(chain, Features.of_range(q), q, x, coupling=coupling, alphas=(0.1, 1.0))
     assert_close(
         hybrid(chain, linear.readout, coupling)(q),
         hybrid(chain, plain.readout, coupling)(q),
@@ -326,7 +335,7 @@ def test_at_the_tip_it_is_ridge_regression_on_the_error(rng):
     chain, q = rows_of("trunk", rng, 50)
     x = disturbed(chain, q, rng, noise=0.003)[1]
     features = Features.of_range(q)
-    fit = fit_readout(chain, features, q, x, coupling="parallel", alphas=(0.5, inf))
+    fit = read_out(chain, features, q, x, coupling="parallel", alphas=(0.5, inf))
     phi = features(q)
     expected = torch.linalg.solve(phi.mT @ phi + 0.5 * torch.eye(10), phi.mT @ (x - chain(q)))
     assert_close(fit.readout.weights, expected.mT)
@@ -335,7 +344,7 @@ def test_at_the_tip_it_is_ridge_regression_on_the_error(rng):
 def test_pure_noise_chooses_no_correction(rng):
     chain, q = rows_of("trunk", rng, 120)
     x = chain(q) + 0.005 * torch.randn(120, 3, generator=rng, dtype=torch.float64)
-    fit = fit_readout(chain, QuadraticFeatures.of_range(q), q, x)
+    fit = read_out(chain, QuadraticFeatures.of_range(q), q, x)
     assert (hybrid(chain, fit.readout)(q) - chain(q)).norm(dim=1).mean() < 5e-4
     assert fit.scores[inf, inf] <= 1.01 * min(fit.scores.values())
 
@@ -346,7 +355,7 @@ def test_choice_is_never_worse_than_nothing_on_rows_left_out(rng):
     for size in (0.003, 0.01, 0.03):
         x = disturbed(chain, q, rng, size=size, noise=0.01)[1]
         groups = torch.arange(24) // 6
-        fit = fit_readout(chain, QuadraticFeatures.of_range(q), q, x, groups=groups)
+        fit = read_out(chain, QuadraticFeatures.of_range(q), q, x, groups=groups)
         left = torch.from_numpy(fit.residual)
         assert left.norm() <= (1 + 1e-9) * (x - chain(q)).norm()
 
@@ -356,11 +365,11 @@ def test_choice_is_no_worse_than_its_parts(rng):
     chain, q = rows_of("trunk", rng, 120)
     truth, x = disturbed(chain, q, rng, noise=0.004)
     features = QuadraticFeatures.of_range(q)
-    fit = fit_readout(chain, features, q, x)
+    fit = read_out(chain, features, q, x)
     chosen = fit.scores[fit.alphas]
     assert chosen <= 1.001 * min(fit.scores.values())
     assert chosen < fit.scores[inf, inf]
-    linear = fit_readout(chain, Features.of_range(q), q, x)
+    linear = read_out(chain, Features.of_range(q), q, x)
     error = lambda model: (model(q) - truth(q)).norm(dim=1).mean()  # noqa: E731
     assert error(hybrid(chain, fit.readout)) < 1.05 * min(
         error(hybrid(chain, linear.readout)), error(chain)
@@ -390,13 +399,13 @@ def test_noise_of_the_actuators_is_allowed_for(rng):
         x, features = shaken(truth, q, rng), QuadraticFeatures.of_range(q)
         alphas = (1e-3, 1e-3)
         fits = [
-            fit_readout(chain, features, q, x, alphas=alphas, noise_ratio=ratio)
+            read_out(chain, features, q, x, alphas=alphas, noise_ratio=ratio)
             for ratio in (0.25, inf)
         ]
         errors.append(
             [(hybrid(chain, fit.readout)(q) - truth(q)).norm(dim=1).mean() for fit in fits]
         )
-        chosen = fit_readout(chain, features, q, x)
+        chosen = read_out(chain, features, q, x)
         assert (hybrid(chain, chosen.readout)(q) - truth(q)).norm(dim=1).mean() < 1.05 * errors[-1][
             0
         ]
@@ -408,12 +417,12 @@ def test_rows_left_out_with_noise_of_the_actuators(rng):
     chain, q = rows_of("trunk", rng, 60)
     x = disturbed(chain, q, rng, size=0.002, noise=0.002)[1]
     options = {"alphas": (0.3, 3.0), "noise_ratio": 0.5}
-    fit = fit_readout(chain, Features.of_range(q), q, x, **options)
+    fit = read_out(chain, Features.of_range(q), q, x, **options)
     assert fit.noise_ratio == 0.5
     assert fit.gradient < 1e-8
     weight = torch.ones(60, dtype=torch.float64)
     weight[3] = 0.0
-    other = fit_readout(chain, Features.of_range(q), q, x, sample_weight=weight, **options)
+    other = read_out(chain, Features.of_range(q), q, x, sample_weight=weight, **options)
     left = x[3] - hybrid(chain, other.readout)(q[3])
     assert_close(torch.from_numpy(fit.residual[3]), left, atol=2e-4, rtol=0.05)
 
@@ -463,12 +472,10 @@ def test_weights_are_repeats(coupling, rng):
     x = disturbed(chain, q, rng, noise=0.003)[1]
     times = torch.randint(0, 4, (40,), generator=rng)
     features = QuadraticFeatures.of_range(q)
-    a = fit_readout(
-        chain, features, q, x, coupling=coupling, sample_weight=times, alphas=(0.1, 1.0)
-    )
+    a = read_out(chain, features, q, x, coupling=coupling, sample_weight=times, alphas=(0.1, 1.0))
     q_many, x_many = q.repeat_interleave(times, 0), x.repeat_interleave(times, 0)
     groups = torch.arange(40).repeat_interleave(times)
-    b = fit_readout(
+    b = read_out(
         chain, features, q_many, x_many, coupling=coupling, groups=groups, alphas=(0.1, 1.0)
     )
     assert_close(a.readout.weights, b.readout.weights, atol=1e-9, rtol=1e-6)
@@ -486,8 +493,8 @@ def test_turning_the_frame_turns_the_model(rng):
     base[:3, 3] = R @ chain.base[:3, 3]
     turned = chain.with_geometry(base=base)
     features = QuadraticFeatures.of_range(q)
-    a = hybrid(chain, fit_readout(chain, features, q, x, alphas=(0.1, 1.0)).readout)
-    b = hybrid(turned, fit_readout(turned, features, q, x @ R.mT, alphas=(0.1, 1.0)).readout)
+    a = hybrid(chain, read_out(chain, features, q, x, alphas=(0.1, 1.0)).readout)
+    b = hybrid(turned, read_out(turned, features, q, x @ R.mT, alphas=(0.1, 1.0)).readout)
     assert_close(a(q) @ R.mT, b(q), atol=1e-8, rtol=0)
 
 
@@ -507,7 +514,7 @@ def test_a_bad_row_stays_alone(rng):
 def test_single_precision(rng):
     chain, q = rows_of("trunk", rng, 100)
     x = disturbed(chain, q, rng, noise=0.003)[1]
-    fit = fit_readout(chain, QuadraticFeatures.of_range(q), q.float(), x.float(), alphas=(0.1, 1.0))
+    fit = read_out(chain, QuadraticFeatures.of_range(q), q.float(), x.float(), alphas=(0.1, 1.0))
     x_single, J_single = hybrid(chain, fit.readout).forward_and_jacobian(q.float())
     assert x_single.dtype == J_single.dtype == torch.float32
     x_double, J_double = hybrid(chain, fit.readout).forward_and_jacobian(q)
@@ -522,7 +529,7 @@ def test_single_precision(rng):
 def test_state_dict_holds_all(kind, rng):
     chain, q = rows_of("trunk", rng, 60)
     x = disturbed(chain, q, rng, noise=0.003)[1]
-    fit = fit_readout(chain, some_features(kind, q, rng), q, x, alphas=(0.1, 1.0))
+    fit = read_out(chain, some_features(kind, q, rng), q, x, alphas=(0.1, 1.0))
     module = hybrid(chain, fit.readout)
     blank = copy.deepcopy(module)
     for buffer in blank.buffers():
@@ -545,7 +552,7 @@ def test_derivatives_by_autograd(rng):
 def test_a_serial_fit_settles_at_the_optimum(rng):
     chain, q = rows_of("cables", rng, 30)
     x = disturbed(chain, q, rng, size=0.005, noise=1e-4)[1]
-    fit = fit_readout(chain, Features.of_range(q), q, x, alphas=(0.01, inf), left_out=False)
+    fit = read_out(chain, Features.of_range(q), q, x, alphas=(0.01, inf), left_out=False)
     assert fit.gradient < 1e-7
 
 

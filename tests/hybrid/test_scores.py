@@ -10,10 +10,12 @@ from sklearn.kernel_ridge import KernelRidge
 from hybridkin import ELMRegressorCV, HybridForwardModel, PlayOperator
 from hybridkin._core.model import FunctionModel
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import Part, Rows, Spec
+from hybridkin.hybrid._error_models import NoCorrection
+from hybridkin.hybrid._fit import Spec
 from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
 from hybridkin.hybrid._play import choose_play
 from hybridkin.hybrid._radius import Radius, _quantile
+from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import _OUTSIDE, _chosen, _HeldOut
 
 N, M = 40, 10  # held-out and outer rows
@@ -205,7 +207,7 @@ def test_the_width_of_backlash_is_found_in_the_residuals(motions):
     noise = 1e-4 * np.random.default_rng(0).standard_normal((len(t), 3))
     y = np.column_stack([moved, moved.sum(axis=1)]) + noise
     model = FunctionModel(lambda q: torch.cat([q, q.sum(-1, keepdim=True)], -1))
-    spec = Spec(model, (Part(1.0, "parallel", "drop"),))
+    spec = Spec(model, NoCorrection())
     found = choose_play(spec, Rows(X, y, None, groups))
     assert found.width == pytest.approx(0.04, rel=0.1)
     assert choose_play(spec, Rows(moved, y, None, groups)) is None

@@ -1,0 +1,90 @@
+"""Measured rows of a log on their way through a fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import Self
+
+from hybridkin._core.distinct import at_place, distinct_rows
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Measured rows, as they were given or with equal rows merged, see `distinct`."""
+
+    X: NDArray  # (N, n) actuator vectors, float64 or float32
+    y: NDArray  # (N, m) or (N,) [m]
+    weights: NDArray | None = None  # (N,), number of times each row counts
+    groups: NDArray | None = None  # (N,), motion of every row
+    place: NDArray | None = None  # (M,), the row here of each of the M given rows; -1: none
+
+    def __len__(self) -> int:
+        return len(self.X)
+
+    @property
+    def q(self) -> Tensor:
+        """Actuator vectors (N, n) in double precision."""
+        return torch.from_numpy(self.X.astype(np.float64))
+
+    @property
+    def tips(self) -> NDArray:
+        """Measured tips as a matrix (N, m) [m]."""
+        return self.y.reshape(len(self.y), -1)
+
+    @property
+    def counts(self) -> NDArray:
+        """Number of times each row counts, (N,)."""
+        return np.ones(len(self.X)) if self.weights is None else self.weights
+
+    def take(self, rows: NDArray) -> Self:
+        """Return some of the rows."""
+        weights = None if self.weights is None else self.weights[rows]
+        groups = None if self.groups is None else self.groups[rows]
+        return replace(
+            self, X=self.X[rows], y=self.y[rows], weights=weights, groups=groups, place=None
+        )
+
+    def marker(self, k: int) -> Self:
+        """Return the rows in which marker k was measured, with only its positions as tips."""
+        tips = self.tips[:, 3 * k : 3 * k + 3]
+        measured = np.flatnonzero(~np.isnan(tips[:, 0]))
+        if not len(measured):
+            raise rare_marker(k)
+        return replace(self, y=tips).take(measured)
+
+    def distinct(self) -> Self:
+        """Return the different rows with the number of times each counts."""
+        return self._merged(runs=False)
+
+    def in_runs(self) -> Self:
+        """Return the rows in order of time, without those that repeat the row before."""
+        return self._merged(runs=True)
+
+    def _merged(self, runs: bool) -> Self:
+        first, counts, place = distinct_rows(self.X, self.y, self.weights, self.groups, runs)
+        return replace(self.take(first), weights=counts, place=place)
+
+    def thinned(self, most: int) -> Self:
+        """Return every k-th row, about `most` rows."""
+        return self.take(np.arange(0, len(self), 1 + len(self) // most))
+
+    def repeated(self) -> Self:
+        """Return every row as often as it counts, or these rows if they count in fractions."""
+        times = self.counts.astype(int)
+        if self.weights is None or (times != self.weights).any():
+            return self
+        return replace(self.take(np.repeat(np.arange(len(self)), times)), weights=None)
+
+    def as_given(self, values: NDArray) -> NDArray:
+        """Return values (N, ...) of these rows for the given rows (M, ...); NaN for weight 0."""
+        return values if self.place is None else at_place(values, self.place)
+
+
+def rare_marker(k: int) -> ValueError:
+    """Return the error for a marker that too few rows hold."""
+    return ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")
