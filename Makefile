@@ -54,7 +54,8 @@ $(VENV)/.installed: pyproject.toml
 	touch $@
 
 # Compiles what has changed since the installation. Without a C compiler torch computes everything.
-$(VENV)/.native: $(VENV)/.installed hatch_build.py $(wildcard hybridkin/native/src/*.[ch])
+$(VENV)/.native: $(VENV)/.installed hatch_build.py hybridkin/_core/kernel_numbers.py \
+		$(wildcard hybridkin/native/src/*.[ch])
 	-$(BIN)/python hatch_build.py
 	touch $@
 

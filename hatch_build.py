@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import os
 import platform
+import runpy
 import shlex
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tempfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,8 @@ try:
 except ImportError:  # compiling in place needs no hatchling
     BuildHookInterface = object
 
-NATIVE = Path(__file__).parent / "hybridkin" / "native"
+PACKAGE = Path(__file__).parent / "hybridkin"
+NATIVE = PACKAGE / "native"
 FLAGS = (
     "-std=c99 -O3 -Wall -Wextra -pedantic -fno-math-errno -fno-trapping-math -ffp-contract=fast "
     "-fvisibility=hidden -shared -s"
@@ -60,11 +61,13 @@ def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
     windows, apple = target.startswith("win"), target.startswith("macos")
     suffix = ".dll" if windows else ".dylib" if apple else ".so"
     variants = X86 if target.endswith(("x86_64", "amd64")) else {"generic": ""}
-    sources = sorted((NATIVE / "src").glob("*.[ch]"))
-    stamp = zlib.crc32(b"".join(path.read_bytes() for path in sources))
+    shared = runpy.run_path(str(PACKAGE / "_core" / "kernel_numbers.py"))
+    stamp = shared["checksum"](NATIVE / "src")
     command = [*compiler(), *FLAGS, f"-DHK_SOURCES={stamp}u", *([] if windows else ["-fPIC"])]
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as work:
+        Path(work, "kinds.h").write_text(shared["c_header"]())
+        command += ["-I", work]
         running = {}
         for name in names or variants:
             path = Path(work, f"hk_{name}{suffix}")

@@ -18,7 +18,7 @@ from torch.autograd import grad
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_tensor
 from hybridkin._core.html import html_table
-from hybridkin._core.stored import Layout, Restore, Stored
+from hybridkin._core.stored import WRITERS, Layout, Restore, Stored
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
@@ -38,6 +38,13 @@ class Portable:
     Tensors, also those in dicts, are pickled as plain arrays. They are restored on their device,
     or on the CPU if that device does not exist. What belongs to the process is not pickled.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Register the plan writer of a class that sets a `layout`."""
+        super().__init_subclass__(**options)
+        layout = vars(cls).get("layout")
+        if layout is not None and layout.write_plan is not None:
+            WRITERS[layout.kind] = layout.write_plan
 
     def __getstate__(self) -> dict[str, Any]:
         own = vars(self).copy()  # one copy: another thread may add its program
@@ -79,17 +86,18 @@ class PortableModule(Portable, nn.Module):
         TypeError
             For modules that could only be stored as code.
         """
-        kind, arrays, settings, parts, derived = self.layout
-        if not kind:
+        layout = self.layout
+        if not layout.kind:
             raise TypeError(_only_code(self))
         buffers = {name: None if a is None else a.detach() for name, a in self._buffers.items()}
         stored = Stored.of(
-            kind,
-            {name: buffers[name] for name in arrays},
-            {name: _described(self._modules.get(name)) for name in parts},
-            **{name: vars(self)[name] for name in settings},
+            layout.kind,
+            {name: buffers[name] for name in layout.arrays},
+            {name: _described(self._modules.get(name)) for name in layout.parts},
+            **{name: vars(self)[name] for name in layout.settings},
         )
-        stored.derived.update((name, as_array(self.get_buffer(name).detach())) for name in derived)
+        for name in layout.derived:
+            stored.derived[name] = as_array(self.get_buffer(name).detach())
         return stored
 
     @classmethod

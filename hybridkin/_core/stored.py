@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, check_shape
+
+if TYPE_CHECKING:
+    from hybridkin._core.plan import Plan
 
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
@@ -34,6 +37,9 @@ class Layout(NamedTuple):
         Submodules, lists of them, or None.
     derived : tuple of str
         Buffers computed from the others. Kernels use them; files do not contain them.
+    write_plan : callable, optional
+        Writes the node of a description of this kind into a plan, and returns its place. None: the
+        class has no kernel.
     """
 
     kind: str
@@ -41,6 +47,7 @@ class Layout(NamedTuple):
     settings: Mapping[str, type] = MappingProxyType({})
     parts: tuple[str, ...] = ()
     derived: tuple[str, ...] = ()
+    write_plan: WritePlan | None = None
 
 
 @dataclass(frozen=True)
@@ -169,6 +176,10 @@ class Stored:
             raise ValueError(f"the part {name!r} of {self.kind!r} is missing")
         return self.parts[name]
 
+
+WritePlan = Callable[["Plan", Stored], int]
+WRITERS: dict[str, WritePlan] = {}
+"""The plan writer of each kind that has a kernel; a class with a `layout` registers its own."""
 
 Restore = Callable[[Stored], Any]
 """A function that returns the model of a description, and a list for a list of them."""

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.kernel_numbers import HK_MOST_TURNS, HK_WHOLE_STEPS
 
 MOST = 62  # a set of tendons is the bits of one integer
-_WHOLE_STEPS = 8  # then one tendon at a time, which always terminates
-_MOST_TURNS = 12  # 2 to this power bounds the steps if rounding prevents the end
 
 
 class Elasticity(NamedTuple):
@@ -99,11 +98,11 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
     bits = 2 ** torch.arange(n, device=x.device)
     at, here = torch.arange(len(x), device=x.device), ((full @ x.T >= 0) * bits[:, None]).sum(0)
     codes = here.clone()
-    for step in range(_WHOLE_STEPS + 2 ** min(n, _MOST_TURNS)):
+    for step in range(HK_WHOLE_STEPS + 2 ** min(n, HK_MOST_TURNS)):
         maps = maps_of(here)
         stretch = applied(maps, x)
         found = ((stretch >= 0) * bits).sum(-1)
-        if step >= _WHOLE_STEPS:  # one at a time, ignoring rounding errors
+        if step >= HK_WHOLE_STEPS:  # one at a time, ignoring rounding errors
             rounding = 4.0 * torch.finfo(x.dtype).eps * applied(maps.abs(), x.abs())
             wrong = (found ^ here) & ((stretch.abs() > rounding) * bits).sum(-1)
             found = here ^ (wrong & -wrong)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import identity, whole
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
@@ -28,6 +31,32 @@ ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 
 Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
 STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "markers": list, "routing": str}
+
+
+def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
+    """Return the numbers of the frame of a chain, and the parts (m,) of its arcs up to the tip.
+
+    The frame is the rotation and position of the base, the reach, and the rigid offsets.
+    """
+    base, offsets = stored.array("base"), stored.array("offsets")
+    tip_at = stored.value("tip_at", float)
+    markers = stored.settings.get("markers", [[tip_at, 0.0, 0.0, 0.0]])
+    _, x, y, z = markers[0]
+    if len(markers) > 1 or x or y:
+        raise NoKernel("several markers, or a marker beside the backbone, have no kernel")
+    plan.limit("segments", len(offsets))
+    m = math.ceil(tip_at)
+    parts = np.append(np.ones(m - 1), tip_at - m + 1)
+    rigid = offsets[:m] * (parts == 1)
+    rigid[-1] += z
+    return np.concatenate([base[:3, :3].ravel(), base[:3, 3], [reach], rigid]), parts
+
+
+def write_whole_chain(plan: Plan, stored: Stored) -> int:
+    """Write the node of a chain of arcs up to the robot's end, wherever its tip is."""
+    end = float(len(stored.array("offsets")))
+    settings = {**stored.settings, "tip_at": end, "markers": [[end, 0.0, 0.0, 0.0]]}
+    return plan.node_of(replace(stored, settings=settings))
 
 
 class Frames(NamedTuple):

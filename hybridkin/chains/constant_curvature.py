@@ -7,19 +7,49 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform, identity
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.stored import Layout
+from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains._arcs import free_arcs, levers, reading_matrix, turned_by_first
 from hybridkin.chains._checks import bend_counts, filled, float_dtype
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, frame_numbers
 
 __all__ = ["ConstantCurvatureChain"]
 
 _CONTRADICTED = 0.3  # share of the readings that the arcs explain, in one segment
 _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
+
+
+def _write_plan(plan: Plan, stored: Stored) -> int:
+    """Write the node of a chain: its frame, and the linear map from q to its arcs."""
+    if stored.settings.get("stage") is not None:
+        raise NoKernel("a chain on a rotation stage has no kernel")
+    radii = stored.array("radii")
+    reach = 10.0 * radii.mean()
+    if "lengths" in stored.arrays:
+        reach = stored.array("lengths").sum()
+    frame, parts = frame_numbers(plan, stored, reach)
+    n_segments, n_arcs = len(radii), len(parts)
+
+    def by_segment(name: str) -> NDArray:
+        """Return rows (n_arcs, 3, ...) of length, x- and y-bending up to the tip."""
+        rows = stored.derived[name].reshape(3, n_segments, -1).swapaxes(0, 1)
+        return rows[:n_arcs] * parts[:, None, None]
+
+    matrix, offset = by_segment("arc_matrix"), by_segment("arc_offset")
+    n = width = matrix.shape[2]
+    step = 0  # columns from the actuators of a segment to those of the next one
+    if n % n_segments == 0:
+        per_segment = n // n_segments
+        blocks = [rows[:, k * per_segment :][:, :per_segment] for k, rows in enumerate(matrix)]
+        diagonal = np.stack(blocks)
+        if np.count_nonzero(diagonal) == np.count_nonzero(matrix):
+            matrix, step, width = diagonal, per_segment, per_segment
+    return plan.node("arcs", n, 3, [frame, offset, matrix], n_arcs, step, width)
 
 
 class ConstantCurvatureChain(ArcChain):
@@ -91,6 +121,7 @@ class ConstantCurvatureChain(ArcChain):
         dict.fromkeys(_entries, ""),
         {**STRUCTURE, "extensible": list, "bends": list, "stage": str},
         derived=("arc_matrix", "arc_offset"),
+        write_plan=_write_plan,
     )
     _structure = (*ArcChain._structure, "bends", "stage")
 

@@ -6,21 +6,53 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import LARGEST, Numbers, Transform
-from hybridkin._core.stored import Layout
+from hybridkin._core.plan import Plan
+from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains import _slack
 from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled, float_dtype
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, frame_numbers
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]
 
 _SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros gains".split()
 _TABLE = 12  # largest number of tendons for which all responses are stored
+
+
+def _write_plan(plan: Plan, stored: Stored) -> int:
+    """Write the node of a chain: its frame, then numbers of its segments and of its tendons."""
+    lengths, rest_bends = stored.array("lengths"), stored.array("rest_bends")
+    bending, axial = stored.array("bending_stiffness"), stored.array("axial_stiffness")
+    counts = stored.list_of(int, "actuators_per_segment")
+    n_segments = len(lengths)
+    from_base = stored.value("routing", str) == "base"
+    frame, parts = frame_numbers(plan, stored, lengths.sum())
+    n_arcs = len(parts)
+
+    # Tendons from the base also act on the segment before, which is coupled to this one.
+    up_to_tip = np.append(parts, np.zeros(n_segments - n_arcs))[:, None]
+    coupled = from_base * (np.arange(n_segments) > 0)[:, None]
+    stiffness = np.column_stack([axial, bending, bending])
+    arcs = up_to_tip * np.column_stack([lengths, rest_bends])
+    segments = [stiffness, coupled * stiffness, arcs, up_to_tip, coupled * up_to_tip]
+
+    segment = np.repeat(np.arange(n_segments), counts)
+    radii, angles = stored.array("radii")[segment], stored.array("angles")
+    x, y = -radii * np.cos(angles), -radii * np.sin(angles)
+    if from_base:
+        rest_bends = np.cumsum(rest_bends, 0)
+    bends = rest_bends[segment]  # zeros of the tendons are for bends measured from rest
+    zeros = stored.array("tendon_zeros") + x * bends[:, 0] + y * bends[:, 1]
+    tendons = np.column_stack([zeros, x, y, x * x, x * y, y * y, stored.array("gains")])
+    equal_count = counts[0] if len({*counts}) == 1 else 0
+    numbers = [frame, np.hstack(segments), tendons]
+    return plan.node("elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts)
 
 
 class ElasticTendonChain(ArcChain):
@@ -102,7 +134,9 @@ class ElasticTendonChain(ArcChain):
     """
 
     _entries = (*_SHAPING, "lengths", "offsets", "base")
-    layout = Layout("elastic_tendons", dict.fromkeys(_entries, ""), STRUCTURE)
+    layout = Layout(
+        "elastic_tendons", dict.fromkeys(_entries, ""), STRUCTURE, write_plan=_write_plan
+    )
     _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
 
     def __init__(

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints
@@ -23,6 +24,30 @@ if TYPE_CHECKING:
 __all__ = ["RigidChain"]
 
 _KINDS = ("revolute", "prismatic")
+
+
+def _write_plan(plan: Plan, stored: Stored) -> int:
+    """Write the node of an arm: the frame of every joint relative to the one before."""
+    slides = [kind == "prismatic" for kind in stored.list_of(str, "kinds")]
+    n_joints = len(slides)
+    if not slides:
+        raise NoKernel("an arm without moving joints is a constant")
+    plan.limit("actuators", n_joints)
+    before, numbers, motions = stored.array("base"), [], stored.derived["motions"]
+    origins = motions[:, 0] + motions[:, 2]
+    for origin, axis in zip(origins, stored.array("axes"), strict=True):
+        side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+        side = side / np.linalg.norm(side)
+        turn = np.eye(4)  # turns the joint's axis to z
+        turn[:3, :3] = np.stack([side, np.cross(axis, side), axis], 1)
+        frame = before @ origin @ turn
+        numbers += [frame[:3, :3], frame[:3, 3]]
+        before = turn.T
+    before = before @ stored.array("tip")
+    tip = before @ np.append(stored.array("tool"), 1.0)
+    couplings = stored.arrays.get("couplings", np.zeros((0, n_joints)))
+    numbers += [tip[:3], before[:3, :3], couplings]
+    return plan.node("rigid", couplings.shape[1], 3, numbers, n_joints, len(couplings) > 0, *slides)
 
 
 class RigidChain(JointChain):
@@ -83,7 +108,11 @@ class RigidChain(JointChain):
     _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "dq_max", "base")
     _arrays += ("joint_zeros", "couplings")
     layout = Layout(
-        "rigid", dict.fromkeys(_arrays, ""), {"kinds": list, "names": list}, derived=("motions",)
+        "rigid",
+        dict.fromkeys(_arrays, ""),
+        {"kinds": list, "names": list},
+        derived=("motions",),
+        write_plan=_write_plan,
     )
 
     def __init__(

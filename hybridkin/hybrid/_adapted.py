@@ -10,11 +10,19 @@ from typing_extensions import Self
 
 from hybridkin._core.blocks import check_vectors
 from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin._core.plan import Plan
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
+
+
+def _write_plan(plan: Plan, stored: Stored) -> int:
+    fitted, motion = plan.node_of(stored.part("fitted")), stored.array("motion", (4, 4))
+    n, m = plan.lengths(fitted)
+    numbers = [stored.array("shift", (n,)), motion[:3, :3], motion[:3, 3]]
+    return plan.node("adapted", n, m, numbers, fitted)
 
 
 class AdaptedModel(ForwardModel):
@@ -32,7 +40,9 @@ class AdaptedModel(ForwardModel):
         T, the motion of the base in the measuring frame.
     """
 
-    layout = Layout("adapted_model", {"shift": "n", "motion": "44"}, parts=("fitted",))
+    layout = Layout(
+        "adapted_model", {"shift": "n", "motion": "44"}, parts=("fitted",), write_plan=_write_plan
+    )
     fitted: HybridModule
 
     def __init__(self, fitted: HybridModule, shift: Tensor, motion: Tensor) -> None:
@@ -149,7 +159,7 @@ class AdaptedModel(ForwardModel):
 class AdaptedPoseModel(AdaptedModel, PoseModel):
     """An `AdaptedModel` of a pose hybrid; its rows are positions and rotation vectors."""
 
-    layout = AdaptedModel.layout._replace(kind="adapted_pose_model")
+    layout = AdaptedModel.layout._replace(kind="adapted_pose_model", write_plan=None)
     fitted: PoseHybridModule  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def pose(self, q: Tensor) -> Tensor:

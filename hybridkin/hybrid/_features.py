@@ -5,15 +5,18 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.kernel_numbers import HK_POSE_FEATURES, HK_QUADRATIC_FEATURES
 from hybridkin._core.model import ForwardModel, PortableModule
-from hybridkin._core.stored import Layout
-from hybridkin.chains.arc_chain import ArcChain, Frames
-from hybridkin.learning.network import ACTIVATIONS
+from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.stored import Layout, Stored
+from hybridkin.chains.arc_chain import ArcChain, Frames, write_whole_chain
+from hybridkin.learning.network import ACTIVATIONS, write_units
 
 _POSE_BLOCK = 2048  # rows of pose features, whose temporaries stay in the cache
 _BLOCK = 2**18  # numbers in the features of a block of rows, which stay in the cache
@@ -258,6 +261,35 @@ def _turning(forces: Tensor) -> Tensor:
     return torch.stack(rows, -1).unflatten(-1, (3, 3)).permute(0, 2, 1, 3).reshape(3 * len(fx), -1)
 
 
+def _write_readout(plan: Plan, stored: Stored) -> int:
+    """Write the node of W phi(q), by the kind of its features."""
+    features, weights = stored.part("features"), stored.array("weights")
+    center, scale = features.array("center"), features.array("scale")
+    n, m = len(center), len(weights)
+    constant, linear, bent = np.split(weights, [1, 1 + n], axis=1)
+    readout = constant, linear, bent
+    if features.kind == "linear_features":
+        none = np.zeros((0, n)), np.zeros(0)
+        return write_units(plan, "elm", "sin", (center, scale), readout, none)
+    if features.kind == "hidden_features":
+        hidden = features.array("input_weights"), features.array("input_bias")
+        activation = features.value("activation", str)
+        return write_units(plan, "elm", activation, (center, scale), readout, hidden)
+    if features.kind == "quadratic_features":
+        i, j = np.triu_indices(n, 1)
+        crossed, squared = np.split(bent, [len(i)], axis=1)
+        hessian = np.zeros((m, n, n))
+        hessian[:, i, j] = hessian[:, j, i] = crossed
+        hessian[:, range(n), range(n)] = 3.0 * squared
+        constant = constant - 0.5 * squared.sum(1, keepdims=True)
+        numbers = [center, 1.0 / scale, np.column_stack([constant, linear, hessian.reshape(m, -1)])]
+        return plan.node("readout", n, m, numbers, HK_QUADRATIC_FEATURES)
+    if features.kind == "pose_features":
+        chain = write_whole_chain(plan, features.part("chain"))
+        return plan.node("readout", n, m, [center, 1.0 / scale, *readout], HK_POSE_FEATURES, chain)
+    raise NoKernel(f"a readout of {features.kind!r} has no kernel")
+
+
 class Readout(ForwardModel):
     """The readout W phi(q) as a torch module q (..., n) -> (..., C).
 
@@ -269,7 +301,7 @@ class Readout(ForwardModel):
         W [unit of the outputs].
     """
 
-    layout = Layout("readout", {"weights": "cp"}, parts=("features",))
+    layout = Layout("readout", {"weights": "cp"}, parts=("features",), write_plan=_write_readout)
 
     def __init__(self, features: Features, weights: Tensor) -> None:
         super().__init__()
@@ -293,6 +325,12 @@ class Readout(ForwardModel):
         return value, slope
 
 
+def _write_projected(plan: Plan, stored: Stored) -> int:
+    model = plan.node_of(stored.part("model"))
+    numbers = [stored.array("matrix").T, stored.array("offset")]
+    return plan.node("projected", *plan.lengths(model), numbers, model)
+
+
 class Projected(ForwardModel):
     """A model of the part of q that its rows moved: model(q @ matrix + offset).
 
@@ -306,7 +344,12 @@ class Projected(ForwardModel):
         See `Directions.projection`.
     """
 
-    layout = Layout("projected", {"matrix": "nn", "offset": "n"}, parts=("model",))
+    layout = Layout(
+        "projected",
+        {"matrix": "nn", "offset": "n"},
+        parts=("model",),
+        write_plan=_write_projected,
+    )
 
     def __init__(self, model: ForwardModel, matrix: Tensor, offset: Tensor) -> None:
         super().__init__()

@@ -5,16 +5,25 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.directions import Directions, moved_directions
+from hybridkin._core.kernel_numbers import (
+    HK_BOX_STEEPNESS,
+    HK_FULL,
+    HK_FULL_LEVERAGE,
+    HK_GROUP,
+    HK_LONGEST,
+)
 from hybridkin._core.model import ForwardModel, PortableModule, reverse_jacobian
-from hybridkin._core.stored import Layout
+from hybridkin._core.plan import Plan
+from hybridkin._core.stored import Layout, Stored
 from hybridkin.calibration.choice import split_by_effect
 from hybridkin.hybrid._features import center_and_scale
-from hybridkin.learning.network import LeverageModule
+from hybridkin.learning.network import LeverageModule, lever_numbers, write_network
 
 GUARDS = ("leverage", "box", None)
 _AS_IF = 0.1  # of half the range: the spread assumed in a direction that the log does not move
@@ -38,8 +47,8 @@ class Guard(PortableModule):
         `MOST` times this length, which limits the distance from the mechanical model everywhere.
     """
 
-    MOST = 1.5
-    FULL = 1.0
+    MOST = HK_LONGEST
+    FULL = HK_FULL
 
     def __init__(self, largest: Tensor) -> None:
         super().__init__()
@@ -94,6 +103,18 @@ class Guard(PortableModule):
         return 1.0 + margin * bent, 1.0 - bent * bent
 
 
+def _write_leverage_guard(plan: Plan, stored: Stored) -> int:
+    model = stored.part("model")
+    if model.kind == "elm":
+        place = write_network(plan, model, leverage=True)
+    else:
+        place = plan.node_of(model)
+    n, _ = plan.lengths(place)
+    return plan.node(
+        "leverage_guard", n, 0, [stored.array("largest"), stored.array("limit")], place
+    )
+
+
 class LeverageGuard(Guard):
     """Distance from the training rows by the leverage phi^T (G + lambda 1)^-1 phi of a model.
 
@@ -111,8 +132,13 @@ class LeverageGuard(Guard):
         The longest correction of a training row [m].
     """
 
-    layout = Layout("leverage_guard", {"limit": "", "largest": ""}, parts=("model",))
-    FULL = 3.0
+    layout = Layout(
+        "leverage_guard",
+        {"limit": "", "largest": ""},
+        parts=("model",),
+        write_plan=_write_leverage_guard,
+    )
+    FULL = HK_FULL_LEVERAGE
 
     def __init__(self, model: LeverageModule, limit: Tensor, largest: Tensor) -> None:
         super().__init__(largest)
@@ -135,6 +161,12 @@ class LeverageGuard(Guard):
         return self.model.leverage(q) / self.limit.to(q)
 
 
+def _write_box_guard(plan: Plan, stored: Stored) -> int:
+    low, high = stored.array("low"), stored.array("high")
+    width = np.where(high > low, high - low, 1.0)
+    return plan.node("box_guard", len(low), 0, [stored.array("largest"), low, high, 1.0 / width])
+
+
 class BoxGuard(Guard):
     """Distance from the training rows: how far q is outside a box, in tenths of its width.
 
@@ -146,7 +178,9 @@ class BoxGuard(Guard):
         The longest correction of a training row [m].
     """
 
-    layout = Layout("box_guard", {"low": "n", "high": "n", "largest": ""})
+    layout = Layout(
+        "box_guard", {"low": "n", "high": "n", "largest": ""}, write_plan=_write_box_guard
+    )
 
     def __init__(self, low: Tensor, high: Tensor, largest: Tensor) -> None:
         super().__init__(largest)
@@ -158,7 +192,17 @@ class BoxGuard(Guard):
         low, high = self.low.to(q), self.high.to(q)
         width = torch.where(high > low, high - low, torch.ones_like(low))
         outside = (low - q).clamp(min=0.0) + (q - high).clamp(min=0.0)
-        return 1.0 + (100.0 * (outside / width).square()).sum(-1)
+        return 1.0 + (HK_BOX_STEEPNESS * (outside / width).square()).sum(-1)
+
+
+def _write_quadratic_leverage(plan: Plan, stored: Stored) -> int:
+    center, half_width = stored.array("center"), stored.array("half_width")
+    # |L^-1 phi|^2 in the form of a network's leverage: R = L^-T is upper triangular.
+    identity_matrix = np.eye(2 * len(center) + 1)
+    factor = solve_triangular(stored.array("factor"), identity_matrix, lower=True).T
+    _, lever = lever_numbers(plan, np.zeros(1), np.zeros(len(factor)), np.triu(factor))
+    numbers = [center, 1.0 / half_width, *lever]
+    return plan.node("quadratic_leverage", len(center), 0, numbers, aligned=True)
 
 
 class QuadraticLeverage(LeverageModule):
@@ -172,7 +216,11 @@ class QuadraticLeverage(LeverageModule):
         Lower Cholesky factor of the features' Gram matrix plus the penalty.
     """
 
-    layout = Layout("quadratic_leverage", {"center": "n", "half_width": "n", "factor": "ff"})
+    layout = Layout(
+        "quadratic_leverage",
+        {"center": "n", "half_width": "n", "factor": "ff"},
+        write_plan=_write_quadratic_leverage,
+    )
 
     def __init__(self, center: Tensor, half_width: Tensor, factor: Tensor) -> None:
         super().__init__()
@@ -235,6 +283,16 @@ def fit_guard(
         return LeverageGuard.fit(model, q, largest, times)
 
 
+def _write_group_distance(plan: Plan, stored: Stored) -> int:
+    rows, axes = stored.array("rows"), stored.array("axes") / stored.array("farthest")
+    center = rows.mean(0)
+    padding = (0, -len(rows) % HK_GROUP), (0, 0)
+    placed = np.pad((rows - center) @ axes, padding, mode="edge")
+    groups = placed.reshape(-1, HK_GROUP, axes.shape[1]).swapaxes(1, 2)
+    numbers = [center, axes.T, groups]
+    return plan.node("group_distance", len(center), 0, numbers, *groups.shape[:2])
+
+
 class GroupDistance(PortableModule):
     """Distance from the training rows, at most 1 in the part that held-out groups have tested.
 
@@ -252,7 +310,11 @@ class GroupDistance(PortableModule):
         Largest distance of a training row from the rows of other groups, except for a few rows.
     """
 
-    layout = Layout("group_distance", {"rows": "rn", "axes": "nk", "farthest": ""})
+    layout = Layout(
+        "group_distance",
+        {"rows": "rn", "axes": "nk", "farthest": ""},
+        write_plan=_write_group_distance,
+    )
 
     def __init__(self, rows: Tensor, axes: Tensor, farthest: Tensor) -> None:
         super().__init__()

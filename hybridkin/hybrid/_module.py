@@ -12,10 +12,12 @@ from typing_extensions import Self
 
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
-from hybridkin._core.stored import Layout
+from hybridkin._core.plan import CHAINS, NoKernel, Plan
+from hybridkin._core.stored import Layout, Stored
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule
-from hybridkin.native.plan import ROUNDING
+
+_ROUNDING = 1e-7  # of weights that sum to one
 
 
 class Inside:
@@ -135,6 +137,45 @@ class InnerCorrection(PortableModule):
 Correction = TipCorrection | InnerCorrection
 
 
+def _write_plan(plan: Plan, stored: Stored) -> int:
+    """Write the node of a hybrid: places of its parts, and for each correction three entries."""
+
+    def place_of(name: str) -> int:
+        return plan.node_of(stored.part(name)) if name in stored.parts else -1
+
+    base, drift, tested = place_of("mechanical"), place_of("drift"), place_of("tested")
+    if base >= 0 and plan.kind(base) not in CHAINS:
+        raise NoKernel(f"the mechanical part {stored.part('mechanical').kind!r} is not a chain")
+    corrections = stored.part("corrections").parts.values()
+    inside = [correction.kind == "inner_correction" for correction in corrections]
+    entries = []
+    for correction, acts_inside in zip(corrections, inside, strict=True):
+        entries += _entries_of(plan, correction, acts_inside)
+    weights = stored.array("weights")
+    left = 1.0 - weights[inside].sum()  # weight of f beside inner corrections
+    numbers = [weights, [left * (left > _ROUNDING), any(inside)]]
+    n, m = plan.lengths(base if base >= 0 else entries[1])
+    return plan.node("hybrid", n, m, numbers, base, drift, tested, len(inside), *entries)
+
+
+def _entries_of(plan: Plan, correction: Stored, acts_inside: bool) -> tuple[bool, int, int]:
+    """Return whether a correction acts inside, and the places of its regressor and its guard."""
+    regressor = correction.part("readout" if acts_inside else "module")
+    if "guard" not in correction.parts:
+        return acts_inside, plan.node_of(regressor), -1
+    guard = correction.part("guard")
+    place = plan.node_of(guard)
+    if [_content(part) for part in guard.parts.values()] == [_content(regressor)]:
+        return False, plan.entry(place, 0), place  # value and leverage share the features
+    return acts_inside, plan.node_of(regressor), place
+
+
+def _content(stored: Stored) -> tuple:
+    """Return a tuple that is equal for equal descriptions without parts."""
+    arrays = {name: array.tobytes() for name, array in stored.arrays.items()}
+    return stored.kind, stored.settings, arrays
+
+
 class HybridModule(ForwardModel):
     """The sum x = f(q) + sum_k w_k s_k(q) + t(q) d(q) as a torch module q (..., n) -> x (..., m).
 
@@ -165,6 +206,7 @@ class HybridModule(ForwardModel):
         "hybrid_module",
         {"weights": "k"},
         parts=("mechanical", "corrections", "drift", "tested", "log_plane"),
+        write_plan=_write_plan,
     )
 
     def __init__(
@@ -327,7 +369,7 @@ class HybridModule(ForwardModel):
             # Inner corrections include f. df/dq is needed only if their weights sum to less than 1.
             inner = (weight for weight, c in self._parts() if isinstance(c, InnerCorrection))
             share = 1.0 - sum(inner)
-            if share > ROUNDING:
+            if share > _ROUNDING:
                 total = share * inside.x, share * inside.jacobian
         elif self.mechanical is not None:
             total = self.mechanical.forward_and_jacobian(q)

@@ -31,7 +31,7 @@ class PoseHybridModule(HybridModule, PoseModel):
         As for `HybridModule`.
     """
 
-    layout = HybridModule.layout._replace(kind="pose_hybrid_module")
+    layout = HybridModule.layout._replace(kind="pose_hybrid_module", write_plan=None)
     n_outputs = 3
     mechanical: PoseModel  # pyright: ignore[reportIncompatibleVariableOverride]
 

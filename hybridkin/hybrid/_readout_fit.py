@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Restore, Stored
 from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
@@ -23,7 +24,6 @@ from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
 from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import Program, program_of
-from hybridkin.native.plan import Plan
 
 _LARGEST = 1000  # most weights; of more features only the strongest directions are kept
 _ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # steps; the first ones and every tenth factorise

@@ -8,10 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hybridkin._core.kernel_numbers import IK_NEWTON, IK_PROXIMAL
 from hybridkin.ik._gram import apply_columns, apply_rows, solve_rows
-
-_PROXIMAL_ROUNDS = 2
-_MAX_NEWTON = 60  # steps; a handful is usual
 
 
 class BoxProblem(NamedTuple):
@@ -72,7 +70,7 @@ class HalfSpaces(NamedTuple):
         J = self.normals.to(margin).T.expand(len(margin), -1, -1)
         way, nu = margin.new_zeros(len(margin), J.shape[1]), torch.zeros_like(margin)
         small = margin.new_full((len(margin),), max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps)))
-        for _ in range(1 + _PROXIMAL_ROUNDS):
+        for _ in range(1 + IK_PROXIMAL):
             z = (self.along(way) - margin) / small[:, None]
             problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
             change = box_limited_step(problem, small)[0]
@@ -117,7 +115,7 @@ def box_limited_step(
     rows = torch.arange(len(mu), device=mu.device)
     noise = 4.0 * torch.finfo(mu.dtype).eps
     settled = torch.zeros(len(mu), dtype=torch.bool, device=mu.device)
-    for _ in range(_MAX_NEWTON):
+    for _ in range(IK_NEWTON):
         y, dq = live.at(mu)
         pull = damping_sq[:, None] * mu
         residual = apply_rows(live.J, dq) + pull - live.v
@@ -201,7 +199,7 @@ def _proximal_box_step(
     """
     used = torch.maximum(damping_sq, floor)
     excess, dq, mu = (used - damping_sq)[:, None], problem.z, centre
-    for _ in range(1 + _PROXIMAL_ROUNDS):
+    for _ in range(1 + IK_PROXIMAL):
         dq, mu = box_limited_step(problem._replace(v=problem.v + excess * mu), used, mu)
     return dq, mu
 

@@ -14,6 +14,33 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridkin._core.kernel_numbers import (
+    IK_AT_REST,
+    IK_DAMPING,
+    IK_DISTANCE,
+    IK_ERROR,
+    IK_FEED,
+    IK_FROM_REST,
+    IK_HAS_FEED,
+    IK_HAS_TARGET,
+    IK_HAS_TIP,
+    IK_HELD,
+    IK_LAST,
+    IK_LOWERS,
+    IK_MEMORY,
+    IK_MODE,
+    IK_MUST_SEE,
+    IK_PERIOD,
+    IK_Q,
+    IK_REACHED,
+    IK_SIGMA_MIN,
+    IK_TARGET,
+    IK_TIP,
+    IK_TO_DOMAIN,
+    IK_TO_POSTURE,
+    IK_X,
+)
+from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.ik._search import Found, Point, Search
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
@@ -26,15 +53,7 @@ from hybridkin.native.library import (
     opened_library,
     program_of,
 )
-from hybridkin.native.plan import NoKernel, Plan
 
-# The state of `ik_tick`, see native/src/ik_step.h.
-_MODE, _PERIOD, _MEMORY, _LAST, _SIGMA_MIN, _DAMPING, _DISTANCE = range(7)
-_TARGET, _FEED, _TIP, _OFFSET, _X, _ERROR, _Q = range(7, 26, 3)
-_HAS_TARGET, _HAS_FEED, _HAS_TIP, _MUST_SEE, _FROM_REST = 1, 2, 4, 8, 16
-# Modes and results of `hk_ik_find`, see native/src/ik_search.h.
-_LOWER, _TO_DOMAIN, _TO_POSTURE = 1, 2, 4
-_REACHED, _AT_REST, _HELD = 1, 2, 4
 _FLOAT64 = np.dtype(np.float64)
 _write_point = Struct("3d").pack_into
 
@@ -100,12 +119,12 @@ class Core:
         self._idle: list[Follower] = []  # one for every thread that has used `step`
         n = self.n
         self._places = {
-            "dq": slice(_Q + n, _Q + 2 * n),
-            "x": slice(_X, _ERROR),
-            "error": (_DISTANCE, ...),
-            "sigma_min": (_SIGMA_MIN, ...),
-            "damping": (_DAMPING, ...),
-            "saturated": slice(_Q + 3 * n, _Q + 4 * n),
+            "dq": slice(IK_Q + n, IK_Q + 2 * n),
+            "x": slice(IK_X, IK_ERROR),
+            "error": (IK_DISTANCE, ...),
+            "sigma_min": (IK_SIGMA_MIN, ...),
+            "damping": (IK_DAMPING, ...),
+            "saturated": slice(IK_Q + 3 * n, IK_Q + 4 * n),
         }
 
     def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, Program]]:
@@ -118,7 +137,7 @@ class Core:
         try:
             follower = self._idle.pop()
         except IndexError:  # other threads use them
-            follower = Follower(self, None, _MUST_SEE + _FROM_REST)
+            follower = Follower(self, None, IK_MUST_SEE + IK_FROM_REST)
         follower.q[...] = q
         found = (follower.state.copy(), self._places) if follower.tick(target, dx, tip) else None
         self._idle.append(follower)
@@ -129,8 +148,8 @@ class Core:
 
         `given` is the target, its motion in a period, the measured tip, and the previous step.
         """
-        n, mode = self.n, _MUST_SEE
-        for bit, a in zip((_HAS_TARGET, _HAS_FEED, _HAS_TIP), given[:3], strict=True):
+        n, mode = self.n, IK_MUST_SEE
+        for bit, a in zip((IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP), given[:3], strict=True):
             mode += 0 if a is None else bit
         out, held = np.empty((len(q), n + 6)), np.empty((len(q), n), dtype=bool)
         arrays = [None if a is None else _plain(a) for a in (q, *given)]
@@ -152,7 +171,7 @@ class Core:
         numbers = [ctypes.c_int32(mode), ctypes.c_int32(max_iter), ctypes.c_double(way), turn]
         self._run("hk_ik_find", rows, numbers, [_plain(target), best, J, e, found, n_iter])
         at, J, e, found, n_iter = (torch.from_numpy(a) for a in (best, J, e, found, n_iter))
-        reached, at_rest, held = (found & bit > 0 for bit in (_REACHED, _AT_REST, _HELD))
+        reached, at_rest, held = (found & bit > 0 for bit in (IK_REACHED, IK_AT_REST, IK_HELD))
         n_iter = n_iter.long()
         ends = n_iter, torch.ones_like(n_iter)
         x = target - e if self.rows == 3 else torch.full_like(target, math.nan)  # not used
@@ -193,12 +212,12 @@ class Follower:
     ) -> None:
         self.core, self._memory, self._least = core, memory, mode
         n = core.n
-        self.state = state = np.zeros(_Q + 7 * core.n) if state is None else state
-        self._dt = state[_PERIOD] = core.settings.dt
-        state[_MEMORY] = memory or 0.0
-        self.q, self._held = state[_Q : _Q + n], state[_Q + 3 * n : _Q + 4 * n]
+        self.state = state = np.zeros(IK_Q + 7 * core.n) if state is None else state
+        self._dt = state[IK_PERIOD] = core.settings.dt
+        state[IK_MEMORY] = memory or 0.0
+        self.q, self._held = state[IK_Q : IK_Q + n], state[IK_Q + 3 * n : IK_Q + 4 * n]
         self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
-        self._inputs = {at: state[at : at + 3] for at in (_TARGET, _FEED, _TIP)}
+        self._inputs = {at: state[at : at + 3] for at in (IK_TARGET, IK_FEED, IK_TIP)}
         self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
         self._follow, self._mode = opened_library().hk_ik_tick, -1
 
@@ -208,32 +227,32 @@ class Follower:
     def start(self, q: Tensor, dq: Tensor) -> None:
         """Set the initial configuration (1, n), and the step that led to it."""
         state, n = self.state, self.core.n
-        state[_SIGMA_MIN:] = 0.0
-        state[[_SIGMA_MIN, _DISTANCE, *range(_ERROR, _Q)]] = math.nan
-        state[_X:_ERROR] = self.core.settings.evaluate(q)[0][0]
-        state[_LAST] = self._dt
-        state[_Q + n : _Q + 2 * n] = dq[0]
-        self.q[:] = state[_Q + 2 * n : _Q + 3 * n] = q[0]
+        state[IK_SIGMA_MIN:] = 0.0
+        state[[IK_SIGMA_MIN, IK_DISTANCE, *range(IK_ERROR, IK_Q)]] = math.nan
+        state[IK_X:IK_ERROR] = self.core.settings.evaluate(q)[0][0]
+        state[IK_LAST] = self._dt
+        state[IK_Q + n : IK_Q + 2 * n] = dq[0]
+        self.q[:] = state[IK_Q + 2 * n : IK_Q + 3 * n] = q[0]
 
     def tick(self, target: Any, dx: Any, tip: Any) -> bool:
         """Do a tick with plain arrays: the target, its velocity, the measured tip.
 
         Returns False, and does nothing, if one of them needs full checks.
         """
-        mode = self._least | _HAS_TARGET
-        if not self._put(_TARGET, target):
+        mode = self._least | IK_HAS_TARGET
+        if not self._put(IK_TARGET, target):
             return False
         if dx is not None:
-            if not self._put(_FEED, dx):
+            if not self._put(IK_FEED, dx):
                 return False
-            self._inputs[_FEED] *= self._dt
-            mode |= _HAS_FEED
+            self._inputs[IK_FEED] *= self._dt
+            mode |= IK_HAS_FEED
         if tip is not None:
-            if not self._put(_TIP, tip):
+            if not self._put(IK_TIP, tip):
                 return False
-            mode |= _HAS_TIP
+            mode |= IK_HAS_TIP
         if mode != self._mode:
-            self.state[_MODE] = self._mode = mode
+            self.state[IK_MODE] = self._mode = mode
         self._follow(self._call.place)
         return True
 
@@ -254,24 +273,24 @@ class Follower:
 
     def advance(self, period: float | None, *given: Tensor | None) -> Tick:
         """Do a tick with checked rows: the target, its motion in the period, the measured tip."""
-        mode, bits = self._least, (_HAS_TARGET, _HAS_FEED, _HAS_TIP)
+        mode, bits = self._least, (IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP)
         for bit, place, a in zip(bits, self._inputs.values(), given, strict=True):
             if a is not None:
                 place[...] = a.reshape(3).numpy()
                 mode += bit
-        self.state[_MODE] = self._mode = mode
-        self.state[_PERIOD] = period or self._dt
+        self.state[IK_MODE] = self._mode = mode
+        self.state[IK_PERIOD] = period or self._dt
         self._follow(self._call.place)
-        self.state[_PERIOD] = self._dt
+        self.state[IK_PERIOD] = self._dt
         return self.last()
 
     command = property(lambda self: self.q.copy())
-    x = property(lambda self: self.state[_X:_ERROR].copy())
+    x = property(lambda self: self.state[IK_X:IK_ERROR].copy())
     stopped = False  # by tip limits, which have no kernel
     saturated = property(lambda self: self._held.astype(bool))
-    error = property(lambda self: float(self.state[_DISTANCE]))
-    sigma_min = property(lambda self: float(self.state[_SIGMA_MIN]))
-    damping = property(lambda self: float(self.state[_DAMPING]))
+    error = property(lambda self: float(self.state[IK_DISTANCE]))
+    sigma_min = property(lambda self: float(self.state[IK_SIGMA_MIN]))
+    damping = property(lambda self: float(self.state[IK_DAMPING]))
 
     def reached(self, tol: Tolerance) -> bool:
         """Return whether the error is within the tolerance."""
@@ -280,14 +299,14 @@ class Follower:
     def in_domain(self) -> bool:
         """Return whether the last tick began inside the domain of the model."""
         n = self.core.n
-        return bool(self.core.program.domain(self.state[_Q + 2 * n : _Q + 3 * n])[0] <= 1.0)
+        return bool(self.core.program.domain(self.state[IK_Q + 2 * n : IK_Q + 3 * n])[0] <= 1.0)
 
     def last(self) -> Tick:
         """Return the results of the last tick."""
         a, n = torch.from_numpy(self.state.copy())[None], self.core.n
-        _, dq, before, held, J = a[:, _Q:].split([n, n, n, n, 3 * n], dim=1)
-        step = StepRows(dq, a[:, _SIGMA_MIN], a[:, _DAMPING], held > 0.0)
-        return Tick(before, a[:, _X:_ERROR], J.view(1, 3, n), a[:, _ERROR:_Q], step)
+        _, dq, before, held, J = a[:, IK_Q:].split([n, n, n, n, 3 * n], dim=1)
+        step = StepRows(dq, a[:, IK_SIGMA_MIN], a[:, IK_DAMPING], held > 0.0)
+        return Tick(before, a[:, IK_X:IK_ERROR], J.view(1, 3, n), a[:, IK_ERROR:IK_Q], step)
 
 
 class _CoreTask(PositionTask):
@@ -312,11 +331,11 @@ class _CoreSearch(Search):
     core: Core
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
-        return self._find(_LOWER + _TO_DOMAIN, q, target)
+        return self._find(IK_LOWERS + IK_TO_DOMAIN, q, target)
 
     def _to_posture(self, found: Found) -> None:
         rows = found.reached.nonzero()[:, 0]
-        slid = self._find(_TO_POSTURE, found.q[rows], found.target[rows])
+        slid = self._find(IK_TO_POSTURE, found.q[rows], found.target[rows])
         found.put(rows, Point(slid.q, slid.x, slid.J, slid.e, slid.target))
         found.n_iter[rows] += slid.n_iter
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
-
-HEALTHY = 0.02  # sigma_min / sigma_max above which the pseudo-inverse needs no damping
+from hybridkin._core.kernel_numbers import IK_HEALTHY
 
 
 class RowGram(NamedTuple):
@@ -28,7 +27,7 @@ class RowGram(NamedTuple):
     @property
     def is_singular(self) -> Tensor:
         """Whether a direction is (nearly) lost, shape (...), bool."""
-        return self.sigma_min < HEALTHY * self.sigma_max
+        return self.sigma_min < IK_HEALTHY * self.sigma_max
 
 
 def row_gram(J: Tensor) -> RowGram:
@@ -171,7 +170,7 @@ def adaptive_damping(gram: RowGram) -> Tensor:
     ----------
     Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
     """
-    threshold = HEALTHY * gram.sigma_max
+    threshold = IK_HEALTHY * gram.sigma_max
     ratio = gram.sigma_min / torch.where(threshold > 0.0, threshold, torch.ones_like(threshold))
     return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
 

@@ -9,6 +9,16 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from hybridkin._core.kernel_numbers import (
+    IK_INSIDE,
+    IK_LAST_DAMPING,
+    IK_NULL_GAIN,
+    IK_NULL_SLIP,
+    IK_NULL_STEPS,
+    IK_SLOW,
+    IK_SLOW_STEPS,
+    IK_STATIONARY,
+)
 from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._starts import even_starts, nearest_starts
@@ -16,13 +26,6 @@ from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
 
 _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
-_LAST_DAMPING = 1e8  # no descent even with this damping: the point is stationary
-_STATIONARY = 1e-4  # sine of the angle between the error and the directions left by the limits
-_SLOW_STEPS = 8  # consecutive iterations that gain less than 1 % of tol
-_NULL_STEPS = 30  # iterations of a null-space descent
-_NULL_SLIP = 0.3  # largest error after a null-space step, per motion of the tip without projection
-_NULL_GAIN = 1e-8  # smallest gain of a null-space step, per square of the remaining step
-_INSIDE = 0.98  # target domain distance for starts outside the domain
 _OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
 _RETURNS = 30  # attempts to return rows that ended outside the tip limits
 _PARTS = [4, 8, 16]  # where further starts are split; only rows still open use the next part
@@ -215,7 +218,7 @@ class Search:
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
             live.stationary = self._blocked(live)
-            live.stationary |= (live.nu > _LAST_DAMPING) | (live.slow >= _SLOW_STEPS)
+            live.stationary |= (live.nu > IK_LAST_DAMPING) | (live.slow >= IK_SLOW_STEPS)
             live.n_iter = torch.full_like(live.n_iter, iteration)
             going = (~live.reached & ~live.stationary) & (iteration < self.max_iter)
             if not going.all():
@@ -242,7 +245,7 @@ class Search:
             live.nu = torch.where(better, less, live.nu * live.growth)
             live.growth = torch.where(better, 2.0, 2.0 * live.growth)
             metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
-            little = better & (error - error_new < 0.01 * metres)
+            little = better & (error - error_new < IK_SLOW * metres)
             live.slow = torch.where(little, live.slow + 1.0, 0.0)
             live.held = step.saturated.any(-1)
             taken = better.nonzero()[:, 0]
@@ -261,7 +264,7 @@ class Search:
             distance = self.settings.task.domain_distance(leaf)
             if distance.requires_grad:
                 (slope,) = torch.autograd.grad(distance.sum(), leaf, materialize_grads=True)
-        beyond = (distance.detach() - _INSIDE).clamp_min(0.0)
+        beyond = (distance.detach() - IK_INSIDE).clamp_min(0.0)
         square = slope.square().sum(-1)
         return -(beyond / torch.where(square > 0.0, square, 1.0))[:, None] * slope
 
@@ -280,13 +283,14 @@ class Search:
         task, unit = self.settings.task, self.settings.unit(found.q)
         inside = task.in_domain(found.q)
         live = self._slide(found.take(rows), wanted, torch.ones_like(found.e[rows, 0]))
-        for iteration in range(_NULL_STEPS):
-            last = iteration == _NULL_STEPS - 1
+        for iteration in range(IK_NULL_STEPS):
+            last = iteration == IK_NULL_STEPS - 1
             step, point = self._try_step(live, None if last else live.share[:, None] * live.free)
             new = self._slide(point, wanted, live.share)
             way = (new.q - live.q) / unit
             gain = 0.5 * ((live.free + new.free) / unit * way).sum(-1)
-            loose = new.error <= _NULL_SLIP * live.J.flatten(1).norm(dim=-1) * step.dq.norm(dim=-1)
+            moved = live.J.flatten(1).norm(dim=-1) * step.dq.norm(dim=-1)
+            loose = new.error <= IK_NULL_SLIP * moved
             reached, reached_new = self._within(live.e), self._within(new.e)
             ok = ((loose | reached_new) & (gain > 0.0)) | last
             ok |= ~reached & (new.error < 0.5 * live.error)
@@ -294,7 +298,7 @@ class Search:
             record = ok & reached_new
             found.put(rows[record], point.take(record))
             found.n_iter[rows] += 1
-            worth = _NULL_GAIN * (live.wish / unit).square().sum(-1)
+            worth = IK_NULL_GAIN * (live.wish / unit).square().sum(-1)
             far = (gain > worth) | ~reached | ~reached_new
             going = torch.where(ok, far, live.share > 0.01)
             curvature = (way * (live.free - new.free) / unit).sum(-1) / way.square().sum(-1)
@@ -335,7 +339,7 @@ class Search:
         out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
         out &= torch.isinf(self.settings.periods.to(q.device))
         left = torch.where(out, 0.0, pull).norm(dim=-1)
-        return left <= _STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
+        return left <= IK_STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
 
     def _nudged(self, found: Found) -> Tensor:
         """Return starts beside singular points, where first-order motion does not help.

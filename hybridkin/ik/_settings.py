@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from inspect import Signature
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 import torch
@@ -23,8 +23,17 @@ from hybridkin._core.arrays import (
     real_array,
     whole,
 )
+from hybridkin._core.kernel_numbers import (
+    IK_ACCELERATES,
+    IK_LIMITED,
+    IK_NORMALS,
+    IK_POSTURE,
+    IK_PULLS,
+    IK_WEIGHTS,
+)
 from hybridkin._core.model import Portable
-from hybridkin._core.stored import Stored
+from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.stored import Layout, Stored
 from hybridkin.ik._box import HalfSpaces
 from hybridkin.ik.tasks import PoseTask, PositionTask, Task, Tolerance
 
@@ -87,6 +96,36 @@ _FULL = 0.999  # a range of this share of a turn counts as a whole turn
 PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
 
 
+def _write_plan(plan: Plan, stored: Stored) -> int:
+    """Write the node of a step: limits, posture and weights, rates, and the plane to keep to."""
+    model = plan.node_of(stored.part("model"))
+    n, m = plan.lengths(model)
+    if m != 3:
+        raise NoKernel(f"the kernel of a step needs tips of 3 coordinates, got {m}")
+    settings = stored.settings
+    radian = settings["radian"]
+    if radian and plan.kind(model) != "rigid":
+        raise NoKernel("the kernels for poses support rigid arms only")
+    names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
+    vectors = [stored.array(name, [n], finite=False) for name in names]
+    weights, pulls = stored.array("weights", [n]), stored.array("pulls", [n])
+    periods, normals = stored.array("periods", [n], finite=False), stored.array("normals").T
+    if len(normals) > IK_NORMALS:
+        raise NoKernel(f"the log leaves {len(normals)} directions of q out, more than {IK_NORMALS}")
+    gain = -1.0 if settings["gain"] is None else settings["gain"]
+    # Steps of more than a second end at the posture.
+    beta = 1.0 if settings["beta"] is None else settings["beta"]
+    damping = -1.0 if settings["damping"] == "adaptive" else settings["damping"]
+    rates = [gain, beta, settings["dt"], damping, radian]
+    flags = IK_LIMITED * (settings["limits"] == "saturate")
+    flags |= IK_POSTURE * settings["has_posture"]
+    flags |= IK_WEIGHTS * bool((weights != 1.0).any())
+    flags |= IK_ACCELERATES * settings["accelerates"]
+    flags |= IK_PULLS * bool(pulls.any())
+    numbers = [*vectors, weights**-0.5, rates, periods, pulls, normals]
+    return plan.node("ik", n, 6 if radian else 3, numbers, model, flags, len(normals))
+
+
 @dataclass(frozen=True)
 class StepSettings(Portable):
     """All inputs of a step except q and the target; see `InverseKinematics`.
@@ -96,6 +135,8 @@ class StepSettings(Portable):
     model. `periods`, shape () or (n,), are the periods of q: a turn for an angle with a range of a
     whole turn, else inf. `pulls` is that of the robot, see `ForwardModel`.
     """
+
+    layout: ClassVar[Layout] = Layout("inverse_kinematics", {}, write_plan=_write_plan)
 
     task: Task
     q_min: Tensor
@@ -264,7 +305,7 @@ class StepSettings(Portable):
         names = ("beta", "gain", "damping", "limits", "dt", "has_posture", "accelerates")
         settings = {name: getattr(self, name) for name in names}
         settings["radian"] = self.task.units[1] if len(self.task.parts) > 1 else 0.0
-        return Stored.of("inverse_kinematics", arrays, {"model": model.stored()}, **settings)
+        return Stored.of(self.layout.kind, arrays, {"model": model.stored()}, **settings)
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:

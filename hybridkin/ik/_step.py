@@ -8,6 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hybridkin._core.kernel_numbers import (
+    IK_BALANCE,
+    IK_CORRECTIONS,
+    IK_LEAST_PULL,
+    IK_PULL_RATIO,
+    IK_SLACK,
+    IK_SLIP,
+)
 from hybridkin.ik._box import BoxProblem, strict_box_step
 from hybridkin.ik._gram import (
     adaptive_damping,
@@ -21,11 +29,6 @@ from hybridkin.ik._gram import (
 from hybridkin.ik._settings import StepSettings, stopping
 
 _PROJECTIONS, _EXCESS = 8, 1.5  # for a step that would leave the tip limits
-_BALANCE = 30.0  # of the tip's motion: of a motion that leaves the plane
-_CORRECTIONS = 3
-_SLACK = 0.02  # a tendon that moves the tip less, relative to the most, is slack
-_SLIP = 1e-4  # of the tip, relative to the motion of all actuators
-_PULLS = (1.0, 0.125, 0.015625)
 
 
 class StepRows(NamedTuple):
@@ -221,7 +224,7 @@ def _with_plane(
     """
     if settings.plane is None:
         return J, v
-    stiff = _BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
+    stiff = IK_BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
     rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
     aside = torch.zeros_like(rows[..., 0]) if posture is None else apply_rows(rows, posture)
     return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
@@ -233,7 +236,7 @@ def _only_taut(settings: StepSettings, J: Tensor) -> Tensor:
     A learned error makes them small instead of zero, and a step would drive these tendons far.
     """
     size = J.norm(dim=-2, keepdim=True)
-    slack = (size <= _SLACK * size.amax(-1, keepdim=True)) & (settings.pulls.to(J) != 0.0)
+    slack = (size <= IK_SLACK * size.amax(-1, keepdim=True)) & (settings.pulls.to(J) != 0.0)
     return torch.where(slack, 0.0, J)
 
 
@@ -277,7 +280,7 @@ def _arriving(
 
     def approach(dq: Tensor, motion: Tensor, close: Tensor) -> _End:
         best = end = end_of(dq, motion)
-        for _ in range(_CORRECTIONS):
+        for _ in range(IK_CORRECTIONS):
             going = best.distance > close
             if not going.any():
                 break
@@ -292,7 +295,7 @@ def _arriving(
     size = J.flatten(1).norm(dim=-1, keepdim=True)
     moved = [a.norm(dim=-1, keepdim=True) for a in (step.dq, q)]
     eps = torch.finfo(q.dtype).eps
-    slip = size * (_SLIP * moved[0] + 32.0 * eps * moved[1])
+    slip = size * (IK_SLIP * moved[0] + 32.0 * eps * moved[1])
     promised = apply_rows(J, step.dq)
     close = torch.maximum(0.5 * promised.norm(dim=-1, keepdim=True), slip)
     end = approach(step.dq, promised, close)
@@ -303,14 +306,14 @@ def _arriving(
     to = torch.where(slack & torch.isfinite(to), to, end.dq)
     way = to - end.dq
     weak &= (way != 0.0).any(-1, keepdim=True)
-    for share in _PULLS:
-        if not weak.any():
-            break
+    share = 1.0
+    while share > IK_LEAST_PULL and weak.any():
         pulled = approach(torch.clamp(to - (1.0 - share) * way, lower, upper), v, slip)
         # A slack tendon moves the tip by rounding alone.
         better = weak & (pulled.distance <= (1.0 + eps**0.5) * end.distance)
         end = end.where(better, pulled)
         weak = weak & ~better
+        share *= IK_PULL_RATIO
     held = (end.dq <= lower) | (end.dq >= upper)
     return step._replace(dq=end.dq, saturated=held)
 

@@ -3,13 +3,13 @@
 import numpy as np
 import torch
 from scipy import linalg
-from scipy.linalg.blas import dsyrk  # pyright: ignore
 from scipy.linalg.lapack import dposv  # pyright: ignore
 from sklearn.utils import gen_batches
 
 from hybridkin.learning._ridge import moments
 
 _BLOCK_ELEMENTS = 2_000_000  # 16 MB of float64 per temporary
+_PAIRED = 4  # rows whose products with all rows before are computed at once, in the cache
 
 
 class LeftOut:
@@ -63,47 +63,85 @@ class LeftOut:
             self._Zy = self._basis.T @ C
         self.eigenvalues = np.maximum(eigenvalues, 0.0)
 
-    def rows_at_a_time(self, n_alphas):
-        """Return the number of rows to compute at once within the limit of memory."""
-        return max(1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1]))
-
-    def each(self, rows, alphas):
-        """Return the errors (n_alphas, n_rows, n_outputs) on rows, each held out alone."""
-        Z, D, root = self._z(rows), self._d(alphas), self._root[rows]
-        p = D @ (Z * Z).T
-        if not self._wide:
-            p += 1.0 - (root**2 / self._n if self._intercept else 0.0)
-        return self._residuals(Z, D, rows) / p[:, :, None] / root[:, None]
-
-    def together(self, out, asked, alphas):
-        """Return the errors (n_alphas, n_asked, n_outputs) on rows `asked`, without rows `out`.
+    def alone(self, alphas):
+        """Yield blocks of rows and their errors (n_alphas, n_rows, n_outputs), each held out alone.
 
         Parameters
         ----------
-        out : ndarray of int of shape (n_out,)
-            Held-out rows, ascending.
-        asked : ndarray of int of shape (n_asked,)
-            Rows of `out` to evaluate.
         alphas : ndarray of shape (n_alphas,)
             Penalties.
         """
-        if not self._wide and len(out) > len(self._center):
-            return self._refitted(out, asked, alphas)
-        Z, D = self._z(out), self._d(alphas)
-        residuals, among = self._residuals(Z, D, out), np.searchsorted(out, asked)
-        fixed = np.asfortranarray(np.eye(len(out))) * (not self._wide)
-        if self._intercept and not self._wide:
-            fixed -= np.outer(self._root[out], self._root[out]) / self._n
-        errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
-        for k, d in enumerate(D):  # all of one sign
-            half = Z * np.sqrt(np.abs(d))
-            P = dsyrk(np.copysign(1.0, d[0]), half.T, 1.0, fixed, trans=True, lower=True)
-            _, solution, failed = dposv(P, residuals[k], lower=True)
-            if failed:
-                whole = np.tril(P) + np.tril(P, -1).T  # by singular values: it may have none left
-                solution = np.linalg.lstsq(whole, residuals[k], rcond=None)[0]
-            errors[k] = solution[among]
-        return errors / self._root[asked, None]
+        D = self._d(alphas)
+        for batch in gen_batches(len(self._X), self._rows_at_a_time(len(alphas))):
+            rows = np.arange(batch.start, batch.stop)
+            Z, root = self._z(rows), self._root[rows]
+            p = D @ (Z * Z).T
+            if not self._wide:
+                p += 1.0 - (root**2 / self._n if self._intercept else 0.0)
+            yield rows, self._residuals(Z, D, rows) / p[:, :, None] / root[:, None]
+
+    def together(self, splits, alphas):
+        """Yield the asked rows of each split, and their errors (n_alphas, n_asked, n_outputs).
+
+        Parameters
+        ----------
+        splits : list of (out, asked)
+            Held-out rows, ascending, and the rows of them to evaluate.
+        alphas : ndarray of shape (n_alphas,)
+            Penalties.
+        """
+        D = self._d(alphas)
+        for part in self._in_parts(splits, self._rows_at_a_time(len(alphas))):
+            rows = np.concatenate([out for out, _ in part])
+            if not self._wide and len(rows) > len(self._center) and len(part) == 1:
+                (split,) = part
+                yield split[1], self._refitted(*split, alphas)
+                continue
+            Z = self._z(rows)
+            residuals = self._residuals(Z, D, rows)
+            start = 0
+            for out, asked in part:
+                stop = start + len(out)
+                errors = self._solved(Z[start:stop], D, residuals[:, start:stop], out)
+                yield asked, errors[:, np.searchsorted(out, asked)] / self._root[asked, None]
+                start = stop
+
+    def _in_parts(self, splits, n_rows):
+        """Yield lists of splits that together hold out at most `n_rows` rows, or a single one.
+
+        A split of more rows than features is single, see `_refitted`.
+        """
+        part, size = [], 0
+        for split in splits:
+            count = len(split[0])
+            single = not self._wide and count > len(self._center)
+            if part and (single or size + count > n_rows):
+                yield part
+                part, size = [], 0
+            part.append(split)
+            size = n_rows if single else size + count
+        if part:
+            yield part
+
+    def _solved(self, Z, D, residuals, out):
+        """Return P_SS^-1 r_S (n_alphas, n_out, n_outputs) for the rows S."""
+        fixed = np.zeros((len(out), len(out)))
+        if not self._wide:
+            fixed += np.eye(len(out))
+            if self._intercept:
+                fixed -= np.outer(self._root[out], self._root[out]) / self._n
+        errors = np.empty(residuals.shape)
+        for k, lower in enumerate(_products(Z, D)):
+            lower += fixed
+            # Its transpose is in the order of LAPACK.
+            _, errors[k], failed = dposv(lower.T, residuals[k])
+            if failed:  # by singular values: P may have none left
+                whole = np.tril(lower) + np.tril(lower, -1).T
+                errors[k] = np.linalg.lstsq(whole, residuals[k], rcond=None)[0]
+        return errors
+
+    def _rows_at_a_time(self, n_alphas):
+        return max(1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1]))
 
     def _d(self, alphas):
         numerator = alphas[:, None] if self._wide else -1.0
@@ -119,16 +157,18 @@ class LeftOut:
         return (phi - self._center) * self._root[rows, None]
 
     def _residuals(self, Z, D, rows):
-        r = np.matmul(Z, D[:, :, None] * self._Zy)
+        """Return the residuals r (n_alphas, n_rows, n_outputs) of a fit to all rows."""
+        by_alpha = (D.T[:, :, None] * self._Zy[:, None]).reshape(Z.shape[1], -1)
+        r = (Z @ by_alpha).reshape(len(Z), len(D), -1).swapaxes(0, 1)
         return r if self._wide else self._y[rows] + r
 
     def _refitted(self, out, asked, alphas):
-        """Return the same as `together`, from sums over the remaining rows; faster for large S."""
+        """Return the errors of one split from sums over the remaining rows; faster for large S."""
         n_features = len(self._center)
         scatter = np.diag(np.append(self.eigenvalues, np.zeros(self._y.shape[1])))
         scatter[:n_features, n_features:] = self._Zy
         total, weight = np.zeros(len(scatter)), self._n
-        for batch in gen_batches(len(out), self.rows_at_a_time(0)):
+        for batch in gen_batches(len(out), self._rows_at_a_time(0)):
             rows = out[batch]
             z = np.hstack([self._z(rows), self._y[rows]])
             scatter -= z.T @ z
@@ -140,8 +180,19 @@ class LeftOut:
         shrunk = 1.0 / np.add.outer(alphas, np.maximum(eigenvalues, 0.0))
         W = V @ (shrunk[:, :, None] * (V.T @ scatter[:n_features, n_features:]))
         errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
-        for batch in gen_batches(len(asked), self.rows_at_a_time(len(alphas))):
+        for batch in gen_batches(len(asked), self._rows_at_a_time(len(alphas))):
             root = self._root[asked[batch], None]
             z, y = self._z(asked[batch]) / root, self._y[asked[batch]] / root
             errors[:, batch] = y - mean[n_features:] - (z - mean[:n_features]) @ W
         return errors
+
+
+def _products(Z, D):
+    """Return the lower triangles of ``Z diag(d) Z'`` (n_alphas, n_rows, n_rows) for rows d of D."""
+    n_rows, n_features = Z.shape
+    P = np.zeros((len(D), n_rows, n_rows))
+    for start in range(0, n_rows, _PAIRED):
+        stop = min(start + _PAIRED, n_rows)
+        pairs = (Z[start:stop, None] * Z[:stop]).reshape(-1, n_features)
+        P[:, start:stop, :stop] = (D @ pairs.T).reshape(len(D), -1, stop)
+    return P

@@ -261,7 +261,7 @@ def _candidate(params, relevance, task):
     largest = left_out.eigenvalues[-1] or 1.0
     alphas = _AUTO_ALPHAS * largest if isinstance(alphas, str) else _positive(alphas, "alphas")
     total, weight = np.zeros((len(alphas), targets.shape[1])), 0.0
-    for rows, errors in _errors(left_out, len(X), splits, alphas):
+    for rows, errors in _errors(left_out, splits, alphas):
         total += np.einsum("r, lrm -> lm", weights[rows], errors * errors)
         weight += weights[rows].sum()
     mse = np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
@@ -269,21 +269,15 @@ def _candidate(params, relevance, task):
     return _Candidate(params, relevance, alphas, mse, float(mse.min()), left_out)
 
 
-def _errors(left_out, n_rows, splits, alphas):
+def _errors(left_out, splits, alphas):
     """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
-    if splits is not None:
-        for out, asked in splits:
-            yield asked, left_out.together(out, asked, alphas)
-    else:
-        for batch in gen_batches(n_rows, left_out.rows_at_a_time(len(alphas))):
-            rows = np.arange(batch.start, batch.stop)
-            yield rows, left_out.each(rows, alphas)
+    return left_out.alone(alphas) if splits is None else left_out.together(splits, alphas)
 
 
 def _left_out_errors(best, task):
     total, count = np.zeros(task.targets.shape), np.zeros((len(task.X), 1))
     alpha = np.array([best.params["alpha"]])
-    for rows, errors in _errors(best.left_out, len(task.X), task.splits, alpha):
+    for rows, errors in _errors(best.left_out, task.splits, alpha):
         total[rows] += errors[0]
         count[rows] += 1
     return total / np.where(count > 0, count, np.nan)

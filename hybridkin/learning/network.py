@@ -6,6 +6,8 @@ from torch import nn
 
 from hybridkin._core.arrays import one_of
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.kernel_numbers import ACTIVATIONS as KERNELS
+from hybridkin._core.kernel_numbers import HK_GROUP
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Layout
 
@@ -21,6 +23,76 @@ ACTIVATIONS = {
 LAYER = ("input_weights", "input_bias", "input_center", "input_scale")
 READOUT = ("output_weights", "intercept")
 READOUT += ("leverage_center", "leverage_factor", "leverage_offset")
+
+
+def write_units(plan, kind, activation, scaling, readout, hidden, lever=()):
+    """Write the node of ``x = c + D u + V sigma(W u + b)``, and return its place.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+    kind, activation : str
+        Kind of the node, and name of sigma; the kernels know "gaussian" too.
+    scaling : tuple of ndarray of shape (n,)
+        Center and scale of u.
+    readout : tuple of ndarray of shape (m,), (m, n) and (m, H)
+        c, D and V.
+    hidden : tuple of ndarray of shape (H, n) and (H,)
+        W and b.
+    lever : tuple of ndarray, default=()
+        Arguments of `lever_numbers`, if the node also gives a leverage.
+    """
+    center, scale = scaling
+    intercept, direct, output = readout
+    W, b = hidden
+    (m, n), n_hidden = direct.shape, len(b)
+    units = np.zeros((-(-n_hidden // HK_GROUP) * HK_GROUP, n + 1 + m))
+    units[:n_hidden] = np.column_stack([W, b, output.T])
+    groups = units.reshape(-1, HK_GROUP, n + 1 + m).swapaxes(1, 2)
+    numbers = [center, 1.0 / scale, intercept, direct, groups]
+    n_features, full = 0, False
+    if lever:
+        n_features = len(lever[1])
+        full, leverage = lever_numbers(plan, *lever)
+        numbers += leverage
+    entries = (n_hidden, KERNELS.index(activation), n_features, full)
+    return plan.node(kind, n, m, numbers, *entries, aligned=True)
+
+
+def lever_numbers(plan, offset, center, factor):
+    """Return whether a factor R (f, f) is full, and the numbers of |R' (phi - center)|^2 + offset.
+
+    R is stored in blocks of columns; the first block starts with zeros as padding. An upper
+    triangular R is stored down to its diagonal.
+    """
+    n_features = len(center)
+    plan.limit("features", n_features)
+    full = bool(np.tril(factor, -1).any())
+    padded = np.pad(factor, ((0, 0), (-n_features % HK_GROUP, 0)))
+    ends = range(n_features, 0, -HK_GROUP)[::-1]
+    columns = np.split(padded, len(ends), axis=1)
+    numbers = [offset, center, np.zeros(-(1 + n_features) % HK_GROUP)]
+    for block, end in zip(columns, ends, strict=True):
+        numbers.append(block if full else block[:end])
+    return full, numbers
+
+
+def write_network(plan, stored, leverage=False):
+    """Write the node of an `ELM`, with its leverage if a guard needs it, and return its place."""
+    W, b = stored.array("input_weights"), stored.array("input_bias")
+    weights = stored.array("output_weights")
+    n_hidden = len(b)
+    direct = np.zeros((W.shape[1], weights.shape[1]))
+    if len(weights) > n_hidden:
+        direct = weights[n_hidden:]
+    scaling = stored.array("input_center"), stored.array("input_scale")
+    readout = stored.array("intercept"), direct.T, weights[:n_hidden].T
+    lever = ()
+    if leverage:
+        lever = [stored.array(f"leverage_{name}") for name in ("offset", "center", "factor")]
+    activation = stored.value("activation", str)
+    return write_units(plan, "elm", activation, scaling, readout, (W, b), lever)
 
 
 class LeverageModule(ForwardModel):
@@ -63,6 +135,7 @@ class ELM(LeverageModule):
         | {"output_weights": "fm", "intercept": "m", "leverage_offset": ""}
         | {"leverage_center": "f", "leverage_factor": "ff"},
         {"activation": str},
+        write_plan=write_network,
     )
 
     def __init__(self, activation="logistic", **arrays):

@@ -19,7 +19,9 @@ from torch.autograd.function import once_differentiable
 from hybridkin._core.arrays import copied
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, as_forward_model
-from hybridkin._core.stored import Layout
+from hybridkin._core.plan import Plan
+from hybridkin._core.stored import Layout, Stored
+from hybridkin.learning.network import write_units
 
 _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
 _MOST_POWER = 100
@@ -67,6 +69,14 @@ def _register(module: nn.Module, **arrays: ArrayLike) -> None:
         module.register_buffer(name, torch.tensor(rows, device="cpu"))
 
 
+def _write_affine(plan: Plan, stored: Stored) -> int:
+    coef, bias = stored.array("coef"), stored.array("bias")
+    m, n = coef.shape
+    readout = bias, coef, np.zeros((m, 0))
+    hidden = np.zeros((0, n)), np.zeros(0)
+    return write_units(plan, "affine", "sin", (np.zeros(n), np.ones(n)), readout, hidden)
+
+
 class AffineModule(ForwardModel):
     """A fitted linear regressor as a torch module.
 
@@ -78,7 +88,7 @@ class AffineModule(ForwardModel):
         Value at q = 0.
     """
 
-    layout = Layout("affine", {"coef": "mn", "bias": "m"})
+    layout = Layout("affine", {"coef": "mn", "bias": "m"}, write_plan=_write_affine)
 
     def __init__(self, coef: ArrayLike, bias: ArrayLike) -> None:
         super().__init__()
@@ -93,6 +103,21 @@ class AffineModule(ForwardModel):
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the value (..., m), and the constant matrix for every row (..., m, n)."""
         return self(q), self.coef.to(q).expand(*q.shape[:-1], *self.coef.shape)
+
+
+def _write_polynomial(plan: Plan, stored: Stored) -> int:
+    """Write the node of a polynomial: for each monomial the places of its powers in a table."""
+    powers, readout = stored.array("powers").astype(int), stored.array("readout")
+    n_monomials, n = powers.shape
+    degrees = int(powers.max()) + 1
+    plan.limit("powers", n * degrees)
+    factors = []
+    for exponents in powers:
+        (inputs,) = exponents.nonzero()
+        factors += [len(inputs), *(inputs * degrees + exponents[inputs])]
+    scaling = stored.array("center"), 1.0 / stored.array("scale")
+    numbers = [*scaling, np.column_stack([readout, stored.derived["slope"]])]
+    return plan.node("polynomial", n, readout.shape[1], numbers, n_monomials, degrees, *factors)
 
 
 class PolynomialModule(ForwardModel):
@@ -115,6 +140,7 @@ class PolynomialModule(ForwardModel):
         "polynomial",
         {"powers": "pn", "readout": "pm", "center": "n", "scale": "n"},
         derived=("slope",),
+        write_plan=_write_polynomial,
     )
 
     def __init__(
@@ -164,6 +190,15 @@ class PolynomialModule(ForwardModel):
         return phi
 
 
+def _write_kernel(plan: Plan, stored: Stored) -> int:
+    rows, weights = stored.array("rows"), stored.array("weights")
+    direct = np.zeros((weights.shape[1], rows.shape[1]))
+    hidden = rows, -0.5 * (rows * rows).sum(1)
+    scaling = stored.array("center"), stored.array("scale")
+    readout = stored.array("bias"), direct, weights.T
+    return write_units(plan, "kernel", "gaussian", scaling, readout, hidden)
+
+
 class KernelModule(ForwardModel):
     """A sum of Gaussians ``weights' exp(-|u - u_i|^2 / 2) + bias`` at training rows.
 
@@ -180,7 +215,9 @@ class KernelModule(ForwardModel):
     """
 
     layout = Layout(
-        "kernel", {"rows": "kn", "weights": "km", "bias": "m", "center": "n", "scale": "n"}
+        "kernel",
+        {"rows": "kn", "weights": "km", "bias": "m", "center": "n", "scale": "n"},
+        write_plan=_write_kernel,
     )
 
     def __init__(

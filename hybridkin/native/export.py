@@ -17,10 +17,11 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin._core.files import write_files
+from hybridkin._core.kernel_numbers import IK_LIMITED, c_header
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Stored
 from hybridkin._core.version import __version__
-from hybridkin.native.plan import ARCS, ELASTIC, HYBRID, RIGID, NoKernel, Plan
 
 _FOLDER = Path(__file__).parent
 _REAL = {"float64": "double", "float32": "float"}
@@ -28,16 +29,15 @@ _TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # of the test, relative to the 
 # Buffers with the middle and the half width of the training rows of a learned part.
 _RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "half_width"))
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
-_LIMITED = 1  # flag of a step, see src/ik_step.h
 _NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
 _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
 _STEPS, _MEMORY = 4, 5.0  # steps per run of the test; memory in periods
 # Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
 _OPERATIONS = {
-    ARCS: lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
-    ELASTIC: lambda a, n, m, S: (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S,
-    RIGID: lambda a, n, m, S: 10 * (a - 9) + 15 * n,  # the tip does not turn
-    HYBRID: lambda a, n, m, S: a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2)),
+    "arcs": lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
+    "elastic": lambda a, n, m, S: (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S,
+    "rigid": lambda a, n, m, S: 10 * (a - 9) + 15 * n,  # the tip does not turn
+    "hybrid": lambda a, n, m, S: a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2)),
 }
 
 
@@ -144,6 +144,8 @@ def _filled(template: str, entries: dict[str, Any]) -> str:
 
 def _with_headers(path: Path) -> str:
     """Return the text of a file with the kernel headers inserted."""
+    if path.name == "kinds.h":
+        return c_header()
     return re.sub(
         r'(?m)^#include "(\w+\.h)"$',
         lambda found: _with_headers(_FOLDER / "src" / found[1]),
@@ -153,9 +155,9 @@ def _with_headers(path: Path) -> str:
 
 def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
     """Return sizes and numbers of a plan as C, and the entries of README.md about them."""
-    at = int(plan.code[plan.root + 4]) if steps else plan.root
+    at = plan.entry(plan.root, 0) if steps else plan.root
     # gcc warns about arrays of length 1 if it cannot see that loops over them run at all.
-    sizes = {f"MAX_{s}": max(plan.largest.get(what, 0), 2) for s, what in _SIZES.items()}
+    sizes = {f"MAX_{s}": max(plan.largest[what], 2) for s, what in _SIZES.items()}
     kinds = sum(1 << kind for kind in {*plan.code[plan.places].tolist()})
     lines = [f"#define HK_{a} {number}" for a, number in {**sizes, "KINDS": f"{kinds}u"}.items()]
     found = {
@@ -187,12 +189,15 @@ def _check_stack(plan: Plan, dtype: str) -> None:
 
 def _operations(plan: Plan) -> int:
     """Return the approximate largest number of operations for x and J."""
-    *columns, begin = (plan.code[np.add(plan.places, k)].tolist() for k in range(4))
-    numbers, S = np.diff([*begin, len(plan.data)]).tolist(), plan.largest.get("segments", 0)
+    ends = [plan.begin(place) for place in plan.places[1:]]
     work = 0
-    for kind, n, m, a in zip(*columns, numbers, strict=True):
-        # Learned parts use each number once for x, and at most m times for J.
-        work += _OPERATIONS[kind](a, n, m, S) if kind in _OPERATIONS else 2 * (m + 1) * a
+    for place, end in zip(plan.places, [*ends, len(plan.data)], strict=True):
+        n, m = plan.lengths(place)
+        count, kind = end - plan.begin(place), plan.kind(place)
+        if kind in _OPERATIONS:
+            work += _OPERATIONS[kind](count, n, m, plan.largest["segments"])
+        else:  # learned parts use each number once for x, and at most m times for J
+            work += 2 * (m + 1) * count
     return work
 
 
@@ -201,9 +206,9 @@ def _limits(plan: Plan) -> tuple[NDArray, float]:
 
     What a step does not keep is infinite.
     """
-    n, numbers = plan.n_inputs, plan.data[plan.code[plan.root + 3] :]
+    n, numbers = plan.n_inputs, plan.data[plan.begin(plan.root) :]
     limits = numbers[: 4 * n].reshape(4, n)
-    if not plan.code[plan.root + 5] & _LIMITED:
+    if not plan.entry(plan.root, 1) & IK_LIMITED:
         limits = np.repeat(_NO_LIMITS, n, axis=1)
     return limits, float(numbers[6 * n + 2])
 

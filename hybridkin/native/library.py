@@ -6,7 +6,6 @@ import ctypes
 import os
 import sys
 import threading
-import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -18,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridkin._core.kernel_numbers import ACTIVATIONS, HK_GROUP, checksum
 from hybridkin._core.model import ForwardModel, PortableModule
-from hybridkin._core.stored import Stored
-from hybridkin.native.plan import NoKernel, Plan
+from hybridkin._core.plan import NoKernel, Plan
 
 _FOLDER = Path(__file__).parent
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -85,9 +84,7 @@ def _opened() -> tuple[ctypes.CDLL | None, str]:
 
 def _fault(opened: ctypes.CDLL) -> str:
     """Return what is wrong with a library, or an empty string."""
-    sources = sorted((_FOLDER / "src").glob("*.[ch]"))
-    stamp = zlib.crc32(b"".join(path.read_bytes() for path in sources))
-    if opened.hk_sources() & 0xFFFFFFFF != stamp:
+    if opened.hk_sources() & 0xFFFFFFFF != checksum(_FOLDER / "src"):
         return "was compiled from other sources; reinstall hybridkin, or run hatch_build.py"
     pointer = ctypes.c_void_p
     opened.hk_evaluate.argtypes = [pointer, pointer, ctypes.c_int64, *[pointer] * 3]
@@ -106,26 +103,33 @@ def _is_right(opened: ctypes.CDLL) -> bool:
     side = r * (1.0 - np.cos(t)) / t
     x = np.stack([side * np.cos(a), side * np.sin(a), r * np.sin(t) / t], 1)
     q = np.stack([t * np.cos(a), t * np.sin(a), 0.0 * t + r], 1)
-    halves = 0.5 * np.repeat(np.eye(3)[[2, 0, 1]], 2, axis=0)
-    circles = Stored(
-        "constant_curvature",
-        {"tip_at": 2.0},
-        {"base": np.eye(4), "offsets": np.zeros(2), "radii": np.ones(2)},
-        derived={"arc_matrix": halves, "arc_offset": np.zeros(6)},
-    )
-    names = ("input_weights", "output_weights", "input_bias", "intercept", "input_center")
-    arrays = dict(zip(names, [np.eye(3)] * 2 + [np.zeros(3)] * 3, strict=True))
-    units = Stored("elm", {"activation": "logistic"}, {**arrays, "input_scale": np.ones(3)})
     beside = q[:, None, None] + 1e-5 * np.stack([np.eye(3), -np.eye(3)])
-    for model, right in ((circles, x), (units, 1.0 / (1.0 + np.exp(-q)))):
-        program = Program(Plan(model), opened)
+    for write, right in ((_two_halves, x), (_three_units, 1.0 / (1.0 + np.exp(-q)))):
+        program = Program(Plan(write), opened)
         ahead, behind = program.evaluate(beside)[0].swapaxes(0, 1)
         slopes = np.swapaxes(ahead - behind, 1, 2) / 2e-5
-        ones = zip(*(program.evaluate(row, True)[:2] for row in q), strict=True)
-        for y, J in (program.evaluate(q, True)[:2], map(np.array, ones)):
+        of_each_row = zip(*(program.evaluate(row, True)[:2] for row in q), strict=True)
+        for y, J in (program.evaluate(q, True)[:2], map(np.array, of_each_row)):
             if not (abs(y - right).max() < 1e-12 and abs(J - slopes).max() < 1e-8):
                 return False
     return True
+
+
+def _two_halves(plan: Plan) -> int:
+    """Write a chain of two equal arcs; q is their common bending, x and y, and their length."""
+    identity = np.eye(3)
+    frame = np.concatenate([identity.ravel(), np.zeros(3), [1.0], np.zeros(2)])
+    half = 0.5 * identity[[2, 0, 1]]
+    return plan.node("arcs", 3, 3, [frame, np.zeros((2, 3)), half, half], 2, 0, 3)
+
+
+def _three_units(plan: Plan) -> int:
+    """Write three logistic units, one for each input."""
+    units = np.zeros((HK_GROUP, 7))
+    units[:3] = np.column_stack([np.eye(3), np.zeros(3), np.eye(3)])
+    numbers = [np.zeros(3), np.ones(3), np.zeros(3), np.zeros((3, 3)), units.T]
+    activation = ACTIVATIONS.index("logistic")
+    return plan.node("elm", 3, 3, numbers, 3, activation, 0, 0, aligned=True)
 
 
 class Call(threading.local):

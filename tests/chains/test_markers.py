@@ -6,8 +6,8 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, load_model, save_model
+from hybridkin._core import plan
 from hybridkin.chains.chain import Chain
-from hybridkin.native import plan
 from hybridkin.native.library import evaluate, program_of
 
 MARKERS = [

@@ -18,8 +18,8 @@ from hybridkin import (
     native,
     save_model,
 )
+from hybridkin._core.plan import Plan
 from hybridkin.ik.tasks import PoseTask
-from hybridkin.native.plan import Plan
 
 BASE, ELSEWHERE = torch.eye(4).double(), torch.eye(4).double()
 BASE[:3, :3] = torch.tensor([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, -0.6]])

@@ -14,9 +14,9 @@ from hybridkin import (
     PlayOperator,
     RigidChain,
 )
+from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.hybrid._features import PoseFeatures, Readout
 from hybridkin.native.library import Program
-from hybridkin.native.plan import NoKernel, Plan
 
 pytestmark = pytest.mark.needs_core
 STRAIGHT = 0.25  # [m], actuators of a straight segment

@@ -19,10 +19,10 @@ from hybridkin import (
     InverseKinematics,
     load_model,
 )
+from hybridkin._core.plan import NoKernel
 from hybridkin.cli.main import main
 from hybridkin.ik.tasks import PointsTask, PoseTask, as_task
 from hybridkin.native import export_c
-from hybridkin.native.plan import NoKernel
 
 LOOP = Path(__file__).parents[2] / "examples" / "c" / "loop.c"
 MODELS = ("chain_of_all_parts", "elastic_chain", "rigid", "serial_pose", "blend")

@@ -19,10 +19,10 @@ from hybridkin import (
     datasets,
     robots,
 )
+from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.ik._compiled import core_of
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import PoseTask
-from hybridkin.native.plan import NoKernel, Plan
 
 pytestmark = pytest.mark.needs_core
 

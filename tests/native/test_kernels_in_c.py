@@ -9,6 +9,7 @@ import torch
 
 import hybridkin
 from hybridkin import as_forward_model, load_model
+from hybridkin._core.kernel_numbers import c_header
 from hybridkin.native.library import program_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.needs_core]
@@ -51,7 +52,15 @@ def test_kernels_stay_within_their_arrays(tmp_path, compiled, lanes):
     compiler, tester, plan = shutil.which("cc"), tmp_path / "test", tmp_path / "plan"
     if compiler is None:
         pytest.skip("needs a C compiler")
-    source = [f"-I{SOURCES}", Path(__file__).with_name("kernels_test.c"), "-o", tester, "-lm"]
+    Path(tmp_path, "kinds.h").write_text(c_header())
+    source = [
+        f"-I{SOURCES}",
+        f"-I{tmp_path}",
+        Path(__file__).with_name("kernels_test.c"),
+        "-o",
+        tester,
+        "-lm",
+    ]
     command = [compiler, *FLAGS, *lanes.split(), *source]
     made = subprocess.run(command, capture_output=True, text=True)
     if any(word in made.stderr for word in ("lasan", "unrecognized", "unsupported")):

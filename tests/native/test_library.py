@@ -13,7 +13,6 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ForwardModel, as_forward_model
 from hybridkin.native import available, backend, library
-from hybridkin.native.plan import ARCS, ELM
 
 CHAIN = {"radii": [0.01, 0.012], "lengths": [0.1, 0.08], "routing": "base"}
 ROWS = np.random.default_rng(0).uniform(-0.01, 0.01, (45_001, 6))
@@ -155,13 +154,13 @@ def test_a_file_that_is_no_library_is_refused(elsewhere):
 
 
 @pytest.mark.needs_core
-@pytest.mark.parametrize("kind", [ARCS, ELM])
+@pytest.mark.parametrize("kind", ["arcs", "elm"])
 def test_wrong_numbers_are_refused(elsewhere, monkeypatch, kind):
     evaluate = library.Program.evaluate
 
     def wrong(self, q, *what):
         x, J, distance = evaluate(self, q, *what)
-        x[..., 2] *= 1.0 + 1e-11 * (self.plan.code[self.plan.root] == kind)
+        x[..., 2] *= 1.0 + 1e-11 * (self.plan.kind(self.plan.root) == kind)
         return x, J, distance
 
     monkeypatch.setattr(library.Program, "evaluate", wrong)

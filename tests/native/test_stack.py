@@ -18,11 +18,11 @@ from hybridkin import (
     RigidChain,
     as_forward_model,
 )
+from hybridkin._core.plan import MOST
 from hybridkin.ik._compiled import core_of
 from hybridkin.ik.tasks import PoseTask
 from hybridkin.native import library
 from hybridkin.native.library import program_of
-from hybridkin.native.plan import MOST
 
 SEGMENTS, ACTUATORS = MOST["segments"], MOST["actuators"]
 needs_cc = pytest.mark.skipif(CC is None, reason="no C compiler `cc`")

@@ -123,9 +123,6 @@ HK_INLINE void HK(shape)(
     HK(balance)(e, in, t);
 }
 
-#define HK_WHOLE_STEPS 8
-#define HK_MOST_TURNS 12 /* two to this power, should rounding keep it from an end */
-
 /* Whether a tendon is still to change its role, `found` being the right one now: the first that is
    not wrong by rounding alone. `none` tells whether there was none before it. */
 static inline M HK(first_wrong)(M found, M was, V stretch, V size, M *none) {

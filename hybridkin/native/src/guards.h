@@ -158,7 +158,7 @@ static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen
     for (int j = 0; j < n; j++) {
         const V below = HK(max)(low[j] - q[j], SPLAT(0.0)), above = HK(max)(q[j] - high[j], SPLAT(0.0));
         const V out = (below + above) * high[n + j];
-        sum = sum + R(100.0) * out * out;
+        sum = sum + HK_BOX_STEEPNESS * out * out;
     }
     return sum;
 }
@@ -175,16 +175,16 @@ static inline void HK(guard_slope)(
     }
     for (int j = 0; j < n; j++) {
         const V below = HK(max)(low[j] - q[j], SPLAT(0.0)), above = HK(max)(q[j] - high[j], SPLAT(0.0));
-        slope[j] = R(200.0) * (above - below) * high[n + j] * high[n + j];
+        slope[j] = R(2.0) * HK_BOX_STEEPNESS * (above - below) * high[n + j] * high[n + j];
     }
 }
 
 /* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. By a leverage the
-   excess begins at three times the limit of the domain. Returns whether any row fades; else g is 1
+   excess begins farther out than by a box. Returns whether any row fades; else g is 1
    and the slope is not written. */
 static inline int HK(fading)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *distance,
                              V *g, V *slope, V *work) {
-    const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? R(3.0) : R(1.0);
+    const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? HK_FULL_LEVERAGE : HK_FULL;
     *g = SPLAT(1.0);
     *distance = HK(guard_distance)(p, at, q, seen, work);
     if (!HK(any)(NOT(*distance <= SPLAT(full)))) return 0;
@@ -204,7 +204,7 @@ typedef struct {
 } HK(shortening);
 
 /* Whether any correction x (m) is longer than the longest of the training rows, and then how it is
-   shortened, to less than 1.5 times that. */
+   shortened, to less than HK_LONGEST times that. */
 static inline int HK(is_long)(const hk_plan *p, int at, int m, const V *x, HK(shortening) *how) {
     const real least = HK_MATH(sqrt)(HK_MATH(sqrt)(HK_TINY)), largest = hk_numbers(p, at)[0];
     const real unit = largest > least ? largest : least;
@@ -215,7 +215,8 @@ static inline int HK(is_long)(const hk_plan *p, int at, int m, const V *x, HK(sh
     for (int i = 0; i < m; i++) squares = squares + (x[i] / unit) * (x[i] / unit);
     if (!HK(any)(squares > SPLAT(1.0))) return 0;
     const V relative = HK(sqrt)(HK(max)(squares, SPLAT(1.0)));
-    const V bent = HK(tanh)((relative - R(1.0)) * R(2.0)), kept = R(1.0) + R(0.5) * bent;
+    const real margin = HK_LONGEST - R(1.0);
+    const V bent = HK(tanh)((relative - R(1.0)) / margin), kept = R(1.0) + margin * bent;
     how->factor = kept / relative;
     how->bend = R(1.0) - bent * bent - how->factor;
     how->bend = SELECT(squares > SPLAT(1.0), how->bend, SPLAT(0.0));

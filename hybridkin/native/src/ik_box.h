@@ -3,8 +3,6 @@
    The worst case is two stages of 1 + IK_PROXIMAL solutions in the box, each of IK_NEWTON steps,
    each of at most 2 n + 1 sums over the n actuators in its line search; a handful is usual. */
 
-enum { IK_NEWTON = 60, IK_PROXIMAL = 2 };
-
 #ifdef HK_KINDS /* a controller steers positions */
 enum { IK_ROWS = 3 };
 #define IK_OF(m, f, ...) ((m) == 3 ? f(3, __VA_ARGS__) : f(m, __VA_ARGS__))
@@ -15,7 +13,7 @@ enum { IK_ROWS = 6 };
 #endif
 enum {
     IK_PAIRS = IK_ROWS * (IK_ROWS + 1) / 2,
-    IK_MOST_ROWS = IK_ROWS + 6, /* with the normals of a plane */
+    IK_MOST_ROWS = IK_ROWS + IK_NORMALS, /* with the normals of a plane */
     IK_MOST_PAIRS = IK_MOST_ROWS * (IK_MOST_ROWS + 1) / 2
 };
 

@@ -2,16 +2,7 @@
 
    Every row is a state machine: it requests the model at a configuration and processes the result. */
 
-enum { IK_NULL_STEPS = 30, IK_SLOW_STEPS = 8 };
-#define IK_LAST_DAMPING R(1e8) /* no descent even with this damping: stationary */
-#define IK_STATIONARY R(1e-4)  /* sine of the angle between error and the directions left by limits */
-#define IK_NULL_SLIP R(0.3)    /* largest error after a null-space step, per unprojected tip motion */
-#define IK_NULL_GAIN R(1e-8)   /* smallest gain of a step, per square of the remaining step */
-#define IK_INSIDE R(0.98)      /* target domain distance for starts outside the domain */
-
 /* Modes: lower the error; if the target is reached, slide into the domain, or to the posture. */
-enum { IK_LOWERS = 1, IK_TO_DOMAIN = 2, IK_TO_POSTURE = 4 };
-enum { IK_REACHED = 1, IK_AT_REST = 2, IK_HELD = 4 };
 enum { IK_FIRST, IK_LOWER, IK_SLIDE, IK_POLISH, IK_DONE };
 
 typedef struct {
@@ -189,7 +180,7 @@ static void ik_lowered(const ik_search_t *s, ik_row *r, const ik_point *now) {
     /* The damping follows the ratio of actual to predicted gain. */
     r->nu *= better ? ik_clip(R(1.0) - u * u * u, R(1.0) / R(3.0), R(2.0)) : r->growth;
     r->growth = better ? R(2.0) : R(2.0) * r->growth;
-    r->slow = better && error - now->error < R(0.01) * s->tol ? r->slow + 1 : 0;
+    r->slow = better && error - now->error < IK_SLOW * s->tol ? r->slow + 1 : 0;
     if (better) ik_keep(&s->ik, &r->live, now);
     r->iteration++;
     ik_lower_on(s, r);

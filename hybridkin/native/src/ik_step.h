@@ -3,15 +3,6 @@
 
 #include "ik_box.h"
 
-#define IK_HEALTHY R(0.02) /* sigma_min / sigma_max above which no damping is needed */
-#define IK_SLACK R(0.02)   /* a tendon that moves the tip less, relative to the most, is slack */
-#define IK_SLIP R(1e-4)    /* of the tip, relative to the motion of all actuators */
-#define IK_LEAST_PULL R(0.01)
-#define IK_BALANCE R(30.0) /* of the tip's motion: of a motion that leaves the plane */
-enum { IK_CORRECTIONS = 3 };
-
-enum { IK_LIMITED = 1, IK_POSTURE = 2, IK_WEIGHTS = 4, IK_ACCELERATES = 8, IK_PULLS = 16 };
-
 /* The settings: limits of q, of its speed and acceleration, posture, and units in which nothing has
    a weight. */
 typedef struct {
@@ -278,7 +269,7 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
     for (int i = 0; i < 3; i++) left[i] = v[i] - promised[i] + end.missing[i];
     const real rounding = R(1.0) + HK_MATH(sqrt)(HK_EPS); /* a slack tendon does not move the tip */
     const real most = ik_norm(3, left), close = ik_larger(R(0.5) * ik_norm(3, v), slip);
-    for (real share = R(1.0); most > close && share > IK_LEAST_PULL; share *= R(0.125)) {
+    for (real share = R(1.0); most > close && share > IK_LEAST_PULL; share *= IK_PULL_RATIO) {
         ik_end pulled = end;
         if (!ik_pull_in(ik, s, share, &pulled)) break;
         ik_approach(ik, q, x, v, slip, s, &pulled);
@@ -330,27 +321,9 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
     s->sigma_min = R(NAN), s->damping = R(0.0);
 }
 
-/* The state of a robot that follows targets, one array: what goes in, what comes out, and what is
-   kept from tick to tick, the offset of the measured tip, q and dq. */
-enum {
-    IK_MODE, /* sum of the last five below */
-    IK_PERIOD,
-    IK_MEMORY, /* seconds, 0 for none */
-    IK_LAST, /* period of the tick before, 0 for none */
-    IK_SIGMA_MIN,
-    IK_DAMPING,
-    IK_DISTANCE, /* of the error */
-    IK_TARGET,
-    IK_FEED = IK_TARGET + 3, /* motion of the target in this period */
-    IK_TIP = IK_FEED + 3,
-    IK_OFFSET = IK_TIP + 3,
-    IK_X = IK_OFFSET + 3,
-    IK_ERROR = IK_X + 3,
-    IK_Q = IK_ERROR + 3, /* then dq, q before, whether it was held (n each), and J (3 n) */
-    IK_STATE = IK_Q + 7 * HK_MAX_N
-};
-enum { IK_HAS_TARGET = 1, IK_HAS_FEED = 2, IK_HAS_TIP = 4, IK_MUST_SEE = 8, IK_FROM_REST = 16 };
+enum { IK_STATE = IK_Q + 7 * HK_MAX_N }; /* numbers of the state at most */
 
+/* One period of a robot that follows targets. */
 static inline void ik_tick(const ik_settings *ik, real *state) {
     const int n = ik->n, mode = (int)state[IK_MODE];
     const real *target = state + IK_TARGET, *tip = state + IK_TIP, period = state[IK_PERIOD];

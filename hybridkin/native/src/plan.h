@@ -36,14 +36,8 @@ typedef int64_t hk_bits;
 #define HK_INLINE static inline __attribute__((always_inline))
 #define HK_NOINLINE __attribute__((noinline))
 
-/* Largest sizes that the kernels support. */
-#define HK_MAX_N 64 /* actuators */
-#define HK_MAX_S 16 /* segments */
-#define HK_MAX_M 64 /* outputs of a regressor, or inner coordinates */
-#define HK_MAX_F 2048 /* features whose leverage is taken */
-#define HK_MAX_P 1024 /* powers of the inputs of a polynomial */
 #endif
-#define HK_GROUP 8 /* hidden units, or columns of a leverage, stored together */
+#include "kinds.h"
 #define HK_MOST_Z(n, S) (3 * (S) > (n) ? 3 * (S) : (n)) /* inner coordinates */
 
 /* A plan begins with its largest sizes. */
@@ -56,28 +50,6 @@ enum { HK_KIND, HK_N, HK_M, HK_DATA, HK_MORE };
 /* Whether the node at a place, or the chain, is of a kind. */
 #define HK_IS(p, at, kind) (HK_USES(kind) && (p)->code[at] == (kind))
 #define HK_CHAIN_IS(p, at, kind) (HK_IS_ONLY_CHAIN(kind) || HK_IS(p, at, kind))
-
-enum {
-    HK_ARCS = 1,
-    HK_ELASTIC,
-    HK_RIGID,
-    HK_AFFINE,
-    HK_ELM,
-    HK_POLYNOMIAL,
-    HK_KERNEL,
-    HK_READOUT,
-    HK_LEVERAGE_GUARD,
-    HK_BOX_GUARD,
-    HK_QUADRATIC_LEVERAGE,
-    HK_HYBRID,
-    HK_IK,
-    HK_GROUP_DISTANCE,
-    HK_ADAPTED,
-    HK_PROJECTED
-};
-
-enum { HK_LOGISTIC, HK_TANH, HK_SIN, HK_GAUSSIAN };
-enum { HK_QUADRATIC_FEATURES = 1, HK_POSE_FEATURES = 3 };
 
 /* A hybrid adds the places of mechanical model, drift and distance from other groups, the number of
    corrections, and of each whether it acts inside, its regressor and its guard; -1 stands for none. */

@@ -1,0 +1,118 @@
+"""Numbers that Python and the C kernels share; `c_header` writes them for the C compiler.
+
+Each name is the same in both languages. The build runs this file alone, so it imports nothing of
+hybridkin.
+"""
+
+from pathlib import Path
+from zlib import crc32
+
+# Kinds of the nodes of a plan, numbered from 1; the first three are the chains.
+KINDS = (
+    "arcs",
+    "elastic",
+    "rigid",
+    "affine",
+    "elm",
+    "polynomial",
+    "kernel",
+    "readout",
+    "leverage_guard",
+    "box_guard",
+    "quadratic_leverage",
+    "hybrid",
+    "ik",
+    "group_distance",
+    "adapted",
+    "projected",
+)
+ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
+
+# Largest sizes that the kernels support; exported code has those of its model.
+HK_MAX_N = 64  # actuators
+HK_MAX_S = 16  # segments
+HK_MAX_M = 64  # outputs of a regressor, or inner coordinates
+HK_MAX_F = 2048  # features whose leverage is taken
+HK_MAX_P = 1024  # powers of the inputs of a polynomial
+HK_GROUP = 8  # hidden units, or columns of a leverage, stored together
+
+# Features of a readout that are not those of a network.
+HK_QUADRATIC_FEATURES = 1
+HK_POSE_FEATURES = 3
+
+# The search for taut tendons.
+HK_WHOLE_STEPS = 8  # then one tendon at a time, which always terminates
+HK_MOST_TURNS = 12  # 2 to this power bounds the steps if rounding prevents the end
+
+# Guards of a correction.
+HK_FULL = 1.0  # distance from the training rows up to which the weight is 1
+HK_FULL_LEVERAGE = 3.0  # the same for a leverage
+HK_LONGEST = 1.5  # bound of a correction, relative to the longest one of a training row
+HK_BOX_STEEPNESS = 100.0  # of the distance outside a box, per squared width of it
+
+# A step of inverse kinematics.
+IK_LIMITED, IK_POSTURE, IK_WEIGHTS, IK_ACCELERATES, IK_PULLS = 1, 2, 4, 8, 16  # flags
+IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
+IK_NEWTON = 60  # Newton steps in a box; a handful is usual
+IK_PROXIMAL = 2  # rounds that remove the effect of the least damping
+IK_NORMALS = 6  # most normals of the plane of a log
+IK_BALANCE = 30.0  # weight of a motion that leaves the plane, relative to that of the tip
+IK_CORRECTIONS = 3  # corrections of a step whose tip must move as promised
+IK_SLACK = 0.02  # a tendon that moves the tip less, relative to the most, is slack
+IK_SLIP = 1e-4  # motion of the tip that does not count, relative to that of all actuators
+IK_LEAST_PULL = 0.01  # shares of the way by which slack tendons are pulled in: from 1 to this
+IK_PULL_RATIO = 0.125  # ratio of one share to the one before
+
+# The state of a robot that follows targets: one array.
+IK_MODE = 0  # sum of the bits below
+IK_PERIOD = 1  # [s]
+IK_MEMORY = 2  # [s], 0 for none
+IK_LAST = 3  # period of the step before [s], 0 for none
+IK_SIGMA_MIN = 4
+IK_DAMPING = 5
+IK_DISTANCE = 6  # length of the error
+IK_TARGET = 7
+IK_FEED = 10  # motion of the target in this period
+IK_TIP = 13  # measured
+IK_OFFSET = 16  # last measured tip minus model
+IK_X = 19
+IK_ERROR = 22
+IK_Q = 25  # then step, q before, whether it was held (n each), and J (3 n)
+IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP, IK_MUST_SEE, IK_FROM_REST = 1, 2, 4, 8, 16
+
+# The search for configurations.
+IK_LOWERS, IK_TO_DOMAIN, IK_TO_POSTURE = 1, 2, 4  # modes
+IK_REACHED, IK_AT_REST, IK_HELD = 1, 2, 4  # results
+IK_LAST_DAMPING = 1e8  # no descent even with this damping: the point is stationary
+IK_STATIONARY = 1e-4  # sine of the angle between the error and the directions left by limits
+IK_SLOW_STEPS = 8  # consecutive iterations that gain less than IK_SLOW of the tolerance
+IK_SLOW = 0.01
+IK_NULL_STEPS = 30  # iterations of a descent in the null space
+IK_NULL_SLIP = 0.3  # largest error after such a step, per motion of the tip without projection
+IK_NULL_GAIN = 1e-8  # smallest gain of such a step, per square of the remaining step
+IK_INSIDE = 0.98  # domain distance that points outside the domain are moved to
+
+
+def c_header() -> str:
+    """Return the numbers as a C header, `kinds.h`."""
+    numbers: dict[str, float] = {f"HK_{kind.upper()}": 1 + i for i, kind in enumerate(KINDS)}
+    numbers |= {f"HK_{name.upper()}": i for i, name in enumerate(ACTIVATIONS)}
+    numbers |= {name: n for name, n in globals().items() if name.startswith(("HK_", "IK_"))}
+    lines = [
+        "/* Written by hybridkin/_core/kernel_numbers.py, which says what each number is. */",
+        "",
+    ]
+    for name, number in numbers.items():
+        if isinstance(number, float):
+            lines.append(f"#define {name} R({number!r})")
+        elif name.startswith("HK_MAX_"):
+            lines.append(f"#ifndef {name}\n#define {name} {number}\n#endif")
+        else:
+            lines.append(f"enum {{ {name} = {number} }};")
+    return "\n".join([*lines, ""])
+
+
+def checksum(sources: Path) -> int:
+    """Return a checksum of the C sources in a folder and of the shared numbers."""
+    files = sorted(sources.glob("*.[ch]"))
+    return crc32(b"".join([c_header().encode(), *(path.read_bytes() for path in files)]))

@@ -1,0 +1,158 @@
+"""Plans: a model as one array of numbers and one of integers, for the compiled core."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridkin._core.kernel_numbers import (
+    HK_GROUP,
+    HK_MAX_F,
+    HK_MAX_M,
+    HK_MAX_N,
+    HK_MAX_P,
+    HK_MAX_S,
+    KINDS,
+)
+from hybridkin._core.stored import WRITERS, Stored
+
+CHAINS = KINDS[:3]
+# Largest sizes that the kernels support, in the order in which a plan begins.
+MOST = {
+    "actuators": HK_MAX_N,
+    "segments": HK_MAX_S,
+    "outputs": HK_MAX_M,
+    "features": HK_MAX_F,
+    "powers": HK_MAX_P,
+}
+_OWN = 4  # entries of a node before its own: kind, lengths of input and output, place of numbers
+
+
+class NoKernel(ValueError):
+    """Error: a part of a model has no kernel; the message names the part and the reason."""
+
+
+class Plan:
+    """The nodes of a model, each after its parts, and the numbers they use.
+
+    A model's `Layout` names the function that writes its node.
+
+    Parameters
+    ----------
+    model : Stored or callable
+        Description of the model, or a function that writes its nodes and returns the last place.
+
+    Attributes
+    ----------
+    code : ndarray of int32
+        The largest sizes, in the order of MOST. Then for each node: kind, lengths of input and
+        output, place of its numbers, then its sizes and the places of its parts.
+    data : ndarray of float64
+        All numbers.
+    n_inputs, n_outputs : int
+        Lengths of q and of x.
+    root : int
+        Place in `code` of the node of the whole model.
+    places : list of int
+        Places of all nodes, in the order of their numbers.
+    largest : dict
+        Largest sizes, named as in MOST.
+    """
+
+    def __init__(self, model: Stored | Callable[[Plan], int]) -> None:
+        self._code = [0] * len(MOST)  # then the largest sizes
+        self._data: list[NDArray] = []
+        self._length = 0
+        self.largest = dict.fromkeys(MOST, 0)
+        self._place_of: dict[tuple, int] = {}
+        self.root = self.node_of(model) if isinstance(model, Stored) else model(self)
+        self.n_inputs, self.n_outputs = self.lengths(self.root)
+        self._code[: len(MOST)] = self.largest.values()
+        self.code = np.array(self._code, dtype=np.int32)
+        memory = np.zeros(self._length + 2 * HK_GROUP)
+        start = -memory.ctypes.data // 8 % HK_GROUP  # at the start of a cache line
+        self.data = memory[start : start + self._length + HK_GROUP]
+        self.data[:-HK_GROUP] = np.concatenate(self._data)
+        self.places = [*self._place_of.values()]
+        self._data, self._place_of = [], {}  # do not pickle them twice
+        for array in (self.code, self.data):
+            array.flags.writeable = False
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the plan: equal plans compute the same."""
+        return hashlib.sha256(self.code.tobytes() + self.data.tobytes()).hexdigest()
+
+    def node_of(self, stored: Stored) -> int:
+        """Write the node of a description after its parts, and return its place."""
+        if stored.kind not in WRITERS:
+            raise NoKernel(f"a part of the kind {stored.kind!r} has no kernel")
+        return WRITERS[stored.kind](self, stored)
+
+    def node(
+        self,
+        kind: str,
+        n: int,
+        m: int,
+        numbers: Sequence[ArrayLike],
+        *entries: int,
+        aligned: bool = False,
+    ) -> int:
+        """Write a node with its numbers, and return its place; equal nodes share one place.
+
+        Parameters
+        ----------
+        kind : str
+            One of KINDS.
+        n, m : int
+            Lengths of its input and output.
+        numbers : sequence of array-like
+            Its numbers.
+        *entries : int
+            Its sizes, and the places of its parts.
+        aligned : bool, default=False
+            Whether the numbers after center, scale, intercept and direct link, 2 n + m + m n, start
+            a cache line.
+        """
+        self.limit("actuators", n)
+        self.limit("outputs", m)
+        flat = [np.asarray(part, dtype=np.float64).ravel() for part in numbers]
+        key = (kind, n, m, *entries, *(part.tobytes() for part in flat))
+        if key in self._place_of:
+            return self._place_of[key]
+        place = self._place_of[key] = len(self._code)
+        if aligned:
+            self._append(np.zeros(-(self._length + 2 * n + m + m * n) % HK_GROUP))
+        self._code += [1 + KINDS.index(kind), n, m, self._length, *map(int, entries)]
+        for part in flat:
+            self._append(part)
+        return place
+
+    def _append(self, numbers: NDArray) -> None:
+        self._data.append(numbers)
+        self._length += len(numbers)
+
+    def kind(self, place: int) -> str:
+        """Return the kind of a node."""
+        return KINDS[self._code[place] - 1]
+
+    def lengths(self, place: int) -> tuple[int, int]:
+        """Return the lengths of input and output of a node."""
+        return self._code[place + 1], self._code[place + 2]
+
+    def entry(self, place: int, k: int) -> int:
+        """Return the k-th own entry of a node, a size or the place of a part."""
+        return self._code[place + _OWN + k]
+
+    def begin(self, place: int) -> int:
+        """Return the place in `data` where the numbers of a node begin."""
+        return self._code[place + _OWN - 1]
+
+    def limit(self, what: str, size: int) -> None:
+        """Record a size, and raise if it is larger than the kernels support."""
+        self.largest[what] = max(size, self.largest[what])
+        if size > MOST[what]:
+            raise NoKernel(f"{size} {what}: the kernels support at most {MOST[what]}")
