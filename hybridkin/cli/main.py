@@ -149,7 +149,7 @@ def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
     play = arguments.play
-    names = ("loss", "coverage", "n_folds", "n_seeds", "auto")
+    names = ("loss", "coverage", "n_folds", "auto")
     settings = hybridkin.workflow.FitSettings(
         **{name: vars(arguments)[name] for name in names},
         play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,

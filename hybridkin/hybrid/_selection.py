@@ -17,6 +17,7 @@ from hybridkin.calibration.measured import distance, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid._fit import NamedFeatures, Part, Rows, Spec, calibrated, fit_hybrid
 from hybridkin.hybrid._kernel import folds_of
+from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
@@ -34,7 +35,7 @@ def select(
     rows: Rows,
     given: Rows,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Spec, dict[str, Any]]:
+) -> tuple[Spec, dict[str, Any], dict[str, HybridModule]]:
     """Return the specification with the error model of least held-out error, or a blend.
 
     Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
@@ -58,6 +59,8 @@ def select(
         Calibrated, with its parts.
     results : dict
         Errors of all candidates, see `HybridForwardModel.cv_results_`.
+    modules : dict of str to HybridModule
+        Every candidate, fitted to all rows.
     """
     y, counts, folds = rows.tips, rows.counts, folds_of(rows.X, rows.groups)
     fold_of = np.empty(len(y), dtype=int)
@@ -74,12 +77,14 @@ def select(
     if len(y) > _MOST:
         del candidates["parallel kernel"]
     settled: list[Part] = []
+    modules: dict[str, HybridModule] = {}
     tests = np.concatenate([test for _, test in splits])
     predicted = np.empty((len(candidates), len(tests), y.shape[1]))
-    for i, candidate in enumerate(candidates.values()):
+    for i, (name, candidate) in enumerate(candidates.items()):
         if progress is not None:
             progress(i, len(candidates))
         fitted = fit_hybrid(replace(spec, parts=(candidate,)), by_fold)
+        modules[name] = fitted.module
         part = candidate._replace(error_model=_settled(candidate.error_model, fitted.error_model))
         settled.append(part)
         predicted[i] = np.concatenate(
@@ -108,7 +113,7 @@ def select(
     own = {name: Errors(*(float(results[key][0]) for key in ("mean_distance", "io_distance")))}
     results["parameters"] = name
     results["mechanical_model"] = {n: one.known() for n, one in (errors or own).items()}
-    return replace(spec, parts=_blend(settled, shares)), results
+    return replace(spec, parts=_blend(settled, shares)), results, modules
 
 
 def _blend(parts: Iterable[Part], shares: NDArray) -> tuple[Part, ...]:

@@ -136,6 +136,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     if not (model._drift.scale > 1.0 / LARGEST).all():
         raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
+    model.candidates_ = None
     if "play_width" in stored.arrays:
         one = stored.array("play_width").ndim == 0
         model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))

@@ -38,6 +38,7 @@ from hybridkin.hybrid._fit import (
     residuals,
     with_geometry_chosen,
 )
+from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -131,6 +132,10 @@ class HybridForwardModel(HybridPredictor):
         without backlash [m]. On each fold the blend has weights chosen without that fold.
         ``expected_distance``: the mean distance to expect on new motions like those of the log [m].
         With few groups or rows, the penalties are for this chosen without each fold, too.
+    candidates_ : dict of str to nn.Module, or None
+        For error_model="auto": every candidate of ``cv_results_``, fitted to all rows; a module
+        from q to x as ``module_``, with `play` from the motion of the actuators. `adapt` and
+        `partial_fit` do not change them. A model from a file has none.
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator or None
@@ -263,8 +268,10 @@ class HybridForwardModel(HybridPredictor):
         if self.play_ is not None:
             given = given._replace(X=self._effective(given.X, given.groups))
             rows = given.distinct()[0]
-        found = (spec, None) if asked.parts else select(spec, rows, given, progress)
-        spec, self.cv_results_ = found
+        self.cv_results_: dict[str, Any] | None = None
+        self.candidates_: dict[str, HybridModule] | None = None
+        if not asked.parts:
+            spec, self.cv_results_, self.candidates_ = select(spec, rows, given, progress)
         fitted = fit_hybrid(spec, given)
         self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
         self.error_model_, self.module_ = fitted.error_model, fitted.module

@@ -24,7 +24,7 @@ groups = "motion"
 q_min = -0.006
 q_max = 0.006
 """
-FAST = ["--seeds", "1", "--folds", "2", "--no-auto", "--jobs", "1"]
+FAST = ["--folds", "2", "--no-auto", "--jobs", "1"]
 SHAPE = "--shape line --size 0.001,0.001,0 --unit m --duration 1 --dt 0.1".split()
 COMMANDS = {
     "fit": ["log.csv", "--robot", "data.toml", *FAST],  # without a chain it takes a second

@@ -44,7 +44,7 @@ time = "t"
 q_min = -0.006
 q_max = 0.006
 """
-FIT = ["fit", "log.csv", "--robot", "robot.toml", "--seeds", "1", "--folds", "2", "--no-auto"]
+FIT = ["fit", "log.csv", "--robot", "robot.toml", "--folds", "2", "--no-auto"]
 TRACK = [
     "track",
     "model",
