@@ -483,7 +483,7 @@ def _chosen(model: HybridForwardModel) -> str:
     network = model.error_model_
     if isinstance(network, ELMRegressorCV):
         return f"{network.best_params_['n_hidden']} neurons, alpha = {network.alpha_:.3g}"
-    if isinstance(model.error_model, ELMRegressorCV):
+    if not isinstance(model.error_model, str):
         return "a network for each marker"
     return "no correction" if model.error_model == "drop" else model.error_model
 

@@ -397,7 +397,7 @@ def test_a_request_to_end_is_an_interrupt_and_says_what_was_written(
     monkeypatch.setattr(workflow, "fit_log", asked)
     code, printed, errors = run(capsys, "fit", log, "--robot", robot, "--out", tmp_path / "m")
     assert (code, printed) == (143, "")
-    fate = "all was written" if written else "nothing was written"
+    fate = "files were written" if written else "nothing was written"
     assert errors.split("\n\n")[-1] == f"hybridkin: interrupted; {fate}\n"
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
