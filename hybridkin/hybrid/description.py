@@ -19,7 +19,6 @@ from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.chains.rigid import RigidChain
 from hybridkin.hybrid import _features, _guards, _module
-from hybridkin.hybrid._adapt import held_out_noise
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import Blend
@@ -123,16 +122,14 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     try:  # arrays that do not fit together fail here, not in use
         with torch.no_grad():
             x, J = model.module_.rows().forward_and_jacobian(center[None])
+            model.module_.in_domain(center[None])
     except RuntimeError as error:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
-    stored.arrays.setdefault("drift_squares", np.zeros(()))  # not in files of earlier versions
-    none, gram = Drift.of_range(center[None], x.shape[1]), stored.array("drift_gram")
-    if gram.ndim == 2:  # in files of earlier versions, every row has all markers
-        stored.arrays["drift_gram"] = gram[None].repeat(len(none.gram), axis=0)
-    arrays = none._asdict().items()
-    model._drift = Drift(*(stored.array(f"drift_{name}", a.shape) for name, a in arrays))
+    empty = Drift.of_range(center[None], x.shape[1])
+    arrays = [stored.array(f"drift_{name}", a.shape) for name, a in empty._asdict().items()]
+    model._drift = Drift(*arrays)
     if not (model._drift.scale > 1.0 / LARGEST).all():
         raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
@@ -141,20 +138,14 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         one = stored.array("play_width").ndim == 0
         model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))
     if "radius" in stored.arrays:
-        inside, _, coverage, n_rows = map(float, stored.array("radius", (4,), finite=False))
-        if not (inside >= 0.0 and 0.0 < coverage < 1.0 and n_rows < inf):
+        inside, outside, coverage, n_rows = stored.array("radius", (4,), finite=False).tolist()
+        if not (inside >= 0.0 and outside == inf and 0.0 < coverage < 1.0 and n_rows < inf):
             raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
-        # Files of earlier versions hold a finite radius outside the domain; no log supports it.
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
-    known = "fitted_rows" in stored.arrays  # not in files of earlier versions
-    model._fitted_rows = stored.array("fitted_rows", "N") if known else None
+    model._fitted_rows = stored.array("fitted_rows", "N")
     results = training.get("cv_results") if isinstance(training, dict) else None
-    if results:  # files of earlier versions do not state the error to expect
-        results = {"expected_distance": min(results["mean_distance"]), **results}
     model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
-    known = "noise" in stored.settings
-    noise = stored.value("noise", (float, None)) if known else None
-    model._noise = held_out_noise(model.error_model_, model.cv_results_) if noise is None else noise
+    model._noise = stored.value("noise", float)
     return model
 
 
@@ -163,8 +154,7 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
     known: dict[str, Any] = {}
     error = model.error_model_
     error = error.error_models[0] if isinstance(error, Blend) else error
-    if model._fitted_rows is not None:
-        known["rows"] = len(model._fitted_rows)
+    known["rows"] = len(model._fitted_rows)
     if isinstance(error, ReadoutFit):
         known["left_out_rmse"] = error.rmse
     if (found := model.calibration_) is not None:

@@ -261,7 +261,7 @@ class HybridForwardModel(HybridPredictor):
         asked = self._spec(given)
         rows = given.distinct()[0]
         few = few_rows(rows, asked, self.coverage)
-        self._fitted_rows: NDArray | None = np.unique(row_digests(rows.X, rows.tips))
+        self._fitted_rows = np.unique(row_digests(rows.X, rows.tips))
         spec = with_geometry_chosen(asked, rows, geometry)
         self.play_, said = play_of(self.play, spec, given.distinct(runs=True)[0])
         self._play_state: PlayState | None = None
@@ -406,11 +406,6 @@ class HybridForwardModel(HybridPredictor):
         """
         check_is_fitted(self, "module_")
         fitted = self.module_.fitted.with_drift(None)
-        if np.isnan(self._noise):
-            raise ValueError(
-                "`adapt` needs the held-out errors of the fit; files of earlier versions do not "
-                "hold them. Fit the model again and save it."
-            )
         rows = self._checked_rows(X, y, None, groups, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         rows = rows._replace(X=self._effective(rows.X, rows.groups))

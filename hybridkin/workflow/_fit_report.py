@@ -148,10 +148,7 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "chosen": str(found["chosen"]),
         "weights": {name: float(w) for name, w in found["weights"].items() if w > 0.0},
         "taken": found.get("parameters", type(model.mechanical_model_).__name__),
-        "mechanical_models": {
-            name: e if isinstance(e, dict) else {"cv": float(e)}  # a number in earlier versions
-            for name, e in found["mechanical_model"].items()
-        },
+        "mechanical_models": found["mechanical_model"],
         "candidates": dict(
             zip(found["candidate"], map(float, found["mean_distance"]), strict=True)
         ),
