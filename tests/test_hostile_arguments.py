@@ -60,7 +60,6 @@ META = ROWS.to("meta")
         ("loss", lambda: choose_geometry(trunk(), Q, X, loss=None)),
         ("q", lambda: fit_play(trunk(), Q[:0], X, GROUPS)),
         ("n_folds", lambda: FitSettings(n_folds=np.nan)),
-        ("n_seeds", lambda: FitSettings(n_seeds=2**63)),
         ("max_rows", lambda: FitSettings(max_rows=0)),
         ("auto", lambda: FitSettings(auto=np.nan)),
         ("alphas", lambda: ELMRegressorCV(alphas=[5e-324]).fit(Q, X)),

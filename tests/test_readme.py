@@ -110,7 +110,7 @@ def test_make_knows_its_targets():
         assert "python" in done.stdout or ".venv" in done.stdout
 
 
-QUICK = ["--folds", "2", "--seeds", "1", "--jobs", "1", "--max-rows", "200"]  # of `fit`: less work
+QUICK = ["--folds", "2", "--jobs", "1", "--max-rows", "200"]  # of `fit`: less work
 
 
 @pytest.mark.slow

@@ -472,8 +472,12 @@ class ArcChain(MarkedChain):
         chain = cls(**given, dtype=torch.from_numpy(given["base"]).dtype)
         angles = stored.array("angles").astype(given["base"].dtype, copy=False)
         chain = chain.with_geometry(angles=torch.from_numpy(angles))
-        at = stored.value("tip_at", float)
-        markers = stored.settings.get("markers", [[at, 0.0, 0.0, 0.0]])  # missing in older files
-        markers = [*markers[:-1], [at, *markers[-1][1:]]]
-        found = [(math.ceil(place) - 1, place, beside) for place, *beside in markers]
-        return chain.with_markers([(k, place - k, beside) for k, place, beside in found])
+        tip_at = stored.value("tip_at", float)
+        places = stored.list_of(list, "markers")
+        if [type(number) for place in places for number in place] != len(places) * [float] * 4:
+            raise ValueError(f"`markers` must hold lists of four numbers, got {places!r:.60}")
+        markers = []
+        for at, *beside in [*places[:-1], [tip_at, *places[-1][1:]]]:
+            segment = math.ceil(at) - 1
+            markers.append((segment, at - segment, beside))
+        return chain.with_markers(markers)

@@ -34,8 +34,8 @@ def steps(out: Path) -> dict[str, str]:
     return {
         f"init {at}/robot.toml --log {at}/log.csv {geometry}": "Describe the robot: its rough "
         "geometry, and the columns and units of its log.",
-        f"fit {at}/log.csv --robot {at}/robot.toml --out {at}/model --folds 2 --seeds 1": "Check "
-        "the log, calibrate the geometry, compare models on held-out rows, save the best.",
+        f"fit {at}/log.csv --robot {at}/robot.toml --out {at}/model --folds 2": "Check "
+        "the log, calibrate the geometry, compare models on held-out rows, save a hybrid.",
         f"track {at}/model {shape} --out {at}/track": "Compute the commands (chamber lengths) that "
         "lead the tip along a figure eight.",
         f"animate {at}/model {at}/track --out {at}/track.gif --frames 24": "Make a film of it.",

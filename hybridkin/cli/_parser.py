@@ -156,8 +156,9 @@ def _fit(command: argparse.ArgumentParser) -> None:
     """Fit a hybrid model to a measured log.
 
     Checks the log, calibrates the robot, compares mechanical, data-driven and hybrid models on
-    held-out motions, and saves the best with a report. Errors on held-out motions also decide what
-    to calibrate, unless the robot description lists it as `calibrate`.
+    held-out motions, and saves the hybrid that chooses its error model itself, with a report.
+    Errors on held-out motions also decide what to calibrate, unless the robot description lists it
+    as `calibrate`.
 
     Some examples:
       hybridkin fit log.csv --robot robot.toml --groups motion --out model
@@ -204,7 +205,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
     folds = "number of parts, each held out in turn (5)"
     number = between(1, float("inf"), int)
     add("--folds", type=number, default=5, dest="n_folds", metavar="N", help=folds)
-    fast = 'leave out the hybrid model that chooses its error model itself ("auto"); fast'
+    fast = 'without the hybrid that chooses its error model itself ("auto"); fast; saves the best'
     add("--no-auto", action="store_false", dest="auto", help=fast)
     add(
         "--play",
@@ -217,7 +218,6 @@ def _fit(command: argparse.ArgumentParser) -> None:
     few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
     number = between(-1, float("inf"), int)
     add("--max-rows", type=number, default=2000, metavar="N", help=few)
-    add("--seeds", type=count, default=5, dest="n_seeds", metavar="N", help="random networks (5)")
     add("--jobs", type=int, default=-1, metavar="N", help="processes; -1: one per core (-1)")
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 import hybridkin  # its folders are opened when used: help comes at once
-from hybridkin._core.files import newest, write_file
+from hybridkin._core.files import write_file
 from hybridkin._core.turns import one_thread
 from hybridkin._core.units import METRES
 from hybridkin.cli import _demo as demo
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.showwarning = stages.warn
             outcome = _RUN[arguments.command](arguments, stages)
     except (KeyboardInterrupt, EOFError) as stop:  # EOFError: no answer to a question
-        fate = "nothing was written" if _stamps(arguments) == before else "all was written"
+        fate = "nothing was written" if _stamps(arguments) == before else "files were written"
         code = 143 if isinstance(stop, _Terminated) else 130
         return failed(f"interrupted; {fate}", code, arguments.json)
     except _OF_INPUT as error:
@@ -149,7 +149,7 @@ def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
     play = arguments.play
-    names = ("loss", "coverage", "n_folds", "n_seeds", "auto")
+    names = ("loss", "coverage", "n_folds", "auto")
     settings = hybridkin.workflow.FitSettings(
         **{name: vars(arguments)[name] for name in names},
         play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
@@ -174,7 +174,7 @@ def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
 
 def _model_before(arguments: argparse.Namespace) -> str:
     """Return the model that a fit replaces, in words; raise if the user refuses on a terminal."""
-    model = newest(arguments.out / "model.safetensors")
+    model = arguments.out / "model.safetensors"
     if not model.is_file():
         return ""
     words = f"the model of {datetime.fromtimestamp(model.stat().st_mtime):%Y-%m-%d %H:%M}"

@@ -23,6 +23,7 @@ from hybridkin.hybrid._error_models import (
 )
 from hybridkin.hybrid._fit import Spec, calibrated, fit_hybrid
 from hybridkin.hybrid._kernel import folds_of
+from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
@@ -38,7 +39,7 @@ def select(
     spec: Spec,
     rows: Rows,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Spec, dict[str, Any]]:
+) -> tuple[Spec, dict[str, Any], dict[str, HybridModule]]:
     """Return the specification with the error model of least held-out error, or a blend.
 
     Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
@@ -62,6 +63,8 @@ def select(
         Calibrated, with its parts.
     results : dict
         Errors of all candidates, see `HybridForwardModel.cv_results_`.
+    modules : dict of str to HybridModule
+        Every candidate, fitted to all rows.
     """
     y, counts, folds = rows.tips, rows.counts, folds_of(rows.X, rows.groups)
     fold_of = np.empty(len(y), dtype=int)
@@ -79,12 +82,14 @@ def select(
     if len(y) > _MOST:
         del candidates["parallel kernel"]
     settled: list[ErrorModel] = []
+    modules: dict[str, HybridModule] = {}
     tests = np.concatenate([test for _, test in splits])
     predicted = np.empty((len(candidates), len(tests), y.shape[1]))
-    for i, candidate in enumerate(candidates.values()):
+    for i, (name, candidate) in enumerate(candidates.items()):
         if progress is not None:
             progress(i, len(candidates))
         fitted = fit_hybrid(replace(spec, error_model=candidate), by_fold)
+        modules[name] = fitted.module
         settled.append(fitted.error.settled)
         held_out = []
         for fold_spec, training_rows, (_, test) in zip(alone, parts, splits, strict=True):
@@ -111,7 +116,7 @@ def select(
     own = {name: Errors(*(float(results[key][0]) for key in ("mean_distance", "io_distance")))}
     results["parameters"] = name
     results["mechanical_model"] = {n: one.known() for n, one in (errors or own).items()}
-    return replace(spec, error_model=_blend(settled, shares)), results
+    return replace(spec, error_model=_blend(settled, shares)), results, modules
 
 
 def _blend(models: Iterable[ErrorModel], shares: NDArray) -> ErrorModel:

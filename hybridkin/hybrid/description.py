@@ -122,21 +122,24 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     try:  # arrays that do not fit together fail here, not in use
         with torch.no_grad():
             x, J = model.module_.rows().forward_and_jacobian(center[None])
+            model.module_.in_domain(center[None])
     except RuntimeError as error:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
-    arrays = Drift.of_range(center[None], x.shape[1])._asdict().items()
-    model._drift = Drift(*(stored.array(f"drift_{name}", a.shape) for name, a in arrays))
+    empty = Drift.of_range(center[None], x.shape[1])
+    arrays = [stored.array(f"drift_{name}", a.shape) for name, a in empty._asdict().items()]
+    model._drift = Drift(*arrays)
     if not (model._drift.scale > 1.0 / LARGEST).all():
         raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
+    model.candidates_ = None
     if "play_width" in stored.arrays:
         one = stored.array("play_width").ndim == 0
         model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))
     if "radius" in stored.arrays:
-        inside, _, coverage, n_rows = map(float, stored.array("radius", (4,), finite=False))
-        if not (inside >= 0.0 and 0.0 < coverage < 1.0 and n_rows < inf):
+        inside, outside, coverage, n_rows = stored.array("radius", (4,), finite=False).tolist()
+        if not (inside >= 0.0 and outside == inf and 0.0 < coverage < 1.0 and n_rows < inf):
             raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
     model._fitted_rows = stored.array("fitted_rows", "N")

@@ -33,6 +33,7 @@ from hybridkin.hybrid._fit import (
     residuals,
     with_geometry_chosen,
 )
+from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -129,6 +130,10 @@ class HybridForwardModel(HybridPredictor):
         without backlash [m]. On each fold the blend has weights chosen without that fold.
         ``expected_distance``: the mean distance to expect on new motions like those of the log [m].
         With few groups or rows, the penalties are for this chosen without each fold, too.
+    candidates_ : dict of str to nn.Module, or None
+        For error_model="auto": every candidate of ``cv_results_``, fitted to all rows; a module
+        from q to x as ``module_``, with `play` from the motion of the actuators. `adapt` and
+        `partial_fit` do not change them. A model from a file has none.
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator or None
@@ -254,7 +259,7 @@ class HybridForwardModel(HybridPredictor):
         asked = self._spec(given)
         rows = given.distinct()
         messages = few_rows(rows, asked, self.coverage)
-        self._fitted_rows: NDArray = np.unique(row_digests(rows.X, rows.tips))
+        self._fitted_rows = np.unique(row_digests(rows.X, rows.tips))
         spec = with_geometry_chosen(asked, rows, geometry)
         self.play_, of_play = play_of(self.play, spec, given.in_runs())
         messages += of_play
@@ -263,8 +268,9 @@ class HybridForwardModel(HybridPredictor):
             spec = replace(spec, commanded=moved_directions(rows.X))
             rows = replace(given, X=self._effective(given.X, given.groups)).distinct()
         self.cv_results_: dict[str, Any] | None = None
+        self.candidates_: dict[str, HybridModule] | None = None
         if spec.error_model is None:
-            spec, self.cv_results_ = select(spec, rows, progress)
+            spec, self.cv_results_, self.candidates_ = select(spec, rows, progress)
         fitted = fit_hybrid(spec, rows)
         self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
         self.error_model_, self.module_ = fitted.error.result, fitted.module

@@ -209,9 +209,8 @@ class TrackAnimation(Display):
         ----------
         path : path-like
             Its ending is the format: ".mp4" needs ffmpeg; ".gif" is larger and needs nothing else;
-            ".html" is one page of about 2 MB that needs no network, to turn the robot, play, and
-            scrub the time, in any browser since 2023. To write it needs plotly,
-            ``pip install "hybridkin[interactive]"``.
+            ".html" is one page of about 5 MB that needs no network, to turn the robot, play, and
+            scrub the time. To write it needs plotly, ``pip install "hybridkin[interactive]"``.
         unit : {"m", "cm", "mm"}, default="cm"
             Of the axes and of the error.
         speed : float, default=1.0

@@ -19,12 +19,24 @@ from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.model import play_widths
 from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries, millimetres, statistics
 
-_SHOWN = ("mechanical, calibrated", "hybrid, ELM", "hybrid, auto")
-_SHOWN_OF_DATA = ("data-driven, linear", *_SHOWN[1:])  # of a robot without segments
+_SHOWN = (
+    "mechanical, calibrated",
+    "data-driven, linear",  # of a robot without segments
+    "hybrid, ELM",
+    "hybrid, parallel ELM",
+    "hybrid, auto",
+)
 _MECHANICAL = (
     '"Nominal": the robot description, with a fitted base if the base is calibrated. "Calibrated": '
     'with the geometry fitted to the log. "Data-driven": without a mechanical model. "Hybrid": the '
-    'calibrated model plus a learned residual; "ELM" is a network, "auto" a chosen blend.'
+    "calibrated model plus a learned residual."
+)
+_AUTO = (
+    ' "Parallel": the residual acts at the tip, "serial": inside the robot. "ELM" is a network, '
+    '"auto" the chosen one of the hybrids, or a blend of several.'
+)
+_WITH_BACKLASH = (
+    ' "With backlash": the calibrated model at the motion of the actuators, as hybrids.'
 )
 _NO_MECHANICAL = 'The robot has no segments: "hybrid" models correct the linear model of the data.'
 
@@ -46,10 +58,9 @@ def write_comparison(
     report.text(
         "## Errors on held-out motions",
         f"{n} rows{thinned}, {len(np.unique(log.motions))} {log.split}. Each of {n_folds} folds "
-        "holds out whole motions. A second cross-validation, over the other motions, chooses ridge "
-        'penalty and guard of an ELM, and coupling, features and penalties of "auto". Errors of '
-        f"an ELM are the mean over {report.record['n_seeds']} random hidden layers.\n\n"
-        f"{_MECHANICAL if 'mechanical, nominal' in errors else _NO_MECHANICAL}",
+        "holds out whole motions. The other motions choose and fit everything: geometry, features, "
+        "penalties and blend.",
+        _kinds_of_models(errors),
     )
     record: dict[str, dict[str, Any]] = {}
     for name, values in errors.items():
@@ -62,12 +73,11 @@ def write_comparison(
         "Std: standard deviation. The standard error of the mean counts every motion as one "
         "sample, because rows of a motion have similar errors. 95 %: quantile over rows."
     )
-    shown = _SHOWN if _SHOWN[0] in record else _SHOWN_OF_DATA
-    present = [name for name in shown if name in record]
+    present = [name for name in _SHOWN if name in record]
     first, *others = ((name, record[name]["mean"]) for name in present)
     ratios = [f"by that of {name}: **{first[1] / mean:.2f}**" for name, mean in others]
     best = min(record, key=lambda name: record[name]["mean"])
-    start = "the calibrated model" if shown is _SHOWN else "the linear model"
+    start = "the calibrated model" if present[0] == _SHOWN[0] else "the linear model"
     report.text(f"Mean error of {start} divided {', '.join(ratios)}. Least mean error: {best}.")
     _add_figures(report, errors, (present[0], present[-1]))
     motions, counts = np.unique(log.motions, return_counts=True)
@@ -80,10 +90,23 @@ def write_comparison(
     report.table(["motion", "rows", *present], rows)
     saved, chosen = report.record["saved"], report.record["chosen"]
     by_fold = "; ".join(choices.get(saved, "-") for choices in report.record["choices_by_fold"])
+    reason = "It has the least mean error of the models that can be saved."
+    if saved == "hybrid, auto":
+        reason = "It chooses among the other hybrids itself."
     report.text(
-        f"Saved: **{saved}**, fitted to all motions: {chosen}. It has the least mean error of "
-        f"the models that can be saved. Settings chosen in each fold: {by_fold}."
+        f"Saved: **{saved}**, fitted to all motions: {chosen}. {reason} Settings chosen in each "
+        f"fold: {by_fold}."
     )
+
+
+def _kinds_of_models(errors: dict[str, NDArray]) -> str:
+    """Return what the names of the compared models mean."""
+    words = _MECHANICAL if _SHOWN[0] in errors else _NO_MECHANICAL
+    if "mechanical, with backlash" in errors:
+        words += _WITH_BACKLASH
+    if "hybrid, auto" in errors:
+        words += _AUTO
+    return words
 
 
 def write_markers(report: Report, errors: NDArray, what: str) -> None:
@@ -125,10 +148,7 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "chosen": str(found["chosen"]),
         "weights": {name: float(w) for name, w in found["weights"].items() if w > 0.0},
         "taken": found.get("parameters", type(model.mechanical_model_).__name__),
-        "mechanical_models": {
-            name: e if isinstance(e, dict) else {"cv": float(e)}  # a number in earlier versions
-            for name, e in found["mechanical_model"].items()
-        },
+        "mechanical_models": found["mechanical_model"],
         "candidates": dict(
             zip(found["candidate"], map(float, found["mean_distance"]), strict=True)
         ),

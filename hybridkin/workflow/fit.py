@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.log_distance import held_out_distances
-from hybridkin.learning.elm import ELMRegressor
+from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import save_model
@@ -56,22 +55,15 @@ from hybridkin.workflow.report import (
     quiet,
 )
 
-ALPHAS = tuple(10.0**k for k in range(-5, 4))
-"""Ridge penalties to choose from."""
-
 AUTO = "hybrid, auto"
 CALIBRATED = "mechanical, calibrated"
-ELM = "hybrid, ELM"
-LINEAR = "hybrid, linear"
-_DATA_LINEAR, _DATA_ELM = "data-driven, linear", "data-driven, ELM"
-_SAVED = (CALIBRATED, LINEAR, ELM, AUTO)  # models that can be saved
-_OF_CHAINS = ("mechanical, nominal", CALIBRATED, LINEAR)  # models that need a chain
-_MODELS = (
-    *("mechanical, nominal", CALIBRATED, _DATA_LINEAR, "data-driven, quadratic", _DATA_ELM),
-    *(LINEAR, "hybrid, quadratic", ELM, AUTO),
-)
+_NOMINAL = "mechanical, nominal"
+_BACKLASH = "mechanical, with backlash"
+_DATA_LINEAR = "data-driven, linear"
+_DATA_QUADRATIC = "data-driven, quadratic"
+_DATA_ELM = "data-driven, ELM"
+_HYBRID_ELM = "hybrid, ELM"
 _FILES = ("model.safetensors", "robot.toml", "held_out.png", "error_histogram.png")
-_N_HIDDEN, _INNER_FOLDS = 100, 4
 _ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto; fewer are not worth a start
 
 
@@ -88,10 +80,9 @@ class FitSettings:
         `HybridForwardModel`. None: no radius.
     n_folds : int
         Number of folds of motions that are held out, one after the other.
-    n_seeds : int
-        Number of random hidden layers of an ELM; the errors of each row are averaged over them.
     auto : bool
-        Whether ``error_model="auto"`` is among the models; it takes most of the time.
+        Whether to compare and save ``error_model="auto"``; it takes most of the time. Without it,
+        the comparison has fewer hybrids, and the best of them or the calibrated model is saved.
     play : float, "auto", "detect" or None
         Backlash (also called play) of the actuators [m] in that hybrid, see `HybridForwardModel`.
         It requires `auto`, and named motions in order of time. "detect": "auto" if the log allows
@@ -103,7 +94,6 @@ class FitSettings:
     loss: str = "linear"
     coverage: float | None = None
     n_folds: int = 5
-    n_seeds: int = 5
     auto: bool = True
     play: float | str | None = "detect"
     max_rows: int | None = 2000
@@ -111,7 +101,6 @@ class FitSettings:
     def __post_init__(self) -> None:
         """Check the counts."""
         whole(self.n_folds, "n_folds", 2, 1000)
-        whole(self.n_seeds, "n_seeds", 1, 1000)
         whole(2 if self.max_rows is None else self.max_rows, "max_rows", 2)
         if not isinstance(self.auto, bool):
             raise ValueError(f"`auto` must be True or False, got {self.auto!r:.80}.")
@@ -185,6 +174,12 @@ class _Rows(NamedTuple):
                 entries += geometry_entries(chain, result)
         return entries
 
+    def nominal(self, chain: Chain) -> Chain:
+        """Return the described chain, with a fitted base if the base is calibrated."""
+        if not self.robot.base_is_free:
+            return chain
+        return fit_geometry(chain, self.q, self.x, ("base",), self.settings.loss)[0].chain
+
     def mechanical(self) -> ForwardModel:
         """Return the calibrated chain; for a robot without segments a linear model of the rows."""
         chain, result, _ = self.calibrated()
@@ -230,10 +225,11 @@ def compare_by_group(
 ) -> Comparison:
     """Return the errors of every model on held-out motions.
 
-    Whole motions are held out. In each fold, a second cross-validation over the training motions,
-    with its own calibrations, chooses ridge penalty and guard of the networks, and all settings of
-    ``error_model="auto"``. The prediction for a motion therefore never uses data of this motion.
-    With `play` "detect" one choice is made on all motions: whether the folds look for backlash.
+    Whole motions are held out. In each fold, the geometry is chosen and calibrated on the training
+    motions, and every model is fitted to them. ``error_model="auto"`` is fitted once; the table has
+    each of its candidates, ``candidates_``, and itself. The prediction for a motion therefore never
+    uses data of this motion. With `play` "detect" one choice is made on all motions: whether the
+    folds look for backlash.
 
     Parameters
     ----------
@@ -242,7 +238,7 @@ def compare_by_group(
     robot : RobotDescription
         Nominal kinematics, and the parameters to calibrate.
     settings : FitSettings, optional
-        Loss, folds, seeds and models.
+        Loss, folds and models.
     n_jobs : int, optional
         Largest number of processes.
     progress : callable, optional
@@ -268,15 +264,20 @@ def compare_by_group(
     workers = Parallel(n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator")
     results: Any = workers(jobs)
     progress("cross-validation by motion", 0, len(parts))
+    fitted_folds = []
     for i, ((train, test), (errors, chosen)) in enumerate(zip(parts, results, strict=True)):
-        for name, values in errors.items():
-            empty = np.empty((len(log.q), values.shape[1]))
-            found.markers.setdefault(name, empty)[test] = values
+        fitted_folds.append(errors)
         found.fold[test] = i
         held_out = held_out_distances(log.q[train], log.motions[train], log.q[test])
         found.distance[test] = held_out
         found.choices.append(chosen)
         progress("cross-validation by motion", i + 1, len(parts))
+    for name in sorted(fitted_folds[0], key=_kind_of_model):
+        if any(name not in errors for errors in fitted_folds):  # kernel ridge: up to 2000 rows
+            continue
+        found.markers[name] = np.empty((len(log.q), log.x.shape[1] // 3))
+        for (_, test), errors in zip(parts, fitted_folds, strict=True):
+            found.markers[name][test] = errors[name]
     found.errors.update((name, np.nanmean(values, 1)) for name, values in found.markers.items())
     return found
 
@@ -293,9 +294,10 @@ def fit_log(
 ) -> tuple[Report, list[Path]]:
     """Check a log, compare models on held-out motions, fit the best to all of it, and report.
 
-    The model with the least mean error on held-out motions is saved: the calibrated model, or a
-    hybrid with a linear error model, an ELM or ``error_model="auto"``. For a robot without
-    segments, a linear model of the data takes the place of the mechanical model.
+    The hybrid with ``error_model="auto"`` is saved, which chooses among the other hybrids. Without
+    it (`auto` of the settings) the calibrated model or the hybrid with the least mean error on
+    held-out motions is saved. For a robot without segments, a linear model of the data takes the
+    place of the mechanical model.
 
     Parameters
     ----------
@@ -343,14 +345,11 @@ def fit_log(
     chain = start if result is None else result.chain
     rows = rows.with_play_detected(complete, chain)
     compared = compare_by_group(data, robot, rows.settings, n_jobs=n_jobs, progress=progress)
-    savable = _SAVED if robot.chain is not None else (_DATA_LINEAR, ELM, AUTO)
-    errors = {name: values.mean() for name, values in compared.errors.items() if name in savable}
-    saved = min(errors, key=lambda name: (errors[name], name))
+    saved = AUTO if settings.auto else _best_to_save(compared)
     report_fit = partial(progress, f"fitting {saved} to all motions")
     report_fit(0, 1)
     mechanical = rows.mechanical() if result is None else result.chain
-    # For a robot without segments, a linear model takes the place of the mechanical one.
-    model = _models(CALIBRATED if saved == _DATA_LINEAR else saved, rows, mechanical)[0]
+    model = _models(rows, mechanical)[saved]
     model.set_params(coverage=settings.coverage)
     given = {"groups": rows.groups, "geometry": rows.geometry, "progress": report_fit}
     model.fit_with_messages(rows.q, rows.x, **given)
@@ -366,7 +365,6 @@ def fit_log(
         n_whole=len(complete.q),
         n_motions=len(np.unique(complete.motions)),
         excluded=list(complete.excluded),
-        n_seeds=settings.n_seeds,
         loss=settings.loss,
         choices_by_fold=compared.choices,
     )
@@ -425,72 +423,72 @@ def _add_model(
 @one_thread()  # the processes share the cores already
 def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return the errors of every model on test rows after a fit to training rows, and choices."""
-    names = _MODELS if train.settings.auto else _MODELS[:-1]
-    if train.robot.chain is None:
-        names = [name for name in names if name not in _OF_CHAINS]
     train = train.with_geometry_chosen()
-    mechanical = train.mechanical()
-    models = {name: _models(name, train, mechanical) for name in names}
-    errors = {
-        name: np.mean([_held_out(model, train, test) for model in some], axis=0)
-        for name, some in models.items()
-    }
-    return errors, {n: _chosen(models[n][0]) for n in (_DATA_ELM, ELM, AUTO) if n in models}
+    errors = {}
+    choices = {}
+    for name, model in _models(train, train.mechanical()).items():
+        model.fit_with_messages(train.q, train.x, groups=train.groups, geometry=train.geometry)
+        for candidate, module in (model.candidates_ or {}).items():
+            if candidate != "mechanical":
+                errors[f"hybrid, {candidate}"] = _held_out(model, module, test)
+            elif train.settings.play is not None:  # else it is the calibrated model
+                errors[_BACKLASH] = _held_out(model, module, test)
+        errors[name] = _held_out(model, model.module_, test)
+        if name in (_DATA_ELM, _HYBRID_ELM, AUTO):
+            choices[name] = _chosen(model)
+    return errors, choices
 
 
-def _models(name: str, rows: _Rows, mechanical: ForwardModel) -> list[HybridForwardModel]:
-    """Return the unfitted models of that name: one, or for an ELM one for each seed."""
-    part, learner = name.split(", ")
-    base = None if part == "data-driven" else mechanical
-    if learner == "auto":
-        return [rows.auto_model(mechanical)]
-    if learner == "ELM":
-        choice = _choose(rows, hybrid=base is not None)
-        return [_elm(base, *choice, seed) for seed in range(rows.settings.n_seeds)]
+def _kind_of_model(name: str) -> int:
+    """Return the place of the kind of a model in the table."""
+    return ("mechanical", "data-driven", "hybrid").index(name.partition(",")[0])
+
+
+def _models(rows: _Rows, mechanical: ForwardModel) -> dict[str, HybridForwardModel]:
+    """Return the unfitted models of the comparison by name.
+
+    For a robot without segments `mechanical` is a linear model of the data.
+    """
     chain = rows.robot.chain
-    if chain is not None and learner == "nominal":
-        base = chain
-        if rows.robot.base_is_free:
-            base = fit_geometry(chain, rows.q, rows.x, ("base",), rows.settings.loss)[0].chain
-    learners = {"linear": linear, "quadratic": quadratic}
-    return [HybridForwardModel(base, learners[learner]() if learner in learners else "drop")]
+    models = {}
+    if chain is None:
+        models[_DATA_LINEAR] = HybridForwardModel(mechanical, "drop")
+    else:
+        models[_NOMINAL] = HybridForwardModel(rows.nominal(chain), "drop")
+        models[CALIBRATED] = HybridForwardModel(mechanical, "drop")
+    models[_DATA_QUADRATIC] = HybridForwardModel(None, quadratic())
+    network = ELMRegressorCV(250, max_hidden=1000, random_state=0)  # as in auto
+    if rows.settings.auto:
+        models[_DATA_ELM] = HybridForwardModel(None, network)
+        models[AUTO] = rows.auto_model(mechanical)
+        return models
+    if chain is not None:
+        models["hybrid, linear"] = HybridForwardModel(mechanical, "linear")
+    models["hybrid, quadratic"] = HybridForwardModel(mechanical, "quadratic")
+    models[_HYBRID_ELM] = HybridForwardModel(mechanical, network)
+    return models
 
 
-def _elm(
-    base: ForwardModel | None, alpha: float | None, guard: str | None, seed: int = 0
-) -> HybridForwardModel:
-    """Return an ELM by its ridge penalty and guard; with alpha=None there is no correction."""
-    elm = "drop" if alpha is None else ELMRegressor(_N_HIDDEN, alpha, random_state=seed)
-    return HybridForwardModel(base, elm, guard=guard)
+def _best_to_save(compared: Comparison) -> str:
+    """Return the model of least mean error that stays near a mechanical or linear model."""
+    unsaved = (_NOMINAL, _DATA_QUADRATIC)
+    errors = {name: values.mean() for name, values in compared.errors.items()}
+    return min((name for name in errors if name not in unsaved), key=errors.__getitem__)
 
 
 def _chosen(model: HybridForwardModel) -> str:
     """Return the chosen settings of a fitted model in words."""
     if model.cv_results_ is not None:
         return auto_in_short(auto_entry(model))
-    if isinstance(model.error_model, ELMRegressor):
-        return f"alpha = {model.error_model.alpha:g}, guard: {model.guard or 'none'}"
-    return "no correction" if model.error_model == "drop" else "linear"
+    network = model.error_model_
+    if isinstance(network, ELMRegressorCV):
+        return f"{network.best_params_['n_hidden']} neurons, alpha = {network.alpha_:.3g}"
+    if not isinstance(model.error_model, str):
+        return "a network for each marker"
+    return "no correction" if model.error_model == "drop" else model.error_model
 
 
-def _held_out(model: HybridForwardModel, train: _Rows, test: _Rows) -> NDArray:
-    """Return the errors (N, K) of the markers on test rows; the fit does not warn."""
-    model.fit_with_messages(train.q, train.x, groups=train.groups, geometry=train.geometry)
+def _held_out(model: HybridForwardModel, module: ForwardModel, test: _Rows) -> NDArray:
+    """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
     q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
-    return distances(evaluate(model.module_, np.array(q, dtype=float))[0], test.x)
-
-
-def _choose(rows: _Rows, *, hybrid: bool) -> tuple[float | None, str | None]:
-    """Return penalty and guard of the ELM with the least mean error on held-out groups."""
-    guards: Sequence[str | None] = ("leverage", "box", None) if hybrid else (None,)
-    if hybrid and rows.robot.chain is None:
-        guards = ("leverage",)  # only a guard keeps a path near the data
-    candidates: list[Any] = [(alpha, guard) for guard in guards for alpha in ALPHAS]
-    if len(guards) > 1:
-        candidates.insert(0, (None, "leverage"))
-    errors = np.zeros(len(candidates))
-    for train, test in folds(rows.q, rows.groups, _INNER_FOLDS):
-        known, new = rows.of(train), rows.of(test)
-        base = known.mechanical() if hybrid else None
-        errors += [np.nansum(_held_out(_elm(base, *c), known, new)) for c in candidates]
-    return candidates[int(errors.argmin())]
+    return distances(evaluate(module, np.array(q, dtype=float))[0], test.x)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import in_terms
-from hybridkin._core.files import newest
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
@@ -124,7 +123,7 @@ class LoadedModel:
 
         None if the model does not hold its rows.
         """
-        if self.hybrid is None or self.hybrid._fitted_rows is None:
+        if self.hybrid is None:
             return None if self.header else np.zeros(len(q), dtype=bool)  # nominal: no fit
         fitted = np.isin(row_digests(q, x), self.hybrid._fitted_rows)
         _, motion = np.unique(motions, return_inverse=True)
@@ -251,10 +250,10 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     if path.suffix.lower() in LOG_SUFFIXES:
         raise ValueError(f"`model` must be a model or a robot description, got the log {path}.")
     if path.is_dir():
-        if not newest(path / _MODEL).is_file():
+        if not (path / _MODEL).is_file():
             raise FileNotFoundError(f"`model` {path} is a folder without {_MODEL}; name the file.")
         path = path / _MODEL
-    file, beside = newest(path), newest(path.with_name(_ROBOT))
+    file, beside = path, path.with_name(_ROBOT)
     model = load_model(file)
     if robot is None and path.name == _MODEL and beside.is_file():
         robot = beside

@@ -1,4 +1,4 @@
-"""A report: text, tables, numbers and figures that are written together or not at all."""
+"""A report: text, tables, numbers and figures, and the files they are written to."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin._core.arrays import as_path
-from hybridkin._core.files import newest, write_files
+from hybridkin._core.files import write_files
 from hybridkin._core.stored import plain
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.arc_chain import ArcChain
@@ -140,7 +140,7 @@ def _start_value(start: Chain, name: str) -> NDArray:
 
 
 class Report:
-    """Markdown blocks, a JSON record and named files, written together.
+    """Markdown blocks, a JSON record and named files.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ class Report:
     def write(self, out: str | Path) -> list[Path]:
         """Write everything into the folder `out` and return the paths.
 
-        A failure, an interrupt or a killed process does not change `out`, see `write_files`.
+        The report is the last file. A killed process leaves whole files, old or new ones.
         """
         out = Path(out)
         texts = {"report.json": json_text(self.record) + "\n", "report.md": self.markdown()}
@@ -255,11 +255,11 @@ def check_out(out: str | Path, command: str, files: Sequence[str] = (), *, force
     home = next(parent for parent in [path, *path.absolute().parents] if parent.exists())
     if not os.access(home, os.W_OK):
         raise PermissionError(f"`out` must be writable, but {home} is not; name another folder.")
-    report = newest(path / "report.json")
+    report = path / "report.json"
     entry = f'"command": "{command}"'
     if force or (report.is_file() and entry in report.read_text(errors="replace")):
         return
-    there = [name for name in (*files, report.name, "report.md") if newest(path / name).exists()]
+    there = [name for name in (*files, report.name, "report.md") if (path / name).exists()]
     if there:
         raise FileExistsError(
             f"`out` {path} has {', '.join(there)}, not written by `hybridkin {command}`; name "

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.files import newest
 from hybridkin._core.units import METRES
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
@@ -289,7 +288,7 @@ def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
     """
     file = Path(path)
     if file.is_dir():
-        file = newest(file / "track.csv")
+        file = file / "track.csv"
     if not file.is_file():
         raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     with open(file, encoding="utf-8-sig", newline="") as lines:

@@ -243,7 +243,7 @@ def test_demo_keeps_out_of_folders_with_files(tmp_path, capsys):
 def test_demo_goes_from_a_log_to_a_film(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(_demo, "_ROWS", 60)  # for speed, as what follows
     steps = _demo.steps
-    fast = {"--seeds 1": "--seeds 1 --no-auto", "--frames 24": "--frames 3", "--dt 0.1": "--dt 0.5"}
+    fast = {"--folds 2": "--folds 2 --no-auto", "--frames 24": "--frames 3", "--dt 0.1": "--dt 0.5"}
 
     def quick(out):
         commands = {}

@@ -1,7 +1,6 @@
 """Files that another command or program wrote are replaced only by --force."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import torch
 
 from hybridkin import robots
 from hybridkin.cli.main import main
-from hybridkin.workflow import Report
 from hybridkin.workflow.report import check_out
 
 ROBOT = """calibrate = []
@@ -24,7 +22,7 @@ groups = "motion"
 q_min = -0.006
 q_max = 0.006
 """
-FAST = ["--seeds", "1", "--folds", "2", "--no-auto", "--jobs", "1"]
+FAST = ["--folds", "2", "--no-auto", "--jobs", "1"]
 SHAPE = "--shape line --size 0.001,0.001,0 --unit m --duration 1 --dt 0.1".split()
 COMMANDS = {
     "fit": ["log.csv", "--robot", "data.toml", *FAST],  # without a chain it takes a second
@@ -108,17 +106,6 @@ def test_a_report_of_another_program_is_not_replaced(tmp_path, text):
     with pytest.raises(FileExistsError, match=r"has report\.json, not written by `hybridkin next`"):
         check_out(tmp_path, "next", ["next.csv"], force=False)
     check_out(tmp_path, "next", ["next.csv"], force=True)
-
-
-def test_files_of_a_killed_command_count(tmp_path):
-    waiting = tmp_path / ".hybridkin-new"
-    waiting.mkdir()
-    report = Report("plan")
-    report.record["command"] = "next"
-    shutil.move(report.write(tmp_path / "new")[0], waiting / "report.json")
-    check_out(tmp_path, "next", ["next.csv"], force=False)
-    with pytest.raises(FileExistsError, match=r"has report\.json"):
-        check_out(tmp_path, "track", ["track.csv"], force=False)
 
 
 @pytest.mark.slow

@@ -185,7 +185,7 @@ def test_the_radius_chooses_the_error_model_without_the_held_out_rows(monkeypatc
 
     def chosen(_, part):
         lengths.append(len(part))
-        return spec, {}
+        return spec, {}, {}
 
     monkeypatch.setattr(_radius, "select", chosen)
     rows = Rows(*log(30))

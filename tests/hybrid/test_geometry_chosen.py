@@ -41,8 +41,8 @@ def test_the_held_out_error_of_a_blend_is_that_of_its_first_model():
     )
     model = SimpleNamespace(
         error_model_=Blend((0.5, 0.5), (first, second)),
-        _fitted_rows=np.zeros(2),
+        _fitted_rows=np.zeros(7),
         calibration_=None,
         cv_results_=None,
     )
-    assert training_of(model) == {"rows": 2, "left_out_rmse": 0.1}  # pyright: ignore
+    assert training_of(model) == {"rows": 7, "left_out_rmse": 0.1}  # pyright: ignore

@@ -1,5 +1,6 @@
 """The error model chosen by held-out motions: what it takes, and what it reports."""
 
+import pickle
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
@@ -121,6 +122,28 @@ def test_clone_refit_and_file(chosen, trunk, tmp_path):
     assert_array_equal(again.predict(q), chosen.predict(q))
     save_model(chosen, tmp_path / "model.safetensors")
     assert_array_equal(load_model(tmp_path / "model.safetensors").predict(q), chosen.predict(q))
+
+
+@pytest.mark.slow
+def test_candidates_are_the_models_that_auto_compared(chosen, trunk, tmp_path):
+    q = torch.from_numpy(trunk[0])
+    weights = chosen.cv_results_["weights"]
+    assert chosen.candidates_.keys() == weights.keys()
+    with torch.no_grad():
+        tips = {name: module(q).numpy() for name, module in chosen.candidates_.items()}
+    assert_allclose(tips["mechanical"], chosen.predict_mechanical(trunk[0]), atol=1e-12)
+    blend = sum(weight * tips[name] for name, weight in weights.items())
+    assert_allclose(blend, chosen.predict(trunk[0]), atol=2e-4)
+    copied = pickle.loads(pickle.dumps(chosen))
+    assert_array_equal(copied.candidates_["serial pose"](q).detach(), tips["serial pose"])
+    assert not hasattr(clone(chosen), "candidates_")
+    save_model(chosen, tmp_path / "model.safetensors")
+    assert load_model(tmp_path / "model.safetensors").candidates_ is None
+
+
+def test_only_auto_has_candidates(trunk):
+    q, x = trunk
+    assert HybridForwardModel(bha(), "linear").fit(q[:50], x[:50]).candidates_ is None
 
 
 @pytest.mark.slow

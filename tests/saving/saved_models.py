@@ -96,6 +96,13 @@ def _hybrid(error_model: Any = None, chain: Any = None, **settings: Any) -> Any:
     return model.fit(q, x, groups=groups), q
 
 
+def _blend():
+    """A blend of small models, without a network."""
+    q, x, groups = trunk_log(20)
+    model = HybridForwardModel(trunk(), "auto", calibrate=("radii",), random_state=0)
+    return model.fit(q, x, groups=groups), q
+
+
 def _rigid_hybrid():
     rng = np.random.default_rng(0)
     q = rng.uniform(-1, 1, (24, 3))
@@ -158,7 +165,7 @@ def models() -> dict[str, tuple[Any, Any]]:
             HybridForwardModel(None, small).fit(*trunk_log()[:2]),
             trunk_log()[0],
         ),
-        "blend": _hybrid("auto", calibrate=("radii",)),
+        "blend": _blend(),
         "play": _hybrid("linear", play=[0.01, 0.02, 0.0]),
         "tested_by_groups": _hybrid("linear", coupling="serial", guard="box"),
         "drift_and_radius": _drifting(),

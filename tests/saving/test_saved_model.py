@@ -301,7 +301,7 @@ def settings(model):
 @pytest.mark.parametrize("kind", ["serial_elm", "parallel_elm", "parallel_kernel", "blend"])
 def test_a_loaded_hybrid_is_fitted_again_as_what_it_was(tmp_path, kind, fitted):
     model, q = fitted[kind]
-    _, x, groups = trunk_log()
+    _, x, groups = trunk_log(len(q))
     save_model(model, tmp_path / "model")
     twin = load_model(tmp_path / "model").fit(q, x, groups=groups)
     fresh: Any = clone(model)

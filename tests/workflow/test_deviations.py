@@ -94,7 +94,7 @@ def test_a_horizontal_robot_may_hide_a_wrong_sign_of_all_tendons():
 def test_a_fit_warns_of_deviations_and_reports_them(tmp_path):
     q, x = measured(robot())
     description = robots.RobotDescription("r", robot(length=0.125), ("lengths", "base"), None)
-    settings = workflow.FitSettings(n_folds=2, n_seeds=1, auto=False)
+    settings = workflow.FitSettings(n_folds=2, auto=False)
     log = Log(q[::3], x[::3], MOTIONS[::3])
     with pytest.warns(UserWarning, match=r"moved lengths\[0\] from 125 to 100") as caught:
         workflow.fit_log(log, description, tmp_path, settings, n_jobs=1)

@@ -6,7 +6,7 @@ import torch
 
 from hybridkin import ConstantCurvatureChain, robots
 from hybridkin.datasets import check_log, load_log
-from hybridkin.workflow import FitSettings, evaluate_log, fit, fit_log, open_model, read_log
+from hybridkin.workflow import FitSettings, evaluate_log, fit_log, open_model, read_log
 
 ROBOT = """
 calibrate = ["radii", "base"]
@@ -94,12 +94,11 @@ def test_the_tip_is_checked_where_it_was_measured(folder):
 
 
 @pytest.mark.slow
-def test_a_fit_reports_every_marker_and_its_model_steers_the_tip(folder, monkeypatch):
-    monkeypatch.setattr(fit, "ALPHAS", (0.1,))
+def test_a_fit_reports_every_marker_and_its_model_steers_the_tip(folder):
     robot = robots.read_description(folder / "robot.toml")
     log = read_log(folder / "log.csv", robot.log, chain=robot.chain)
     out = folder / "fit"
-    settings = FitSettings(auto=False, n_seeds=1, n_folds=2, coverage=0.8)
+    settings = FitSettings(auto=False, n_folds=2, coverage=0.8)
     report, _ = fit_log(log, robot, out, settings, n_jobs=1)
     entries = report.record["markers"]
     assert [entry["rows"] for entry in entries] == [48, 63]

@@ -17,7 +17,7 @@ from entry_points import (
 
 from hybridkin import ConstantCurvatureChain, fit_play, workflow
 
-SETTINGS = {"n_folds": 2, "n_seeds": 1, "auto": False, "loss": "linear", "coverage": None}
+SETTINGS = {"n_folds": 2, "auto": False, "loss": "linear", "coverage": None}
 SETTINGS |= {"play": None, "max_rows": None}
 OUT, TRACK = FOLDER / "out", FOLDER / "sent.csv"
 TRACK.write_text("q1,q2,q3,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in np.c_[Q, X]))
