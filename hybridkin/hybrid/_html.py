@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from hybridkin._core.arrays import as_array
 from hybridkin._core.html import numbers
 from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.learning.elm import ELMRegressor
@@ -79,12 +78,12 @@ def _radius(model: Any) -> str:
 
 
 def _range(model: Any) -> dict[str, object]:
-    center, scale, *_ = model._drift
-    half = np.where(scale == 1.0, 0.0, scale)  # an actuator that never moved counts as 1
-    center = center - as_array(model.module_.shift)
-    names = vars(model).get("feature_names_in_", [f"q[{k}]" for k in range(len(half))])
-    ends = zip(map(numbers, center - half), map(numbers, center + half), strict=True)
-    return {"": ("least", "largest"), **dict(zip(map(str, names), ends, strict=True))}
+    low, high = model.training_range_
+    names = vars(model).get("feature_names_in_", [f"q[{k}]" for k in range(len(low))])
+    ranges: dict[str, object] = {"": ("least", "largest")}
+    for name, least, largest in zip(names, low, high, strict=True):
+        ranges[str(name)] = numbers(least), numbers(largest)
+    return ranges
 
 
 def _mm(metres: float) -> str:

@@ -14,6 +14,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 
+from hybridkin._core.arrays import as_array
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.units import motion_message
@@ -24,6 +25,7 @@ from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._radius import Radius
+from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
@@ -38,6 +40,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     play_: PlayOperator | None
     radius_: Radius | None
     _single_output: bool
+    _fitted_range: TrainingRange
 
     def predict(self, X: Any, return_radius: bool = False, groups: ArrayLike | None = None) -> Any:
         """Return tip positions f_mech(q) + w(q) eps(q).
@@ -130,6 +133,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
+
+    @property
+    def training_range_(self) -> TrainingRange:
+        """The range of q in the fit, where it lies after `adapt` [unit of q]."""
+        return self._fitted_range.moved(-as_array(self.module_.shift))
 
     @property
     def _repr_html_(self) -> Callable[[], str]:

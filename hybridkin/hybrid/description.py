@@ -25,6 +25,7 @@ from hybridkin.hybrid._error_models import Blend
 from hybridkin.hybrid._marked import MarkedHybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
 from hybridkin.hybrid._radius import Radius
+from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.hybrid._settings import check_settings
 from hybridkin.hybrid.estimator import HybridForwardModel
@@ -82,6 +83,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         "hybrid",
         {
             **{f"drift_{name}": array for name, array in model._drift._asdict().items()},
+            "training_range": model._fitted_range,
             "play_width": None if model.play_ is None else model.play_.width,
             "radius": model.radius_,
             "fitted_rows": model._fitted_rows,
@@ -127,6 +129,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
+    model._fitted_range = TrainingRange(*stored.array("training_range", (2, n)))
     empty = Drift.of_range(center[None], x.shape[1])
     arrays = [stored.array(f"drift_{name}", a.shape) for name, a in empty._asdict().items()]
     model._drift = Drift(*arrays)

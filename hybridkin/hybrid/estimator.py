@@ -37,6 +37,7 @@ from hybridkin.hybrid._module import HybridModule
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
+from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import select
 from hybridkin.hybrid._settings import check_settings, missing_markers
@@ -141,6 +142,9 @@ class HybridForwardModel(HybridPredictor):
     radius_ : Radius or None
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups, and
         ``outside`` it, always infinite. `adapt` and `partial_fit` do not change it.
+    training_range_ : TrainingRange
+        ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with `play`
+        of the motion of the actuators. `adapt` moves it with the actuator zeros.
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)
@@ -275,6 +279,7 @@ class HybridForwardModel(HybridPredictor):
         self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
         self.error_model_, self.module_ = fitted.error.result, fitted.module
         self._single_output = rows.y.ndim == 1
+        self._fitted_range = TrainingRange.of(rows.X)
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
         self._noise = fitted.error.noise
         if self.cv_results_ is not None:

@@ -16,7 +16,7 @@ import numpy as np
 import sklearn
 import torch
 
-from hybridkin._core.arrays import as_array, as_path
+from hybridkin._core.arrays import as_path
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import plain
 from hybridkin._core.version import __version__
@@ -161,8 +161,8 @@ def model_header(path: str | Path) -> dict[str, Any]:
         JSON values: ``created`` (date); ``versions`` of the packages that wrote it; ``units`` of q
         and x; ``training`` (``rows``, errors [m], for error_model="auto" all candidates, and the
         notes given to `save_model`); for a hybrid, ``domain`` (``q_low`` and ``q_high`` of the
-        training rows, null for a column that did not vary, and the ``guard``). The model itself:
-        ``kind``, ``settings``, names of ``arrays``, and ``parts``, each with these four entries.
+        training rows, and the ``guard``). The model itself: ``kind``, ``settings``, names of
+        ``arrays``, and ``parts``, each with these four entries.
 
     Raises
     ------
@@ -209,8 +209,6 @@ def _units(model: object, output: str = "position") -> dict[str, str | list[str]
 
 
 def _domain(model: HybridForwardModel) -> dict[str, Any]:
-    """Return the guard and the range of the training rows, NaN where a column did not vary."""
-    center, scale = model._drift.center - as_array(model.module_.shift), model._drift.scale
-    varied = scale != 1.0  # columns without a range have the scale 1
-    low, high = (np.where(varied, bound, np.nan) for bound in (center - scale, center + scale))
+    """Return the guard and the range of the training rows."""
+    low, high = model.training_range_
     return {"guard": model.guard, "q_low": plain(low), "q_high": plain(high)}

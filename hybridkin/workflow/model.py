@@ -83,10 +83,7 @@ class LoadedModel:
         """
         if self.hybrid is None:
             return None
-        drift = self.hybrid._drift
-        half = np.where(drift.scale == 1.0, 0.0, drift.scale)  # 1: the actuator never moved
-        center = drift.center - as_array(self.hybrid.module_.shift)
-        return robots.Limits(center - half, center + half)
+        return robots.Limits(*self.hybrid.training_range_)
 
     @property
     def play(self) -> PlayOperator | None:

@@ -362,15 +362,17 @@ def test_the_header_describes_the_model(tmp_path, fitted):
         save_model(arm(), path, training={"a": object()})
 
 
-def test_a_column_that_does_not_vary_has_no_range(tmp_path):
-    q, x, _ = trunk_log()
+def test_the_training_range_is_that_of_the_log(tmp_path):
+    """Also of an actuator that never moved, and of one whose half range is 1."""
+    q = np.random.default_rng(0).uniform(0.0, 2.0, (60, 3))
+    q[:2, 0] = 0.0, 2.0
     q[:, 1] = 0.25
-    model = HybridForwardModel(trunk(), ELMRegressor(4, random_state=0))
-    with pytest.warns(UserWarning, match=r"no motion along \+1 q\[1\] "):
-        model.fit(q, x)
+    model = HybridForwardModel(None, ELMRegressor(4, random_state=0)).fit(q, q)
     save_model(model, tmp_path / "model")
     domain = model_header(tmp_path / "model")["domain"]
-    assert [value is None for value in domain["q_low"]] == [False, True, False]
+    for found in (model.training_range_, load_model(tmp_path / "model").training_range_):
+        assert_array_equal(found, [q.min(0), q.max(0)])
+    assert_array_equal([domain["q_low"], domain["q_high"]], [q.min(0), q.max(0)])
 
 
 @pytest.mark.parametrize("kind", ["chain", "parallel_elm", "serial_pose", "elm"])
