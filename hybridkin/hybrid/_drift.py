@@ -87,11 +87,8 @@ class Drift(NamedTuple):
         Parameters
         ----------
         noise : float
-            Standard deviation of one residual coordinate without a change [m]. NaN: unknown, the
-            penalty is then 1.
+            Standard deviation of one residual coordinate without a change [m].
         """
-        if np.isnan(noise):
-            return 1.0
         sizes, axes = np.linalg.eigh(self.gram)
         along = (self.moment.T[:, None] @ axes).ravel() ** 2
         sizes, alphas, misfits = sizes.ravel(), _ALPHAS[:, None], MISFITS[:, None]

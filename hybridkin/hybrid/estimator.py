@@ -253,14 +253,17 @@ class HybridForwardModel(HybridPredictor):
         groups: ArrayLike | None = None,
         geometry: GeometryChoice | None = None,
         progress: Callable[[int, int], None] | None = None,
+        held_out: bool = True,
     ) -> list[str]:
         """Fit as `fit` does and return the messages of its warnings without issuing them.
 
-        `geometry` replaces the choice of what to calibrate. `progress` gets (done, total).
+        `geometry` replaces the choice of what to calibrate. `progress` gets (done, total). Without
+        `held_out`, errors on held-out rows that predictions do not need are not computed: those of
+        the calibration and of readouts, and ``expected_distance`` has the penalties of all rows.
         """
         check_settings(self)
         given = self._checked_rows(X, y, sample_weight, groups)
-        asked = self._spec(given)
+        asked = replace(self._spec(given), left_out=held_out)
         rows = given.distinct()
         messages = few_rows(rows, asked, self.coverage)
         self._fitted_rows = np.unique(row_digests(rows.X, rows.tips))

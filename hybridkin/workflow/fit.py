@@ -427,7 +427,8 @@ def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, 
     errors = {}
     choices = {}
     for name, model in _models(train, train.mechanical()).items():
-        model.fit_with_messages(train.q, train.x, groups=train.groups, geometry=train.geometry)
+        options = {"groups": train.groups, "geometry": train.geometry, "held_out": False}
+        model.fit_with_messages(train.q, train.x, **options)
         for candidate, module in (model.candidates_ or {}).items():
             if candidate != "mechanical":
                 errors[f"hybrid, {candidate}"] = _held_out(model, module, test)

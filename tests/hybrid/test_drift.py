@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from saved_models import FOLDER, trunk_log
 from scipy.optimize import brentq
 from scipy.stats import multivariate_normal
 from sklearn.linear_model import Ridge
@@ -152,15 +151,6 @@ def test_the_penalty_is_that_of_largest_evidence():
 
     alphas = 10.0 ** np.arange(-4, 3.1, 0.5)
     assert found == alphas[np.argmax([log_density(a) for a in alphas])]
-
-
-def test_a_file_without_the_held_out_error_can_still_learn_a_drift():
-    model = load_model(FOLDER / "parallel_elm.safetensors")
-    q, x, _ = trunk_log()
-    model.partial_fit(q[:5], x[:5])
-    with pytest.raises(ValueError, match="`adapt` needs the held-out errors"):
-        model.adapt(q[:5], x[:5])
-    load_model(FOLDER / "blend.safetensors").adapt(q[:5], x[:5])  # has the scores of all candidates
 
 
 @pytest.mark.parametrize(("gain", "changed"), [(3.0, False), (5.0, True)])

@@ -173,7 +173,6 @@ def test_a_drift_is_emptied_and_learns_anew():
     rest = new.learned(q, 1e-4 * rng.standard_normal((50, 3)), np.ones(50), 1.0)
     assert rest.likeliest_alpha(1e-4) == np.inf
     assert_array_equal(rest.correction(np.inf)(torch.from_numpy(q)).numpy(), 0.0)
-    assert rest.likeliest_alpha(np.nan) == 1.0
 
 
 def test_the_kernel_does_not_depend_on_the_unit_of_q():
