@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.spatial.transform import Rotation
 
 from hybridkin._core.arrays import as_array
+from hybridkin._core.rotations import nearest_rotation
 from hybridkin.chains.play import PlayOperator
 from hybridkin.datasets import Log
 from hybridkin.native.library import evaluate
@@ -184,12 +184,11 @@ def _without_backlash(motion: NDArray, rows: NDArray, J: NDArray, residual: NDAr
 
 
 def _moved(tips: NDArray, x: NDArray) -> NDArray:
-    """Return tips (N, 3) after the rigid motion that brings them nearest to x (Kabsch)."""
-    here, there = tips.mean(axis=0), x.mean(axis=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # points on a line: any turn about it
-        turn = Rotation.align_vectors(x - there, tips - here)[0]
-    return there + turn.apply(tips - here)
+    """Return tips (N, 3) after the rigid motion that brings them nearest to x."""
+    middle = x.mean(axis=0)
+    centred = tips - tips.mean(axis=0)
+    turn, _ = nearest_rotation(torch.from_numpy((x - middle).T @ centred))
+    return middle + centred @ turn.numpy().T
 
 
 def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
