@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
+from sklearn.linear_model import LinearRegression
 from sklearn.utils import Bunch
 
 from hybridkin import ELMRegressor, HybridForwardModel, calibrate, robots
@@ -15,7 +16,7 @@ from hybridkin.calibration.measured import distance
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
 from hybridkin.plots import model_color, new_figure
-from hybridkin.workflow.report import Progress, Report, linear, quadratic, quiet
+from hybridkin.workflow.report import Progress, Report, quadratic, quiet
 
 PAPER_TABLE_1 = {
     ("mechanical, nominal", "-"): ("", "2.5 (9.3)"),
@@ -124,7 +125,7 @@ def _one_split(
     roles = {"data-driven": None, **{f"hybrid on {name}": c for name, c in chains.items()}}
     for role, chain in roles.items():
         # The paper uses the error model everywhere, without a guard.
-        record(role, "linear", HybridForwardModel(chain, linear(), guard=None))
+        record(role, "linear", HybridForwardModel(chain, LinearRegression(), guard=None))
         record(role, "quadratic", HybridForwardModel(chain, quadratic(), guard=None))
         for seed in range(n_seeds):
             elm = ELMRegressor(**PAPER_ELM, random_state=1000 * split + seed)

@@ -1,4 +1,4 @@
-"""Rotations: the exponential map, its left Jacobian, and the logarithm."""
+"""Rotations: the exponential map, its left Jacobian, the logarithm, and the nearest rotation."""
 
 from __future__ import annotations
 
@@ -26,6 +26,22 @@ def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
     eye = identity(3, phi)
     _, f, g, c3, _ = (part[..., None, None] for part in stumpff(phi.square().sum(-1)))
     return eye + f * K + g * K @ K, eye + g * K + c3 * K @ K
+
+
+def nearest_rotation(moments: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rotations R (..., 3, 3) of largest trace(R^T M), and that trace (...,).
+
+    For centred points a and b (N, 3) and moments M = b^T a, R brings a nearest to b; the trace over
+    the sum of squares of a is then the best scale.
+
+    References
+    ----------
+    Umeyama, IEEE PAMI 13 (1991): least squares over rotations without mirror images.
+    """
+    left, stretch, right = torch.linalg.svd(moments)
+    sign = torch.ones_like(stretch)
+    sign[..., 2] = torch.linalg.det(left @ right).sign()
+    return (left * sign[..., None, :]) @ right, (stretch * sign).sum(-1)
 
 
 def rotation_vector(R: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.rotations import nearest_rotation
 from hybridkin.calibration._least_squares import Rows
 from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
@@ -57,17 +58,15 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
 
 
 def aligned(chain: _Chain, rows: Rows) -> _Chain:
-    """Return the chain at the base pose that aligns predicted and measured tips (Kabsch)."""
+    """Return the chain at the base pose that aligns predicted and measured tips."""
     x = torch.from_numpy(points(rows.x.numpy())[rows.seen])
     tips = x + torch.from_numpy(rows.residual(chain)).to(x)
     weight = torch.from_numpy(rows.weights).to(x)[:, None] / rows.weights.sum()
     here, there = (weight * tips).sum(0), (weight * x).sum(0)
-    u, _, vh = torch.linalg.svd((weight * (tips - here)).mT @ (x - there))
-    sign = torch.ones_like(here)
-    sign[2] = torch.sign(torch.linalg.det(u @ vh))
-    rotation = vh.mT @ (sign[:, None] * u.mT)
+    rotation, _ = nearest_rotation((weight * (x - there)).mT @ (tips - here))
     move = torch.eye(4, dtype=here.dtype, device=here.device)
-    move[:3, :3], move[:3, 3] = rotation, there - rotation @ here
+    move[:3, :3] = rotation
+    move[:3, 3] = there - rotation @ here
     return chain.with_geometry(base=move @ chain.geometry()["base"])
 
 

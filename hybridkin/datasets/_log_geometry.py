@@ -18,21 +18,25 @@ from hybridkin.datasets._log_report import LogFinding
 from hybridkin.datasets._logs import Log, column_names
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
-_ROWS, _FEW = 500, 150  # enough to distinguish a robot from its mirror image; for many changes
+_ROWS = 500  # enough to distinguish a robot from its mirror image
+_FEW = 150  # for many changes
 _CONVERT = (
     "set `spool_radius` (of motors) or `gain` (of pressures or steps: metres per unit) in every "
     "[[segment]] of the robot description (`gains` of a chain)"
 )
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
-# Range of the tip over the reach of the robot: impossible, usual. Strokes over radii (a bend, in
-# rad) and chamber lengths over radii: too small, usual, too large.
-_REACH, _USUAL_REACH = 5.0, 0.7
-_BEND, _LONG = (0.02, 1.0, 15.0), (0.05, 3.0, 100.0)
+_REACH = 5.0  # impossible range of the tip over the reach of the robot
+_USUAL_REACH = 0.7
+# Too small, usual, too large: strokes over radii (a bend, in rad); chamber lengths over radii.
+_BEND = (0.02, 1.0, 15.0)
+_LONG = (0.05, 3.0, 100.0)
 _LONGEST = 10.0  # [m] a longer robot, or one with radii of a tenth, is described in millimetres
 _SMALL_SHARE = 0.04  # range of the tip relative to that of the model
-_FAR_BETTER, _GOOD = 0.6, 0.55  # missed motion of another reading: relative to declared; absolute
+_FAR_BETTER = 0.6  # missed motion of another reading relative to that of the declared one
+_GOOD = 0.55  # missed motion of another reading
 _ENOUGH = 0.85  # explained share of the variance
-_TWIST, _TILT = 120.0, 45.0  # [deg] least rotation of a base about its axis; its largest tilt
+_TWIST = 120.0  # [deg] least rotation of a base about its axis
+_TILT = 45.0  # [deg] largest tilt of a base
 _BENDS = (0.25, 0.4, 0.5, 0.65, 1.5, 2.0, 2.5, 4.0)  # factors on all bends that are tried
 _SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # offsets, in standard deviations
 _SHIFTED = 0.87  # relative missed motion; for clean logs, simulated and real, it was above 0.89
@@ -78,16 +82,20 @@ class _Robot:
         The changes are a factor on all bends, as from wrong radii, and an offset or a drift of one
         actuator, in standard deviations.
         """
-        found, t, parts = {}, np.linspace(0.0, 1.0, len(q)), np.split(q, self.ends, axis=1)
-        rest = np.hstack([0.0 * part + part.mean(axis=1, keepdims=True) for part in parts])
-        rest[:, self.pulled] = 0.0
-        for by in _BENDS:
-            found["size", by, 0.0] = rest + by * (q - rest)
-        for kind, way in (("offset", np.ones(len(q))), ("drift", t)):
+        straight = np.zeros_like(q)
+        for columns in np.split(np.arange(q.shape[1]), self.ends):
+            straight[:, columns] = q[:, columns].mean(axis=1, keepdims=True)
+        straight[:, self.pulled] = 0.0
+        changed = {}
+        for factor in _BENDS:
+            changed["size", factor, 0.0] = straight + factor * (q - straight)
+        growth = {"offset": np.ones(len(q)), "drift": np.linspace(0.0, 1.0, len(q))}
+        for kind, shape in growth.items():
             for i, by in itertools.product(range(q.shape[1]), _SHIFTS):
-                shift = by * q[:, i].std() * way[:, None] * np.eye(q.shape[1])[i]
-                found[kind, i, by] = q + shift
-        return found
+                shifted = q.copy()
+                shifted[:, i] += by * q[:, i].std() * shape
+                changed[kind, i, by] = shifted
+        return changed
 
 
 def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
@@ -95,8 +103,9 @@ def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
     if chain is None or chain.in_metres:
         return log, chain
     q = chain.metres(torch.from_numpy(log.q.astype(float))).detach().cpu().numpy()
-    plain = {"gains": chain.gains / chain.gains, "actuator_zeros": 0.0 * chain.gains}
-    plain = {name: value for name, value in plain.items() if name in chain.geometry()}
+    plain = {"gains": chain.gains / chain.gains}
+    if "actuator_zeros" in chain.geometry():
+        plain["actuator_zeros"] = 0.0 * chain.gains
     return replace(log, q=q, units={**log.units, "q": "m"}), chain.with_geometry(**plain)
 
 
@@ -110,8 +119,9 @@ def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFindi
 def zero_findings(log: Log, chain: Any) -> Iterator[LogFinding]:
     """Yield a finding if no row is near the zeros of tendons, but rows are near their negatives."""
     tendons = (~chain.absolute & (chain.rest != 0.0)).cpu().numpy()
-    rest, q = chain.rest.detach().cpu().numpy()[tendons], log.q[:, tendons]
-    low, high = q.min(axis=0), q.max(axis=0)
+    rest = chain.rest.detach().cpu().numpy()[tendons]
+    low = log.q[:, tendons].min(axis=0)
+    high = log.q[:, tendons].max(axis=0)
     beyond = np.maximum(low - rest, rest - high) > 0.5 * (high - low)
     if tendons.any() and (beyond & (low <= -rest) & (-rest <= high)).all():
         message = "no row is near the `zeros` of the tendons, but rows are near their negatives."
@@ -121,39 +131,49 @@ def zero_findings(log: Log, chain: Any) -> Iterator[LogFinding]:
 
 def _kind_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
     """Yield a finding if q holds no lengths, lengths instead of changes, or the reverse."""
-    low, high = log.q.min(axis=0), log.q.max(axis=0)
     if log.units["q"] != "m":
         message = f"the actuators of the robot are lengths, but q is in {log.file_units['q']}."
         yield LogFinding("units", "error", message, f"{_CONVERT}.")
         return
-    what, kind, advice = "tendons, whose q are changes of length", "geometry", _ADVICE["whole"]
-    own, wrong = robot.pulled, robot.pulled.any() and (low > 0.1 * high)[robot.pulled].all()
+    low = log.q.min(axis=0)
+    high = log.q.max(axis=0)
+    kind = "geometry"
     if not (low > 0)[robot.absolute].all():
-        what, advice = "chambers, whose q are positive lengths", _ADVICE["changes"]
-        own, wrong, turned = robot.absolute, True, robot.absolute & (high < 0)
-        if ((low > 0) | (high < 0))[own].all():
-            kind, advice = "sign", _sign_advice(log, _signs(np.where(turned, -1, 1)))
-    if wrong:
-        span = f"lies between {1e3 * low[own].min():.4g} and {1e3 * high[own].max():.4g} mm"
-        message = f"the robot is described with {what}, but q {span}."
-        yield LogFinding(kind, "error", message, advice)
+        what = "chambers, whose q are positive lengths"
+        columns = robot.absolute
+        advice = _ADVICE["changes"]
+        negative = columns & (high < 0)
+        if ((low > 0) | negative)[columns].all():
+            kind = "sign"
+            advice = _sign_advice(log, _signs(np.where(negative, -1, 1)))
+    elif robot.pulled.any() and (low > 0.1 * high)[robot.pulled].all():
+        what = "tendons, whose q are changes of length"
+        columns = robot.pulled
+        advice = _ADVICE["whole"]
+    else:
+        return
+    span = f"{1e3 * low[columns].min():.4g} and {1e3 * high[columns].max():.4g} mm"
+    message = f"the robot is described with {what}, but q lies between {span}."
+    yield LogFinding(kind, "error", message, advice)
 
 
 def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
-    q, radii, own = log.q, robot.radii, robot.absolute
-    length = robot.length + sum(part.mean() for part in np.split(own * q, robot.ends, axis=1))
+    q = log.q
+    radii = robot.radii
+    lengths = np.split(robot.absolute * q, robot.ends, axis=1)
+    length = robot.length + sum(part.mean() for part in lengths)
     if robot.extensible:
-        size, radius, (low, usual, high) = float(np.median(q[:, own])), radii.mean(), _LONG
-        # The length is that of q; its unit is checked next.
-        length /= 1.0 if low <= size / radius <= high else _factor(size / radius, usual)
+        size = float(np.median(q[:, robot.absolute]))
+        radius = radii.mean()
+        low, usual, high = _LONG
+        if not low <= size / radius <= high:
+            # The length is that of q; its unit is checked next.
+            length /= _factor(size / radius, usual)
     else:
-        # A tendon bends its own segment and, with routing "base", all segments before it.
-        spans = np.cumsum(radii) if robot.chain.routing == "base" else radii
-        pulls, spans = np.abs(q).max(axis=0), np.repeat(spans, robot.chain.actuators_per_segment)
-        pairs = zip(pulls[robot.pulled], spans[robot.pulled], strict=True)
-        size, radius = max(pairs, key=lambda pair: pair[0] / pair[1])
+        size, radius = _longest_stroke(q, robot)
         low, usual, high = _BEND
-    stroke, spread = size / radius, float(np.linalg.norm(np.ptp(log.x, axis=0)))
+    stroke = size / radius
+    spread = float(np.linalg.norm(np.ptp(log.x, axis=0)))
     reach = spread / (length + robot.offsets)
     small = stroke < low and (robot.extensible or reach > 0.1 or stroke < low / 4)
     q_factor = _factor(stroke, usual) if stroke > high or small else None
@@ -181,14 +201,28 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         yield _unit_finding("x", what, log.file_units["x"], x_factor)
 
 
+def _longest_stroke(q: NDArray, robot: _Robot) -> tuple[float, float]:
+    """Return the stroke of the tendon that bends most, and the radius that it has there [m].
+
+    A tendon bends its own segment and, with routing "base", all segments before it.
+    """
+    spans = np.cumsum(robot.radii) if robot.chain.routing == "base" else robot.radii
+    spans = np.repeat(spans, robot.chain.actuators_per_segment)[robot.pulled]
+    strokes = np.abs(q).max(axis=0)[robot.pulled]
+    most = int(np.argmax(strokes / spans))
+    return strokes[most], spans[most]
+
+
 def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
-    true = next((u for u in _NAMES if np.isclose(METRES[u] * factor, METRES.get(unit, 0.0))), None)
     where = f"in [log] of the robot description or --{name}-unit"
-    remedy = f'set {name}_unit = "{true}" {where} {true}'
-    if true is None:
-        q_remedy = f"if these are not lengths, {_CONVERT}"
-        remedy = q_remedy if name == "q" else f"check `{name}_unit` {where}"
-    looks = f"these look like {_NAMES[true]}" if true else f"they are off by about {factor:g}"
+    looks = f"they are off by about {factor:g}"
+    remedy = f"check `{name}_unit` {where}"
+    if name == "q":
+        remedy = f"if these are not lengths, {_CONVERT}"
+    for other, words in _NAMES.items():
+        if np.isclose(METRES[other] * factor, METRES.get(unit, 0.0)):
+            looks = f"these look like {words}"
+            remedy = f'set {name}_unit = "{other}" {where} {other}'
     message = f"columns of {name} are declared as {unit}, but {what}; {looks}."
     advice = f"{remedy}; or correct the radii and lengths of the description, in metres."
     return LogFinding("units", "error", message, advice)
@@ -201,26 +235,30 @@ def _signs(sign: NDArray) -> Way:
 def _sign_advice(log: Log, way: Way) -> str:
     """Return the advice to set the signs of a way of reading the columns."""
     sign = np.array(way.sign) * np.broadcast_to(log.q_sign, len(way.sign))[list(way.order)]
-    value = sign[0] if np.ptp(sign) == 0 else sign.tolist()
-    option = f", or --q-sign={value}" if np.ptp(sign) == 0 else ""
-    return f"set q_sign = {value} in [log] of the robot description{option}."
+    if np.ptp(sign) > 0:
+        return f"set q_sign = {sign.tolist()} in [log] of the robot description."
+    return f"set q_sign = {sign[0]} in [log] of the robot description, or --q-sign={sign[0]}."
 
 
 def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterator[LogFinding]:
-    chain, flip = robot.chain, _sign_advice(log, _signs(np.where(robot.pulled, -1, 1)))
+    chain = robot.chain
+    flip = _sign_advice(log, _signs(np.where(robot.pulled, -1, 1)))
     pulls = log.q[:, robot.pulled]
     if not robot.extensible and pulls.max() > 20 * max(-pulls.min(), 0.0):
         message = "the tendons are only lengthened, never shortened; shortening must be negative."
         yield LogFinding("sign", "warning", message, flip)
         return
     rows = np.linspace(0, len(log.q) - 1, min(len(log.q), _ROWS)).astype(int)
-    q, x = log.q[rows], log.x[rows]
+    q = log.q[rows]
+    x = log.x[rows]
     if len(rows) < 10 or not np.ptp(x, axis=0).any():
         return
     missed = float(misses(chain, q[None], x, base_is_free)[0])
-    free, image = (float(misses(chain, q[None], x * [s, 1, 1], True)[0]) for s in (1.0, -1.0))
+    free = float(misses(chain, q[None], x, True)[0])
+    image = float(misses(chain, q[None], x * [-1.0, 1.0, 1.0], True)[0])
+    turned = min(free, image)
+    good = min(_FAR_BETTER * missed, _GOOD)
     compared = f"the nominal model explains {_share(missed)} of the tip's motion as declared, but "
-    good, turned = min(_FAR_BETTER * missed, _GOOD), min(free, image)
     way, least = better_way(chain, q, x, base_is_free)
     reread = float(misses(chain, way.of(q)[None], x, True)[0])
     if not base_is_free and turned < min(good, _FAR_BETTER * reread):
@@ -231,7 +269,8 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
     few = slice(None, None, -(-len(q) // _FEW))
     other, i, j = _exchanged(chain, q[few], x[few])
     if other < min(good, _FAR_BETTER * least):
-        name, axis = column_names(log, "q")[i], column_names(log, "x")[j]
+        name = column_names(log, "q")[i]
+        axis = column_names(log, "x")[j]
         message = f"{compared}{_share(other)} with columns {name!r} and {axis!r} exchanged."
         yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
         return
@@ -252,7 +291,8 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
     elif share < (_FAR_BETTER if kind == "size" else _SHIFTED):
         what = f"its bends are {i:g} times as large"
         if kind != "size":
-            name, far = column_names(log, "q")[int(i)], 1e3 * abs(by) * q.std(axis=0)[int(i)]
+            name = column_names(log, "q")[int(i)]
+            far = 1e3 * abs(by) * q[:, int(i)].std()
             does = "is off" if kind == "offset" else "drifts"
             what = f"actuator {name!r} {does} by about {far:.1g} mm"
         message = f"the error of the nominal model falls to {100 * share:.0f} % if {what}."
@@ -265,12 +305,15 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
 
 def _exchanged(chain: Any, q: NDArray, x: NDArray) -> tuple[float, int, int]:
     """Return the error after the best exchange of a column of q with one of x, and the columns."""
-    found = []
+    exchanges = []
     for i, j in itertools.product(range(q.shape[1]), range(3)):
-        a, b = q.copy(), x.copy()
-        a[:, i], b[:, j] = x[:, j], q[:, i]
-        found.append((float(misses(chain, a[None], b, True)[0]), i, j))
-    return min(found)
+        other_q = q.copy()
+        other_q[:, i] = x[:, j]
+        other_x = x.copy()
+        other_x[:, j] = q[:, i]
+        missed = float(misses(chain, other_q[None], other_x, True)[0])
+        exchanges.append((missed, i, j))
+    return min(exchanges)
 
 
 def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding:
@@ -278,7 +321,9 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
     declared = column_names(log, "q")
     names = [declared[i] for i in way.order]
     clockwise = next(changes(robot.chain.actuators_per_segment, False)).order
-    kind, what, advice = "sign", [], []
+    kind = "sign"
+    what = []
+    advice = []
     if names != declared and way.order == clockwise:
         kind, what = "numbering", ["the actuators numbered in the other direction"]
         first, second = robot.chain.angles[:2].tolist()
@@ -289,8 +334,10 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
         listed = f"set q = {json.dumps(names)} in [log] of the robot description."
         advice = [listed if log.q_names else f"use q[:, {[*way.order]}]."]
     if min(way.sign) < 0:
-        one = ", ".join(repr(n) for n, s in zip(names, way.sign, strict=True) if s < 0)
-        what.append(f"the sign of {'q' if max(way.sign) < 0 else one} flipped")
+        flipped = "q"
+        if max(way.sign) > 0:
+            flipped = ", ".join(repr(names[i]) for i in np.flatnonzero(np.less(way.sign, 0)))
+        what.append(f"the sign of {flipped} flipped")
         advice.append(_sign_advice(log, way))
     return LogFinding(kind, "warning", f"{compared}{' and '.join(what)}.", " ".join(advice))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,9 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridkin._core.rotations import nearest_rotation
+
 _ROWS = 60  # rows of the search; enough to distinguish two orders
 _MANY = 5  # for more actuators in a segment, or more segments, only pairs of columns are swapped
-_ROUNDS, _KEPT = 12, 10  # successive changes; orders from which each round starts
+_ROUNDS = 12  # successive changes
+_KEPT = 10  # orders from which each round starts
 _GAIN = 0.97  # largest ratio of errors after and before a further change
 _SIMPLE = 1.1  # an earlier change in the list is chosen if it is nearly as good
 
@@ -26,9 +29,9 @@ class Way(NamedTuple):
 
     def then(self, other: Way) -> Way:
         """Return this way followed by another one."""
-        order = tuple(self.order[i] for i in other.order)
-        sign = (self.sign[i] * s for i, s in zip(other.order, other.sign, strict=True))
-        return Way(order, tuple(sign))
+        order = np.array(self.order)[[*other.order]]
+        sign = np.array(self.sign)[[*other.order]] * other.sign
+        return Way(tuple(order.tolist()), tuple(sign.tolist()))
 
     def of(self, q: NDArray) -> NDArray:
         """Return the columns of q (N, n), read this way."""
@@ -37,7 +40,7 @@ class Way(NamedTuple):
 
 def as_declared(n: int) -> Way:
     """Return the way that does not change n columns."""
-    return Way((*range(n),), (1,) * n)
+    return Way(tuple(range(n)), (1,) * n)
 
 
 def changes(counts: list[int], signed: bool) -> Iterator[Way]:
@@ -47,24 +50,56 @@ def changes(counts: list[int], signed: bool) -> Iterator[Way]:
     order of the columns of one segment; another order of the segments.
     """
     n = sum(counts)
-    start, same = as_declared(n)
-    parts = _blocks(counts)
-    clockwise = tuple(i for part in parts for i in (*part[:1], *part[:0:-1]))
-    yield Way(clockwise, same)
+    declared = as_declared(n)
+    clockwise = _clockwise(counts)
+    yield clockwise
     if signed:
-        yield from (Way(order, (-1,) * n) for order in (start, clockwise))
-        yield from (Way(start, (*same[:i], -1, *same[i + 1 :])) for i in range(n))
-    orders = [{i: j, j: i} for i, j in itertools.combinations(range(n), 2)]
-    for part in (part for part in parts if len(part) <= _MANY):
-        orders += [dict(zip(part, o, strict=True)) for o in itertools.permutations(part)][1:]
-    yield from (Way(tuple(order.get(i, i) for i in range(n)), same) for order in orders)
-    for listed in itertools.permutations(range(len(parts))) if len(parts) <= _MANY else ():
-        found = dict(zip(listed, _blocks([counts[k] for k in listed]), strict=True))
-        yield Way(tuple(i for k in range(len(parts)) for i in found[k]), same)
+        yield Way(declared.order, (-1,) * n)
+        yield Way(clockwise.order, (-1,) * n)
+        for i in range(n):
+            sign = [1] * n
+            sign[i] = -1
+            yield Way(declared.order, tuple(sign))
+    for i, j in itertools.combinations(range(n), 2):
+        yield _reordered(n, (i, j), (j, i))
+    segments = _segments(counts)
+    for segment in segments:
+        if len(segment) <= _MANY:
+            for order in [*itertools.permutations(segment)][1:]:
+                yield _reordered(n, segment, order)
+    if len(segments) <= _MANY:
+        for listed in itertools.permutations(range(len(segments))):
+            yield _segments_listed(counts, listed)
 
 
-def _blocks(counts: list[int]) -> list[list[int]]:
+def _segments(counts: Sequence[int]) -> list[list[int]]:
+    """Return the columns of every segment."""
     return [part.tolist() for part in np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])]
+
+
+def _clockwise(counts: list[int]) -> Way:
+    """Return the way with the actuators of every segment numbered in the other direction."""
+    order = []
+    for first, *others in _segments(counts):
+        order += [first, *others[::-1]]
+    return as_declared(len(order))._replace(order=tuple(order))
+
+
+def _reordered(n: int, columns: Sequence[int], order: Sequence[int]) -> Way:
+    """Return the way with some of n columns in another order."""
+    way = [*range(n)]
+    for column, other in zip(columns, order, strict=True):
+        way[column] = other
+    return as_declared(n)._replace(order=tuple(way))
+
+
+def _segments_listed(counts: list[int], listed: Sequence[int]) -> Way:
+    """Return the way for columns that list the segments in another order."""
+    columns = _segments([counts[k] for k in listed])
+    order = []
+    for k in range(len(counts)):
+        order += columns[listed.index(k)]
+    return as_declared(len(order))._replace(order=tuple(order))
 
 
 def misses(chain: Any, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
@@ -73,42 +108,33 @@ def misses(chain: Any, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
     This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for
     a free base also rotation and scale), divided by the rms distance of x from its mean.
     """
-    a, b = _clouds(chain, qs, x)
+    tips, measured = _centred(chain, qs, x)
     if base_is_free:
-        turn, scale = _turn(a, b)
-        a = scale[:, None, None] * a @ turn.mT
-    return ((a - b).square().sum(-1).mean(-1) / b.square().sum(-1).mean()).sqrt().numpy()
+        turn, trace = nearest_rotation(measured.mT @ tips)
+        size = tips.square().sum((-2, -1)).clamp(min=torch.finfo(tips.dtype).tiny)
+        tips = (trace / size)[:, None, None] * tips @ turn.mT
+    squares = (tips - measured).square().sum(-1).mean(-1)
+    return (squares / measured.square().sum(-1).mean()).sqrt().numpy()
 
 
 def base_turn(chain: Any, q: NDArray, x: NDArray) -> tuple[float, float]:
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
+    tips, measured = _centred(chain, q[None], x)
+    turn, _ = nearest_rotation(measured.mT @ tips[0])
     base = chain.base[:3, :3].double()
-    turn = (base.mT @ _turn(*_clouds(chain, q[None], x))[0][0] @ base).numpy()
+    turn = (base.mT @ turn @ base).numpy()
     twist = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-    return float(np.degrees(twist)), float(np.degrees(np.arccos(np.clip(turn[2, 2], -1.0, 1.0))))
+    tilt = np.arccos(np.clip(turn[2, 2], -1.0, 1.0))
+    return float(np.degrees(twist)), float(np.degrees(tilt))
 
 
-def _clouds(chain: Any, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
+def _centred(chain: Any, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
-        a = chain(rows.flatten(0, 1)).double().reshape(*rows.shape[:2], 3)
-    b = torch.from_numpy(np.asarray(x, dtype=np.float64))
-    return a - a.mean(dim=1, keepdim=True), b - b.mean(dim=0)
-
-
-def _turn(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rotations (K, 3, 3) and scales (K,) of centred points a (K, N, 3) to b (N, 3).
-
-    References
-    ----------
-    Umeyama, IEEE PAMI 13 (1991): least squares over rotations without mirror images.
-    """
-    u, s, vh = torch.linalg.svd(b.mT @ a)
-    flip = torch.ones_like(s)
-    flip[:, 2] = torch.linalg.det(u @ vh).sign()
-    size = a.square().sum((-2, -1)).clamp(min=torch.finfo(a.dtype).tiny)
-    return (u * flip[:, None]) @ vh, (s * flip).sum(-1) / size
+        tips = chain(rows.flatten(0, 1)).double().reshape(*rows.shape[:2], 3)
+    measured = torch.from_numpy(np.asarray(x, dtype=np.float64))
+    return tips - tips.mean(dim=1, keepdim=True), measured - measured.mean(dim=0)
 
 
 def better_way(chain: Any, q: NDArray, x: NDArray, base_is_free: bool) -> tuple[Way, float]:
@@ -116,11 +142,13 @@ def better_way(chain: Any, q: NDArray, x: NDArray, base_is_free: bool) -> tuple[
 
     Each round tries all changes on the best ways of the previous round.
     """
-    counts, signed = chain.actuators_per_segment, not any(chain.extensible)
     rows = np.linspace(0, len(q) - 1, min(len(q), _ROWS)).astype(int)
-    q, x, tried = q[rows], x[rows], [*changes(counts, signed)]
-    kept = [as_declared(sum(counts))]
-    best, least = kept[0], float(misses(chain, q[None], x, base_is_free)[0])
+    q = q[rows]
+    x = x[rows]
+    tried = [*changes(chain.actuators_per_segment, not any(chain.extensible))]
+    best = as_declared(q.shape[1])
+    least = float(misses(chain, q[None], x, base_is_free)[0])
+    kept = [best]
     for _ in range(_ROUNDS):
         ways = [*dict.fromkeys(way.then(change) for way in kept for change in tried)]
         missed = misses(chain, np.stack([way.of(q) for way in ways]), x, base_is_free)
@@ -128,5 +156,6 @@ def better_way(chain: Any, q: NDArray, x: NDArray, base_is_free: bool) -> tuple[
         if missed.min() > _GAIN * least:
             break
         first = int(np.flatnonzero(missed <= _SIMPLE * missed.min())[0])
-        best, least = ways[first], float(missed[first])
+        best = ways[first]
+        least = float(missed[first])
     return best, least

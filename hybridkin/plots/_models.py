@@ -51,37 +51,51 @@ def body_of(
             "Give the points along the robot to the display yourself."
         )
     q = shaped(np.atleast_2d(plain(q, "q")), "q", ("K", chain.n_actuators))
-    ends = None if tips is None else shaped(tips, "tips", "K3", len(q))
-    known = np.isfinite(q).all(axis=1) & (True if ends is None else np.isfinite(ends).all(axis=1))
-    rows, learned = torch.from_numpy(q[known]), None
-
-    def spread(values: torch.Tensor | NDArray) -> NDArray:
-        """Return rows of known configurations among rows of NaN for the others."""
-        full = np.full((len(q), *values.shape[1:]), np.nan)
-        full[known] = values
-        return full
-
-    if ends is None and isinstance(model, Predictor):
-        tip = slice(3) if chain.n_outputs == 3 else slice(-3, None)  # of poses, or of markers
-        learned = plain(model.predict(q[known]), "x")[:, tip] if known.any() else np.empty((0, 3))
+    drawn = np.asarray(np.isfinite(q).all(axis=1))
+    ends = None
+    predicted_tips = None
+    if tips is not None:
+        ends = shaped(tips, "tips", "K3", len(q))
+        drawn = drawn & np.isfinite(ends).all(axis=1)
+    elif isinstance(model, Predictor):
+        predicted_tips = _spread(_predicted_tips(model, chain, q[drawn]), drawn)
         if cast(Any, model).module_.fitted.corrects_inside:  # of a HybridForwardModel
-            ends, learned = spread(learned), None
+            ends, predicted_tips = predicted_tips, None
+    rows = torch.from_numpy(q[drawn])
     if ends is not None:
-        rows = _led_to(chain, rows, torch.from_numpy(ends[known]))
+        rows = _led_to(chain, rows, torch.from_numpy(ends[drawn]))
     with torch.no_grad():
-        body: dict[str, Any] = {"frames": spread(chain.poses(rows))}
-        body["tips"] = spread(chain.tip_model(rows))
+        body: dict[str, Any] = {
+            "frames": _spread(chain.poses(rows), drawn),
+            "tips": _spread(chain.tip_model(rows), drawn),
+        }
         if isinstance(chain, ArcChain):
-            points = chain.backbone(rows, n_points)
-            actuators, disks = _around_arcs(chain, rows, points.numpy())
-            body |= {"actuators": [*map(spread, actuators)], "disks": spread(disks)}
+            arcs = _Arcs(chain, rows, n_points)
+            body["points"] = _spread(arcs.backbone, drawn)
+            body["actuators"] = [_spread(path, drawn) for path in arcs.actuators()]
+            body["disks"] = _spread(arcs.disks(), drawn)
             body["segments"] = np.repeat(range(chain.n_segments), chain.actuators_per_segment)
         else:
-            points, body["rigid"] = chain.backbone(rows), True
-    body["points"] = spread(points)
-    if learned is not None:
-        body["predicted"] = spread(learned)
+            body["points"] = _spread(chain.backbone(rows), drawn)
+            body["rigid"] = True
+    if predicted_tips is not None:
+        body["predicted"] = predicted_tips
     return body
+
+
+def _spread(values: torch.Tensor | NDArray, drawn: NDArray[np.bool_]) -> NDArray:
+    """Return values of drawn configurations among rows of NaN for the others."""
+    spread = np.full((len(drawn), *values.shape[1:]), np.nan)
+    spread[drawn] = values
+    return spread
+
+
+def _predicted_tips(model: Predictor, chain: Chain, q: NDArray) -> NDArray:
+    """Return the tips (K, 3) that a hybrid of the chain predicts, of poses and markers too."""
+    if not len(q):
+        return np.empty((0, 3))
+    x = plain(model.predict(q), "x")
+    return x[:, :3] if chain.n_outputs == 3 else x[:, -3:]
 
 
 def _led_to(chain: Chain, q: torch.Tensor, tips: torch.Tensor) -> torch.Tensor:
@@ -98,38 +112,57 @@ def _led_to(chain: Chain, q: torch.Tensor, tips: torch.Tensor) -> torch.Tensor:
     return q.detach()
 
 
-def _around_arcs(
-    chain: ArcChain, q: torch.Tensor, points: NDArray
-) -> tuple[list[NDArray], NDArray]:
-    """Return the actuators, each (K, P_i, 3), and the rims of the disks (K, S + 1, C, 3)."""
-    bending, frames, offsets = map(plain, (chain.arcs(q)[1], chain.poses(q), chain.offsets))
-    radii, S = plain(chain.radii), chain.n_segments
-    if chain.stage is not None:  # in the frames that turn with the stage
-        bending = bending @ (frames[:, 0, :3, :3].swapaxes(1, 2) @ frames[:, 1, :3, :3])[:, :2, :2]
-    n_points = (points.shape[1] - 1) // S
-    angles = np.split(plain(chain.angles), np.cumsum(chain.actuators_per_segment)[:-1])
-    t = np.linspace(0.0, 1.0, n_points + 1)
-    centres, turns = [], []  # positions and orientations along each segment
-    for s in range(S):
-        centre = points[:, s * n_points : (s + 1) * n_points + 1].copy()
-        # The backbone includes the rigid offset, the actuators do not.
-        centre[:, -1] -= offsets[s] * frames[:, s + 1, :3, 2]
-        # An arc turns evenly about the normal of its bending direction.
-        about = np.stack([-bending[:, s, 1], bending[:, s, 0], 0.0 * bending[:, s, 0]], axis=-1)
-        turn = Rotation.from_rotvec((t[:, None] * about[:, None]).reshape(-1, 3)).as_matrix()
-        centres.append(centre)
-        turns.append(frames[:, s, None, :3, :3] @ turn.reshape(len(q), len(t), 3, 3))
-    corner = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
-    rim = _RIM * np.stack([np.cos(corner), np.sin(corner), 0.0 * corner])
+class _Arcs:
+    """The segments of a chain in K configurations: points, and orientations along them."""
 
-    def disk(s: int, k: int, radius: float) -> NDArray:
-        return centres[s][:, k, None] + radius * (turns[s][:, k] @ rim).swapaxes(-1, -2)
+    def __init__(self, chain: ArcChain, q: torch.Tensor, n_points: int) -> None:
+        self.chain = chain
+        self.radii = plain(chain.radii)
+        frames = plain(chain.poses(q))
+        bending = plain(chain.arcs(q)[1])
+        if chain.stage is not None:  # in the frames that turn with the stage
+            turned = frames[:, 0, :3, :3].swapaxes(1, 2) @ frames[:, 1, :3, :3]
+            bending = bending @ turned[:, :2, :2]
+        self.backbone = plain(chain.backbone(q, n_points))
+        offsets = plain(chain.offsets)
+        along = np.linspace(0.0, 1.0, n_points + 1)[:, None]
+        self.centres = []  # (K, P, 3) of each segment
+        self.turns = []  # (K, P, 3, 3)
+        for s in range(chain.n_segments):
+            centre = self.backbone[:, s * n_points : (s + 1) * n_points + 1].copy()
+            # The backbone includes the rigid offset, the actuators do not.
+            centre[:, -1] -= offsets[s] * frames[:, s + 1, :3, 2]
+            # An arc turns evenly about the normal of its bending direction.
+            normal = np.zeros((len(q), 1, 3))
+            normal[:, 0, 0] = -bending[:, s, 1]
+            normal[:, 0, 1] = bending[:, s, 0]
+            turn = Rotation.from_rotvec((along * normal).reshape(-1, 3)).as_matrix()
+            turn = turn.reshape(len(q), len(along), 3, 3)
+            self.centres.append(centre)
+            self.turns.append(frames[:, s, None, :3, :3] @ turn)
 
-    actuators, disks = [], [disk(0, 0, radii[0])]
-    for s in range(S):
-        for angle in angles[s]:
-            at = radii[s] * np.array([np.cos(angle), np.sin(angle), 0.0])
-            path = [centres[k] + turns[k] @ at for k in range(chain.starts[s], s + 1)]
-            actuators.append(np.concatenate(path, axis=1))
-        disks.append(disk(s, -1, radii[s:].max() if chain.routing == "base" else radii[s]))
-    return actuators, np.stack(disks, axis=1)
+    def actuators(self) -> list[NDArray]:
+        """Return the points of every actuator, each (K, P_i, 3)."""
+        chain = self.chain
+        segments = np.repeat(range(chain.n_segments), chain.actuators_per_segment)
+        paths = []
+        for s, angle in zip(segments, plain(chain.angles), strict=True):
+            at = self.radii[s] * np.array([np.cos(angle), np.sin(angle), 0.0])
+            crossed = range(chain.starts[s], s + 1)
+            path = [self.centres[k] + self.turns[k] @ at for k in crossed]
+            paths.append(np.concatenate(path, axis=1))
+        return paths
+
+    def disks(self) -> NDArray:
+        """Return the rims of the disks (K, S + 1, C, 3): at the base and at every segment's end."""
+        based = self.chain.routing == "base"
+        disks = [self._disk(0, 0, self.radii[0])]
+        for s, radius in enumerate(self.radii):
+            disks.append(self._disk(s, -1, self.radii[s:].max() if based else radius))
+        return np.stack(disks, axis=1)
+
+    def _disk(self, s: int, point: int, radius: float) -> NDArray:
+        corner = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+        rim = _RIM * radius * np.stack([np.cos(corner), np.sin(corner), 0.0 * corner])
+        turned = (self.turns[s][:, point] @ rim).swapaxes(-1, -2)
+        return self.centres[s][:, point, None] + turned

@@ -106,7 +106,9 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         ErrorHistogramDisplay
             Itself, drawn.
         """
-        known, ax, bins = self._known(unit), axes_or_new(ax), whole(bins, "bins", most=10_000)
+        known = self._known(unit)
+        ax = axes_or_new(ax)
+        bins = whole(bins, "bins", most=10_000)
         top = max(float(values.max()) for values in known.values()) or 1e-3
         edges = np.linspace(0.0, top, bins + 1).tolist()
         for look, (name, values) in zip(looks_of(known), known.items(), strict=True):
@@ -156,34 +158,42 @@ class ErrorBoxDisplay(_ErrorDisplay):
         ErrorBoxDisplay
             Itself, drawn.
         """
-        known, ax = self._known(unit), axes_or_new(ax)
-        places, values = np.arange(len(known), 0, -1), [*known.values()]
-        look = {"widths": 0.6, "patch_artist": True, "medianprops": {"color": "black"}}
-        options = {"orientation": "horizontal", "whis": (5, 95), "showfliers": False}
-        box = ax.boxplot(values, positions=places.tolist(), **options, **look)
-        for patch, line in zip(box["boxes"], looks_of(known), strict=True):
-            patch.set(facecolor=line["color"], alpha=0.5)
-        means, most = (np.array([f(v) for v in values]) for f in (np.mean, np.max))
+        known = self._known(unit)
+        ax = axes_or_new(ax)
+        values = [*known.values()]
+        places = np.arange(len(values), 0, -1)
+        box = ax.boxplot(
+            values,
+            positions=places.tolist(),
+            orientation="horizontal",
+            whis=(5, 95),
+            showfliers=False,
+            widths=0.6,
+            patch_artist=True,
+            medianprops={"color": "black"},
+        )
+        for patch, look in zip(box["boxes"], looks_of(known), strict=True):
+            patch.set(facecolor=look["color"], alpha=0.5)
+        means = np.array([errors.mean() for errors in values])
+        largest = np.array([errors.max() for errors in values])
         ax.plot(means, places, "o", color="black", label="mean")
-        ax.plot(most, places, "x", color="black", label="maximum")
+        ax.plot(largest, places, "x", color="black", label="maximum")
         ax.set_yticks(places, [*known])
         ax.set(xlabel=f"tip error [{unit}]")
         if log:
-            low = min(float(np.percentile(v, 5)) for v in values)
-            ax.set(xscale="log", xlim=(0.7 * max(low, 1e-6 * most.max()), 1.5 * most.max()))
+            low = min(float(np.percentile(errors, 5)) for errors in values)
+            most = largest.max()
+            ax.set(xscale="log", xlim=(0.7 * max(low, 1e-6 * most), 1.5 * most))
         else:
-            end = self._end(values)
+            upper = np.median([np.percentile(errors, 95) for errors in values])
+            # A few bad models do not extend a linear axis.
+            end = 1.05 * float(min(largest.max(), 3.0 * upper)) or 1e-3
             ax.set_xlim(0.0, end)
-            for place, mean, largest in zip(places, means, most, strict=True):
-                words = f"mean {mean:.0f}, " * bool(mean > end) + f"max {largest:.0f}"
-                if largest > end:
-                    beside = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
-                    ax.annotate(f"▸ {words}", (end, place), **beside, fontsize="small")
+            for row in np.flatnonzero(largest > end):
+                words = f"max {largest[row]:.0f}"
+                if means[row] > end:
+                    words = f"mean {means[row]:.0f}, {words}"
+                beside = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+                ax.annotate(f"▸ {words}", (end, places[row]), **beside, fontsize="small")
         legend_below(ax, 2)
         return self._drawn(ax)
-
-    @staticmethod
-    def _end(values: list[NDArray]) -> float:
-        """Return the end of a linear axis, which a few bad models do not extend."""
-        upper, largest = (np.array([np.percentile(v, p) for v in values]) for p in (95, 100))
-        return 1.05 * float(min(largest.max(), 3.0 * np.median(upper))) or 1e-3

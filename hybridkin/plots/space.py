@@ -89,31 +89,47 @@ class WorkspaceDisplay(Display):
         WorkspaceDisplay
             Itself, drawn.
         """
-        scale, space = scale_of(unit), space_or_new(ax)
-        errors = scale * distance(self.predicted, self.x)
-        known = np.isfinite(errors)
-        order = np.flatnonzero(known)[np.argsort(errors[known])]  # the worst in front
-        top = float(np.quantile(errors[order], _TOP)) if len(order) else 1.0
-        look = {"c": errors[order], "s": 7, "cmap": "cividis", "vmin": 0.0, "vmax": top}
-        look |= {"depthshade": False, "linewidths": 0.0, "alpha": 0.8, "rasterized": True}
+        scale = scale_of(unit)
+        space = space_or_new(ax)
         space.computed_zorder = False  # the robot in front of the cloud
-        dots = space.scatter(*(scale * self.x[order].T), **look)
-        bar = {"label": f"tip error [{unit}]", "shrink": 0.75, "pad": 0.1, "extend": "max"}
-        space.figure.colorbar(dots, ax=space, **bar)
+        dots = self._draw_tips(space, scale)
+        space.figure.colorbar(
+            dots, ax=space, label=f"tip error [{unit}]", shrink=0.75, pad=0.1, extend="max"
+        )
         if self.backbone is not None:
-            robot = {"color": _BODY, "linewidth": 4, "label": "robot (model)"}
-            space.plot(*(scale * self.backbone.T), **robot)
+            line = scale * self.backbone.T
+            space.plot(*line, color=_BODY, linewidth=4, label="robot (model)")
         if self.row is not None:
-            ends = scale * np.stack([self.x[self.row], self.predicted[self.row]])
-            space.plot(*ends.T, color="black", linewidth=1.5)
-            space.scatter(*ends[:1].T, color="black", s=30, label="measured tip", zorder=3)
-            ring = {"facecolor": "white", "edgecolor": "black", "s": 30, "depthshade": False}
-            space.scatter(*ends[1:].T, **ring, label="predicted tip", zorder=3)
+            measured = scale * self.x[self.row]
+            predicted = scale * self.predicted[self.row]
+            space.plot(*np.stack([measured, predicted], axis=1), color="black", linewidth=1.5)
+            space.scatter(*measured, color="black", s=30, label="measured tip", zorder=3)
+            ring = {"facecolor": "white", "edgecolor": "black", "depthshade": False}
+            space.scatter(*predicted, s=30, label="predicted tip", zorder=3, **ring)
         if self.backbone is not None or self.row is not None:
             place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.03), "ncols": 3}
             space.legend(frameon=False, fontsize="small", **place)
         label_space(space, unit)
         return self._drawn(space)
+
+    def _draw_tips(self, space: Any, scale: float) -> Any:
+        """Draw the measured tips, coloured by error, the worst in front."""
+        errors = scale * distance(self.predicted, self.x)
+        finite = np.flatnonzero(np.isfinite(errors))
+        order = finite[np.argsort(errors[finite])]
+        top = float(np.quantile(errors[order], _TOP)) if len(order) else 1.0
+        return space.scatter(
+            *(scale * self.x[order].T),
+            c=errors[order],
+            s=7,
+            cmap="cividis",
+            vmin=0.0,
+            vmax=top,
+            depthshade=False,
+            linewidths=0.0,
+            alpha=0.8,
+            rasterized=True,
+        )
 
 
 class BackboneDisplay(Display):
@@ -247,18 +263,14 @@ class BackboneDisplay(Display):
         BackboneDisplay
             Itself, drawn.
         """
-        scale, space = scale_of(unit), space_or_new(ax)
-        single, shades = len(self.points) == 1, colormaps["cividis"]
-        for k in np.flatnonzero(np.isfinite(self.points).all(axis=(1, 2))):
-            for line in self.lines(body=single):
-                look = line.look() | ({"label": line.label or None} if single else {})
-                look["color"] = line.color if single else shades(k / len(self.points))
-                space.plot(*(scale * line.points[k].T), **look)
-            if single and self.disks is not None and self.disks.size:
-                disks = scale * self.disks[k]
-                space.add_collection3d(Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0))
-            if single and self.frames is not None:
-                self._draw_frames(space, self.frames[k], scale)
+        scale = scale_of(unit)
+        space = space_or_new(ax)
+        drawn = np.flatnonzero(np.isfinite(self.points).all(axis=(1, 2)))
+        if len(self.points) > 1:
+            for k in drawn.tolist():
+                self._draw_outline(space, k, scale)
+        elif len(drawn):
+            self._draw_body(space, scale)
         if space.get_legend_handles_labels()[1]:
             space.legend(frameon=False, loc="upper left", fontsize="small")
         label_space(space, unit)
@@ -278,24 +290,51 @@ class BackboneDisplay(Display):
             Named tuples (label, points, color, width, marker, style), points of shape
             (K, M, 3) [m] with NaN between strokes.
         """
-        name, marker = ("links and joints", "o") if self.rigid else ("backbone", "")
-        found = [Line(name, self.points, _BODY, 4.0, marker=marker)]
-        if body and self.names:
-            for i, (name, path) in enumerate(zip(self.names, self.actuators, strict=True)):
-                found.append(Line(name, path, COLORS[i % len(COLORS)], 1.6))
-        elif body:
-            for s in sorted(set(self.segments)):
-                own = [p for p, of in zip(self.actuators, self.segments, strict=True) if of == s]
-                label = f"actuators of segment {s + 1}"
-                found.append(Line(label, _joined(own), _SEGMENTS[s % len(_SEGMENTS)], 1.6))
+        if self.rigid:
+            lines = [Line("links and joints", self.points, _BODY, 4.0, marker="o")]
+        else:
+            lines = [Line("backbone", self.points, _BODY, 4.0)]
+        if body:
+            lines += self._actuator_lines()
         if body and self.disks is not None and self.disks.size:
-            found.append(Line("", _joined(self.disks.swapaxes(0, 1)), "#808080", 1.0))
+            lines.append(Line("", _joined(self.disks.swapaxes(0, 1)), "#808080", 1.0))
         if tip:
-            found.append(Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none"))
+            lines.append(Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none"))
         if self.predicted is not None:
             way = np.stack([self.tips, self.predicted], axis=1)
-            found.append(Line("learned correction", way, COLORS[0], 1.5, style=":", marker="."))
-        return found
+            lines.append(Line("learned correction", way, COLORS[0], 1.5, style=":", marker="."))
+        return lines
+
+    def _actuator_lines(self) -> list[Line]:
+        """Return the actuators, each by its name or together by segment."""
+        lines = []
+        for i, name in enumerate(self.names):
+            lines.append(Line(name, self.actuators[i], COLORS[i % len(COLORS)], 1.6))
+        if lines:
+            return lines
+        paths: dict[int, list[NDArray]] = {segment: [] for segment in sorted({*self.segments})}
+        for segment, path in zip(self.segments, self.actuators, strict=True):
+            paths[segment].append(path)
+        for segment, own in paths.items():
+            color = _SEGMENTS[segment % len(_SEGMENTS)]
+            lines.append(Line(f"actuators of segment {segment + 1}", _joined(own), color, 1.6))
+        return lines
+
+    def _draw_outline(self, space: Any, k: int, scale: float) -> None:
+        """Draw backbone and tip of one of several configurations."""
+        color = colormaps["cividis"](k / len(self.points))
+        for line in self.lines(body=False):
+            space.plot(*(scale * line.points[k].T), **line.look() | {"color": color})
+
+    def _draw_body(self, space: Any, scale: float) -> None:
+        """Draw all parts of the only configuration."""
+        for line in self.lines():
+            space.plot(*(scale * line.points[0].T), label=line.label or None, **line.look())
+        if self.disks is not None and self.disks.size:
+            disks = scale * self.disks[0]
+            space.add_collection3d(Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0))
+        if self.frames is not None:
+            self._draw_frames(space, self.frames[0], scale)
 
     def _draw_frames(self, ax: Any, frames: NDArray, scale: float) -> None:
         steps = np.linalg.norm(np.diff(self.points, axis=1), axis=-1)

@@ -118,8 +118,9 @@ class TrackingDisplay(Display):
             Itself, drawn.
         """
         one_of(plane, "plane", _PLANES)
-        scale, ax = scale_of(unit), axes_or_new(ax)
-        i, j = ("xyz".index(letter) for letter in plane)
+        scale = scale_of(unit)
+        ax = axes_or_new(ax)
+        i, j = map("xyz".index, plane)
         for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
             label = self._summary(name, scale, unit)
             ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look)
@@ -132,7 +133,8 @@ class TrackingDisplay(Display):
 
     def plot_time(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw the three coordinates over time and return self; parameters as of `plot`."""
-        scale, ax = scale_of(unit), axes_or_new(ax)
+        scale = scale_of(unit)
+        ax = axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
         for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
             lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
@@ -170,7 +172,8 @@ class TrackingDisplay(Display):
         TrackingDisplay
             Itself, drawn.
         """
-        scale, ax = scale_of(unit), axes_or_new(ax)
+        scale = scale_of(unit)
+        ax = axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
         for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
             error = scale * distance(x, self.target)
@@ -194,7 +197,8 @@ class TrackingDisplay(Display):
 
     def _summary(self, name: str, scale: float, unit: str) -> str:
         error = scale * distance(self.tracks[name], self.target)
-        mean = error[np.isfinite(error)].mean() if np.isfinite(error).any() else np.nan
+        finite = np.isfinite(error)
+        mean = error[finite].mean() if finite.any() else np.nan
         return f"{name}: mean error {mean:.{decimals(mean)}f} {unit}"
 
 
@@ -242,11 +246,14 @@ class ActuatorDisplay:
                     f"`paths` must hold arrays of one shape (T, {n}), as `actuators_per_segment` "
                     f"says, got {q.shape} for {name!r}; the first has {rows} rows."
                 )
-        self.t, self.names = times(t, *rows), None
+        self.t = times(t, *rows)
+        self.names: list[str] = []
         if names is not None:
             self.names = [str(name) for name in np.ravel(np.asarray(names, dtype=object))]
-        if self.names is not None and len(self.names) != n:
-            raise ValueError(f"`names` must hold {n} names, one per actuator, got {names!r:.80}.")
+            if len(self.names) != n:
+                raise ValueError(
+                    f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
+                )
         self.limits = None if limits is None else shaped(limits, "limits", ("2", n))
 
     @classmethod
@@ -292,13 +299,13 @@ class ActuatorDisplay:
         ActuatorDisplay
             Itself, drawn.
         """
-        shares, names = self.actuators_per_segment, self.names or ()
-        n = len(shares)
+        counts = self.actuators_per_segment
+        n = len(counts)
         if per_unit is None:
             scale = scale_of(unit, _ACTUATOR_UNITS)
         else:
             size = plain(per_unit, "per_unit")
-            if size.shape not in ((), (sum(shares),)) or not size.all():
+            if size.shape not in ((), (sum(counts),)) or not size.all():
                 raise ValueError(f"`per_unit` must be one or (n,) numbers, not 0, got {per_unit}.")
             scale = 1.0 / size
         if axes is None:
@@ -308,26 +315,40 @@ class ActuatorDisplay:
         if len(axes) != n:
             raise ValueError(f"`axes` must hold {n} axes, got {len(axes)}.")
         steps, when = steps_of(self.t, len(next(iter(self.paths.values()))))
-        parts = np.split(np.arange(sum(shares)), np.cumsum(shares)[:-1])
-        looks = looks_of(self.paths)
-        for k, (ax, own) in enumerate(zip(axes, parts, strict=True)):
-            colors = [COLORS[j % 8] if names else "black" for j in range(len(own))]
-            for i, (name, q) in enumerate(self.paths.items()):
-                lines = ax.plot(steps, (scale * q)[:, own], **{**looks[i], "linewidth": 1.2})
-                lines[0].set_label(name)
-                for j, line in enumerate(lines if names else ()):
-                    label = names[own[j]] if i == 0 else line.get_label()
-                    line.set(color=colors[j], linestyle="-:"[i % 2], label=label)
-            if self.limits is not None:
-                look = {"colors": 2 * colors, "linestyles": "dashed", "linewidth": 0.8}
-                values = (scale * self.limits)[:, own].ravel()
-                ax.hlines(values, steps[0], steps[-1], label="limits", **look)
+        parts = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        for k, (ax, columns) in enumerate(zip(axes, parts, strict=True)):
+            self._draw_segment(ax, steps, columns, scale)
             ax.set(ylabel=f"segment {k + 1} [{unit}]")
-        beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-        above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(self.paths)}
-        look = beside if names else above
-        for ax in axes if names else axes[:1]:
-            ax.legend(frameon=False, fontsize="small", **look)
+        if self.names:
+            for ax in axes:
+                beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+                ax.legend(frameon=False, fontsize="small", **beside)
+        else:
+            above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(self.paths)}
+            axes[0].legend(frameon=False, fontsize="small", **above)
         axes[-1].set(xlabel=when)
-        self.axes_, self.figure_ = axes, axes[0].figure
+        self.axes_ = axes
+        self.figure_ = axes[0].figure
         return self
+
+    def _draw_segment(
+        self, ax: Any, steps: NDArray, columns: NDArray, scale: float | NDArray
+    ) -> None:
+        """Draw the actuators of a segment and their limits."""
+        looks = looks_of(self.paths)
+        colors = len(columns) * ["black"]
+        if self.names:
+            colors = [COLORS[j % 8] for j in range(len(columns))]
+        for i, (name, q) in enumerate(self.paths.items()):
+            lines = ax.plot(steps, (scale * q)[:, columns], **{**looks[i], "linewidth": 1.2})
+            lines[0].set_label(name)
+            if self.names:
+                for line, color in zip(lines, colors, strict=True):
+                    line.set(color=color, linestyle="-:"[i % 2])
+            if self.names and i == 0:
+                for line, column in zip(lines, columns, strict=True):
+                    line.set_label(self.names[column])
+        if self.limits is not None:
+            look = {"colors": 2 * colors, "linestyles": "dashed", "linewidth": 0.8}
+            values = (scale * self.limits)[:, columns].ravel()
+            ax.hlines(values, steps[0], steps[-1], label="limits", **look)

@@ -32,8 +32,11 @@ def describe(loaded: LoadedModel) -> Report:
         "training", "domain", "radius", "play" (width [m]), "auto", "log_format", "limits", and
         "created" and "versions" of the program that wrote the file. Unknown entries are None.
     """
-    header, description, hybrid = loaded.header or {}, loaded.description, loaded.hybrid
-    kind, trained = type(loaded.model).__name__, loaded.trained_range
+    header = loaded.header or {}
+    description = loaded.description
+    hybrid = loaded.hybrid
+    kind = type(loaded.model).__name__
+    trained = loaded.trained_range
     log_format = None if description is None else description.log
     report = Report(f"{loaded.name}: {kind}, {loaded.n_actuators} actuators")
     report.record = {
@@ -49,7 +52,9 @@ def describe(loaded: LoadedModel) -> Report:
         "domain": None if trained is None else dict(vars(trained)),
         "log_format": None if log_format is None else dict(vars(log_format)),
         "limits": None if description is None else dict(vars(description.limits)),
-        **{key: header.get(key) for key in ("training", "created", "versions")},
+        "training": header.get("training"),
+        "created": header.get("created"),
+        "versions": header.get("versions"),
     }
     if hybrid is not None:
         report.record |= _of_hybrid(hybrid)
@@ -60,10 +65,13 @@ def describe(loaded: LoadedModel) -> Report:
 
 
 def _of_hybrid(model: HybridForwardModel) -> dict[str, Any]:
-    asked = model.calibrate
-    calibrated = [asked] if isinstance(asked, str) else list(asked or ())
-    auto, kind = None, "none" if model.error_model_ is None else type(model.error_model_).__name__
-    error = {"kind": kind, "coupling": model.coupling}
+    calibrated = [*(model.calibrate or ())]
+    if isinstance(model.calibrate, str):
+        calibrated = [model.calibrate]
+    auto = None
+    error: dict[str, Any] = {"kind": "none", "coupling": model.coupling}
+    if model.error_model_ is not None:
+        error["kind"] = type(model.error_model_).__name__
     if model.cv_results_ is not None:
         auto = auto_entry(model)
         error = {"kind": auto_in_short(auto), "coupling": None}
@@ -85,28 +93,30 @@ def geometry(chain: Chain) -> dict[str, Any]:
     pose = real_array(chain.base, "base")
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec(degrees=True)
     base = {"position": pose[:3, 3], "rotation_vector_deg": turn}
-    found: dict[str, Any] = {"kind": type(chain).__name__, "base": base}
+    entries: dict[str, Any] = {"kind": type(chain).__name__, "base": base}
     if not isinstance(chain, ArcChain):
-        return found
+        return entries
     parts = {name: real_array(value, name) for name, value in chain.geometry().items()}
-    angles = np.split(np.degrees(parts["angles"]), np.cumsum(chain.actuators_per_segment)[:-1])
+    ends = np.cumsum(chain.actuators_per_segment)[:-1]
     lengths = iter(parts.get("lengths", ()))
     columns = {
         "radius": parts["radii"],
         "length": [None if own else next(lengths) for own in chain.extensible],
         "offset": parts["offsets"],
-        "angles_deg": angles,
+        "angles_deg": np.split(np.degrees(parts["angles"]), ends),
         "rest_bend_deg": np.degrees(parts["rest_bends"].reshape(-1, 2)),
     }
     if not chain.in_metres:
-        columns["gain"] = np.split(parts["gains"], np.cumsum(chain.actuators_per_segment)[:-1])
+        columns["gain"] = np.split(parts["gains"], ends)
     for name in ("bending_stiffness", "axial_stiffness"):
         if name in parts:
             columns[name] = parts[name].ravel()
-    rows = zip(*columns.values(), strict=True)
-    segments = [dict(zip(columns, row, strict=True)) for row in rows]
-    stage = {} if chain.stage is None else {"stage": chain.stage}
-    return {**found, **stage, "routing": chain.routing, "segments": segments}
+    segments = []
+    for row in zip(*columns.values(), strict=True):
+        segments.append(dict(zip(columns, row, strict=True)))
+    if chain.stage is not None:
+        entries["stage"] = chain.stage
+    return {**entries, "routing": chain.routing, "segments": segments}
 
 
 def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
@@ -133,7 +143,8 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
 
     Training range and limits are in the unit and sign of the logs, if these are known.
     """
-    record, description = report.record, loaded.description
+    record = report.record
+    description = loaded.description
     lengths = isinstance(loaded.chain, ArcChain) and loaded.chain.in_metres
     log_format = LogFormat((), (), "mm" if lengths else "1")
     if description is not None and description.log is not None:
@@ -146,18 +157,24 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
         report.text(record["radius"]["words"])
     if record["play"] is not None:
         report.text(f"Backlash (play) of the actuators: {millimetres(record['play'])}.")
-    known = {"Training range:": loaded.trained_range, "Limits:": description and description.limits}
-    for what, limits in known.items():
-        shown = Limits() if limits is None else limits.scaled(1 / log_format.q_factor)
-        for name, value in vars(shown).items():
-            if value is not None:
-                unit = "" if log_format.q_unit == "1" else f" {log_format.q_unit}"
-                unit += {"dq_max": "/s", "ddq_max": "/s^2"}.get(name, "")
-                report.text(f"{what} {name} = {', '.join(f'{v:.4g}' for v in value)}{unit}.")
+    if loaded.trained_range is not None:
+        _write_limits(report, "Training range:", loaded.trained_range, log_format)
+    if description is not None:
+        _write_limits(report, "Limits:", description.limits, log_format)
     if record["log_format"] is not None:
         q, x, q_unit, x_unit, q_sign, *_ = record["log_format"].values()
         columns = f"q in {q_unit}, q_sign {q_sign} ({', '.join(q)}), x in {x_unit} ({', '.join(x)})"
         report.text(f"Logs: {columns}.")
+
+
+def _write_limits(report: Report, what: str, limits: Limits, log_format: LogFormat) -> None:
+    """Add limits in the unit and sign of the logs."""
+    unit = "" if log_format.q_unit == "1" else f" {log_format.q_unit}"
+    per_time = {"dq_max": "/s", "ddq_max": "/s^2"}
+    for name, values in vars(limits.scaled(1 / log_format.q_factor)).items():
+        if values is not None:
+            numbers = ", ".join(f"{value:.4g}" for value in values)
+            report.text(f"{what} {name} = {numbers}{unit}{per_time.get(name, '')}.")
 
 
 def _write_training(report: Report, training: dict[str, Any]) -> None:

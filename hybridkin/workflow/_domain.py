@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,8 +17,11 @@ from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.workflow.model import LoadedModel
 
-_WALKERS, _STEPS, _STEP = 256, 60, 0.12  # last: length of a step, as a share of the range
+_WALKERS = 256
+_STEPS = 60
+_STEP = 0.12  # length of a step, as a share of the range
 _PLANAR = 1e-9  # relative cut-off of singular values, for tendons in one plane
+_NAMES = ("q_min", "q_max", "dq_max", "ddq_max")
 _EASE = 0.5  # domain distance from which the posture returns; 1 is the edge of the domain
 
 
@@ -75,37 +78,56 @@ def path_limits(
     ValueError
         If the range of the actuators is not known.
     """
+    n = loaded.n_actuators
+    given: dict[str, NDArray] = {}
+    for name, value in zip(_NAMES, (q_min, q_max, dq_max, ddq_max), strict=True):
+        if value is not None:
+            given[name] = real_array(value, name).astype(float)
+            if given[name].shape not in ((), (1,), (n,)):
+                raise ValueError(f"`{name}` must be one number or {n}, got {given[name].size}.")
+    described = robots.Limits()
+    if loaded.description is not None:
+        described = loaded.description.limits
+    trained = robots.Limits()
+    if within_fit or described.q_min is None or described.q_max is None:
+        trained = loaded.trained_range or trained
     half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
-    described = robots.Limits() if loaded.description is None else loaded.description.limits
-    open_end = described.q_min is None or described.q_max is None
-    trained = (loaded.trained_range if within_fit or open_end else None) or robots.Limits()
-    given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max, "ddq_max": ddq_max}
-    asked = {k: real_array(v, k).astype(float) for k, v in given.items() if v is not None}
-    overrides = vars(robots.Limits(**asked).narrowed(half_play))
-    found = described.narrowed(half_play).intersect(trained)
-    found = replace(found, **{name: overrides[name] for name in asked})
-    if found.q_min is None or found.q_max is None:
+    limits = described.narrowed(half_play).intersect(trained)
+    overrides = robots.Limits(**given).narrowed(half_play)
+    limits = replace(limits, **{name: getattr(overrides, name) for name in given})
+    if limits.q_min is None or limits.q_max is None:
         raise ValueError(
             "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
             "robot description, because this model has no training range."
         )
-    n = loaded.n_actuators
-    for name, value in asked.items():
-        if value.shape not in ((), (1,), (n,)):
-            raise ValueError(f"`{name}` must be one number or {n}, got {value.size}.")
-    low, high = (np.broadcast_to(v, n).astype(float) for v in (found.q_min, found.q_max))
-    fast = None if found.dq_max is None else np.broadcast_to(found.dq_max, n).astype(float)
-    hard = None if found.ddq_max is None else np.broadcast_to(found.ddq_max, n).astype(float)
+    low = _of_actuators(limits.q_min, n)
+    high = _of_actuators(limits.q_max, n)
     if (low > high).any():
         raise ValueError(
             "`q_min` must not exceed `q_max`, including half the backlash and the training range, "
             f"got {low.tolist()} and {high.tolist()} m; check their unit and sign."
         )
-    sources = {"robot description": described, "training range": trained}
-    known = (words for words, limits in sources.items() if limits.q_min is not None)
-    ends = len({"q_min", "q_max"} & {*asked})
-    parts = ["given"] * (ends > 0) + [", within the ".join(known)] * (ends < 2)
-    return PathLimits(low, high, fast, hard, " and ".join(parts))
+    speed = None if limits.dq_max is None else _of_actuators(limits.dq_max, n)
+    acceleration = None if limits.ddq_max is None else _of_actuators(limits.ddq_max, n)
+    return PathLimits(low, high, speed, acceleration, _source(given, described, trained))
+
+
+def _of_actuators(value: ArrayLike, n: int) -> NDArray:
+    """Return one value for each of n actuators (n,)."""
+    return np.broadcast_to(np.asarray(value, dtype=float), n).copy()
+
+
+def _source(given: Iterable[str], described: robots.Limits, trained: robots.Limits) -> str:
+    """Return in words where the range of the actuators comes from."""
+    known = []
+    if described.q_min is not None:
+        known.append("robot description")
+    if trained.q_min is not None:
+        known.append("training range")
+    n_given = len({"q_min", "q_max"}.intersection(given))
+    if n_given == 2:
+        return "given"
+    return "given and " * n_given + ", within the ".join(known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +145,17 @@ class Domain:
         tendon pulled, the training row nearest to the middle. For a model without a fit it is no
         tendon pulled, or for other robots the middle of the limits.
         """
-        trained, limits = self.loaded.trained_range, self.limits
-        low, high = (vars(trained or limits)[name] for name in ("q_min", "q_max"))
-        candidates = [self.rest + (0.5 * (low + high) - self.rest) @ self.bending]
+        trained = self.loaded.trained_range
+        limits = self.limits
+        spanned = limits if trained is None else trained
+        middle = 0.5 * (np.asarray(spanned.q_min) + np.asarray(spanned.q_max))
+        middle = self.rest + (middle - self.rest) @ self.bending
+        candidates = [middle]
         if self.tendons is not None:
-            candidates.insert(0 if trained is None else 1, self.rest)
+            candidates = [self.rest, middle] if trained is None else [middle, self.rest]
         hybrid = self.loaded.hybrid
-        if hybrid is not None and (tested := hybrid.module_.fitted.tested) is not None:
+        tested = None if hybrid is None else hybrid.module_.fitted.tested
+        if hybrid is not None and tested is not None:
             rows = as_array(tested.rows - hybrid.module_.shift)
             candidates.append(rows[np.linalg.norm(rows - candidates[0], axis=1).argmin()])
         q = np.clip(candidates, limits.q_min, limits.q_max)
@@ -158,7 +184,9 @@ class Domain:
         because with many actuators most of the training range lies outside the domain. On a plain
         tendon chain no tendon pulls against another. Without a learned part the limits are sampled.
         """
-        low, high, rng = self.limits.q_min, self.limits.q_max, np.random.default_rng(0)
+        rng = np.random.default_rng(0)
+        low = self.limits.q_min
+        high = self.limits.q_max
         q = rng.uniform(low, high, (_WALKERS, len(low)))
         if self.loaded.hybrid is not None:
             q[:] = self.preferred
@@ -180,14 +208,18 @@ class Domain:
         The tendons of a segment do not pull against each other. If a balanced command exceeds an
         upper limit, all tendons of the segment are pulled until the slackest is at its limit.
         """
-        low, high, chain = self.limits.q_min, self.limits.q_max, self.tendons
+        low = self.limits.q_min
+        high = self.limits.q_max
         q = np.random.default_rng(0).uniform(low, high, (n, len(low)))
+        chain = self.tendons
         if chain is None:
             return q
-        rest, gains = self.rest, as_array(chain.gains.detach())  # balanced in metres
+        rest = self.rest
+        gains = as_array(chain.gains.detach())  # balanced in metres
         low, high = np.sort([gains * (low - rest), gains * (high - rest)], axis=0)
         q = gains * (q - rest)
-        ends, angles = np.cumsum(chain.actuators_per_segment), as_array(chain.angles.detach())
+        angles = as_array(chain.angles.detach())
+        ends = np.cumsum(chain.actuators_per_segment)
         for own in np.split(np.arange(len(low)), ends[:-1]):
             axes = np.stack([np.cos(angles[own]), np.sin(angles[own])], axis=1)
             q[:, own] = q[:, own] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
@@ -215,11 +247,13 @@ class Domain:
         distance. In addition it moves by a share `pull` of the way to the `preferred`
         configuration. Without a guard it is the `preferred` configuration.
         """
-        hybrid, module, limits = self.loaded.hybrid, self.loaded.module, self.limits
+        hybrid = self.loaded.hybrid
         if hybrid is None or hybrid.guard is None or hybrid.error_model_ is None:
             return self.preferred
-        home, bending = torch.from_numpy(self.preferred), torch.from_numpy(self.bending)
-        squares = torch.from_numpy((limits.q_max - limits.q_min) ** 2)
+        module = self.loaded.module
+        home = torch.from_numpy(self.preferred)
+        bending = torch.from_numpy(self.bending)
+        squares = torch.from_numpy((self.limits.q_max - self.limits.q_min) ** 2)
 
         def posture(q: Tensor) -> Tensor:
             rows = q.detach().reshape(-1, q.shape[-1])

@@ -27,10 +27,10 @@ def placed(domain: Domain, path: Trajectory, tol: float) -> tuple[Trajectory, fl
     shifts = np.concatenate([np.zeros((1, 3)), places - center])
     x = path.x[some_rows(path)] + shifts[:, None]
     nearest = np.linalg.norm(tips - x[..., None, :], axis=-1).argmin(axis=-1)
-    found = solver(domain).solve(x, q0=commands[nearest], tol=tol, max_iter=100, restarts=0)
-    shares = (found.status == IKStatus.CONVERGED).mean(axis=1)
-    best = int(shares.argmax())
-    return Trajectory(path.t, path.x + shifts[best]), float(shares[best])
+    solution = solver(domain).solve(x, q0=commands[nearest], tol=tol, max_iter=100, restarts=0)
+    inside = (solution.status == IKStatus.CONVERGED).mean(axis=1)
+    best = int(inside.argmax())
+    return Trajectory(path.t, path.x + shifts[best]), float(inside[best])
 
 
 def better_place(domain: Domain, path: Trajectory, tol: float) -> str:
@@ -44,11 +44,15 @@ def better_place(domain: Domain, path: Trajectory, tol: float) -> str:
 
 def solver(domain: Domain) -> InverseKinematics:
     """Return the solver that looks for points of a path."""
-    low, high = domain.limits.q_min, domain.limits.q_max
-    return InverseKinematics(domain.loaded.module, q_min=low, q_max=high, q_pref=domain.preferred)
+    return InverseKinematics(
+        domain.loaded.module,
+        q_min=domain.limits.q_min,
+        q_max=domain.limits.q_max,
+        q_pref=domain.preferred,
+    )
 
 
 def some_rows(path: Trajectory) -> NDArray:
     """Return rows of a path: some evenly in time, and its ends in each direction."""
-    ends = [f(column) for column in path.x.T for f in (np.argmin, np.argmax)]
-    return np.unique([*np.linspace(0, len(path) - 1, _POINTS).astype(int), *ends])
+    evenly = np.linspace(0, len(path) - 1, _POINTS).astype(int)
+    return np.unique([*evenly, *path.x.argmin(axis=0), *path.x.argmax(axis=0)])

@@ -77,19 +77,25 @@ def evaluate_log(
                 np.isinf(radius), np.nan, np.nanmax(markers, axis=1) <= radius
             )
             report.record["radius"] = radius_entry(loaded.hybrid)
-    motions = {name: measured.motions == name for name in dict.fromkeys(measured.motions)}
+    motions = {}
+    for name in dict.fromkeys(measured.motions):
+        motions[str(name)] = _entry(columns, measured.motions == name)
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
-    some = {} if fitted is None else {"new": ~fitted, "fitted": fitted}
-    parts = {name: _entry(columns, rows) for name, rows in some.items() if rows.any()}
+    new_errors = fitted_errors = None
+    if fitted is not None and not fitted.all():
+        new_errors = _entry(columns, ~fitted)
+    if fitted is not None and fitted.any():
+        fitted_errors = _entry(columns, fitted)
     report.record.update(
         command="evaluate",
         model=str(loaded.path),
         log=log.source,
         all=_entry(columns, slice(None)),
-        motions={str(name): _entry(columns, rows) for name, rows in motions.items()},
+        motions=motions,
         fitted_rows=None if fitted is None else int(fitted.sum()),
-        **{name: parts.get(name) for name in ("new", "fitted")},
-        held_out=loaded.held_out if "fitted" in parts else None,
+        new=new_errors,
+        fitted=fitted_errors,
+        held_out=None if fitted_errors is None else loaded.held_out,
         split=measured.split,
     )
     write_check(report, measured)
@@ -103,13 +109,17 @@ def evaluate_log(
 
 def _entry(columns: dict[str, NDArray], rows: NDArray | slice) -> dict[str, Any]:
     error = columns["error"][rows]
-    known = {key: np.ma.masked_invalid(columns[key][rows]) for key in _SHARES if key in columns}
-    shares = {key: float(np.ma.filled(part.mean(), np.nan)) for key, part in known.items()}
-    return {"rows": len(error), **statistics(error), **shares}
+    entry = {"rows": len(error), **statistics(error)}
+    for name in _SHARES:
+        if name in columns:
+            values = np.ma.masked_invalid(columns[name][rows])
+            entry[name] = float(np.ma.filled(values.mean(), np.nan))
+    return entry
 
 
 def _write_errors(report: Report) -> None:
-    record, everything = report.record, report.record["all"]
+    record = report.record
+    everything = record["all"]
     motions = sorted(record["motions"].items(), key=lambda item: -item[1]["mean"])
     report.text("## Errors by motion, largest first")
     if record["fitted_rows"] is None:
@@ -119,10 +129,14 @@ def _write_errors(report: Report) -> None:
             f"**{record['fitted_rows']} of {everything['rows']} rows were fitted: their errors are "
             "training errors.** To test the model, evaluate a log of other motions."
         )
-    known = _PARTS if record["fitted"] else {}
-    parts = {title: record[name] for title, name in known.items() if record[name] is not None}
-    columns = ["rows", "mean", "median", "p95", "max", *(s for s in _SHARES if s in everything)]
-    report.errors({"all rows": everything, **parts, **dict(motions)}, columns)
+    entries = {"all rows": everything}
+    if record["fitted"] is not None:
+        for title, name in _PARTS.items():
+            if record[name] is not None:
+                entries[title] = record[name]
+    columns = ["rows", "mean", "median", "p95", "max"]
+    columns += [share for share in _SHARES if share in everything]
+    report.errors({**entries, **dict(motions)}, columns)
     if "radius" in report.record:
         report.text(f"{report.record['radius']['words']} Rows without a radius do not count.")
 
@@ -136,7 +150,8 @@ def _add_figures(
     ax.set(ylabel="rows")
     report.figure("error_histogram", figure, "Tip errors of all rows.")
     figure, ax = new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
-    row, body = int(np.argsort(errors)[int(0.95 * len(errors))]), None
+    row = int(np.argsort(errors)[int(0.95 * len(errors))])
+    body = None
     if loaded.chain is not None:
         q = loaded.effective(log.q, motion)[row]
         body = BackboneDisplay.from_estimator(loaded.chain, q).points[0]

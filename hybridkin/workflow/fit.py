@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
+from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import whole
 from hybridkin._core.digests import row_digests
@@ -50,7 +51,6 @@ from hybridkin.workflow.report import (
     Report,
     check_out,
     geometry_entries,
-    linear,
     quadratic,
     quiet,
 )
@@ -184,7 +184,8 @@ class _Rows(NamedTuple):
         """Return the calibrated chain; for a robot without segments a linear model of the rows."""
         chain, result, _ = self.calibrated()
         if chain is None:
-            return error_module(linear().fit(self.q, self.x), torch.from_numpy(self.q))
+            linear = LinearRegression().fit(self.q, self.x)
+            return error_module(linear, torch.from_numpy(self.q))
         return chain if result is None else result.chain
 
     def with_play_detected(self, log: MeasuredLog, calibrated: ForwardModel | None) -> _Rows:

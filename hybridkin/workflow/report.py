@@ -29,12 +29,17 @@ from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 
 _WIDTH = 98
-_MILLIMETRES, _DEGREES = (1e3, "mm"), (180.0 / np.pi, "deg")
-_UNITS = {
+_Unit = tuple[float, str]  # factor from SI, and name
+_MILLIMETRES: _Unit = (1e3, "mm")
+_DEGREES: _Unit = (180.0 / np.pi, "deg")
+_UNITS: dict[str, _Unit] = {
     "bending_stiffness": (1e6, "mm²/rad²"),
     "axial_stiffness": (1.0, "-"),
-    **dict.fromkeys(("gains", "gain"), (1.0, "m/unit of q")),
-    **dict.fromkeys(("angles", "turns", "rest_bends"), _DEGREES),
+    "gains": (1.0, "m/unit of q"),
+    "gain": (1.0, "m/unit of q"),
+    "angles": _DEGREES,
+    "turns": _DEGREES,
+    "rest_bends": _DEGREES,
 }
 
 _COLUMNS = {  # of tables of errors: heading, factor, format; others in mm
@@ -55,11 +60,6 @@ it and the others of its kind stay physical."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
-
-
-def linear() -> Any:
-    """Return the paper's linear model A q + b."""
-    return LinearRegression()
 
 
 def quadratic() -> Any:
@@ -104,26 +104,43 @@ def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, 
         and "std_error" in that unit, for the base its rotation from the start and its position;
         "narrowing", "physical" and "identified".
     """
-    entries = []
-    labels, narrowing = iter(result.names), iter(result.narrowing.tolist())
+    columns: list[tuple[Any, ...]] = []
     for name, value in result.values.items():
-        before, value = _start_value(start, name), np.asarray(value)
-        units = value.size * [_UNITS.get(name, _MILLIMETRES)]
-        if name == "actuator_zeros" and isinstance(start, ArcChain) and not start.in_metres:
-            units = value.size * [(1.0, "units of q")]
-        if name == "base":
-            turn = Rotation.from_matrix(value[:3, :3] @ before[:3, :3].T).as_rotvec()
-            before, value = np.append(np.zeros(3), before[:3, 3]), np.append(turn, value[:3, 3])
-            units = 3 * [_DEGREES] + 3 * [_MILLIMETRES]
-        columns = (before, value, np.asarray(result.std_errors[name]))
-        for (scale, unit), *numbers in zip(units, *map(np.ravel, columns), strict=True):
-            entry: dict[str, Any] = {"name": next(labels), "unit": unit}
-            entry["start"], entry["value"], entry["std_error"] = np.multiply(scale, numbers)
-            entry["narrowing"] = next(narrowing)
-            entry["physical"] = name not in result.unphysical
-            entry["identified"] = entry["physical"] and entry["narrowing"] >= IDENTIFIED
-            entries.append(entry)
+        physical = name not in result.unphysical
+        before, after, units = _values(start, name, np.asarray(value))
+        errors = np.ravel(result.std_errors[name])
+        for numbers in zip(units, before.ravel(), after.ravel(), errors, strict=True):
+            columns.append((physical, *numbers))
+    entries = []
+    for label, narrowing, (physical, (scale, unit), before, after, error) in zip(
+        result.names, result.narrowing.tolist(), columns, strict=True
+    ):
+        entries.append(
+            {
+                "name": label,
+                "unit": unit,
+                "start": scale * before,
+                "value": scale * after,
+                "std_error": scale * error,
+                "narrowing": narrowing,
+                "physical": physical,
+                "identified": physical and narrowing >= IDENTIFIED,
+            }
+        )
     return entries
+
+
+def _values(start: Chain, name: str, value: NDArray) -> tuple[NDArray, NDArray, list[_Unit]]:
+    """Return a parameter before and after its calibration, and the unit of every number."""
+    before = _start_value(start, name)
+    if name == "base":
+        turn = Rotation.from_matrix(value[:3, :3] @ before[:3, :3].T).as_rotvec()
+        after = np.append(turn, value[:3, 3])
+        return np.append(np.zeros(3), before[:3, 3]), after, 3 * [_DEGREES] + 3 * [_MILLIMETRES]
+    unit: _Unit = _UNITS.get(name, _MILLIMETRES)
+    if name == "actuator_zeros" and isinstance(start, ArcChain) and not start.in_metres:
+        unit = (1.0, "units of q")
+    return before, value, value.size * [unit]
 
 
 def _start_value(start: Chain, name: str) -> NDArray:
@@ -167,26 +184,27 @@ class Report:
 
     def errors(self, record: dict[str, dict[str, Any]], columns: Sequence[str]) -> None:
         """Add a table of tip errors [mm] by name, with some of their `statistics`."""
-        looks = {key: _COLUMNS.get(key, (key, 1e3, ".2f")) for key in columns}
-        rows = []
-        for name, entry in record.items():
-            values = (
-                f"{factor * entry.get(key, math.nan):{form}}"
-                for key, (_, factor, form) in looks.items()
-            )
-            rows.append([name, *(value.replace("nan", "-") for value in values)])
-        titles = (title for title, *_ in looks.values())
-        self.table(["tip error [mm]", *titles], rows)
+        header = ["tip error [mm]"]
+        rows = [[name] for name in record]
+        for key in columns:
+            title, factor, form = _COLUMNS.get(key, (key, 1e3, ".2f"))
+            header.append(title)
+            for row, entry in zip(rows, record.values(), strict=True):
+                text = f"{factor * entry.get(key, math.nan):{form}}"
+                row.append(text.replace("nan", "-"))
+        self.table(header, rows)
 
     def geometry(self, entries: Sequence[dict[str, Any]]) -> None:
         """Add a table of calibrated parameters, see `geometry_entries`."""
         header = ["parameter", "start", "calibrated", "standard error", "prior narrowed by"]
         rows = []
         for entry in entries:
-            numbers = (f"{entry[key]:.2f}" for key in ("start", "value", "std_error"))
-            answer = "yes" if entry["identified"] else "no" if entry["physical"] else "not physical"
-            label, narrowing = f"{entry['name']} [{entry['unit']}]", f"{entry['narrowing']:.3g}"
-            rows.append([label, *numbers, narrowing, answer])
+            identified = "yes" if entry["identified"] else "no"
+            row = [f"{entry['name']} [{entry['unit']}]"]
+            row += [f"{entry[key]:.2f}" for key in ("start", "value", "std_error")]
+            row.append(f"{entry['narrowing']:.3g}")
+            row.append(identified if entry["physical"] else "not physical")
+            rows.append(row)
         self.table([*header, "identified"], rows)
 
     def figure(self, name: str, figure: Any, caption: str) -> None:
@@ -201,8 +219,10 @@ class Report:
     def plain(self, table: Callable[..., str] | None = None) -> str:
         """Return the report as text; `table` makes text of header and rows, by default aligned."""
         table = _aligned if table is None else table
-        blocks = (block if isinstance(block, str) else table(*block) for _, block in self._blocks)
-        return "\n\n".join(filter(None, blocks))
+        texts = []
+        for _, block in self._blocks:
+            texts.append(block if isinstance(block, str) else table(*block))
+        return "\n\n".join(filter(None, texts))
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Add a file; `write` gets its path and writes it."""
@@ -213,21 +233,21 @@ class Report:
 
         The report is the last file. A killed process leaves whole files, old or new ones.
         """
-        out = Path(out)
-        texts = {"report.json": json_text(self.record) + "\n", "report.md": self.markdown()}
-        written = {name: partial(_write_text, text=text) for name, text in texts.items()}
-        write_files(out, {**self._files, **written})
-        return [out / name for name in [*self._files, *texts]]
+        files = dict(self._files)
+        files["report.json"] = partial(_write_text, text=json_text(self.record) + "\n")
+        files["report.md"] = partial(_write_text, text=self.markdown())
+        write_files(out, files)
+        return [Path(out) / name for name in files]
 
 
 def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table as text, the first column aligned to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    lines = (
-        [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]
-        for line in [header, *rows]
-    )
-    return "\n".join("  " + "  ".join(line) for line in lines)
+    lines = []
+    for name, *cells in [header, *rows]:
+        aligned = map(str.rjust, cells, widths[1:])
+        lines.append("  " + "  ".join([name.ljust(widths[0]), *aligned]))
+    return "\n".join(lines)
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -289,8 +309,8 @@ def json_text(record: Any) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the main packages."""
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name in ("hybridkin", "torch", "numpy", "scikit-learn", "mujoco"):
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            versions[name] = version(name)
+    return versions

@@ -32,9 +32,11 @@ TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
 LEAD_IN = "LEAD_IN"  # status of the rows before the path
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
-_PEAK, _PUSH = 1.875, 10.0 / math.sqrt(3.0)  # largest speed and acceleration of `min_jerk`
+_PEAK = 1.875  # largest speed of `min_jerk`
+_PUSH = 10.0 / math.sqrt(3.0)  # its largest acceleration
 _MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
-_SLOW, _DT = 0.1, 0.02  # without known limits: share of the range per second; period [s]
+_SLOW = 0.1  # share of the range per second, without known limits
+_DT = 0.02  # period of a path of one point [s]
 _PULLS = (0.2, 0.0)  # pull to the preferred configuration, in each attempt
 
 
@@ -140,15 +142,17 @@ def track_path(
 
 def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
     """Return the configuration (n,) before the path; None: its first command."""
-    low, high = domain.limits.q_min, domain.limits.q_max
+    low = domain.limits.q_min
+    high = domain.limits.q_max
     if isinstance(start, str):
         if start not in ("rest", "path"):
             raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
+        if start == "path":
+            return None
         zero = domain.tendons or ((low <= 0) & (high >= 0)).all()
-        rest = domain.rest if zero else domain.preferred
-        return rest if start == "rest" else None
-    q, span = np.array(start, dtype=float), high - low
-    if q.shape != low.shape or (np.abs(q - 0.5 * (low + high)) > 1.5 * span).any():
+        return domain.rest if zero else domain.preferred
+    q = np.array(start, dtype=float)
+    if q.shape != low.shape or (np.abs(q - 0.5 * (low + high)) > 1.5 * (high - low)).any():
         raise ValueError(
             f"`start` must be {len(low)} values in or near the limits, {low.round(4)} to "
             f"{high.round(4)} m, got {q} m; check its unit and sign."
@@ -166,9 +170,11 @@ def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[
     dt = float(track.t[1] - track.t[0]) if len(track.t) > 1 else _DT
     widest = max((limits.q_max - limits.q_min).max(), np.abs(way).max())
     speed = _SLOW * widest if limits.dq_max is None else limits.dq_max
-    n = moves = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
+    moves = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
+    n = moves
     if limits.ddq_max is not None:
-        moves = max(n, math.ceil(np.sqrt(_PUSH * np.abs(way) / limits.ddq_max).max() / dt))
+        seconds = np.sqrt(_PUSH * np.abs(way) / limits.ddq_max).max()
+        moves = max(moves, math.ceil(seconds / dt))
         n = moves + 1  # the path begins at rest
     q = track.q[0] - (1.0 - trajectories.min_jerk(np.arange(n) / max(moves, 1)))[:, None] * way
     x = domain.loaded.tips(q)
@@ -195,10 +201,10 @@ def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress)
         def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
             progress(what, done + 1, total)
 
-        found: Any = ik.track(fine, q0=commands, tol=tol, progress=report)
+        track: Any = ik.track(fine, q0=commands, tol=tol, progress=report)
         # Only the points are kept, not the steps between them.
-        rows = {k: v[::every] for k, v in vars(found).items() if v is not None}
-        tracks.append(replace(found, **rows))
+        rows = {k: v[::every] for k, v in vars(track).items() if v is not None}
+        tracks.append(replace(track, **rows))
         if score(tracks[-1]) == (len(path), len(path)):
             break
     return max(tracks, key=score)  # of equal tracks the first
@@ -304,14 +310,14 @@ def _write_track(
     track: Track, shown: dict[str, NDArray], statuses: list[str], log: robots.LogFormat, file: Path
 ) -> None:
     """Write commands, and with backlash the motion of the actuators, point by point."""
-    scale = 1 / METRES[log.x_unit]
-    sent, *effective = (_text(log.to_log(q)) for q in shown.values())
-    rest = _text(scale * np.column_stack([track.x, track.target, track.error]))
+    lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
-    head += [f"effective_{name}" for name in log.q for _ in effective]
-    cells = [_text(track.t), *sent, *rest, statuses, *(column for q in effective for column in q)]
+    columns = [_text(track.t), *_text(log.to_log(shown["command"])), *_text(lengths), statuses]
+    if "actuator" in shown:
+        head += [f"effective_{name}" for name in log.q]
+        columns += [*_text(log.to_log(shown["actuator"]))]
     with open(file, "w", encoding="utf-8", newline="") as lines:
-        csv.writer(lines, lineterminator="\n").writerows([head, *zip(*cells, strict=True)])
+        csv.writer(lines, lineterminator="\n").writerows([head, *zip(*columns, strict=True)])
 
 
 def _text(values: NDArray) -> NDArray:
@@ -328,21 +334,25 @@ def _add_path(report: Report, loaded: LoadedModel, track: Track) -> None:
     expected = {f"robot, {name}": values for name, values in errors.items()}
     display.plot_error(axes[2], unit="mm", expected=expected)
     caption = "Path and tip by the model; error of the solver"
-    report.figure("track", figure, caption + (", and expected error of the robot." * bool(errors)))
+    if errors:
+        caption += ", and expected error of the robot."
+    report.figure("track", figure, caption)
 
 
 def _add_commands(
     report: Report, domain: Domain, t: NDArray, shown: dict[str, NDArray], n_lead: int
 ) -> None:
     """Add the commands and their limits, in names, unit and sign of the robot's logs."""
-    loaded, limits = domain.loaded, domain.limits
-    chain, log_format = loaded.chain, loaded.log_format()
-    shares = chain.actuators_per_segment if isinstance(chain, ArcChain) else (loaded.n_actuators,)
-    n = len(shares)
+    loaded = domain.loaded
+    log_format = loaded.log_format()
+    counts: tuple[int, ...] = (loaded.n_actuators,)
+    if isinstance(loaded.chain, ArcChain):
+        counts = loaded.chain.actuators_per_segment
+    n = len(counts)
     figure, axes = new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
     half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
-    ends = np.stack([limits.q_min - half_play, limits.q_max + half_play])
-    display = ActuatorDisplay(shown, shares, t, names=log_format.q, limits=ends)
+    ends = np.stack([domain.limits.q_min - half_play, domain.limits.q_max + half_play])
+    display = ActuatorDisplay(shown, counts, t, names=log_format.q, limits=ends)
     display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
     caption = "Commands and their limits, with the names, unit and sign of the robot's logs."
     if n_lead:
@@ -354,12 +364,12 @@ def _add_commands(
 
 def _write_summary(report: Report, plane: str, better: str | None) -> None:
     record = report.record
-    columns, source = record["columns"], record["limits"]["source"]
-    mean, most, largest = (f"{1e3 * record['errors'][key]:.3g}" for key in ("mean", "p95", "max"))
+    columns = record["columns"]
+    errors = {name: f"{1e3 * error:.3g}" for name, error in record["errors"].items()}
     report.text(
         f"In the model, {record['reached']} of {record['n']} points are reached within "
-        f"{1e3 * record['tol']:g} mm. Error of the solver in mm: mean {mean}, 95 % quantile "
-        f"{most}, max {largest}. Limits: {source}."
+        f"{1e3 * record['tol']:g} mm. Error of the solver in mm: mean {errors['mean']}, 95 % "
+        f"quantile {errors['p95']}, max {errors['max']}. Limits: {record['limits']['source']}."
     )
     report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
     if record["lead_in"]["rows"]:
@@ -382,11 +392,12 @@ def _write_summary(report: Report, plane: str, better: str | None) -> None:
 
 def _promise_in_words(record: dict[str, Any], better: str | None) -> str:
     """Return what to expect of the robot, and where the path would lie better."""
-    expected, inside = record["expected"], record["in_domain"]
+    inside = record["in_domain"]
     words = "The error of the robot is not known: the model has no held-out errors"
-    if expected:
-        mean, most = (f"{1e3 * expected[name]:.2g} mm" for name in ("mean", "p95"))
-        words = f"Expect {mean} (95 % below {most}) of the robot inside the log"
+    if record["expected"]:
+        expected = {name: f"{1e3 * error:.2g} mm" for name, error in record["expected"].items()}
+        words = f"Expect {expected['mean']} (95 % below {expected['p95']}) of the robot inside "
+        words += "the log"
     if inside is not None and inside < 1.0:
         words += f"; {100 * (1.0 - inside):.0f} % of the path is outside, where nothing is known"
     return f"{words}: {better}." if better else f"{words}."

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.spatial.transform import Rotation
 
 from hybridkin._core.arrays import as_array
+from hybridkin._core.rotations import nearest_rotation
 from hybridkin.chains.play import PlayOperator
 from hybridkin.datasets import Log
 from hybridkin.native.library import evaluate
@@ -22,7 +22,8 @@ from hybridkin.workflow.track import LEAD_IN, read_track
 _KEPT = 1.5  # largest mean error of a kept promise, relative to the promised one
 _LIKELY = 0.5  # least share of the mean squared error that a likely cause explains
 _OFF = 0.01  # least distance from the plane of the log, as a share of the range of the commands
-_ROUNDS, _NARROW = 3, 1e-3  # of the fit of backlash; its least width, as a share of the range
+_ROUNDS = 3  # of the fit of backlash
+_NARROW = 1e-3  # least width of backlash, as a share of the range
 _DIFFERENT = 0.1  # of the range: commands of a log that differ from those of the track
 _COLUMNS = ("rows", "promised", "promised_p95", "mean", "p95", "max")
 
@@ -83,24 +84,28 @@ def verify_track(
     check_columns(log.q, loaded)
     sent = read_track(track, loaded.log_format())
     motion = loaded.effective(sent.q)
-    rows, x = _rows_of(log, sent), log.x[:, -3:]
+    rows = _rows_of(log, sent)
+    x = log.x[:, -3:]
     used = np.isfinite(x).all(axis=1)
     if sent.groups is not None:
         used &= sent.groups[rows] != LEAD_IN
-    rows, x = rows[used], x[used]
+    rows = rows[used]
+    x = x[used]
     if len(rows) < 3:
         raise ValueError(f"`log` must have at least 3 measured tips of the path, got {len(rows)}.")
     q = motion[rows]
     errors = np.linalg.norm(x - loaded.tips(q), axis=1)
-    causes, promised = _explained(loaded, motion, rows, x), loaded.promised_errors(q)
+    causes = _explained(loaded, motion, rows, x)
+    promised = loaded.promised_errors(q)
     parts = {name: _entry(errors, promised, part) for name, part in _parts(loaded, q).items()}
-    path = parts["path"]
-    good = bool(path["mean"] <= _KEPT * path["promised"]) if promised else None
+    kept = None
+    if promised:
+        kept = bool(parts["path"]["mean"] <= _KEPT * parts["path"]["promised"])
     likely = max(causes, key=causes.__getitem__)
-    cause = likely if not good and causes[likely] > _LIKELY else None
+    cause = likely if not kept and causes[likely] > _LIKELY else None
     report = Report(f"{loaded.name}: {Path(track).name} against {Path(log.source).name}")
     report.record.update(command="verify", model=str(loaded.path), track=str(track), log=log.source)
-    report.record.update(parts=parts, kept=good, causes=causes, cause=cause)
+    report.record.update(parts=parts, kept=kept, causes=causes, cause=cause)
     _write(report)
     return report, [] if out is None else report.write(out)
 
@@ -129,24 +134,30 @@ def _rows_of(log: Log, sent: Log) -> NDArray:
 
 def _parts(loaded: LoadedModel, q: NDArray) -> dict[str, NDArray]:
     """Return the rows of the parts of the path: the whole, in and out of the log, quarters."""
-    inside, quarter = loaded.domain_distance(q) <= 1.0, 4 * np.arange(len(q)) // len(q)
-    parts = {"path": np.ones(len(q), dtype=bool), "inside the log": inside}
+    inside = loaded.domain_distance(q) <= 1.0
+    parts = {"path": np.ones(len(q), dtype=bool)}
+    parts["inside the log"] = inside
     parts["outside the log"] = ~inside
-    parts |= {f"quarter {k + 1}": quarter == k for k in range(4)}
+    quarter = 4 * np.arange(len(q)) // len(q)
+    for k in range(4):
+        parts[f"quarter {k + 1}"] = quarter == k
     return {name: rows for name, rows in parts.items() if rows.any()}
 
 
 def _entry(errors: NDArray, promised: dict[str, NDArray], rows: NDArray) -> dict[str, Any]:
-    names = {"promised": "mean", "promised_p95": "p95"}
-    means = {name: promised[key][rows].mean() for name, key in names.items() if promised}
-    return {"rows": rows.sum(), **means, **statistics(errors[rows])}
+    entry = {"rows": rows.sum()}
+    if promised:
+        entry["promised"] = promised["mean"][rows].mean()
+        entry["promised_p95"] = promised["p95"][rows].mean()
+    return {**entry, **statistics(errors[rows])}
 
 
 def _explained(loaded: LoadedModel, motion: NDArray, rows: NDArray, x: NDArray) -> dict[str, float]:
     """Return the share of the mean squared error that each cause explains."""
     q = motion[rows]
     tips, J = evaluate(loaded.module, q, jacobian=True)
-    residual, off = x - tips, _off_plane(loaded, q)
+    residual = x - tips
+    off = _off_plane(loaded, q)
     linear = off @ np.linalg.lstsq(off, residual)[0]
     left = {
         "backlash": _without_backlash(motion, rows, J, residual),
@@ -173,7 +184,8 @@ def _without_backlash(motion: NDArray, rows: NDArray, J: NDArray, residual: NDAr
     The tip errors are linear in the widths if the shape of the lag, from -1/2 to 1/2, is known. It
     is that of the widths of the round before.
     """
-    least, left = _NARROW * np.ptp(motion, axis=0).max(), 0.0
+    least = _NARROW * np.ptp(motion, axis=0).max()
+    left = 0.0
     widths = np.zeros(motion.shape[1])
     for _ in range(_ROUNDS):
         widths = np.maximum(widths, least)
@@ -184,25 +196,27 @@ def _without_backlash(motion: NDArray, rows: NDArray, J: NDArray, residual: NDAr
 
 
 def _moved(tips: NDArray, x: NDArray) -> NDArray:
-    """Return tips (N, 3) after the rigid motion that brings them nearest to x (Kabsch)."""
-    here, there = tips.mean(axis=0), x.mean(axis=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # points on a line: any turn about it
-        turn = Rotation.align_vectors(x - there, tips - here)[0]
-    return there + turn.apply(tips - here)
+    """Return tips (N, 3) after the rigid motion that brings them nearest to x."""
+    middle = x.mean(axis=0)
+    centred = tips - tips.mean(axis=0)
+    turn, _ = nearest_rotation(torch.from_numpy((x - middle).T @ centred))
+    return middle + centred @ turn.numpy().T
 
 
 def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
     """Return the sum of squares if the errors were everywhere as inside the log."""
-    squares, inside = np.square(residual).sum(axis=1), loaded.domain_distance(q) <= 1.0
+    squares = np.square(residual).sum(axis=1)
+    inside = loaded.domain_distance(q) <= 1.0
     if inside.any():
         return len(q) * squares[inside].mean()
-    known = loaded.held_out
-    return squares.sum() if known is None else len(q) * known["mean"] ** 2
+    held_out = loaded.held_out
+    return squares.sum() if held_out is None else len(q) * held_out["mean"] ** 2
 
 
 def _write(report: Report) -> None:
-    parts, kept, cause = (report.record[key] for key in ("parts", "kept", "cause"))
+    parts = report.record["parts"]
+    kept = report.record["kept"]
+    cause = report.record["cause"]
     path = {key: f"{1e3 * value:.3g} mm" for key, value in parts["path"].items()}
     promise = "The model promised no error"
     if kept is not None:
