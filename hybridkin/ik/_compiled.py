@@ -143,17 +143,24 @@ class Core:
         self._idle.append(follower)
         return found
 
-    def steps(self, q: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
+    def steps(
+        self,
+        q: Tensor,
+        target: Tensor,
+        feed: Tensor | None,
+        tip: Tensor | None,
+        last: Tensor | None,
+    ) -> tuple[Tensor, ...]:
         """Return dq, x, error, sigma_min, damping and held actuators, for rows q (N, n).
 
-        `given` is the target, its motion in a period, the measured tip, and the previous step.
+        `feed` is the motion of the targets in a period, `tip` the measured tips, and `last` the
+        previous steps.
         """
-        n, mode = self.n, IK_MUST_SEE
-        for bit, a in zip((IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP), given[:3], strict=True):
-            mode += 0 if a is None else bit
+        n = self.n
         out, held = np.empty((len(q), n + 6)), np.empty((len(q), n), dtype=bool)
-        arrays = [None if a is None else _plain(a) for a in (q, *given)]
-        self._run("hk_ik_steps", len(q), [ctypes.c_int32(mode)], [*arrays, out, held])
+        arrays = [None if a is None else _plain(a) for a in (q, target, feed, tip, last)]
+        mode = ctypes.c_int32(IK_MUST_SEE | _mode(target, feed, tip))
+        self._run("hk_ik_steps", len(q), [mode], [*arrays, out, held])
         dq, x, numbers = torch.from_numpy(out).split([n, 3, 3], dim=1)
         return dq, x, *numbers.unbind(1), torch.from_numpy(held)
 
@@ -163,19 +170,28 @@ class Core:
 
     def find(self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int) -> Found:
         """Return the result of `hk_ik_find` for starts q (N, n)."""
-        best, rows = _plain(q).copy(), len(q)
-        J, e = np.empty((rows, self.rows, self.n)), np.empty((rows, self.rows))
-        found, n_iter = np.empty((2, rows), dtype=np.int32)
-        way, turn = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
-        turn = ctypes.c_double(turn * self.settings.task.units[-1])
-        numbers = [ctypes.c_int32(mode), ctypes.c_int32(max_iter), ctypes.c_double(way), turn]
-        self._run("hk_ik_find", rows, numbers, [_plain(target), best, J, e, found, n_iter])
-        at, J, e, found, n_iter = (torch.from_numpy(a) for a in (best, J, e, found, n_iter))
-        reached, at_rest, held = (found & bit > 0 for bit in (IK_REACHED, IK_AT_REST, IK_HELD))
-        n_iter = n_iter.long()
-        ends = n_iter, torch.ones_like(n_iter)
-        x = target - e if self.rows == 3 else torch.full_like(target, math.nan)  # not used
-        return Found(at, x, J, e, target.clone(), reached, at_rest, held, *ends)
+        n_rows = len(q)
+        best = _plain(q).copy()
+        J, e = np.empty((n_rows, self.rows, self.n)), np.empty((n_rows, self.rows))
+        outcome, n_iter = np.empty(n_rows, dtype=np.int32), np.empty(n_rows, dtype=np.int32)
+        metres, radians = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
+        tolerances = metres, radians * self.settings.task.units[-1]
+        numbers = [*map(ctypes.c_int32, (mode, max_iter)), *map(ctypes.c_double, tolerances)]
+        self._run("hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter])
+        error, result = torch.from_numpy(e), torch.from_numpy(outcome)
+        iterations = torch.from_numpy(n_iter).long()
+        return Found(
+            torch.from_numpy(best),
+            target - error if self.rows == 3 else torch.full_like(target, math.nan),  # not used
+            torch.from_numpy(J),
+            error,
+            target.clone(),
+            reached=result & IK_REACHED > 0,
+            stationary=result & IK_AT_REST > 0,
+            held=result & IK_HELD > 0,
+            n_iter=iterations,
+            n_starts=torch.ones_like(iterations),
+        )
 
     def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
         """Call a function of the library for all rows of arrays."""
@@ -213,9 +229,10 @@ class Follower:
         self.core, self._memory, self._least = core, memory, mode
         n = core.n
         self.state = state = np.zeros(IK_Q + 7 * core.n) if state is None else state
+        self.task = core.settings.task
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = memory or 0.0
-        self.q, self._held = state[IK_Q : IK_Q + n], state[IK_Q + 3 * n : IK_Q + 4 * n]
+        self.q = state[IK_Q : IK_Q + n]
         self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
         self._inputs = {at: state[at : at + 3] for at in (IK_TARGET, IK_FEED, IK_TIP)}
         self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
@@ -271,35 +288,22 @@ class Follower:
             return False
         return True
 
-    def advance(self, period: float | None, *given: Tensor | None) -> Tick:
+    def advance(self, period: float | None, *inputs: Tensor | None) -> Tick:
         """Do a tick with checked rows: the target, its motion in the period, the measured tip."""
-        mode, bits = self._least, (IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP)
-        for bit, place, a in zip(bits, self._inputs.values(), given, strict=True):
-            if a is not None:
-                place[...] = a.reshape(3).numpy()
-                mode += bit
+        for place, rows in zip(self._inputs.values(), inputs, strict=True):
+            if rows is not None:
+                place[...] = rows.reshape(3).numpy()
+        mode = self._least | _mode(*inputs)
         self.state[IK_MODE] = self._mode = mode
         self.state[IK_PERIOD] = period or self._dt
         self._follow(self._call.place)
         self.state[IK_PERIOD] = self._dt
         return self.last()
 
-    command = property(lambda self: self.q.copy())
-    x = property(lambda self: self.state[IK_X:IK_ERROR].copy())
-    stopped = False  # by tip limits, which have no kernel
-    saturated = property(lambda self: self._held.astype(bool))
-    error = property(lambda self: float(self.state[IK_DISTANCE]))
-    sigma_min = property(lambda self: float(self.state[IK_SIGMA_MIN]))
-    damping = property(lambda self: float(self.state[IK_DAMPING]))
-
-    def reached(self, tol: Tolerance) -> bool:
-        """Return whether the error is within the tolerance."""
-        return self.error <= (tol[0] if isinstance(tol, tuple) else tol)
-
-    def in_domain(self) -> bool:
-        """Return whether the last tick began inside the domain of the model."""
-        n = self.core.n
-        return bool(self.core.program.domain(self.state[IK_Q + 2 * n : IK_Q + 3 * n])[0] <= 1.0)
+    @property
+    def command(self) -> NDArray:
+        """The present command (n,)."""
+        return self.q.copy()
 
     def last(self) -> Tick:
         """Return the results of the last tick."""
@@ -341,6 +345,12 @@ class _CoreSearch(Search):
 
     def _find(self, mode: int, q: Tensor, target: Tensor) -> Found:
         return self.core.find(mode, q, target, self.tol, self.max_iter)
+
+
+def _mode(target: Tensor | None, feed: Tensor | None, tip: Tensor | None) -> int:
+    """Return the bits of the inputs that there are."""
+    mode = IK_HAS_TARGET * (target is not None) + IK_HAS_FEED * (feed is not None)
+    return mode + IK_HAS_TIP * (tip is not None)
 
 
 def _plain(a: Tensor) -> NDArray:

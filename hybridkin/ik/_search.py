@@ -134,34 +134,45 @@ class Search:
 
         Rows without a further point have NaN as q.
         """
-        settings, s, tol = self.settings, restarts + 1, self.tol
-        tol = tuple(_FINE * t for t in tol) if isinstance(tol, tuple) else _FINE * tol
-        fine, spans = replace(self, tol=tol), settings.spans.to(start)
-        found = best.take(torch.arange(len(start), device=start.device).repeat_interleave(count))
+        settings, n_starts = self.settings, restarts + 1
+        spans = settings.spans.to(start)
+        tol = (
+            tuple(_FINE * t for t in self.tol) if isinstance(self.tol, tuple) else _FINE * self.tol
+        )
+        fine = replace(self, tol=tol)
+        rows = torch.arange(len(start), device=start.device)
+        found = best.take(rows.repeat_interleave(count))
         further = torch.arange(len(found.q), device=start.device) % count > 0
         found.q[further] = torch.nan
         for some in (self._cost(best) == _DONE).nonzero()[:, 0].split(_ROWS):
-            size, near = torch.zeros_like(best.error[some]), start[some].repeat_interleave(s, 0)
-            starts = even_starts(settings, start[some], size, restarts).expand(len(some), -1, -1)
-            starts = torch.cat([best.q[some, None], starts], dim=1).flatten(0, 1)
-            more = fine._attempt(
-                settings.start_at(starts), best.target[some].repeat_interleave(s, 0)
-            )
-            if settings.has_posture:
-                fine._to_posture(more)
+            near = start[some].repeat_interleave(n_starts, 0)
+            more = fine._from_even_starts(best.take(some), start[some], restarts)
             turned = more.q + settings.whole_turns(near - more.q)
             more.q = torch.where(settings.inside(turned) == turned, turned, more.q)
-            far = ((more.q - near) / spans).norm(dim=-1)
-            far = torch.where(fine._cost(more) == _DONE, far, torch.inf).view(-1, s)
-            first, q = s * torch.arange(len(some), device=some.device), more.q.unflatten(0, (-1, s))
-            more.n_starts = best.n_starts[some].repeat_interleave(s) + s
+            distance = ((more.q - near) / spans).norm(dim=-1)
+            distance = torch.where(fine._cost(more) == _DONE, distance, torch.inf)
+            distance = distance.view(-1, n_starts)
+            first = n_starts * torch.arange(len(some), device=some.device)
+            q = more.q.unflatten(0, (-1, n_starts))
+            more.n_starts = best.n_starts[some].repeat_interleave(n_starts) + n_starts
             for place in range(count):
-                distance, pick = far.min(1)
-                there, picked = torch.isfinite(distance), more.take(first + pick)
-                found.put(count * some[there] + place, picked.take(there))
+                nearest, pick = distance.min(1)
+                exists = torch.isfinite(nearest)
+                picked = more.take(first + pick)
+                found.put(count * some[exists] + place, picked.take(exists))
                 apart = q - picked.q[:, None]
                 apart = ((apart - settings.whole_turns(apart)) / spans).abs().amax(-1)
-                far = torch.where(apart <= _SAME, torch.inf, far)
+                distance = torch.where(apart <= _SAME, torch.inf, distance)
+        return found
+
+    def _from_even_starts(self, best: Found, start: Tensor, restarts: int) -> Found:
+        """Return the results from the best points and from `restarts` even starts, row by row."""
+        starts = even_starts(self.settings, start, torch.zeros_like(best.error), restarts)
+        starts = torch.cat([best.q[:, None], starts.expand(len(start), -1, -1)], dim=1)
+        target = best.target.repeat_interleave(restarts + 1, 0)
+        found = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
+        if self.settings.has_posture:
+            self._to_posture(found)
         return found
 
     def _to_posture(self, found: Found) -> None:
@@ -204,53 +215,56 @@ class Search:
     def _start(self, q: Tensor, target: Tensor) -> Found:
         point = self._point(q, target)
         no = torch.zeros(len(q), dtype=torch.bool, device=q.device)
-        parts = (*vars(point).values(), self._within(point.e), no, no, no.long(), (~no).long())
-        return Found(*(part.clone() for part in parts))
+        outcome = (self._within(point.e), no, no, no.long(), (~no).long())
+        return Found(*(part.clone() for part in (*vars(point).values(), *outcome)))
 
     def _lower(self, q: Tensor, target: Tensor) -> Found:
         """Lower the error until it is within tol or cannot be lowered."""
         found = self._start(q, target)
-        one = torch.ones_like(found.error)
-        own = {"start": found.error, "nu": _FIRST_DAMPING * one, "growth": 2.0 * one}
-        live = _Descent(**vars(found), **own, slow=0.0 * one)
-        rows, half = torch.arange(len(q), device=q.device), 0.5 * self.settings.periods.to(q)
-        turning = torch.isfinite(half)
+        rows = torch.arange(len(q), device=q.device)
+        damping = torch.full_like(found.error, _FIRST_DAMPING)
+        none = torch.zeros_like(damping)
+        live = _Descent(**vars(found), start=found.error, nu=damping, growth=2.0 + none, slow=none)
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
             live.stationary = self._blocked(live)
             live.stationary |= (live.nu > IK_LAST_DAMPING) | (live.slow >= IK_SLOW_STEPS)
             live.n_iter = torch.full_like(live.n_iter, iteration)
-            going = (~live.reached & ~live.stationary) & (iteration < self.max_iter)
+            going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
             if not going.all():
-                done, going = ((~going).nonzero()[:, 0], going.nonzero()[:, 0])
-                found.put(rows[done], live.take(done))
-                if going.numel() == 0:
-                    break
+                found.put(rows[~going], live.take(~going))
                 rows, live = rows[going], live.take(going)
-            error = live.error
-            # Damping proportional to the error: the last iterations are Gauss-Newton steps.
-            trust = live.nu * (error / live.start)
-            bounds = self.settings.step_bounds(live.q)
-            # A turning joint may pass its limit and continue at the other one.
-            bounds = (a.where(~turning, b) for a, b in zip(bounds, (-half, half), strict=True))
-            step = limited_step(self.settings, live.J, live.e, None, *bounds, trust, quick=True)
-            new = self._point(self.settings.inside(live.q + step.dq), live.target)
-            error_new = new.error
-            predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
-            # The damping follows the ratio of actual to predicted gain.
-            gained = error.square() - error_new.square()
-            quality = gained / (error.square() - predicted.square()).clamp_min(1e-30)
-            better = error_new < error
-            less = live.nu * (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
-            live.nu = torch.where(better, less, live.nu * live.growth)
-            live.growth = torch.where(better, 2.0, 2.0 * live.growth)
-            metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
-            little = better & (error - error_new < IK_SLOW * metres)
-            live.slow = torch.where(little, live.slow + 1.0, 0.0)
-            live.held = step.saturated.any(-1)
-            taken = better.nonzero()[:, 0]
-            live.put(taken, new.take(taken))
+            if rows.numel() == 0:
+                break
+            self._lower_once(live)
         return found
+
+    def _lower_once(self, live: _Descent) -> None:
+        """Try a step of all rows, and take it where it lowers the error."""
+        settings, error = self.settings, live.error
+        # Damping proportional to the error: the last iterations are Gauss-Newton steps.
+        trust = live.nu * (error / live.start)
+        lower, upper = settings.step_bounds(live.q)
+        # A turning joint may pass its limit and continue at the other one.
+        half_turn = 0.5 * settings.periods.to(live.q)
+        stays = torch.isinf(half_turn)
+        bounds = lower.where(stays, -half_turn), upper.where(stays, half_turn)
+        step = limited_step(settings, live.J, live.e, None, *bounds, trust, quick=True)
+        new = self._point(settings.inside(live.q + step.dq), live.target)
+        error_new = new.error
+        predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
+        # The damping follows the ratio of actual to predicted gain.
+        gain = error.square() - error_new.square()
+        quality = gain / (error.square() - predicted.square()).clamp_min(1e-30)
+        factor = (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
+        better = error_new < error
+        live.nu = live.nu * torch.where(better, factor, live.growth)
+        live.growth = torch.where(better, 2.0, 2.0 * live.growth)
+        metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
+        little = better & (error - error_new < IK_SLOW * metres)
+        live.slow = torch.where(little, live.slow + 1.0, 0.0)
+        live.held = step.saturated.any(-1)
+        live.put(better, new.take(better))
 
     def _inward(self, q: Tensor) -> Tensor:
         """Return Newton's step to a domain distance slightly below 1.

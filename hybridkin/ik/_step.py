@@ -82,13 +82,16 @@ def control_step(
     """
     gain, beta, seconds = settings.rates(period)
     v = gain * e if feed_forward is None else feed_forward + gain * e
-    sizes = [a.norm(dim=-1, keepdim=True) for a in (e, v)]
-    given = [a for a in (q, J.flatten(1), *sizes, last) if a is not None]
-    before = 0.0 if last is None else torch.where(torch.isfinite(last).all(-1)[:, None], last, 0.0)
-    fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
+    sizes = torch.stack([e.norm(dim=-1), v.norm(dim=-1)], dim=-1)
+    fine = _finite(q) & _finite(J.flatten(1)) & _finite(sizes)
+    before = 0.0
+    if last is not None:
+        fine = fine & _finite(last)
+        before = torch.where(_finite(last), last, 0.0)
     at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
-    J, posture = _only_taut(settings, torch.where(fine[..., None], J, 0.0)), None
+    J = _only_taut(settings, torch.where(fine[..., None], J, 0.0))
     limits = None if tip is None else settings.tip_limits
+    posture = None
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
     change = settings.change(q, seconds)
@@ -114,7 +117,7 @@ def control_step(
         v = v + limits.way_in(margin - limits.along(v))
     if settings.pulls.any():
         step = _arriving(settings, at, J, v, step, *bounds)
-    fine = fine & torch.isfinite(step.dq).all(-1, keepdim=True)
+    fine = fine & _finite(step.dq)
     still = torch.where(torch.isfinite(q), torch.clamp(torch.zeros_like(q), *bounds), 0.0)
     held = (still <= bounds[0]) | (still >= bounds[1])
     return step._replace(
@@ -123,6 +126,11 @@ def control_step(
         damping=torch.where(fine[:, 0], step.damping, 0.0),
         saturated=torch.where(fine, step.saturated, held),
     )
+
+
+def _finite(rows: Tensor) -> Tensor:
+    """Return whether all numbers of rows (N, k) are finite, shape (N, 1)."""
+    return torch.isfinite(rows).all(-1, keepdim=True)
 
 
 def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
@@ -249,12 +257,17 @@ class _End(NamedTuple):
 
     @property
     def distance(self) -> Tensor:
-        return self.missing.norm(dim=-1, keepdim=True)
+        return _norm(self.missing)
 
     def where(self, better: Tensor, other: _End) -> _End:
         """Return the ends of `other` in the rows (N, 1) where it is better."""
         pairs = zip(other, self, strict=True)
         return _End(*(a.where(better if a.ndim == 2 else better[..., None], b) for a, b in pairs))
+
+
+def _norm(rows: Tensor) -> Tensor:
+    """Return the lengths (N, 1) of rows."""
+    return rows.norm(dim=-1, keepdim=True)
 
 
 def _arriving(
@@ -292,15 +305,13 @@ def _arriving(
             best = best.where(going & (end.distance < best.distance), end)
         return best
 
-    size = J.flatten(1).norm(dim=-1, keepdim=True)
-    moved = [a.norm(dim=-1, keepdim=True) for a in (step.dq, q)]
     eps = torch.finfo(q.dtype).eps
-    slip = size * (IK_SLIP * moved[0] + 32.0 * eps * moved[1])
+    slip = _norm(J.flatten(1)) * (IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q))
     promised = apply_rows(J, step.dq)
-    close = torch.maximum(0.5 * promised.norm(dim=-1, keepdim=True), slip)
+    close = torch.maximum(0.5 * _norm(promised), slip)
     end = approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)
-    weak = end.distance > torch.maximum(0.5 * v.norm(dim=-1, keepdim=True), slip)
+    weak = end.distance > torch.maximum(0.5 * _norm(v), slip)
     to = torch.where(pulls < 0.0, lower, upper)
     slack = (end.J == 0.0).all(-2) & (pulls != 0.0)
     to = torch.where(slack & torch.isfinite(to), to, end.dq)

@@ -25,15 +25,6 @@ from hybridkin.ik.tasks import Tolerance
 Plant = Callable[["NDArray | Tensor"], Array]
 
 
-def _seen(name: str, text: str) -> Any:
-    def read(self: Tracker) -> Any:
-        with self._lock:
-            return getattr(self._robot, name)
-
-    read.__doc__ = text
-    return property(read)
-
-
 class Tracker(Portable):
     """Inverse kinematics step by step: each target gives the next command.
 
@@ -92,13 +83,48 @@ class Tracker(Portable):
         n = len(self.q)
         return f"Tracker({n} actuators, {self.status.name}, error {self.error:.3g} m)"
 
-    backend = _seen("backend", '"compiled", or "torch: " and the reason.')
-    q = _seen("command", "The present command, shape (n,).")
-    x = _seen("x", "The model's tip before the last step [m], in the shape of the task.")
-    error = _seen("error", "Distance from the tip, measured or the model's, to the target [m].")
-    saturated = _seen("saturated", "Actuators that the last step held at a limit, bool (n,).")
-    sigma_min = _seen("sigma_min", "Smallest singular value of the Jacobian before the last step.")
-    damping = _seen("damping", "Damping lambda of the last step, in the unit of `sigma_min`.")
+    @property
+    def backend(self) -> str:
+        """What computes the steps: "compiled", or "torch: " and the reason."""
+        return self._robot.backend
+
+    @property
+    def q(self) -> NDArray | Tensor:
+        """The present command, shape (n,)."""
+        with self._lock:
+            return self._robot.command
+
+    @property
+    def x(self) -> NDArray | Tensor:
+        """The model's tip before the last step [m], in the shape of the task."""
+        return self._given_back(self._last().x)
+
+    @property
+    def saturated(self) -> NDArray | Tensor:
+        """Actuators that the last step held at a limit, bool (n,)."""
+        return self._given_back(self._last().step.saturated)
+
+    @property
+    def error(self) -> float:
+        """Distance from the tip, measured or the model's, to the target [m]."""
+        return float(self._last().e.norm())
+
+    @property
+    def sigma_min(self) -> float:
+        """Smallest singular value of the Jacobian before the last step."""
+        return float(self._last().step.sigma_min)
+
+    @property
+    def damping(self) -> float:
+        """Damping lambda of the last step, in the unit of `sigma_min`."""
+        return float(self._last().step.damping)
+
+    def _last(self) -> Tick:
+        with self._lock:
+            return self._robot.last()
+
+    def _given_back(self, rows: Tensor) -> NDArray | Tensor:
+        return as_array(rows[0]).copy() if self._as_numpy else rows[0].clone()
 
     @property
     def status(self) -> IKStatus:
@@ -109,16 +135,18 @@ class Tracker(Portable):
         was damped or no motion is possible, MAX_ITER otherwise. INVALID_INPUT before the first
         step, and if the target, the measured tip or the model's output was not finite.
         """
-        with self._lock:
-            robot = self._robot
-            if not math.isfinite(robot.error + robot.sigma_min):
-                return IKStatus.INVALID_INPUT
-            if robot.reached(self._tol):
-                return IKStatus.CONVERGED if robot.in_domain() else IKStatus.OUT_OF_DOMAIN
-            if robot.saturated.any() or robot.stopped:
-                return IKStatus.AT_LIMITS
-            damped = robot.damping > 0.0 or robot.sigma_min == 0.0
-            return IKStatus.SINGULAR if damped else IKStatus.MAX_ITER
+        last, task = self._last(), self._robot.task
+        step = last.step
+        if not torch.isfinite(last.e.norm() + step.sigma_min):
+            return IKStatus.INVALID_INPUT
+        if task.reached(last.e, self._tol):
+            with torch.no_grad():
+                inside = task.in_domain(last.q)
+            return IKStatus.CONVERGED if inside else IKStatus.OUT_OF_DOMAIN
+        if step.saturated.any() or step.stopped:
+            return IKStatus.AT_LIMITS
+        damped = step.damping > 0.0 or step.sigma_min == 0.0
+        return IKStatus.SINGULAR if damped else IKStatus.MAX_ITER
 
     def reset(self, q: Array) -> None:
         """Restart at rest from an actuator vector, as read from the robot.
@@ -302,22 +330,7 @@ class _InTorch:
         """Return the results of the last tick."""
         return self._last
 
-    def reached(self, tol: Tolerance) -> bool:
-        """Return whether the error is within the tolerance."""
-        return bool(self.task.reached(self._last.e, tol))
-
-    @torch.no_grad()
-    def in_domain(self) -> bool:
-        """Return whether the last step began inside the domain of the models."""
-        return bool(self.task.in_domain(self._last.q))
-
-    command = property(lambda self: self._given_back(self._q))
-    x = property(lambda self: self._given_back(self._last.x))
-    saturated = property(lambda self: self._given_back(self._last.step.saturated))
-    stopped = property(lambda self: bool(self._last.step.stopped))
-    error = property(lambda self: float(self._last.e.norm(dim=-1)))
-    sigma_min = property(lambda self: float(self._last.step.sigma_min))
-    damping = property(lambda self: float(self._last.step.damping))
-
-    def _given_back(self, row: Tensor) -> NDArray | Tensor:
-        return as_array(row[0]).copy() if self._as_numpy else row[0].clone()
+    @property
+    def command(self) -> NDArray | Tensor:
+        """The present command (n,)."""
+        return as_array(self._q[0]).copy() if self._as_numpy else self._q[0].clone()
