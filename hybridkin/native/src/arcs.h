@@ -1,4 +1,4 @@
-/* Chains of circular arcs. Arcs are the lengths of all segments, then the x-, then the y-bendings. */
+/* Chains of circular arcs. Arcs are lengths of all segments, then their x-, then y-bendings. */
 
 #define HK_FRAME 13 /* numbers of a frame before its offsets */
 

@@ -25,9 +25,29 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
     const int32_t *node = code + at;
     const int n = node[HK_N];
     const real *a = data + node[HK_DATA], *b = a + 6 * n;
-    const ik_settings ik = {{code, data}, work, node[HK_MORE], n, node[HK_M], node[HK_MORE + 1],
-                      node[HK_MORE + 2], a, a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n, b + 5,
-                      b + 5 + n, b + 5 + 2 * n, b[0], b[1], b[2], b[3], b[4]};
+    const ik_settings ik = {
+        .plan = {code, data},
+        .work = work,
+        .model = node[HK_MORE],
+        .n = n,
+        .m = node[HK_M],
+        .flags = node[HK_MORE + 1],
+        .n_normals = node[HK_MORE + 2],
+        .low = a,
+        .high = a + n,
+        .speed = a + 2 * n,
+        .accel = a + 3 * n,
+        .posture = a + 4 * n,
+        .unit = a + 5 * n,
+        .gain = b[0],
+        .beta = b[1],
+        .dt = b[2],
+        .damping = b[3],
+        .radian = b[4],
+        .period = b + 5,
+        .pulls = b + 5 + n,
+        .normals = b + 5 + 2 * n,
+    };
     return ik;
 }
 
