@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
 from torch import Tensor
 
+from hybridkin._core.turns import THREADS
+
 
 @runtime_checkable
 class Transform(Protocol):
@@ -37,6 +39,7 @@ def as_tensor(
 
     float32 is kept; all other types become float64.
     """
+    THREADS.check()
     if isinstance(value, Transform):
         value = value.get_matrix()
     if not isinstance(value, Tensor):
@@ -49,6 +52,7 @@ def as_tensor(
 
 def real_array(value: Numbers | Transform, name: str) -> NDArray:
     """Return a caller's real numbers as an array; float32 is kept, others become float64."""
+    THREADS.check()
     if isinstance(value, (Tensor, Transform)):
         return as_tensor(value, name).numpy(force=True)
     if np.ma.is_masked(value):
