@@ -127,7 +127,8 @@ def check_shape(
 
     In `need`, digits are lengths, equal letters are equal lengths, a leading "..." is any axes.
     """
-    got, sizes = tuple(value.shape), [str(size) for size in need if size != "..."]
+    got = tuple(value.shape)
+    sizes = [str(size) for size in need if size != "..."]
     axes = got[-len(sizes) :] if len(sizes) < len(need) else got
     lengths = {
         size: int(size) if size.isdigit() else n for size, n in zip(sizes, axes, strict=False)

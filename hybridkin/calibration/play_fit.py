@@ -126,7 +126,8 @@ def fit_play(
     given = _WIDTHS / size if widths is None else real_array(widths, "widths").ravel()
     tried = np.unique(np.concatenate([[0.0], given])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
-    q, x = real_array(q, "q"), real_array(x, "x")
+    q = real_array(q, "q")
+    x = real_array(x, "x")
     check_shape(x, "x", ("N", chain.n_outputs))
     check_shape(q, "q", (len(x), chain.n_actuators), "one row for each row of `x`")
     groups = labels(groups, len(x))
@@ -138,7 +139,8 @@ def fit_play(
 
     def held_out_errors(width: float) -> NDArray:
         """Return the root mean square tip distance of every fold."""
-        y, squares = effective(width), []
+        y = effective(width)
+        squares = []
         for train, test in splits:
             result, _ = fit_geometry(chain, y[train], x[train], names, **calibrate_options)
             with torch.no_grad():

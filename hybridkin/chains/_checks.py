@@ -147,7 +147,8 @@ def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
         raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
     given["angles"] = np.split(given["angles"], np.cumsum(counts)[:-1])
     if "stage" in stored.settings:  # older files have neither stages nor planes
-        lengths, flags = iter(given.pop("lengths", ())), stored.list_of(bool, "extensible")
+        lengths = iter(given.pop("lengths", ()))
+        flags = stored.list_of(bool, "extensible")
         given["lengths"] = [None if own else next(lengths, math.nan) for own in flags]
         given["stage"] = stored.value("stage", (str, None))
         # Planar actuators stay planar, although calibration has moved their angles slightly.
@@ -178,7 +179,8 @@ def numeric(
 
 def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
     """Return `q_min`, `q_max` and `dq_max`, shape (n,), infinite if given as None."""
-    limits, ends = {}, {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
+    limits = {}
+    ends = {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
     for (name, end), value in zip(ends.items(), given, strict=True):
         value = np.full(n, end) if value is None else value
         limits[name] = numeric(value, name, need="n", length=n, finite=False)

@@ -33,7 +33,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     if not slides:
         raise NoKernel("an arm without moving joints is a constant")
     plan.limit("actuators", n_joints)
-    before, numbers, motions = stored.array("base"), [], stored.derived["motions"]
+    before = stored.array("base")
+    numbers = []
+    motions = stored.derived["motions"]
     origins = motions[:, 0] + motions[:, 2]
     for origin, axis in zip(origins, stored.array("axes"), strict=True):
         side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])

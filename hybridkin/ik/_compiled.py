@@ -74,7 +74,8 @@ def core_of(settings: StepSettings, search: bool = False) -> Core | None:
     Poses have kernels for the search only. The core is kept with the settings, and made again if
     the model has changed.
     """
-    kept, model = vars(settings).get("_program"), program_of(settings.task.models[0])
+    kept = vars(settings).get("_program")
+    model = program_of(settings.task.models[0])
     if kept is None or kept[0] is not model:
         try:
             kept = model, None if model is None else Core(settings, model), ""
@@ -110,9 +111,12 @@ class Core:
     """
 
     def __init__(self, settings: StepSettings, model: Program) -> None:
-        self.plan, self._made_of = Plan(settings.stored()), (settings, model)
-        self.n, self.program = self.plan.n_inputs, model
-        self.settings, self.rows = settings, sum(settings.task.parts)
+        self.plan = Plan(settings.stored())
+        self._made_of = (settings, model)
+        self.n = self.plan.n_inputs
+        self.program = model
+        self.settings = settings
+        self.rows = sum(settings.task.parts)
         if self.rows == 3:
             self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
         self._call = Call(self.plan, opened_library())
@@ -157,7 +161,8 @@ class Core:
         previous steps.
         """
         n = self.n
-        out, held = np.empty((len(q), n + 6)), np.empty((len(q), n), dtype=bool)
+        out = np.empty((len(q), n + 6))
+        held = np.empty((len(q), n), dtype=bool)
         arrays = [None if a is None else _plain(a) for a in (q, target, feed, tip, last)]
         mode = ctypes.c_int32(IK_MUST_SEE | _mode(target, feed, tip))
         self._run("hk_ik_steps", len(q), [mode], [*arrays, out, held])
@@ -172,13 +177,16 @@ class Core:
         """Return the result of `hk_ik_find` for starts q (N, n)."""
         n_rows = len(q)
         best = _plain(q).copy()
-        J, e = np.empty((n_rows, self.rows, self.n)), np.empty((n_rows, self.rows))
-        outcome, n_iter = np.empty(n_rows, dtype=np.int32), np.empty(n_rows, dtype=np.int32)
+        J = np.empty((n_rows, self.rows, self.n))
+        e = np.empty((n_rows, self.rows))
+        outcome = np.empty(n_rows, dtype=np.int32)
+        n_iter = np.empty(n_rows, dtype=np.int32)
         metres, radians = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
         tolerances = metres, radians * self.settings.task.units[-1]
         numbers = [*map(ctypes.c_int32, (mode, max_iter)), *map(ctypes.c_double, tolerances)]
         self._run("hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter])
-        error, result = torch.from_numpy(e), torch.from_numpy(outcome)
+        error = torch.from_numpy(e)
+        result = torch.from_numpy(outcome)
         iterations = torch.from_numpy(n_iter).long()
         return Found(
             torch.from_numpy(best),
@@ -226,7 +234,9 @@ class Follower:
     def __init__(
         self, core: Core, memory: float | None, mode: int = 0, state: NDArray | None = None
     ) -> None:
-        self.core, self._memory, self._least = core, memory, mode
+        self.core = core
+        self._memory = memory
+        self._least = mode
         n = core.n
         self.state = state = np.zeros(IK_Q + 7 * core.n) if state is None else state
         self.task = core.settings.task
@@ -236,14 +246,16 @@ class Follower:
         self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
         self._inputs = {at: state[at : at + 3] for at in (IK_TARGET, IK_FEED, IK_TIP)}
         self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
-        self._follow, self._mode = opened_library().hk_ik_tick, -1
+        self._follow = opened_library().hk_ik_tick
+        self._mode = -1
 
     def __reduce__(self) -> tuple[type[Follower], tuple]:
         return Follower, (self.core, self._memory, self._least, self.state.copy())
 
     def start(self, q: Tensor, dq: Tensor) -> None:
         """Set the initial configuration (1, n), and the step that led to it."""
-        state, n = self.state, self.core.n
+        state = self.state
+        n = self.core.n
         state[IK_SIGMA_MIN:] = 0.0
         state[[IK_SIGMA_MIN, IK_DISTANCE, *range(IK_ERROR, IK_Q)]] = math.nan
         state[IK_X:IK_ERROR] = self.core.settings.evaluate(q)[0][0]
@@ -307,7 +319,8 @@ class Follower:
 
     def last(self) -> Tick:
         """Return the results of the last tick."""
-        a, n = torch.from_numpy(self.state.copy())[None], self.core.n
+        a = torch.from_numpy(self.state.copy())[None]
+        n = self.core.n
         _, dq, before, held, J = a[:, IK_Q:].split([n, n, n, n, 3 * n], dim=1)
         step = StepRows(dq, a[:, IK_SIGMA_MIN], a[:, IK_DAMPING], held > 0.0)
         return Tick(before, a[:, IK_X:IK_ERROR], J.view(1, 3, n), a[:, IK_ERROR:IK_Q], step)

@@ -26,7 +26,9 @@ from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
 
 _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
-_OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
+# in place of the error: reached outside the domain, and inside
+_OUTSIDE = -1.0
+_DONE = -2.0
 _RETURNS = 30  # attempts to return rows that ended outside the tip limits
 _PARTS = [4, 8, 16]  # where further starts are split; only rows still open use the next part
 _ROWS = 256  # rows searched again at once
@@ -102,7 +104,8 @@ class Search:
     def solve(self, q: Tensor, target: Tensor, cold: bool, restarts: int) -> Found:
         """Return the best points from starts q (N, n), and from further starts if these fail."""
         settings = self.settings
-        q, target = settings.start_at(q), settings.allowed(target)
+        q = settings.start_at(q)
+        target = settings.allowed(target)
         if cold and len(q) > 0 and row_gram(settings.evaluate(q[:1])[1]).is_singular.all():
             # At a straight backbone, motions that cancel to first order would be missed.
             at_start = self._start(q, target)
@@ -134,7 +137,8 @@ class Search:
 
         Rows without a further point have NaN as q.
         """
-        settings, n_starts = self.settings, restarts + 1
+        settings = self.settings
+        n_starts = restarts + 1
         spans = settings.spans.to(start)
         tol = (
             tuple(_FINE * t for t in self.tol) if isinstance(self.tol, tuple) else _FINE * self.tol
@@ -192,7 +196,8 @@ class Search:
         n_starts = starts.shape[1]
         if rows.numel() == 0 or n_starts == 0:
             return
-        q, target = starts.flatten(0, 1), found.target[rows].repeat_interleave(n_starts, 0)
+        q = starts.flatten(0, 1)
+        target = found.target[rows].repeat_interleave(n_starts, 0)
         again = self._attempt(self.settings.start_at(q), target)
         n_iter = found.n_iter[rows] + again.n_iter.view(-1, n_starts).sum(1)
         n_tried = found.n_starts[rows] + n_starts
@@ -233,7 +238,8 @@ class Search:
             going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
             if not going.all():
                 found.put(rows[~going], live.take(~going))
-                rows, live = rows[going], live.take(going)
+                rows = rows[going]
+                live = live.take(going)
             if rows.numel() == 0:
                 break
             self._lower_once(live)
@@ -241,7 +247,8 @@ class Search:
 
     def _lower_once(self, live: _Descent) -> None:
         """Try a step of all rows, and take it where it lowers the error."""
-        settings, error = self.settings, live.error
+        settings = self.settings
+        error = live.error
         # Damping proportional to the error: the last iterations are Gauss-Newton steps.
         trust = live.nu * (error / live.start)
         lower, upper = settings.step_bounds(live.q)
@@ -294,7 +301,8 @@ class Search:
         all_rows = rows = found.reached.nonzero()[:, 0]
         if rows.numel() == 0:
             return
-        task, unit = self.settings.task, self.settings.unit(found.q)
+        task = self.settings.task
+        unit = self.settings.unit(found.q)
         inside = task.in_domain(found.q)
         live = self._slide(found.take(rows), wanted, torch.ones_like(found.e[rows, 0]))
         for iteration in range(IK_NULL_STEPS):
@@ -305,7 +313,8 @@ class Search:
             gain = 0.5 * ((live.free + new.free) / unit * way).sum(-1)
             moved = live.J.flatten(1).norm(dim=-1) * step.dq.norm(dim=-1)
             loose = new.error <= IK_NULL_SLIP * moved
-            reached, reached_new = self._within(live.e), self._within(new.e)
+            reached = self._within(live.e)
+            reached_new = self._within(new.e)
             ok = ((loose | reached_new) & (gain > 0.0)) | last
             ok |= ~reached & (new.error < 0.5 * live.error)
             ok &= task.in_domain(new.q) | ~inside[rows]
@@ -320,7 +329,8 @@ class Search:
             new.share = new.share.clamp(0.1, 4.0)
             live.share = 0.25 * live.share
             live.put(ok, new.take(ok))
-            rows, live = rows[going], live.take(going)
+            rows = rows[going]
+            live = live.take(going)
             if rows.numel() == 0:
                 break
         _, ended = self._try_step(found.take(all_rows), None, hold=True)
@@ -348,7 +358,8 @@ class Search:
 
     def _blocked(self, at: Point) -> Tensor:
         """Return whether no motion within the limits lowers the error to first order."""
-        q, (lower, upper) = at.q, self.settings.box(at.q)
+        q = at.q
+        lower, upper = self.settings.box(at.q)
         pull = apply_columns(at.J, at.e)
         out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
         out &= torch.isinf(self.settings.periods.to(q.device))
@@ -362,7 +373,8 @@ class Search:
         stationary but not minimal. A second-order motion is needed, which is large even for small
         errors: 5 % of the limits, or the motion that moves a regular tip by a tenth of the error.
         """
-        n, settings = found.q.shape[-1], self.settings
+        n = found.q.shape[-1]
+        settings = self.settings
         size = 0.1 * _per_tip(found.J, found.error)[:, None].expand_as(found.q)
         span = 0.05 * (settings.q_max - settings.q_min).to(found.q)
         size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)

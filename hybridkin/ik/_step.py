@@ -28,7 +28,9 @@ from hybridkin.ik._gram import (
 )
 from hybridkin.ik._settings import StepSettings, stopping
 
-_PROJECTIONS, _EXCESS = 8, 1.5  # for a step that would leave the tip limits
+# for a step that would leave the tip limits
+_PROJECTIONS = 8
+_EXCESS = 1.5
 
 
 class StepRows(NamedTuple):
@@ -88,7 +90,8 @@ def control_step(
     if last is not None:
         fine = fine & _finite(last)
         before = torch.where(_finite(last), last, 0.0)
-    at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
+    at = torch.where(fine, q, 0.0)
+    e = torch.where(fine, e, 0.0)
     J = _only_taut(settings, torch.where(fine[..., None], J, 0.0))
     limits = None if tip is None else settings.tip_limits
     posture = None
@@ -149,7 +152,9 @@ def _step_inside(
     end. A remaining violation is removed by taking a fraction of the way from a safe step, one
     that stays or returns, to this step.
     """
-    limits, close = settings.tip_limits, 32.0 * torch.finfo(v.dtype).eps  # [m]
+    # [m]
+    limits = settings.tip_limits
+    close = 32.0 * torch.finfo(v.dtype).eps
     assert limits is not None
 
     def taken(way: Tensor, z: Tensor | None = z) -> tuple[StepRows, Tensor]:
@@ -192,9 +197,12 @@ def limited_step(
     so it can use estimates of the singular values (`quick`), and `trust`,
     lambda^2 / sigma_max^2, in place of the damping.
     """
-    box, unit = (lower, upper), settings.unit(v)
+    box = (lower, upper)
+    unit = settings.unit(v)
     if settings.weights is not None:
-        J, lower, upper = J * unit, lower / unit, upper / unit
+        J = J * unit
+        lower = lower / unit
+        upper = upper / unit
         posture = None if posture is None else posture / unit
     gram = quick_gram(J, trust is not None) if quick else row_gram(J)
     if trust is not None:
@@ -285,7 +293,9 @@ def _arriving(
     Newton's method corrects it within the bounds. Where the result is less than half of the motion
     v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
     """
-    pulls, task, x = settings.pulls.to(q), settings.task, settings.evaluate(q)[0]
+    pulls = settings.pulls.to(q)
+    task = settings.task
+    x = settings.evaluate(q)[0]
 
     def end_of(dq: Tensor, motion: Tensor) -> _End:
         tip, slope = settings.evaluate(q + dq)
@@ -297,7 +307,8 @@ def _arriving(
             going = best.distance > close
             if not going.any():
                 break
-            low, high = lower - end.dq, upper - end.dq
+            low = lower - end.dq
+            high = upper - end.dq
             more = limited_step(settings, end.J, end.missing, None, low, high).dq
             dq = torch.clamp(end.dq + more, lower, upper)
             dq = torch.where(more <= low, lower, torch.where(more >= high, upper, dq))

@@ -69,7 +69,9 @@ class Tracker(Portable):
         memory = None if memory is None else number(memory, "memory")
         good = memory is None or 0.0 < memory < math.inf
         require(good, f"`memory` must be a positive time [s], got {memory!r}.")
-        self._settings, self._tol, self._memory = settings, tol, memory
+        self._settings = settings
+        self._tol = tol
+        self._memory = memory
         self._as_numpy = is_numpy(q0)
         self._lock = Lock()  # of the state, for threads that share the tracker
         self.reset(q0)
@@ -135,7 +137,8 @@ class Tracker(Portable):
         was damped or no motion is possible, MAX_ITER otherwise. INVALID_INPUT before the first
         step, and if the target, the measured tip or the model's output was not finite.
         """
-        last, task = self._last(), self._robot.task
+        last = self._last()
+        task = self._robot.task
         step = last.step
         if not torch.isfinite(last.e.norm() + step.sigma_min):
             return IKStatus.INVALID_INPUT
@@ -168,14 +171,17 @@ class Tracker(Portable):
     def _start(self, q: Tensor, dq: Tensor) -> None:
         """Read the model, and start at q (n,) after a step dq (n,)."""
         self._settings = settings = self._settings.present()
-        core, task = core_of(settings), settings.task
+        core = core_of(settings)
+        task = settings.task
         if core is not None and self._as_numpy and q.dtype == torch.float64:
             robot = Follower(core, self._memory)
         else:
             reason = "`q0` is no float64 array of NumPy" if core else why_torch(settings)
             robot = _InTorch(settings, self._memory, self._as_numpy, reason)
         robot.start(q[None], dq[None])
-        self._estimator, self._module, self._robot = task.estimator, task.module, robot
+        self._estimator = task.estimator
+        self._module = task.module
+        self._robot = robot
 
     def step(
         self, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
@@ -210,9 +216,11 @@ class Tracker(Portable):
 
     def _step(self, x_target: Array, dx: Array | None, x_measured: Array | None) -> None:
         """Do a step with arguments that need full checks."""
-        settings, like = self._settings, self._like
+        settings = self._settings
+        like = self._like
         target = settings.points(x_target, "x_target", like, lead="")[None]
-        feed_forward, tip = None, None
+        feed_forward = None
+        tip = None
         if dx is not None:
             rows = (sum(settings.task.parts),)
             feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)[None]
@@ -233,7 +241,8 @@ class Tracker(Portable):
         Rows are the points of the path (T, ...). Held and damped refer to the step to the point,
         all others to the state at the point.
         """
-        task, n = self._settings.task, len(targets)
+        task = self._settings.task
+        n = len(targets)
         ahead = task.difference(targets, torch.cat([targets[1:], targets[-1:]]))
         ahead = torch.where(torch.isfinite(ahead).all(-1, keepdim=True), ahead, 0.0)
         known = torch.isfinite(targets.flatten(1)).all(-1).tolist()
@@ -245,7 +254,8 @@ class Tracker(Portable):
                 progress(i, n)
             tip = None if plant is None else self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
-            ahead_now, target = ahead[i : i + 1], target if known[i] else None
+            ahead_now = ahead[i : i + 1]
+            target = target if known[i] else None
             tick = self._robot.advance(periods[i], target, ahead_now, used)
             rows.append((tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped))
             held = tick.step.saturated.any(-1) | tick.step.stopped
@@ -272,16 +282,20 @@ class _InTorch:
     def __init__(
         self, settings: StepSettings, memory: float | None, as_numpy: bool, reason: str
     ) -> None:
-        self._memory, self._as_numpy, self.backend = memory, as_numpy, f"torch: {reason}"
+        self._memory = memory
+        self._as_numpy = as_numpy
+        self.backend = f"torch: {reason}"
         self.task = settings.task.frozen()
         self._settings = replace(settings, task=self.task)
 
     @torch.no_grad()
     def start(self, q: Tensor, dq: Tensor) -> None:
         """Set the initial configuration (1, n), and the step that led to it."""
-        self._q, (x, J) = q, self._settings.evaluate(q)
+        self._q = q
+        x, J = self._settings.evaluate(q)
         self._offset = x.new_zeros(1, sum(self.task.parts))  # last measured minus model
-        unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(q)
+        unknown = torch.full_like(self._offset, math.nan)
+        none = torch.zeros_like(q)
         step = StepRows(dq, unknown[:, 0], none[:, 0], none > 0.0)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
@@ -302,9 +316,11 @@ class _InTorch:
 
         If `tip` is None the model's is used. Without a target the step is feed-forward only.
         """
-        settings, task = self._settings, self.task
+        settings = self._settings
+        task = self.task
         x, J = settings.evaluate(self._q)
-        error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
+        error = torch.full_like(self._offset, math.nan)
+        used = torch.zeros_like(self._offset)
         if target is not None:
             error = used = task.difference(x, target)
             if tip is not None:
@@ -322,7 +338,8 @@ class _InTorch:
         step = control_step(settings, self._q, J, used, feed_forward, seconds, last, at)
         if self._memory is not None:
             self._offset = math.exp(-seconds / self._memory) * self._offset
-        self._last, self._period = Tick(self._q, x, J, error, step), seconds
+        self._last = Tick(self._q, x, J, error, step)
+        self._period = seconds
         self._q = self._q + step.dq
         return self._last
 
