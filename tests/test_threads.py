@@ -126,7 +126,8 @@ def test_a_child_computes_after_a_fork():
         child = os.fork()
         if child == 0:
             signal.alarm(int(LONG))  # ends a child that waits
-            found = (rows.sin().sum(), model.module_(rows))
+            x = model.module_(rows)
+            found = (rows.sin().sum(), x)
             hybrid("kernel").fit(Q, X)
             same = all(torch.allclose(a, b) for a, b in zip(found, expected, strict=True))
             os._exit(0 if same else 1)
@@ -135,6 +136,46 @@ def test_a_child_computes_after_a_fork():
         torch.set_num_threads(threads)
         done.set()
         holder.join(LONG)
+
+
+def in_child(work):
+    """Return the bytes that a function returns in a forked child."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(int(LONG))
+        os.write(writing, work())
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    os.close(writing)
+    with os.fdopen(reading, "rb") as pipe:
+        return pipe.read()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_child_keeps_its_number_of_threads():
+    """Until it computes; a number that the child chooses itself stays."""
+    module, rows, threads = trunk(), torch.from_numpy(Q), torch.get_num_threads()
+
+    def counts():
+        inherited = torch.get_num_threads()
+        module(rows)
+        return bytes([inherited, torch.get_num_threads()])
+
+    def chosen():
+        torch.set_num_threads(2)
+        module(rows)
+        return bytes([torch.get_num_threads()])
+
+    try:
+        torch.set_num_threads(3)
+        assert in_child(counts) == bytes([3, 1])
+        assert in_child(chosen) == bytes([2])
+        module(rows)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
 
 
 def test_a_model_is_copied_while_another_thread_compiles_it():

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
 from torch import Tensor
 
+from hybridkin._core.turns import THREADS
+
 
 @runtime_checkable
 class Transform(Protocol):
@@ -37,6 +39,7 @@ def as_tensor(
 
     float32 is kept; all other types become float64.
     """
+    THREADS.check()
     if isinstance(value, Transform):
         value = value.get_matrix()
     if not isinstance(value, Tensor):
@@ -49,6 +52,7 @@ def as_tensor(
 
 def real_array(value: Numbers | Transform, name: str) -> NDArray:
     """Return a caller's real numbers as an array; float32 is kept, others become float64."""
+    THREADS.check()
     if isinstance(value, (Tensor, Transform)):
         return as_tensor(value, name).numpy(force=True)
     if np.ma.is_masked(value):
@@ -123,7 +127,8 @@ def check_shape(
 
     In `need`, digits are lengths, equal letters are equal lengths, a leading "..." is any axes.
     """
-    got, sizes = tuple(value.shape), [str(size) for size in need if size != "..."]
+    got = tuple(value.shape)
+    sizes = [str(size) for size in need if size != "..."]
     axes = got[-len(sizes) :] if len(sizes) < len(need) else got
     lengths = {
         size: int(size) if size.isdigit() else n for size, n in zip(sizes, axes, strict=False)

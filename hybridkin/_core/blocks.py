@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import check_shape
-
-if hasattr(os, "register_at_fork"):
-    # A forked child has no OpenMP threads, and would wait for them forever.
-    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
+from hybridkin._core.turns import THREADS
 
 
 def in_blocks(
@@ -36,6 +32,7 @@ def in_blocks(
 
 def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:
     """Raise if `value` is not a dense tensor of float64 or float32."""
+    THREADS.check()
     if not isinstance(value, Tensor):
         raise TypeError(
             f"`{name}` must be a torch tensor of shape (..., {size}), got "

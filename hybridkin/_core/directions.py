@@ -43,7 +43,9 @@ def moved_directions(X: NDArray) -> Directions:
     direction that moves by less than 1 % of the largest motion counts as still.
     """
     X = X.astype(np.float64)
-    mean, half, size = X.mean(axis=0), 0.5 * np.ptp(X, axis=0), np.abs(X).max(axis=0)
+    mean = X.mean(axis=0)
+    half = 0.5 * np.ptp(X, axis=0)
+    size = np.abs(X).max(axis=0)
     moves = half > _ROUNDING * size
     scale = np.where(moves, half, max(half.max(), _POINT * size.max(), _POINT**2))
     rows = np.where(moves, (X - mean) / scale, 0.0)

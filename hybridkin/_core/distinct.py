@@ -52,7 +52,8 @@ def distinct_rows(
         kept = np.flatnonzero(times)
         keys = rows[kept].view(np.dtype((np.void, rows.itemsize * rows.shape[1])))[:, 0]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    order, place = np.argsort(first), np.full(len(rows), -1)
+    order = np.argsort(first)
+    place = np.full(len(rows), -1)
     place[kept] = np.argsort(order)[inverse]
     counts = np.bincount(place[kept], weights=times[kept])
     return kept[first[order]], None if (counts == 1.0).all() else counts, place

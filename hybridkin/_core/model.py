@@ -36,7 +36,8 @@ class Portable:
     """An object whose pickle and joblib hash are the same in every process.
 
     Tensors, also those in dicts, are pickled as plain arrays. They are restored on their device,
-    or on the CPU if that device does not exist. What belongs to the process is not pickled.
+    else on the first device of its kind, else on the CPU. What belongs to the process is not
+    pickled.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -66,8 +67,17 @@ def _opened(value: Any) -> Any:
         return type(value)((key, _opened(entry)) for key, entry in value.items())
     if not isinstance(value, _Closed):
         return value
-    device = value.device if torch.cuda.is_available() else "cpu"
-    return torch.tensor(value.array, device=device)
+    return torch.tensor(value.array, device=_present(torch.device(value.device)))
+
+
+def _present(device: torch.device) -> torch.device:
+    """Return a device, or the first one of its kind, or the CPU, whatever this machine has."""
+    count = torch.cuda.device_count() if device.type == "cuda" else 0
+    if device.type != "cpu" and count == 0:
+        return torch.device("cpu")
+    if device.index is not None and device.index >= count > 0:
+        return torch.device(device.type, 0)
+    return device
 
 
 class PortableModule(Portable, nn.Module):

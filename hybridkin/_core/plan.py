@@ -77,7 +77,9 @@ class Plan:
         self.data = memory[start : start + self._length + HK_GROUP]
         self.data[:-HK_GROUP] = np.concatenate(self._data)
         self.places = [*self._place_of.values()]
-        self._data, self._place_of = [], {}  # do not pickle them twice
+        # do not pickle them twice
+        self._data = []
+        self._place_of = {}
         for array in (self.code, self.data):
             array.flags.writeable = False
 

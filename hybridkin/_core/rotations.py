@@ -62,7 +62,8 @@ def rotation_vector(R: Tensor) -> Tensor:
     row = whole.gather(-2, largest.expand(*largest.shape[:-1], 4))[..., 0, :]
     row = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
     row = torch.where(row[..., :1] < 0.0, -row, row)
-    w, axis = row[..., :1], row[..., 1:]
+    w = row[..., :1]
+    axis = row[..., 1:]
     square = axis.square().sum(-1, keepdim=True)
     tiny = square < 1e-12
     size = torch.where(tiny, 1.0, square).sqrt()

@@ -113,7 +113,8 @@ class Stored:
         """
         if key not in self.settings:
             raise ValueError(f"`{key}` of {self.kind!r} is missing")
-        value, kinds = self.settings[key], kinds if isinstance(kinds, tuple) else (kinds,)
+        value = self.settings[key]
+        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
         if type(value) is int and float in kinds and int not in kinds:
             value = float(value)
         if (None if value is None else type(value)) not in kinds:
@@ -163,7 +164,8 @@ class Stored:
             One letter per axis of every array; equal letters are equal lengths:
             ``tensors(coef="mn", bias="m")``.
         """
-        lengths, found = {}, {}
+        lengths = {}
+        found = {}
         for name, letters in shapes.items():
             array = self.array(name, [lengths.get(letter, letter) for letter in letters])
             lengths |= dict(zip(letters, array.shape, strict=True))
@@ -219,7 +221,8 @@ def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
 
 def restore_columns(estimator: Any, stored: Stored, n: int) -> None:
     """Set the number of columns, and their names if there are any, as scikit-learn keeps them."""
-    estimator.n_features_in_, names = n, stored.list_of(str, "feature_names_in")
+    estimator.n_features_in_ = n
+    names = stored.list_of(str, "feature_names_in")
     if names and len(names) != n:
         raise ValueError(f"`feature_names_in` must be {n} names, got {len(names)}")
     if names:

@@ -63,6 +63,8 @@ def stumpff(s: Tensor) -> Stumpff:
     far_c3 = (1.0 - torch.sin(theta) / theta) / far
     far_c4 = (0.5 - (1.0 - c) / far) / far
     bent = s > _SERIES_END
-    c3, c4 = torch.where(bent, far_c3, c3), torch.where(bent, far_c4, c4)
-    f, g = 1.0 - s * c3, 0.5 - s * c4
+    c3 = torch.where(bent, far_c3, c3)
+    c4 = torch.where(bent, far_c4, c4)
+    f = 1.0 - s * c3
+    g = 0.5 - s * c4
     return Stumpff(torch.where(bent, c, 1.0 - s * g), f, g, c3, c4)

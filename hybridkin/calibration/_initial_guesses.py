@@ -62,7 +62,8 @@ def aligned(chain: _Chain, rows: Rows) -> _Chain:
     x = torch.from_numpy(points(rows.x.numpy())[rows.seen])
     tips = x + torch.from_numpy(rows.residual(chain)).to(x)
     weight = torch.from_numpy(rows.weights).to(x)[:, None] / rows.weights.sum()
-    here, there = (weight * tips).sum(0), (weight * x).sum(0)
+    here = (weight * tips).sum(0)
+    there = (weight * x).sum(0)
     rotation, _ = nearest_rotation((weight * (x - there)).mT @ (tips - here))
     move = torch.eye(4, dtype=here.dtype, device=here.device)
     move[:3, :3] = rotation
@@ -84,7 +85,8 @@ def _searched(chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool) ->
                         tried = [*choice[:k], option, *choice[k + 1 :]]
                         rms = _chosen(chain, tried, scale, rows, free_base)[1]
                         if rms < score * (1.0 - 1e-9):
-                            score, choice = rms, tried
+                            score = rms
+                            choice = tried
             guess, _ = _chosen(chain, choice, scale, rows, free_base)
             key = tuple(choice)
             if key not in found or score < found[key][0]:

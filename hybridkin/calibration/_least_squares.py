@@ -74,7 +74,8 @@ class Rows(NamedTuple):
 
     def noise(self, residual: NDArray, robust: bool) -> float:
         """Return the standard deviation of one coordinate, from the median if robust."""
-        squares, weight = _squares(residual), self.weights
+        squares = _squares(residual)
+        weight = self.weights
         if not robust:
             return float(np.sqrt(np.average(squares, weights=weight) / 3.0))
         order = np.argsort(squares)
@@ -146,17 +147,21 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
     floor = 1e-12 * float(problem.chain.reach)
     robust = loss != "linear"
     sigma = max(rows.noise(residual(theta), robust), floor)
-    converged, tol = False, 1e-5 if roughly else 1e-12
+    converged = False
+    tol = 1e-5 if roughly else 1e-12
     options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol)
     options |= {"jac": slope, "bounds": (problem.low, problem.high), "max_nfev": 100}
     options |= {"loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"}
     for _ in range(2 if roughly else _MAX_ROUNDS):
         solution = least_squares(whitened, theta, args=(sigma,), **options)
-        theta, converged = solution.x, solution.status > 0
-        previous, sigma = sigma, max(rows.noise(residual(theta), robust), floor)
+        theta = solution.x
+        converged = solution.status > 0
+        previous = sigma
+        sigma = max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    found, count = rows.rmse(known(theta.tobytes())[0]), float(weight.sum())
+    found = rows.rmse(known(theta.tobytes())[0])
+    count = float(weight.sum())
     free = max(3.0 * count - theta.size, 1.0)
     noise = max(sigma if robust else found * (count / free) ** 0.5, floor)
     return Fit(problem, theta, jacobian(theta), noise, found, bool(converged))

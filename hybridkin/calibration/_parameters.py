@@ -89,7 +89,8 @@ class Entries(_Named):
         origin = np.abs(origin) if self.log else origin
         low, high = self.physical if bound is None else bound
         if bound is None:  # the start itself is always allowed
-            low, high = np.minimum(low, origin), np.maximum(high, origin)
+            low = np.minimum(low, origin)
+            high = np.maximum(high, origin)
         if not np.all(np.less(low, high)) or (self.log and np.any(np.less(low, 0.0))):
             need = "(low, high) with low < high" + ", and must not be negative" * self.log
             raise ValueError(f"`bounds` of {self.name!r} must be {need}, got {bound}.")
@@ -163,22 +164,31 @@ def parameter(chain: Chain, name: str) -> Parameter:
     """Return the free directions of one parameter, at the chain's present geometry."""
     geometry = {key: value.detach().cpu() for key, value in chain.geometry().items()}
     entry = name if name in geometry else ALIASES[name]
-    start, reach = geometry[entry], float(chain.reach)
-    shape, size = tuple(start.shape), start.numel()
+    start = geometry[entry]
+    reach = float(chain.reach)
+    shape = tuple(start.shape)
+    size = start.numel()
     if name == "base":
         labels = tuple(f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z"))
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
-    unit, kind, physical, origin = reach, "m", (-np.inf, np.inf), np.abs(start.numpy().ravel())
+    unit = reach
+    kind = "m"
+    physical = (-np.inf, np.inf)
+    origin = np.abs(start.numpy().ravel())
     joints = chain.units if isinstance(chain, RigidChain) else []
     kinds = tuple(joints) if entry == "joint_zeros" else ()
     if entry in SCALED:
-        unit, kind = 1.0, "-"
+        unit = 1.0
+        kind = "-"
         physical = origin / SCALED[entry], origin * SCALED[entry]
     elif entry == "rest_bends":
-        unit, kind, physical = 1.0, "rad", (-math.pi, math.pi)
+        unit = 1.0
+        kind = "rad"
+        physical = (-math.pi, math.pi)
     elif entry == "angles":
-        unit, kind = 1.0, "rad"
+        unit = 1.0
+        kind = "rad"
     elif entry == "offsets":
         physical = (_SHORTEST * reach, np.inf)
     elif kinds:
@@ -188,17 +198,24 @@ def parameter(chain: Chain, name: str) -> Parameter:
     elif entry == "actuator_zeros":
         unit = float(geometry["radii"].mean() / geometry["gains"].abs().mean())
         kind = "m" if (geometry["gains"] == 1.0).all() else "q"
-    directions, shown = unit * np.eye(size), np.arange(size)
+    directions = unit * np.eye(size)
+    shown = np.arange(size)
     if name == "turns" and isinstance(chain, ArcChain):  # each segment's actuators together
         counts = np.array(chain.actuators_per_segment)
         directions = np.repeat(np.eye(len(counts)), counts, axis=0)
-        shown, shape = np.cumsum(counts) - counts, (len(counts),)
+        shown = np.cumsum(counts) - counts
+        shape = (len(counts),)
     elif name == "gain":  # a common factor
-        directions, shown, shape = np.ones((size, 1)), shown[:1], ()
+        directions = np.ones((size, 1))
+        shown = shown[:1]
+        shape = ()
         physical = origin[:1] / SCALED[entry], origin[:1] * SCALED[entry]
     elif name != entry:  # "tool", the last of the offsets
-        directions, shown, shape = directions[:, -1:], shown[-1:], ()
-    labels, size = _labels(name, shape), len(shown)
+        directions = directions[:, -1:]
+        shown = shown[-1:]
+        shape = ()
+    labels = _labels(name, shape)
+    size = len(shown)
     basic = name, entry, start, labels, np.broadcast_to(unit, size), kinds or (kind,) * size
     return Entries(*basic, directions, physical, shown, shape, log=entry in SCALED)
 

@@ -71,7 +71,8 @@ def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit
 
     Among equal fits the first is taken; a mirror image is taken only if it is clearly better.
     """
-    best, image = fits[0], None
+    best = fits[0]
+    image = None
     for fit, guess in zip(fits[1:], guesses[1:], strict=True):
         if not any(guess.mirrored):
             best = fit if fit.rmse < _EQUAL * best.rmse else best

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,14 @@ _DETERMINED = 0.05  # largest standard error of the logarithm
 _STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%"), "q": (1.0, "of q")}
 
 
+class _Term(NamedTuple):
+    """A part of a direction: one free direction, or all of a parameter that change equally."""
+
+    label: str
+    size: float  # in steps of its unit
+    place: int  # of its (first) free direction
+
+
 def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float) -> tuple[str, ...]:
     """Return a sentence for each direction that hardly moves the tips, in few parameters.
 
@@ -33,28 +43,43 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
     columns = 1e3 * fit.jacobian * problem.prior_std / np.sqrt(n_rows)  # [mm] of tip
     found = []
     for move in few_terms(directions):
-        # The first parameter with a fair share is named first and changes by one step.
+        # The first parameter with a fair part is named first and changes by one step.
         lead = int(np.argmax(np.abs(move) > _FAIR * np.abs(move).max()))
         move = move / (move[lead] * to_steps[lead])
         tips = float(np.linalg.norm(columns @ move))
-        alone = np.abs(move) * np.linalg.norm(columns, axis=0)
-        counts = alone > max(_SMALL * tips, _SLIGHT * alone.max(), _STILL)
-        effect = f"moves the tips by {tips:.2g} mm rms" if tips >= _STILL else _NO_EFFECT
+        by_one = np.abs(move) * np.linalg.norm(columns, axis=0)
+        noticed = by_one > max(_SMALL * tips, _SLIGHT * by_one.max(), _STILL)
         terms = _terms(problem, move * to_steps, lead)
-        shown = [term for term in terms if abs(term[1]) > _SMALL][:_N_TERMS]
-        hidden = sum(counts[term[2]] for term in terms if term not in shown)
-        words = [f"{label} {at:+.3g} {steps[i][1]}" for label, at, i in shown]
-        rest = [", ".join(words[1:]), f"{hidden} smaller" if hidden else ""]
-        moved = " with ".join(filter(None, [words[0], " and ".join(filter(None, rest))]))
-        name_of = [part.name for part in problem.parameters for _ in part.labels]
-        first, *others = [(label.removeprefix("all "), name_of[i], i) for label, _, i in shown]
-        advice, known = f"leave {first[0]} out or measure it", ""
-        if others:
-            second = next((other for other in others if other[1] != first[1]), others[0])
-            advice = f"leave out or measure {first[0]} or {second[0]}"
-            known = _determined(fit, covariance, move * to_steps, first[2], second[2])
-        found.append(f"{moved} {effect}: {advice}.{known}")
+        shown = [term for term in terms if abs(term.size) > _SMALL][:_N_TERMS]
+        n_hidden = sum(noticed[term.place] for term in terms if term not in shown)
+        effect = f"moves the tips by {tips:.2g} mm rms" if tips >= _STILL else _NO_EFFECT
+        words = [f"{label} {size:+.3g} {steps[place][1]}" for label, size, place in shown]
+        advice = _advice(fit, covariance, move * to_steps, shown)
+        found.append(f"{_joined(words, n_hidden)} {effect}: {advice}")
     return tuple(found)
+
+
+def _joined(words: list[str], n_hidden: int) -> str:
+    """Return the first part of a direction "with" the others."""
+    others = [", ".join(words[1:])] if len(words) > 1 else []
+    if n_hidden:
+        others.append(f"{n_hidden} smaller")
+    return " with ".join([words[0], " and ".join(others)]) if others else words[0]
+
+
+def _advice(fit: Fit, covariance: NDArray, move: NDArray, shown: list[_Term]) -> str:
+    """Return what to leave out or measure, and what the data identify nevertheless."""
+    name_of = [part.name for part in fit.problem.parameters for _ in part.labels]
+    labels = [term.label.removeprefix("all ") for term in shown]
+    if len(shown) == 1:
+        return f"leave {labels[0]} out or measure it."
+    second = 1
+    for k in range(1, len(shown)):
+        if name_of[shown[k].place] != name_of[shown[0].place]:
+            second = k
+            break
+    determined = _determined(fit, covariance, move, shown[0].place, shown[second].place)
+    return f"leave out or measure {labels[0]} or {labels[second]}.{determined}"
 
 
 def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) -> str:
@@ -62,7 +87,9 @@ def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) ->
 
     They do if both change by the same factor and the standard error of the logarithm is small.
     """
-    parts, labels, geometry = fit.problem.parameters, fit.problem.labels, fit.chain().geometry()
+    parts = fit.problem.parameters
+    labels = fit.problem.labels
+    geometry = fit.chain().geometry()
     kinds = [kind for part in parts for kind in part.kind]
     if not kinds[i] == kinds[j] == "-" or abs(abs(move[i]) - abs(move[j])) > _ALIKE * abs(move[i]):
         return ""
@@ -76,18 +103,18 @@ def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) ->
     return shown if error < _DETERMINED else ""
 
 
-def _terms(problem: Problem, shown: NDArray, lead: int) -> list[tuple[str, float, int]]:
-    """Return a change as (label, size, index): the leading one, then the largest first.
-
-    Entries of one name that all change equally count as one.
-    """
-    terms, row = [], 0
+def _terms(problem: Problem, move: NDArray, lead: int) -> list[_Term]:
+    """Return the parts of a direction: the leading one, then the largest first."""
+    terms = []
+    row = 0
     for part in problem.parameters:
-        own = shown[row : row + part.size]
-        alike = part.size > 1 and np.ptp(own) < _ALIKE * np.abs(own).max()
-        for i, at in enumerate(own[:1] if alike else own):
-            label = f"all {part.name}" if alike else part.labels[i]
-            leads = row <= lead < row + part.size if alike else row + i == lead
-            terms.append((not leads, -abs(at), (label, float(at), row + i)))
+        sizes = move[row : row + part.size]
+        if part.size > 1 and np.ptp(sizes) < _ALIKE * np.abs(sizes).max():
+            leads = row <= lead < row + part.size
+            terms.append((leads, _Term(f"all {part.name}", float(sizes[0]), row)))
+        else:
+            for index, (label, size) in enumerate(zip(part.labels, sizes, strict=True), row):
+                terms.append((index == lead, _Term(label, float(size), index)))
         row += part.size
-    return [term for *_, term in sorted(terms)]
+    terms.sort(key=lambda pair: (not pair[0], -abs(pair[1].size), pair[1]))
+    return [term for _, term in terms]

@@ -31,7 +31,9 @@ __all__ = ["CalibrationResult", "calibrate"]
 # Identified if the standard error is below this fraction of the prior. (The prior alone narrows k
 # parameters that share one unidentified direction to 1 / sqrt(k).)
 _IDENTIFIED = 0.1
-_FEW, _LEFT = 10, 0.5  # fewest rows; ratio of residual to spread, a quarter of the variance
+# fewest rows; ratio of residual to spread, a quarter of the variance
+_FEW = 10
+_LEFT = 0.5
 _MEASURED = ("radii", "lengths")  # sizes that can be measured with a ruler:
 _UNPHYSICAL = 1.75  # a change by this factor gives a warning
 
@@ -227,7 +229,8 @@ def fit_geometry(
         )
     names = _check_parameters(chain, parameters, bounds, prior)
     one_of(loss, "loss", LOSSES)
-    torch_given, device = isinstance(q, Tensor), chain.geometry()["base"].device
+    torch_given = isinstance(q, Tensor)
+    device = chain.geometry()["base"].device
     chain = copy.deepcopy(chain).cpu()  # the solver runs on the CPU, without a graph
     q, x, messages = check_data(chain, q, x)
     if groups is not None:
@@ -262,7 +265,8 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
 
 def _few(fit: Fit, rows: Rows) -> str | None:
     """Return a warning if there are fewer rows than free parameters: `rmse` is then too small."""
-    n_rows, n_free = len(rows.q), fit.theta.size
+    n_rows = len(rows.q)
+    n_free = fit.theta.size
     if n_rows >= n_free:
         return None
     return (
@@ -287,7 +291,9 @@ def _unexplained(fit: Fit, rows: Rows) -> str | None:
 
 def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
     """Return the parameters at a bound or outside the physical range, and a warning."""
-    problem, names, words = fit.problem, {}, []
+    problem = fit.problem
+    names = {}
+    words = []
     pieces = map(problem.parts, (fit.theta, problem.low, problem.high))
     for part, *values in zip(problem.parameters, *pieces, strict=True):
         n = len(words)
@@ -316,7 +322,8 @@ def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
 def _result(
     fit: Fit, rows: Rows, cv_rmse: float | None, unphysical: tuple[str, ...], torch_given: bool
 ) -> CalibrationResult:
-    problem, chain = fit.problem, fit.chain()
+    problem = fit.problem
+    chain = fit.chain()
     prior_std = problem.prior_std
     # Singular values of J in units of the prior; those of J'J would lose small ones to rounding.
     J = fit.jacobian * prior_std
@@ -327,7 +334,9 @@ def _result(
     std = np.sqrt(np.diag(covariance))
     safe = np.where(std > 0, std, 1.0)
     geometry = {name: value.detach() for name, value in chain.geometry().items()}
-    values, std_errors, identifiable = {}, {}, {}
+    values = {}
+    std_errors = {}
+    identifiable = {}
     pieces = (problem.parts(part) for part in (std, std < _IDENTIFIED * prior_std))
     for part, error, identified in zip(problem.parameters, *pieces, strict=True):
         value = part.value(geometry[part.entry])
@@ -396,13 +405,15 @@ def _check_parameters(
 def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str | None]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
-    q, x = as_tensor(q, "q").to("cpu", dtype), as_tensor(x, "x").to("cpu", dtype)
+    q = as_tensor(q, "q").to("cpu", dtype)
+    x = as_tensor(x, "x").to("cpu", dtype)
     check_shape(q, "q", ("N", "n_actuators"))
     check_shape(x, "x", (len(q), chain.n_outputs), "one tip position per row of `q`")
     if len(q) == 0:
         raise ValueError("`q` must hold at least one row, got none.")
     messages = chain.check_actuators(q)
-    x, found = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x")), chain(q)
+    x = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x"))
+    found = chain(q)
     known = torch.where(x.isnan(), found, x)
     return q, x, [*messages, motion_message("x", known, found, float(chain.reach.detach()))]
 

@@ -24,9 +24,13 @@ from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
-_MOST, _FOLDS = 400, 3  # rows and folds for the scores
+# rows and folds for the scores
+_MOST = 400
+_FOLDS = 3
 _FEW = 40  # with fewer rows `io` is not used
-_ROWS, _CLEARLY = 7, 0.7  # rows per parameter; with fewer rows a set must be clearly better
+# rows per parameter; with fewer rows a set must be clearly better
+_ROWS = 7
+_CLEARLY = 0.7
 _WORSE = 1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
 _USUAL = ("nothing", "base", "radii + base", "radii + base + gain")  # also from few rows
 _EQUAL = 0.007  # of the score: within it the smaller set is taken
@@ -152,7 +156,8 @@ def choose_geometry(
         The parameters to calibrate, and the errors of all sets.
     """
     one_of(loss, "loss", LOSSES)
-    given, chain = chain, copy.deepcopy(chain).cpu()
+    given = chain
+    chain = copy.deepcopy(chain).cpu()
     q, x, _ = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))
@@ -164,7 +169,9 @@ def choose_geometry(
         rungs = _rungs(chain, q, parameters)
         tied = () if parameters is not None else unmoved(chain, q)
     starts = _starts(rungs, rows, loss)
-    best, errors, near = 0, {}, []
+    best = 0
+    errors = {}
+    near = []
     if len(rungs) > 1:
         motions = None if groups is None else groups[kept]
         splits = [(1, *split) for split in _splits(rows, motions)]
@@ -266,10 +273,14 @@ def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]
     """
     starts: list[Start | None] = []
     for chain, names, free in ((rung.chain, rung.parameters, _rings(rung)) for rung in rungs):
-        stds, near, far, enough = dict.fromkeys(names, 0.5), None, None, False
+        stds = dict.fromkeys(names, 0.5)
+        near = None
+        far = None
+        enough = False
         for one, start in zip(rungs, starts, strict=False):
             if start is not None and one.chain is chain:
-                near, enough = start, free <= _rings(one)
+                near = start
+                enough = free <= _rings(one)
             elif start is not None and ("angles" in free) == ("angles" in _rings(one)):
                 far = start
         if not names:
@@ -320,7 +331,8 @@ def _errors(
         chain, known, new = rung.chain, *(Rows(*(part[i] for part in rows)) for i in (train, test))
         if start is not None:
             chain = solve(start.problem, known, start.theta, loss, roughly=True).chain()
-        residual, weight = new.residual(chain), new.weights
+        residual = new.residual(chain)
+        weight = new.weights
         totals[kind] += weight @ np.linalg.norm(residual, axis=1), weight.sum()
     with np.errstate(invalid="ignore"):
         io, cv = (totals[:, 0] / totals[:, 1]).tolist()

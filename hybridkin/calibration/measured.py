@@ -11,7 +11,9 @@ from sklearn.model_selection import GroupKFold, KFold
 from hybridkin._core.arrays import countable
 from hybridkin._core.turns import TURNS
 
-_INNER, _BEYOND = 0.4, 0.65  # fractions of rows by distance: end of the inner, start of the outer
+# fractions of rows by distance: end of the inner, start of the outer
+_INNER = 0.4
+_BEYOND = 0.65
 _EXCITED = 0.01  # of the largest spread
 
 

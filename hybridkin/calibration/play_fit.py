@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
 from hybridkin.calibration.measured import folds
+from hybridkin.calibration.play_search import search_width
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
@@ -125,35 +126,40 @@ def fit_play(
     given = _WIDTHS / size if widths is None else real_array(widths, "widths").ravel()
     tried = np.unique(np.concatenate([[0.0], given])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
-    q, x = real_array(q, "q"), real_array(x, "x")
+    q = real_array(q, "q")
+    x = real_array(x, "x")
     check_shape(x, "x", ("N", chain.n_outputs))
     check_shape(q, "q", (len(x), chain.n_actuators), "one row for each row of `x`")
     groups = labels(groups, len(x))
     splits = folds(groups, groups)
     sizes = [len(test) for _, test in splits]
-    effective, mean_squares = {}, {}  # by width
 
-    def mean_square(y: NDArray, train: NDArray, test: NDArray) -> float:
-        """Return the mean squared tip distance on the held-out motions."""
-        result, _ = fit_geometry(chain, y[train], x[train], names, **calibrate_options)
-        with torch.no_grad():
-            tips = result.chain(torch.from_numpy(y[test]).to(result.chain.base)).numpy()
-        return float(np.nansum((tips - x[test]) ** 2) / len(test))  # NaN: missing markers
+    def effective(width: float) -> NDArray:
+        return PlayOperator(width).apply_by_group(q, groups)
 
-    def error(width: float) -> float:
-        """Return the root mean square tip distance on held-out motions."""
-        if width not in mean_squares:
-            y = effective[width] = PlayOperator(width).apply_by_group(q, groups)
-            mean_squares[width] = np.array([mean_square(y, *split) for split in splits])
-        return float(np.sqrt(np.average(mean_squares[width], weights=sizes)))
+    def held_out_errors(width: float) -> NDArray:
+        """Return the root mean square tip distance of every fold."""
+        y = effective(width)
+        squares = []
+        for train, test in splits:
+            result, _ = fit_geometry(chain, y[train], x[train], names, **calibrate_options)
+            with torch.no_grad():
+                tips = result.chain(torch.from_numpy(y[test]).to(result.chain.base)).numpy()
+            squares.append(np.nansum((tips - x[test]) ** 2) / len(test))  # NaN: missing markers
+        return np.sqrt(squares)
+
+    def root_mean_square(errors: NDArray) -> float:
+        return float(np.sqrt(np.average(errors**2, weights=sizes)))
 
     widest = float(np.ptp(q, axis=0).max())
-    while 0.0 < (best := min(tried, key=error)) == tried[-1] < widest:
-        tried.append(min(2.0 * best, widest))
-    gains = np.sqrt(mean_squares[0.0]) - np.sqrt(mean_squares[best])
-    gain, std_error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(splits)))
-    kept = best > 0.0 and gain > std_error
-    width = best if kept else 0.0
-    result = calibrate(chain, effective[width], x, names, **calibrate_options)
-    cv_rmse = np.array([error(width) for width in tried])
-    return PlayFit(width, np.array(tried), cv_rmse, gain, std_error, kept, result)
+    search = search_width(held_out_errors, root_mean_square, tried, widest)
+    width = search.width if search.kept else 0.0
+    return PlayFit(
+        width,
+        np.array(search.widths),
+        np.array(search.errors),
+        search.gain,
+        search.gain_std_error,
+        search.kept,
+        calibrate(chain, effective(width), x, names, **calibrate_options),
+    )

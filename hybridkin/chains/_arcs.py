@@ -45,12 +45,17 @@ def _carried(point: Vector, length: Tensor, b: Bending, arc: Stumpff, offset: Te
 
 def _columns(at: _Carried, b: Bending, arc: Stumpff) -> tuple[Vector, Vector, Vector]:
     """Return the derivatives of a carried point with respect to the segment's (l, bx, by)."""
-    (bx, by), (x, y, z), m = b, at.tail, at.across
+    bx, by = b
+    x, y, z = at.tail
+    m = at.across
     _, f, g, c3, c4 = arc
-    slope_f, slope_g = c3 - g, 2.0 * c4 - c3  # twice the derivatives df/ds, dg/ds
+    # twice the derivatives df/ds, dg/ds
+    slope_f = c3 - g
+    slope_g = 2.0 * c4 - c3
     to = fma(slope_g * at.rest, slope_f, z)
     n = fms(slope_f * at.rest, f, z)
-    to_x, to_y = fms(to * bx, g, x), fms(to * by, g, y)
+    to_x = fms(to * bx, g, x)
+    to_y = fms(to * by, g, y)
     return (
         (g * bx, g * by, f),
         (fma(m, bx, to_x), by * to_x, fms(n * bx, f, x)),
@@ -120,7 +125,8 @@ def _all_carried(
     arcs = [Stumpff(*each) for each in zip(*(part.unbind() for part in arc), strict=True)]
     segments = [*zip(bends, arcs, strict=True)]
     zero = torch.zeros_like(length[0])
-    point, carried = (zero + beside[0], zero + beside[1], zero + beside[2]), []
+    point = (zero + beside[0], zero + beside[1], zero + beside[2])
+    carried = []
     parts = [*zip(length.unbind(), segments, offsets.unbind(), strict=True)]
     for of_length, (b, of_arc), offset in reversed(parts):
         carried.append(_carried(point, of_length, b, of_arc, offset))
@@ -130,7 +136,9 @@ def _all_carried(
 
 def _spins(x: Tensor, y: Tensor, arc: Stumpff) -> list[Tensor]:
     """Return the nine entries of the angular velocity per (l, bx, by), each (S, N)."""
-    zero, c3, g = torch.zeros_like(x), arc.c3, arc.g
+    zero = torch.zeros_like(x)
+    c3 = arc.c3
+    g = arc.g
     by_x = -c3 * x * y, 1.0 - c3 * y * y, -g * y
     by_y = c3 * x * x - 1.0, c3 * x * y, g * x
     return [zero, zero, zero, *by_x, *by_y]
@@ -140,12 +148,15 @@ def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     """Return the transforms (..., S, 4, 4) from segment ends after offsets to segment starts."""
     arc = stumpff(bending.square().sum(-1))
     x, y = bending.unbind(-1)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    fx, fy, gxy = arc.f * x, arc.f * y, -arc.g * x * y
-    px, py = (length * arc.g + offsets * arc.f) * x, (length * arc.g + offsets * arc.f) * y
+    zero = torch.zeros_like(x)
+    one = torch.ones_like(x)
+    fx = arc.f * x
+    fy = arc.f * y
+    gxy = -arc.g * x * y
+    across = length * arc.g + offsets * arc.f
     entries = [
-        *(1.0 - arc.g * x * x, gxy, fx, px),
-        *(gxy, 1.0 - arc.g * y * y, fy, py),
+        *(1.0 - arc.g * x * x, gxy, fx, across * x),
+        *(gxy, 1.0 - arc.g * y * y, fy, across * y),
         *(-fx, -fy, arc.c, length * arc.f + offsets * arc.c),
         *(zero, zero, zero, one),
     ]
@@ -199,7 +210,8 @@ def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Seque
     for k in (k for k in range(S) if bends[k] == 1):
         # In a plane at the angle psi: [[1 + cos 2 psi, sin 2 psi], [sin 2 psi, 1 - cos 2 psi]] / 2.
         x, y = bend_readings(angles[k], extensible[k])
-        a, b = (x * x - y * y).sum(), 2.0 * (x * y).sum()
+        a = (x * x - y * y).sum()
+        b = 2.0 * (x * y).sum()
         plane = torch.stack([a, b, b, -a]).reshape(2, 2) / (2.0 * torch.hypot(a, b))
         at = identity(3 * S, free)[[S + k, 2 * S + k]]
         free = free + at.T @ plane @ at
@@ -210,7 +222,8 @@ def rolled(poses: Tensor, angle: Tensor) -> Tensor:
     """Return poses (..., K, 4, 4), all but the first turned by an angle (..., 1) about own z."""
     moves = torch.arange(poses.shape[-3], device=poses.device) > 0
     angle = (angle * moves)[..., None, None]
-    c, s = angle.cos(), angle.sin()
+    c = angle.cos()
+    s = angle.sin()
     x, y, rest = poses.split([1, 1, 2], dim=-1)
     return torch.cat([c * x + s * y, c * y - s * x, rest], dim=-1)
 
@@ -222,9 +235,13 @@ def turned_by_first(arcs: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
     turned arcs are returned too.
     """
     S = len(arcs) // 3
-    c, s, slope = arcs[0].cos(), arcs[0].sin(), slope.expand(-1, -1, arcs.shape[1])
-    turned, moved = [0.0 * arcs[:1], arcs[1:S]], [0.0 * slope[:1], slope[1:S]]
-    (x, y), (dx, dy) = arcs[S:].chunk(2), slope[S:].chunk(2)
+    c = arcs[0].cos()
+    s = arcs[0].sin()
+    slope = slope.expand(-1, -1, arcs.shape[1])
+    turned = [0.0 * arcs[:1], arcs[1:S]]
+    moved = [0.0 * slope[:1], slope[1:S]]
+    x, y = arcs[S:].chunk(2)
+    dx, dy = slope[S:].chunk(2)
     for a, b, da, db in ((x, -y, dx, -dy), (y, x, dy, dx)):
         turned.append(c * a + s * b)
         moved.append(c * da + s * db + (c * b - s * a)[:, None] * slope[0])

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 UNLIMITED = (-math.inf, math.inf)
 _BYTES = 4_000_000  # largest size of a robot description
 _MOST = 1000  # moving joints
-_SIZES, _MOST_COPIES = ("count", "nrow", "ncol", "width", "height"), 4e6
+_SIZES = ("count", "nrow", "ncol", "width", "height")
+_MOST_COPIES = 4e6
 _MJCF_KINDS = {2: "prismatic", 3: "revolute"}  # mjJNT_SLIDE, mjJNT_HINGE
 
 
@@ -150,7 +151,8 @@ def _check_sizes(data: bytes) -> None:
 
     MuJoCo checks neither, and writes a file for NaN. Included files are not checked here.
     """
-    parser, copies = ParserCreate(), [1.0]
+    parser = ParserCreate()
+    copies = [1.0]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         costly = any(name == "count" or name.startswith("nuser") for name in attributes)
@@ -164,7 +166,8 @@ def _check_sizes(data: bytes) -> None:
                 raise ValueError(f"`text_or_path` must have {need}, got {name}={value!r:.60}.")
         copies.append(size if tag == "replicate" else copies[-1])
 
-    parser.StartElementHandler, parser.EndElementHandler = start, lambda _: copies.pop()
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda _: copies.pop()
     with suppress(ExpatError):  # MuJoCo reports other errors
         parser.Parse(data, True)
 
@@ -174,13 +177,16 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
     steps = [Joint(_mjcf_pose(model.body_pos[body], model.body_quat[body]))]
     first = model.body_jntadr[body]
     for j in range(first, first + model.body_jntnum[body]):
-        name, kind = model.joint(j).name, int(model.jnt_type[j])
+        name = model.joint(j).name
+        kind = int(model.jnt_type[j])
         if kind not in _MJCF_KINDS:
             raise ValueError(
                 f"joint {name!r} of body {model.body(body).name!r} is free or a ball; only hinges "
                 "and slides are supported on the path to `end_link`; use a `root_link` after it."
             )
-        axis, anchor, zero = model.jnt_axis[j], model.jnt_pos[j], model.qpos0[model.jnt_qposadr[j]]
+        axis = model.jnt_axis[j]
+        anchor = model.jnt_pos[j]
+        zero = model.qpos0[model.jnt_qposadr[j]]
         # MuJoCo ignores a range that is not in order; the default, two zeros, means no limits.
         limits = tuple(model.jnt_range[j].tolist())
         if not model.jnt_limited[j] and (limits[0] < limits[1] or not any(limits)):
@@ -190,7 +196,9 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
                 f"`range` of joint {name!r} must be an interval, got {limits}: MuJoCo would ignore "
                 'it. Remove the joint to lock it, or set limited="false".'
             )
-        back, slides = -zero * axis, kind == 2  # from MuJoCo's reference to q = 0
+        # from MuJoCo's reference to q = 0
+        back = -zero * axis
+        slides = kind == 2
         origin = matrix_of(Rotation.from_rotvec((not slides) * back), anchor + slides * back)
         steps.append(Joint(origin, _MJCF_KINDS[kind], axis, name, limits))
         steps.append(Joint(matrix_of(Rotation.identity(), -anchor)))

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core import arrays
-from hybridkin._core.arrays import Numbers, Transform, one_of, real_array
+from hybridkin._core.arrays import Numbers, Transform, one_of, real_array, shaped
 from hybridkin._core.stored import Stored
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arcs import bend_readings
@@ -34,7 +33,7 @@ def float_dtype(dtype: Any) -> torch.dtype:
 
 def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
     """Return one positive length per segment, shape (S,)."""
-    lengths = shaped(value, name, "n", size, dtype)
+    lengths = numeric(value, name, dtype, need="n", length=size)
     if not len(lengths) or not (lengths > 0).all():
         raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
     return lengths
@@ -148,7 +147,8 @@ def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
         raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
     given["angles"] = np.split(given["angles"], np.cumsum(counts)[:-1])
     if "stage" in stored.settings:  # older files have neither stages nor planes
-        lengths, flags = iter(given.pop("lengths", ())), stored.list_of(bool, "extensible")
+        lengths = iter(given.pop("lengths", ()))
+        flags = stored.list_of(bool, "extensible")
         given["lengths"] = [None if own else next(lengths, math.nan) for own in flags]
         given["stage"] = stored.value("stage", (str, None))
         # Planar actuators stay planar, although calibration has moved their angles slightly.
@@ -162,37 +162,28 @@ def numeric(
     name: str,
     dtype: torch.dtype = torch.float64,
     *,
+    need: str | None = None,
+    length: int | None = None,
     finite: bool = True,
 ) -> Tensor:
     """Return a copy of numbers as a tensor; NaN and infinity raise.
 
-    With ``finite=False`` only NaN raises.
+    With `need` the shape is checked, see `arrays.shaped`. With ``finite=False`` only NaN raises.
     """
-    tensor = torch.tensor(real_array(value, name), dtype=dtype, device="cpu")
+    array = real_array(value, name) if need is None else shaped(value, name, need, length)
+    tensor = torch.tensor(array, dtype=dtype, device="cpu")
     if (not torch.isfinite(tensor).all() and finite) or torch.isnan(tensor).any():
         raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")
     return tensor
 
 
-def shaped(
-    value: Numbers,
-    name: str,
-    need: str,
-    length: int | None = None,
-    dtype: torch.dtype = torch.float64,
-    *,
-    finite: bool = True,
-) -> Tensor:
-    """Return an array as a tensor of a checked shape, see `arrays.shaped`."""
-    return numeric(arrays.shaped(value, name, need, length), name, dtype, finite=finite)
-
-
 def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
     """Return `q_min`, `q_max` and `dq_max`, shape (n,), infinite if given as None."""
-    limits, ends = {}, {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
+    limits = {}
+    ends = {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
     for (name, end), value in zip(ends.items(), given, strict=True):
         value = np.full(n, end) if value is None else value
-        limits[name] = shaped(value, name, "n", n, finite=False)
+        limits[name] = numeric(value, name, need="n", length=n, finite=False)
     low, high, speed = limits.values()
     if not ((low <= high) & (speed > 0.0)).all():
         raise ValueError(

@@ -41,7 +41,8 @@ def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor) 
     zero = zeros[:, None, None]
     turn = torch.where(slide, 0.0, zero)
     still = still - torch.where(slide, zero, 0.0) * by_u1
-    ahead, aside = turn.cos(), turn.sin()
+    ahead = turn.cos()
+    aside = turn.sin()
     parts = [still, ahead * by_u1 + aside * by_u2, ahead * by_u2 - aside * by_u1]
     return origins[:, None] @ torch.stack(parts, 1)
 
@@ -93,7 +94,8 @@ def last_frame_and_joints(
     # With the three coordinates of all rows side by side, a joint costs one small product.
     u1, u2 = (part.T.repeat(1, 3) for part in (u1, u2))
     frame = torch.eye(4, dtype=u1.dtype, device=u1.device)[:, :3].repeat_interleave(n_rows, 1)
-    axes, points = [frame[:0]], [frame[:0]]
+    axes = [frame[:0]]
+    points = [frame[:0]]
     for carrier, of_u1, of_u2 in zip(carriers.unbind(), u1.unbind(), u2.unbind(), strict=True):
         still, by_u1, by_u2, axis = (carrier @ frame).split((4, 4, 4, 1))
         frame = torch.addcmul(torch.addcmul(still, of_u1, by_u1), of_u2, by_u2)
@@ -266,7 +268,8 @@ class JointChain(Chain):
         if n_points < 1:
             raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
         corners = torch.cat([self._frames(q)[..., :3, 3], self(q)[..., None, :]], dim=-2)
-        start, end = corners[..., :-1, None, :], corners[..., 1:, None, :]
+        start = corners[..., :-1, None, :]
+        end = corners[..., 1:, None, :]
         t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
         return torch.cat([corners[..., :1, :], torch.lerp(start, end, t).flatten(-3, -2)], dim=-2)
 
@@ -313,7 +316,8 @@ class JointChain(Chain):
         All are in the base frame, at joint positions (N, n_joints). The frame (4, 3, N) holds the
         three axes and the origin of the last joint's moving frame.
         """
-        shares, carriers = self._shares(z), self.carriers.to(z)
+        shares = self._shares(z)
+        carriers = self.carriers.to(z)
         frame, axes, points = last_frame_and_joints(*shares, carriers)
         tip = (self._end(z) @ frame.flatten(1)).unflatten(0, (3, -1))
         columns = torch.linalg.cross(axes, tip - points, dim=1)

@@ -24,10 +24,13 @@ else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
-_PLAIN, _ELASTIC = "constant-curvature", "elastic-tendon"
+_PLAIN = "constant-curvature"
+_ELASTIC = "elastic-tendon"
 _MOST = 64  # segments of a robot, actuators of a segment
 
-_LEAST, _LARGEST = 1e-18, 1e9  # of positive numbers, and of all; others are mistakes
+# of positive numbers, and of all; others are mistakes
+_LEAST = 1e-18
+_LARGEST = 1e9
 _DOTS = 600  # between two commas; the time for a key grows with the square of its dots
 _BYTES = 30_000  # of a file; the time to read hostile TOML grows with the square of its size
 _Test = Callable[[Any], bool]
@@ -190,7 +193,8 @@ def _segment(table: Mapping[str, Any], where: str, elastic: bool, unit: str) -> 
         step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
         angles = math.radians(table.get("angle_deg", 0.0)) + step * np.arange(n)
     n = len(angles)
-    gains, zeros = _gains(table, where, n, unit), each(table, "zeros", where, n)
+    gains = _gains(table, where, n, unit)
+    zeros = each(table, "zeros", where, n)
     if gains is not None and not elastic:  # in the unit of the log
         zeros *= UNITS.get(unit, 1.0)
     return {

@@ -96,7 +96,8 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
     """
     n = x.shape[1] - 1
     bits = 2 ** torch.arange(n, device=x.device)
-    at, here = torch.arange(len(x), device=x.device), ((full @ x.T >= 0) * bits[:, None]).sum(0)
+    at = torch.arange(len(x), device=x.device)
+    here = ((full @ x.T >= 0) * bits[:, None]).sum(0)
     codes = here.clone()
     for step in range(HK_WHOLE_STEPS + 2 ** min(n, HK_MOST_TURNS)):
         maps = maps_of(here)
@@ -135,12 +136,15 @@ class FindTaut(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        find, tensors, dims = args[0], args[1:], in_dims[1:]
+        find = args[0]
+        tensors = args[1:]
+        dims = in_dims[1:]
         if all(dim is None for dim in dims[1:]):  # the same robot: the batch is more rows
             rows = tensors[0].movedim(dims[0], 0)
             codes = FindTaut.apply(find, rows.flatten(0, 1), *tensors[1:])
             return codes.unflatten(0, rows.shape[:2]), 0
-        n, pairs = info.batch_size, zip(tensors, dims, strict=True)
+        n = info.batch_size
+        pairs = zip(tensors, dims, strict=True)
         each = [[a] * n if dim is None else a.unbind(dim) for a, dim in pairs]
         found = [FindTaut.apply(find, *parts) for parts in zip(*each, strict=True)]
         return torch.stack(found), 0

@@ -64,7 +64,8 @@ def _read(text: str) -> tuple[list[str], list[_Element]]:
     def refuse(*_: Any) -> None:
         raise ValueError("it declares entities, which can grow without bound")
 
-    parser.StartElementHandler, parser.EntityDeclHandler = start, refuse
+    parser.StartElementHandler = start
+    parser.EntityDeclHandler = refuse
     parser.EndElementHandler = lambda tag: path.pop()
     try:
         parser.Parse(_bytes(text), True)
@@ -86,7 +87,8 @@ def _bytes(text: str) -> bytes:
 
 def _numbers(element: _Element, tag: str, key: str, default: str) -> list[float]:
     """Return the numbers of an attribute, as many as the default has."""
-    text, found = element[tag].get(key, default), []
+    text = element[tag].get(key, default)
+    found = []
     try:
         found = [float(part) for part in text.split()]
     except ValueError:
@@ -164,7 +166,8 @@ def _origin(element: _Element) -> NDArray:
 
 def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
     """Return what a joint does: a free one moves along and about several axes."""
-    origin, name = _origin(element), element["joint"].get("name", "")
+    origin = _origin(element)
+    name = element["joint"].get("name", "")
     kind = element["joint"].get("type", "")
     if kind in _FREE and not element["mimic"]:
         path = [Joint(origin)]
@@ -174,7 +177,9 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
             actuator = unused(f"{name}_{part}", names)
             path.append(Joint(matrix_of(), move, np.eye(3)[_AXES[part]], actuator, UNLIMITED))
         return path
-    driver, factor, offset = element, 1.0, 0.0
+    driver = element
+    factor = 1.0
+    offset = 0.0
     followed = [name]
     while mimic := driver["mimic"]:
         # The joint is at factor * (multiplier * q + its offset) + offset.
@@ -196,7 +201,8 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
             + f" that mimics {driven_by!r}."
             * bool(element["mimic"])
         )
-    kind, axis = kind.replace("continuous", "revolute"), _numbers(element, "axis", "xyz", "1 0 0")
+    kind = kind.replace("continuous", "revolute")
+    axis = _numbers(element, "axis", "xyz", "1 0 0")
     step = offset * np.array(axis) / (np.linalg.norm(axis) or 1.0)
     turn = Rotation.from_rotvec((kind == "revolute") * step)
     origin = origin @ matrix_of(turn, (kind == "prismatic") * step)
@@ -220,12 +226,15 @@ def placed_urdf(
     text: str, end_link: str, root_link: str | None, names: Sequence[str], origins: NDArray
 ) -> str:
     """Return a URDF whose moving joints have new origins (n, 4, 4); the rest is not changed."""
-    path, data = _elements(text, end_link, root_link), _bytes(text)
+    path = _elements(text, end_link, root_link)
+    data = _bytes(text)
     moving = [joint.name for _, joints in path for joint in joints if joint.kind != "fixed"]
     if [*dict.fromkeys(moving)] != [*names] or len(moving) != len(origins):
         need = f"`text_or_path` must be the URDF of this arm, whose actuators are {[*names]}"
         raise ValueError(f"{need}, got {moving} up to {end_link!r}.")
-    wanted, before, changes = iter(origins), matrix_of(), []
+    wanted = iter(origins)
+    before = matrix_of()
+    changes = []
     for element, (joint, *free) in path:
         origin = _origin(element)
         if free:
@@ -250,9 +259,11 @@ def placed_urdf(
 
 def _origin_tag(placed: NDArray) -> bytes:
     """Return the beginning of an <origin>; its angles are exact at a pitch of 90 degrees too."""
-    (a, b, c), position = placed[:3, :3], placed[:3, 3]
+    a, b, c = placed[:3, :3]
+    position = placed[:3, 3]
     yaw = math.atan2(b[0], a[0])
-    sine, cosine = math.sin(yaw), math.cos(yaw)
+    sine = math.sin(yaw)
+    cosine = math.cos(yaw)
     pitch = math.atan2(-c[0], cosine * a[0] + sine * b[0])
     roll = math.atan2(sine * a[2] - cosine * b[2], cosine * b[1] - sine * a[1])
     rows = position, (roll, pitch, yaw)

@@ -38,7 +38,8 @@ def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, ND
 
     The frame is the rotation and position of the base, the reach, and the rigid offsets.
     """
-    base, offsets = stored.array("base"), stored.array("offsets")
+    base = stored.array("base")
+    offsets = stored.array("offsets")
     tip_at = stored.value("tip_at", float)
     markers = stored.settings.get("markers", [[tip_at, 0.0, 0.0, 0.0]])
     _, x, y, z = markers[0]
@@ -128,7 +129,8 @@ class ArcChain(MarkedChain):
         counts, self.extensible, geometry = arc_geometry(*given)
         self.actuators_per_segment = counts
         self.starts = path_starts(routing, counts, self.extensible)
-        self.n_segments, self.n_actuators = len(geometry["radii"]), len(geometry["angles"])
+        self.n_segments = len(geometry["radii"])
+        self.n_actuators = len(geometry["angles"])
         self.routing = routing
         self._set_markers([(self.n_segments, 0.0, 0.0, 0.0)])
         return geometry
@@ -210,7 +212,8 @@ class ArcChain(MarkedChain):
         """Return the derivative (N, 3, P) of the tip along P changes, at arcs (3 S, N)."""
         place = self._to_point(self.up_to_tip(arcs))
         tail, columns = tip_and_columns(*place, rigid=True)
-        columns, S = self._turned(columns).permute(2, 0, 1).contiguous(), len(place[0])
+        columns = self._turned(columns).permute(2, 0, 1).contiguous()
+        S = len(place[0])
         by_arcs, by_offsets = columns.split([3 * S, S], dim=2)
         J = change(by_arcs @ self.up_to_tip(identity(3 * self.n_segments, arcs)), tangents)
         if "offsets" in tangents:
@@ -268,7 +271,8 @@ class ArcChain(MarkedChain):
         """Return the frames after all segments at rows q (N, n), with derivatives of the end."""
         arcs, slope = self._arcs_and_slope(rows)
         length, bending = self._split(arcs)
-        S, offsets = len(length), self.offsets.to(arcs)
+        S = len(length)
+        offsets = self.offsets.to(arcs)
         columns = tip_and_columns(length, bending, offsets, angular=True, rigid=True)[1]
         moves, spins, z = columns.split([3 * S, 3 * S, S], dim=1)
         # An arc of length l and bending b moves the end by l c, where c is its derivative with
@@ -301,7 +305,8 @@ class ArcChain(MarkedChain):
         f, g = stumpff((t * bending[..., None, :]).square().sum(-1))[1:3]
         bend = (g[..., None] * t) * bending[..., None, :]
         arc = (t * length[..., None, None]) * torch.cat([bend, f[..., None]], dim=-1)
-        start, end = poses[..., :-1, :, :], poses[..., 1:, None, :3, 3]
+        start = poses[..., :-1, :, :]
+        end = poses[..., 1:, None, :3, 3]
         points = arc @ start[..., :3, :3].mT + start[..., None, :3, 3]
         points = torch.cat([points[..., :-1, :], end], dim=-2)
         return torch.cat([poses[..., 0, None, :3, 3], points.flatten(-3, -2)], dim=-2)
@@ -346,7 +351,8 @@ class ArcChain(MarkedChain):
 
         The latter are changes of d path / d bending, for all segments, (P, n, 2 S).
         """
-        counts, P = self.actuators_per_segment, len(next(iter(tangents.values())))
+        counts = self.actuators_per_segment
+        P = len(next(iter(tangents.values())))
         change = {
             name: tangents.get(name, torch.zeros_like(value).expand(P, *value.shape)).to(rows)
             for name, value in self.geometry().items()
@@ -364,7 +370,8 @@ class ArcChain(MarkedChain):
         """
         arcs, slope = self._arcs_and_slope(q)
         if len(self.markers) == 1:
-            arcs, slope = self.up_to_tip(arcs), self.up_to_tip(slope)
+            arcs = self.up_to_tip(arcs)
+            slope = self.up_to_tip(slope)
         return arcs.mT, slope if slope.ndim == 2 else slope.permute(2, 0, 1)
 
     def from_coordinates(self, z: Tensor) -> Tensor:
@@ -458,7 +465,8 @@ class ArcChain(MarkedChain):
 
     def _by_actuators(self, columns: Tensor, slope: Tensor, q: Tensor) -> Tensor:
         """Return the Jacobian by q from columns (3, 3 m, N) by arcs and the slope of the arcs."""
-        columns, slope = self._turned(columns), self.up_to_tip(slope)
+        columns = self._turned(columns)
+        slope = self.up_to_tip(slope)
         if slope.ndim == 3:
             J = torch.matmul(columns.permute(2, 0, 1), slope.permute(2, 0, 1))
             return J.reshape(*q.shape[:-1], 3, self.n_actuators)

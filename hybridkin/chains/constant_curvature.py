@@ -33,14 +33,16 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     if "lengths" in stored.arrays:
         reach = stored.array("lengths").sum()
     frame, parts = frame_numbers(plan, stored, reach)
-    n_segments, n_arcs = len(radii), len(parts)
+    n_segments = len(radii)
+    n_arcs = len(parts)
 
     def by_segment(name: str) -> NDArray:
         """Return rows (n_arcs, 3, ...) of length, x- and y-bending up to the tip."""
         rows = stored.derived[name].reshape(3, n_segments, -1).swapaxes(0, 1)
         return rows[:n_arcs] * parts[:, None, None]
 
-    matrix, offset = by_segment("arc_matrix"), by_segment("arc_offset")
+    matrix = by_segment("arc_matrix")
+    offset = by_segment("arc_offset")
     n = width = matrix.shape[2]
     step = 0  # columns from the actuators of a segment to those of the next one
     if n % n_segments == 0:
@@ -48,7 +50,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
         blocks = [rows[:, k * per_segment :][:, :per_segment] for k, rows in enumerate(matrix)]
         diagonal = np.stack(blocks)
         if np.count_nonzero(diagonal) == np.count_nonzero(matrix):
-            matrix, step, width = diagonal, per_segment, per_segment
+            matrix = diagonal
+            step = per_segment
+            width = per_segment
     return plan.node("arcs", n, 3, [frame, offset, matrix], n_arcs, step, width)
 
 
@@ -300,7 +304,8 @@ class ConstantCurvatureChain(ArcChain):
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         super()._set_geometry(geometry)
-        radii, free = self.radii, self._free_arcs(self.angles)
+        radii = self.radii
+        free = self._free_arcs(self.angles)
         # Scaled to bendings times radius: with mixed units half of the digits would be lost.
         units = torch.cat([torch.ones_like(radii), 1.0 / radii, 1.0 / radii])
         scaled = self._readings() * units @ free
@@ -321,7 +326,8 @@ class ConstantCurvatureChain(ArcChain):
         return torch.stack(norms, dim=-1).reshape(*q.shape[:-1], self.n_segments)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        arcs, matrix = self._linear(rows), self.arc_matrix.to(rows)
+        arcs = self._linear(rows)
+        matrix = self.arc_matrix.to(rows)
         return (arcs, matrix) if self.stage is None else turned_by_first(arcs, matrix[..., None])
 
     def _linear(self, rows: Tensor) -> Tensor:
@@ -351,11 +357,14 @@ class ConstantCurvatureChain(ArcChain):
     def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
         change, by_reading = self._changes(rows, tangents)
-        readings, free = self._readings().to(rows), self._free_arcs(self.angles).to(rows)
+        readings = self._readings().to(rows)
+        free = self._free_arcs(self.angles).to(rows)
         by_reading = nn.functional.pad(by_reading, (self.n_segments, 0)) @ free
         # Derivative of the pseudo-inverse M of the matrix B from free arcs to actuator lengths,
         # M B = free (Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12).
-        M, by_matrix = (self.arc_matrix / self.gains).to(rows), 0.0  # for actuators in metres
+        # for actuators in metres
+        M = (self.arc_matrix / self.gains).to(rows)
+        by_matrix = 0.0
         if 1 in self.bends:  # planes turn with their actuators
             turns = torch.func.jacfwd(self._free_arcs)(self.angles).to(rows)
             turns = (turns @ change["angles"].mT).permute(2, 0, 1)

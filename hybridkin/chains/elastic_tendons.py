@@ -27,8 +27,10 @@ _TABLE = 12  # largest number of tendons for which all responses are stored
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
     """Write the node of a chain: its frame, then numbers of its segments and of its tendons."""
-    lengths, rest_bends = stored.array("lengths"), stored.array("rest_bends")
-    bending, axial = stored.array("bending_stiffness"), stored.array("axial_stiffness")
+    lengths = stored.array("lengths")
+    rest_bends = stored.array("rest_bends")
+    bending = stored.array("bending_stiffness")
+    axial = stored.array("axial_stiffness")
     counts = stored.list_of(int, "actuators_per_segment")
     n_segments = len(lengths)
     from_base = stored.value("routing", str) == "base"
@@ -43,8 +45,10 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     segments = [stiffness, coupled * stiffness, arcs, up_to_tip, coupled * up_to_tip]
 
     segment = np.repeat(np.arange(n_segments), counts)
-    radii, angles = stored.array("radii")[segment], stored.array("angles")
-    x, y = -radii * np.cos(angles), -radii * np.sin(angles)
+    radii = stored.array("radii")[segment]
+    angles = stored.array("angles")
+    x = -radii * np.cos(angles)
+    y = -radii * np.sin(angles)
     if from_base:
         rest_bends = np.cumsum(rest_bends, 0)
     bends = rest_bends[segment]  # zeros of the tendons are for bends measured from rest
@@ -206,7 +210,8 @@ class ElasticTendonChain(ArcChain):
                 "`chain` must have `lengths` in all segments: the actuators of extensible segments "
                 "are not tendons."
             )
-        geometry, counts = chain.geometry(), chain.actuators_per_segment
+        geometry = chain.geometry()
+        counts = chain.actuators_per_segment
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
         given = {"n_actuators": counts, "routing": chain.routing, "dtype": chain.radii.dtype}
@@ -325,7 +330,8 @@ class ElasticTendonChain(ArcChain):
         return arcs, maps[..., :-1].permute(1, 2, 0)
 
     def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
-        S, (shape, pull, taut, compliance) = self.n_segments, self._balance(rows)
+        S = self.n_segments
+        shape, pull, taut, compliance = self._balance(rows)
 
         def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
             new, by_bendings = self._changes(rows, tangents)

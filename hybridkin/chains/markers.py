@@ -142,7 +142,8 @@ class MarkedChain(Chain):
 
     def _set_markers(self, markers: Sequence[Any]) -> None:
         self.markers = tuple((float(at), float(x), float(y), float(z)) for at, x, y, z in markers)
-        self.tip_at, self.n_outputs = self.markers[-1][0], 3 * len(self.markers)
+        self.tip_at = self.markers[-1][0]
+        self.n_outputs = 3 * len(self.markers)
 
     def _tip_offsets(self, offsets: Tensor) -> Tensor:
         """Return the rigid offsets (..., m) up to the tip."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +28,6 @@ class PlayState(NamedTuple):
 
     command: Any
     effective: Any
-
-
-_Step = Callable[[Tensor, PlayState, Tensor], PlayState]  # row, state before, half the width
 
 
 class PlayOperator:
@@ -94,13 +90,7 @@ class PlayOperator:
         ValueError
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
-
-        def follow(row: Tensor, at: PlayState, half: Tensor) -> PlayState:
-            return PlayState(
-                row, torch.minimum(torch.maximum(at.effective, row - half), row + half)
-            )
-
-        return self._run(q, state, "q", follow, 1)
+        return self._run(q, state, "q", lead=False)
 
     def command(self, y: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
         """Return the commands that give the effective changes y: the inverse of `apply`.
@@ -126,12 +116,7 @@ class PlayOperator:
         ValueError
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
-
-        def lead(row: Tensor, at: PlayState, half: Tensor) -> PlayState:
-            ahead = row + half * torch.sign(row - at.effective)
-            return PlayState(torch.where(row == at.effective, at.command, ahead), row)
-
-        return self._run(y, state, "y", lead, 0)
+        return self._run(y, state, "y", lead=True)
 
     def apply_by_group(self, q: Any, groups: ArrayLike) -> Any:
         """Return the effective changes of a log of several motions, each with a new state.
@@ -167,36 +152,55 @@ class PlayOperator:
         return f"PlayOperator(width={self.width.tolist()})"
 
     def _run(
-        self, given: Any, state: PlayState | None, name: str, step: _Step, wanted: int
+        self, motion: Any, state: PlayState | None, name: str, *, lead: bool
     ) -> tuple[Any, PlayState]:
-        """Return the entry `wanted` of the state after every given row, and the last state."""
-        as_numpy = not isinstance(given, Tensor)
-        rows = real_array(given, name) if as_numpy else given.to(as_tensor(given, name).dtype)
+        """Return the effective changes of commands, or the reverse (`lead`), and the last state."""
+        rows = motion if isinstance(motion, Tensor) else real_array(motion, name)
+        if isinstance(motion, Tensor):
+            rows = motion.to(as_tensor(motion, name).dtype)
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
         if not rows.shape[1]:
             raise ValueError(f"`{name}` must hold at least one actuator, got none.")
-        if not (rows.isfinite() if isinstance(rows, Tensor) else np.isfinite(rows)).all():
+        if not _is_finite(rows):
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
             raise ValueError(f"`{name}` must hold at least one row if `state` is not given.")
-        given = state if isinstance(state, (tuple, list)) else ()
-        start = [rows[0]] * 2 if state is None else [real_array(part, "state") for part in given]
-        shapes = [tuple(part.shape) for part in start]
-        finite = state is None or all(np.isfinite(part).all() for part in start)
-        if shapes != [tuple(rows.shape[1:])] * 2 or not finite:
-            need = f"must hold two finite vectors of shape ({rows.shape[1]},)"
-            raise ValueError(f"`state` {need}, got {state!r:.200}.")
-        if isinstance(rows, np.ndarray):
-            if len(rows) and rows.dtype == np.float64 and available():
-                found, *last = play(rows, start, self.width / 2, wanted == 0)
-                return found, PlayState(*last)
-            rows = torch.tensor(rows, device="cpu")
-        at = PlayState(*(torch.as_tensor(part, device=rows.device).to(rows) for part in start))
-        found, half = [], as_tensor(self.width / 2, "width").to(rows)
+        start = PlayState(rows[0], rows[0]) if state is None else _checked(state, rows.shape[1])
+        if isinstance(rows, Tensor):
+            return self._by_torch(rows, start, lead)
+        if len(rows) and rows.dtype == np.float64 and available():
+            result, *last = play(rows, start, self.width / 2, lead)
+            return result, PlayState(*last)
+        result, last = self._by_torch(torch.tensor(rows, device="cpu"), start, lead)
+        return result.numpy(), PlayState(last.command.numpy(), last.effective.numpy())
+
+    def _by_torch(self, rows: Tensor, start: PlayState, lead: bool) -> tuple[Tensor, PlayState]:
+        command, effective = (torch.as_tensor(a, device=rows.device).to(rows) for a in start)
+        half = as_tensor(self.width / 2, "width").to(rows)
+        result = []
         for row in rows:
-            at = step(row, at, half)
-            found.append(at[wanted])
-        out = torch.stack(found) if found else rows.clone()
-        if not as_numpy:
-            return out, at
-        return out.numpy(), PlayState(*(part.numpy() for part in at))
+            if lead:
+                ahead = row + half * torch.sign(row - effective)
+                command = torch.where(row == effective, command, ahead)
+                effective = row
+            else:
+                effective = torch.minimum(torch.maximum(effective, row - half), row + half)
+                command = row
+            result.append(command if lead else effective)
+        state = PlayState(command, effective)
+        return (torch.stack(result) if result else rows.clone()), state
+
+
+def _is_finite(a: Any) -> bool:
+    return bool((a.isfinite() if isinstance(a, Tensor) else np.isfinite(a)).all())
+
+
+def _checked(state: Any, n: int) -> PlayState:
+    """Return a caller's state for n tendons, checked."""
+    parts = state if isinstance(state, (tuple, list)) else ()
+    vectors = [real_array(part, "state") for part in parts]
+    good = len(vectors) == 2 and all(a.shape == (n,) and np.isfinite(a).all() for a in vectors)
+    if not good:
+        need = f"must hold two finite vectors of shape ({n},)"
+        raise ValueError(f"`state` {need}, got {state!r:.200}.")
+    return PlayState(*vectors)

@@ -14,7 +14,7 @@ from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints
-from hybridkin.chains._checks import filled, float_dtype, joint_limits, pose, rigid_pose, shaped
+from hybridkin.chains._checks import filled, float_dtype, joint_limits, numeric, pose, rigid_pose
 from hybridkin.chains._joint_motions import FAR, JointChain
 from hybridkin.chains._urdf import placed_urdf, urdf_path, urdf_text
 
@@ -33,7 +33,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     if not slides:
         raise NoKernel("an arm without moving joints is a constant")
     plan.limit("actuators", n_joints)
-    before, numbers, motions = stored.array("base"), [], stored.derived["motions"]
+    before = stored.array("base")
+    numbers = []
+    motions = stored.derived["motions"]
     origins = motions[:, 0] + motions[:, 2]
     for origin, axis in zip(origins, stored.array("axes"), strict=True):
         side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -134,17 +136,17 @@ class RigidChain(JointChain):
     ) -> None:
         super().__init__()
         dtype = float_dtype(dtype)
-        axes = shaped(axes, "axes", "n3")
+        axes = numeric(axes, "axes", need="n3")
         n_joints = len(axes)
         lengths = axes.norm(dim=1, keepdim=True)
         if not (lengths > 0).all():
             raise ValueError(f"`axes` must not have zero length, got {axes.tolist()}.")
         axes = axes / lengths
-        origins = shaped(origins, "origins", "n44", n_joints)
+        origins = numeric(origins, "origins", need="n44", length=n_joints)
         for k in range(n_joints):
             origins[k] = rigid_pose(origins[k], f"origins[{k}]")
         if couplings is not None:
-            couplings = shaped(couplings, "couplings", "nm", n_joints)
+            couplings = numeric(couplings, "couplings", need="nm", length=n_joints)
         self.n_actuators = n = n_joints if couplings is None else couplings.shape[1]
         for name, value in (("kinds", kinds), ("names", names)):
             if value is not None and not np.iterable(value):
@@ -163,7 +165,7 @@ class RigidChain(JointChain):
             "axes": axes,
             **joint_limits(n, q_min, q_max, dq_max),
             "tip": rigid_pose(np.eye(4) if tip is None else tip, "tip"),
-            "tool": shaped(tool, "tool", "3"),
+            "tool": numeric(tool, "tool", need="3"),
             "base": pose(base, "base", torch.float64),
             "joint_zeros": filled(joint_zeros, "joint_zeros", torch.float64, (n,)),
             "couplings": couplings,

@@ -148,7 +148,8 @@ class Limits:
             np.multiply(factor, side if value is None else value)
             for value, side in ((self.q_min, -np.inf), (self.q_max, np.inf))
         ]
-        low, high = np.minimum(*ends), np.maximum(*ends)
+        low = np.minimum(*ends)
+        high = np.maximum(*ends)
         return Limits(
             None if np.isinf(low).all() else low,
             None if np.isinf(high).all() else high,
@@ -158,7 +159,8 @@ class Limits:
 
     def narrowed(self, by: float | np.ndarray) -> Limits:
         """Return the limits with the range of every actuator reduced by `by` at both ends [m]."""
-        low, high = self.q_min, self.q_max
+        low = self.q_min
+        high = self.q_max
         ends = None if low is None else low + by, None if high is None else high - by
         return replace(self, q_min=ends[0], q_max=ends[1])
 
@@ -398,7 +400,8 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
 
 def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
     given = {key: value for key, value in table.items() if key != "unit"}
-    unit, log = table.get("unit", "m"), robot.log
+    unit = table.get("unit", "m")
+    log = robot.log
     plain = robot.chain is not None and robot.chain.in_metres
     need = "m" if log is None else unit if plain else "log"
     if given and unit != need:
@@ -406,7 +409,8 @@ def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
         why = "without [log]" if log is None else why
         raise ValueError(f'`unit` in [limits] must be "{need}" {why}, got "{unit}".')
     limits = Limits(**{key: each(given, key, "[limits]", robot.n_actuators) for key in given})
-    low, high = limits.q_min, limits.q_max
+    low = limits.q_min
+    high = limits.q_max
     if low is not None and high is not None and (low > high).any():
         raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
     return limits if log is None or unit == "m" else limits.scaled(log.q_factor)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize_scalar
 
+from hybridkin.calibration.play_search import search_width
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._fit import Spec, calibrated, residuals
 from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _LEAST = 0.0025  # first width, relative to the stroke
-_CLOSE = 0.02  # tolerance of the best width, relative to it
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
 
 
@@ -86,8 +84,7 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     if len(names) < 2:
         return None
 
-    @cache
-    def error_by_motion(width: float) -> NDArray:
+    def errors_by_motion(width: float) -> NDArray:
         effective = PlayOperator(width).apply_by_group(X, motions)[counted]
         q = torch.from_numpy(effective.astype(np.float64))
         error = residuals(spec.mechanical, q, y[counted], spec.output)
@@ -97,17 +94,5 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
         kept = [motion == a for a in names]
         return np.array([np.average(distance[k], weights=counts[k]) for k in kept])
 
-    def mean_error(width: float) -> float:
-        return float(error_by_motion(width).mean())
-
-    best = min(widths, key=mean_error)
-    if best > 0.0:
-        at = widths.index(best)
-        bounds = widths[at - 1], widths[min(at + 1, len(widths) - 1)]
-        found = minimize_scalar(
-            mean_error, bounds=bounds, method="bounded", options={"xatol": _CLOSE * best}
-        )
-        best = min(best, float(found.x), key=mean_error)
-    gains = error_by_motion(0.0) - error_by_motion(best)
-    kept = best > 0.0 and gains.mean() > gains.std(ddof=1) / np.sqrt(len(names))
-    return PlayOperator(best) if kept else None
+    search = search_width(errors_by_motion, np.mean, widths, widest, refine=True)
+    return PlayOperator(search.width) if search.kept else None

@@ -68,13 +68,15 @@ class HalfSpaces(NamedTuple):
         of nu is a box-limited step; proximal rounds remove the effect of its damping.
         """
         J = self.normals.to(margin).T.expand(len(margin), -1, -1)
-        way, nu = margin.new_zeros(len(margin), J.shape[1]), torch.zeros_like(margin)
+        way = margin.new_zeros(len(margin), J.shape[1])
+        nu = torch.zeros_like(margin)
         small = margin.new_full((len(margin),), max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps)))
         for _ in range(1 + IK_PROXIMAL):
             z = (self.along(way) - margin) / small[:, None]
             problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
             change = box_limited_step(problem, small)[0]
-            nu, way = nu + change, way - apply_rows(J, change)
+            nu = nu + change
+            way = way - apply_rows(J, change)
         return way
 
 
@@ -111,7 +113,8 @@ def box_limited_step(
     (1993), for semismooth Newton methods.
     """
     mu = torch.zeros_like(problem.v) if mu is None else mu
-    best, live = mu.clone(), problem
+    best = mu.clone()
+    live = problem
     rows = torch.arange(len(mu), device=mu.device)
     noise = 4.0 * torch.finfo(mu.dtype).eps
     settled = torch.zeros(len(mu), dtype=torch.bool, device=mu.device)
@@ -198,7 +201,9 @@ def _proximal_box_step(
     J dq + lambda^2 mu = v.
     """
     used = torch.maximum(damping_sq, floor)
-    excess, dq, mu = (used - damping_sq)[:, None], problem.z, centre
+    excess = (used - damping_sq)[:, None]
+    dq = problem.z
+    mu = centre
     for _ in range(1 + IK_PROXIMAL):
         dq, mu = box_limited_step(problem._replace(v=problem.v + excess * mu), used, mu)
     return dq, mu
@@ -225,7 +230,9 @@ def _exact_line_search(
     value = start[:, None] + t * curvature[:, None] + (slope * moved).sum(-1)
     # The root lies on the linear part before the first positive value.
     right = (value > 0.0).to(torch.uint8).argmax(-1, keepdim=True).clamp_min(1)
-    t0, t1 = t.gather(-1, right - 1)[:, 0], t.gather(-1, right)[:, 0]
-    f0, f1 = value.gather(-1, right - 1)[:, 0], value.gather(-1, right)[:, 0]
+    t0 = t.gather(-1, right - 1)[:, 0]
+    t1 = t.gather(-1, right)[:, 0]
+    f0 = value.gather(-1, right - 1)[:, 0]
+    f1 = value.gather(-1, right)[:, 0]
     part = f0 / (f0 - f1)
     return t0 + (t1 - t0) * torch.nan_to_num(part, nan=1.0).clamp(0.0, 1.0)

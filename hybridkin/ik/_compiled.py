@@ -74,7 +74,8 @@ def core_of(settings: StepSettings, search: bool = False) -> Core | None:
     Poses have kernels for the search only. The core is kept with the settings, and made again if
     the model has changed.
     """
-    kept, model = vars(settings).get("_program"), program_of(settings.task.models[0])
+    kept = vars(settings).get("_program")
+    model = program_of(settings.task.models[0])
     if kept is None or kept[0] is not model:
         try:
             kept = model, None if model is None else Core(settings, model), ""
@@ -110,9 +111,12 @@ class Core:
     """
 
     def __init__(self, settings: StepSettings, model: Program) -> None:
-        self.plan, self._made_of = Plan(settings.stored()), (settings, model)
-        self.n, self.program = self.plan.n_inputs, model
-        self.settings, self.rows = settings, sum(settings.task.parts)
+        self.plan = Plan(settings.stored())
+        self._made_of = (settings, model)
+        self.n = self.plan.n_inputs
+        self.program = model
+        self.settings = settings
+        self.rows = sum(settings.task.parts)
         if self.rows == 3:
             self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
         self._call = Call(self.plan, opened_library())
@@ -143,17 +147,25 @@ class Core:
         self._idle.append(follower)
         return found
 
-    def steps(self, q: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
+    def steps(
+        self,
+        q: Tensor,
+        target: Tensor,
+        feed: Tensor | None,
+        tip: Tensor | None,
+        last: Tensor | None,
+    ) -> tuple[Tensor, ...]:
         """Return dq, x, error, sigma_min, damping and held actuators, for rows q (N, n).
 
-        `given` is the target, its motion in a period, the measured tip, and the previous step.
+        `feed` is the motion of the targets in a period, `tip` the measured tips, and `last` the
+        previous steps.
         """
-        n, mode = self.n, IK_MUST_SEE
-        for bit, a in zip((IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP), given[:3], strict=True):
-            mode += 0 if a is None else bit
-        out, held = np.empty((len(q), n + 6)), np.empty((len(q), n), dtype=bool)
-        arrays = [None if a is None else _plain(a) for a in (q, *given)]
-        self._run("hk_ik_steps", len(q), [ctypes.c_int32(mode)], [*arrays, out, held])
+        n = self.n
+        out = np.empty((len(q), n + 6))
+        held = np.empty((len(q), n), dtype=bool)
+        arrays = [None if a is None else _plain(a) for a in (q, target, feed, tip, last)]
+        mode = ctypes.c_int32(IK_MUST_SEE | _mode(target, feed, tip))
+        self._run("hk_ik_steps", len(q), [mode], [*arrays, out, held])
         dq, x, numbers = torch.from_numpy(out).split([n, 3, 3], dim=1)
         return dq, x, *numbers.unbind(1), torch.from_numpy(held)
 
@@ -163,19 +175,31 @@ class Core:
 
     def find(self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int) -> Found:
         """Return the result of `hk_ik_find` for starts q (N, n)."""
-        best, rows = _plain(q).copy(), len(q)
-        J, e = np.empty((rows, self.rows, self.n)), np.empty((rows, self.rows))
-        found, n_iter = np.empty((2, rows), dtype=np.int32)
-        way, turn = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
-        turn = ctypes.c_double(turn * self.settings.task.units[-1])
-        numbers = [ctypes.c_int32(mode), ctypes.c_int32(max_iter), ctypes.c_double(way), turn]
-        self._run("hk_ik_find", rows, numbers, [_plain(target), best, J, e, found, n_iter])
-        at, J, e, found, n_iter = (torch.from_numpy(a) for a in (best, J, e, found, n_iter))
-        reached, at_rest, held = (found & bit > 0 for bit in (IK_REACHED, IK_AT_REST, IK_HELD))
-        n_iter = n_iter.long()
-        ends = n_iter, torch.ones_like(n_iter)
-        x = target - e if self.rows == 3 else torch.full_like(target, math.nan)  # not used
-        return Found(at, x, J, e, target.clone(), reached, at_rest, held, *ends)
+        n_rows = len(q)
+        best = _plain(q).copy()
+        J = np.empty((n_rows, self.rows, self.n))
+        e = np.empty((n_rows, self.rows))
+        outcome = np.empty(n_rows, dtype=np.int32)
+        n_iter = np.empty(n_rows, dtype=np.int32)
+        metres, radians = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
+        tolerances = metres, radians * self.settings.task.units[-1]
+        numbers = [*map(ctypes.c_int32, (mode, max_iter)), *map(ctypes.c_double, tolerances)]
+        self._run("hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter])
+        error = torch.from_numpy(e)
+        result = torch.from_numpy(outcome)
+        iterations = torch.from_numpy(n_iter).long()
+        return Found(
+            torch.from_numpy(best),
+            target - error if self.rows == 3 else torch.full_like(target, math.nan),  # not used
+            torch.from_numpy(J),
+            error,
+            target.clone(),
+            reached=result & IK_REACHED > 0,
+            stationary=result & IK_AT_REST > 0,
+            held=result & IK_HELD > 0,
+            n_iter=iterations,
+            n_starts=torch.ones_like(iterations),
+        )
 
     def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
         """Call a function of the library for all rows of arrays."""
@@ -210,23 +234,28 @@ class Follower:
     def __init__(
         self, core: Core, memory: float | None, mode: int = 0, state: NDArray | None = None
     ) -> None:
-        self.core, self._memory, self._least = core, memory, mode
+        self.core = core
+        self._memory = memory
+        self._least = mode
         n = core.n
         self.state = state = np.zeros(IK_Q + 7 * core.n) if state is None else state
+        self.task = core.settings.task
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = memory or 0.0
-        self.q, self._held = state[IK_Q : IK_Q + n], state[IK_Q + 3 * n : IK_Q + 4 * n]
+        self.q = state[IK_Q : IK_Q + n]
         self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
         self._inputs = {at: state[at : at + 3] for at in (IK_TARGET, IK_FEED, IK_TIP)}
         self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
-        self._follow, self._mode = opened_library().hk_ik_tick, -1
+        self._follow = opened_library().hk_ik_tick
+        self._mode = -1
 
     def __reduce__(self) -> tuple[type[Follower], tuple]:
         return Follower, (self.core, self._memory, self._least, self.state.copy())
 
     def start(self, q: Tensor, dq: Tensor) -> None:
         """Set the initial configuration (1, n), and the step that led to it."""
-        state, n = self.state, self.core.n
+        state = self.state
+        n = self.core.n
         state[IK_SIGMA_MIN:] = 0.0
         state[[IK_SIGMA_MIN, IK_DISTANCE, *range(IK_ERROR, IK_Q)]] = math.nan
         state[IK_X:IK_ERROR] = self.core.settings.evaluate(q)[0][0]
@@ -271,39 +300,27 @@ class Follower:
             return False
         return True
 
-    def advance(self, period: float | None, *given: Tensor | None) -> Tick:
+    def advance(self, period: float | None, *inputs: Tensor | None) -> Tick:
         """Do a tick with checked rows: the target, its motion in the period, the measured tip."""
-        mode, bits = self._least, (IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP)
-        for bit, place, a in zip(bits, self._inputs.values(), given, strict=True):
-            if a is not None:
-                place[...] = a.reshape(3).numpy()
-                mode += bit
+        for place, rows in zip(self._inputs.values(), inputs, strict=True):
+            if rows is not None:
+                place[...] = rows.reshape(3).numpy()
+        mode = self._least | _mode(*inputs)
         self.state[IK_MODE] = self._mode = mode
         self.state[IK_PERIOD] = period or self._dt
         self._follow(self._call.place)
         self.state[IK_PERIOD] = self._dt
         return self.last()
 
-    command = property(lambda self: self.q.copy())
-    x = property(lambda self: self.state[IK_X:IK_ERROR].copy())
-    stopped = False  # by tip limits, which have no kernel
-    saturated = property(lambda self: self._held.astype(bool))
-    error = property(lambda self: float(self.state[IK_DISTANCE]))
-    sigma_min = property(lambda self: float(self.state[IK_SIGMA_MIN]))
-    damping = property(lambda self: float(self.state[IK_DAMPING]))
-
-    def reached(self, tol: Tolerance) -> bool:
-        """Return whether the error is within the tolerance."""
-        return self.error <= (tol[0] if isinstance(tol, tuple) else tol)
-
-    def in_domain(self) -> bool:
-        """Return whether the last tick began inside the domain of the model."""
-        n = self.core.n
-        return bool(self.core.program.domain(self.state[IK_Q + 2 * n : IK_Q + 3 * n])[0] <= 1.0)
+    @property
+    def command(self) -> NDArray:
+        """The present command (n,)."""
+        return self.q.copy()
 
     def last(self) -> Tick:
         """Return the results of the last tick."""
-        a, n = torch.from_numpy(self.state.copy())[None], self.core.n
+        a = torch.from_numpy(self.state.copy())[None]
+        n = self.core.n
         _, dq, before, held, J = a[:, IK_Q:].split([n, n, n, n, 3 * n], dim=1)
         step = StepRows(dq, a[:, IK_SIGMA_MIN], a[:, IK_DAMPING], held > 0.0)
         return Tick(before, a[:, IK_X:IK_ERROR], J.view(1, 3, n), a[:, IK_ERROR:IK_Q], step)
@@ -341,6 +358,12 @@ class _CoreSearch(Search):
 
     def _find(self, mode: int, q: Tensor, target: Tensor) -> Found:
         return self.core.find(mode, q, target, self.tol, self.max_iter)
+
+
+def _mode(target: Tensor | None, feed: Tensor | None, tip: Tensor | None) -> int:
+    """Return the bits of the inputs that there are."""
+    mode = IK_HAS_TARGET * (target is not None) + IK_HAS_FEED * (feed is not None)
+    return mode + IK_HAS_TIP * (tip is not None)
 
 
 def _plain(a: Tensor) -> NDArray:

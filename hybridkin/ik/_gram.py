@@ -51,7 +51,9 @@ def row_gram(J: Tensor) -> RowGram:
         return RowGram((squares, vectors), roots[..., 0], roots[..., -1])
     entries = g11, g21, g31, g22, g32, g33 = _entries_3x3(J)
     mean = (g11 + g22 + g33) / 3.0
-    a, b, c = g11 - mean, g22 - mean, g33 - mean
+    a = g11 - mean
+    b = g22 - mean
+    c = g33 - mean
     off = g21 * g21 + g31 * g31 + g32 * g32
     radius = ((a * a + b * b + c * c + 2.0 * off) / 6.0).sqrt()
     det = a * (b * c - g32 * g32) - g21 * (g21 * c - g32 * g31) + g31 * (g21 * g32 - b * g31)
@@ -202,10 +204,13 @@ def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | floa
     """Solve a symmetric semidefinite 3 x 3 system plus damping by LDL^T without pivoting."""
     g11, g21, g31, g22, g32, g33 = entries
     v1, v2, v3 = v.unbind(-1)
-    g11, g22, g33 = g11 + damping_sq, g22 + damping_sq, g33 + damping_sq
+    g11 = g11 + damping_sq
+    g22 = g22 + damping_sq
+    g33 = g33 + damping_sq
     floor = 8.0 * torch.finfo(v.dtype).eps * (g11 + g22 + g33)
     i1 = _reciprocal(g11, floor)
-    l21, l31 = g21 * i1, g31 * i1
+    l21 = g21 * i1
+    l31 = g31 * i1
     i2 = _reciprocal(g22 - l21 * g21, floor)
     t = g32 - l31 * g21
     l32 = t * i2

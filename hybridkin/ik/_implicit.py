@@ -45,10 +45,12 @@ def differentiable(
         the solution but not beside it.
     """
     rows = reached.nonzero()[:, 0]
-    part, goal = q[rows], target[rows]
+    part = q[rows]
+    goal = target[rows]
     lower, upper = settings.box(part)
     free = (part > lower) & (part < upper)
-    best, least = part, torch.full_like(part[:, 0], torch.inf)
+    best = part
+    least = torch.full_like(part[:, 0], torch.inf)
     for _ in range(_POLISHES + 1):
         dq, lacking = _newton(settings, part, goal.detach(), free, tol)
         better = lacking < least

@@ -26,7 +26,9 @@ from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
 
 _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
-_OUTSIDE, _DONE = -1.0, -2.0  # in place of the error: reached outside the domain, and inside
+# in place of the error: reached outside the domain, and inside
+_OUTSIDE = -1.0
+_DONE = -2.0
 _RETURNS = 30  # attempts to return rows that ended outside the tip limits
 _PARTS = [4, 8, 16]  # where further starts are split; only rows still open use the next part
 _ROWS = 256  # rows searched again at once
@@ -102,7 +104,8 @@ class Search:
     def solve(self, q: Tensor, target: Tensor, cold: bool, restarts: int) -> Found:
         """Return the best points from starts q (N, n), and from further starts if these fail."""
         settings = self.settings
-        q, target = settings.start_at(q), settings.allowed(target)
+        q = settings.start_at(q)
+        target = settings.allowed(target)
         if cold and len(q) > 0 and row_gram(settings.evaluate(q[:1])[1]).is_singular.all():
             # At a straight backbone, motions that cancel to first order would be missed.
             at_start = self._start(q, target)
@@ -134,34 +137,46 @@ class Search:
 
         Rows without a further point have NaN as q.
         """
-        settings, s, tol = self.settings, restarts + 1, self.tol
-        tol = tuple(_FINE * t for t in tol) if isinstance(tol, tuple) else _FINE * tol
-        fine, spans = replace(self, tol=tol), settings.spans.to(start)
-        found = best.take(torch.arange(len(start), device=start.device).repeat_interleave(count))
+        settings = self.settings
+        n_starts = restarts + 1
+        spans = settings.spans.to(start)
+        tol = (
+            tuple(_FINE * t for t in self.tol) if isinstance(self.tol, tuple) else _FINE * self.tol
+        )
+        fine = replace(self, tol=tol)
+        rows = torch.arange(len(start), device=start.device)
+        found = best.take(rows.repeat_interleave(count))
         further = torch.arange(len(found.q), device=start.device) % count > 0
         found.q[further] = torch.nan
         for some in (self._cost(best) == _DONE).nonzero()[:, 0].split(_ROWS):
-            size, near = torch.zeros_like(best.error[some]), start[some].repeat_interleave(s, 0)
-            starts = even_starts(settings, start[some], size, restarts).expand(len(some), -1, -1)
-            starts = torch.cat([best.q[some, None], starts], dim=1).flatten(0, 1)
-            more = fine._attempt(
-                settings.start_at(starts), best.target[some].repeat_interleave(s, 0)
-            )
-            if settings.has_posture:
-                fine._to_posture(more)
+            near = start[some].repeat_interleave(n_starts, 0)
+            more = fine._from_even_starts(best.take(some), start[some], restarts)
             turned = more.q + settings.whole_turns(near - more.q)
             more.q = torch.where(settings.inside(turned) == turned, turned, more.q)
-            far = ((more.q - near) / spans).norm(dim=-1)
-            far = torch.where(fine._cost(more) == _DONE, far, torch.inf).view(-1, s)
-            first, q = s * torch.arange(len(some), device=some.device), more.q.unflatten(0, (-1, s))
-            more.n_starts = best.n_starts[some].repeat_interleave(s) + s
+            distance = ((more.q - near) / spans).norm(dim=-1)
+            distance = torch.where(fine._cost(more) == _DONE, distance, torch.inf)
+            distance = distance.view(-1, n_starts)
+            first = n_starts * torch.arange(len(some), device=some.device)
+            q = more.q.unflatten(0, (-1, n_starts))
+            more.n_starts = best.n_starts[some].repeat_interleave(n_starts) + n_starts
             for place in range(count):
-                distance, pick = far.min(1)
-                there, picked = torch.isfinite(distance), more.take(first + pick)
-                found.put(count * some[there] + place, picked.take(there))
+                nearest, pick = distance.min(1)
+                exists = torch.isfinite(nearest)
+                picked = more.take(first + pick)
+                found.put(count * some[exists] + place, picked.take(exists))
                 apart = q - picked.q[:, None]
                 apart = ((apart - settings.whole_turns(apart)) / spans).abs().amax(-1)
-                far = torch.where(apart <= _SAME, torch.inf, far)
+                distance = torch.where(apart <= _SAME, torch.inf, distance)
+        return found
+
+    def _from_even_starts(self, best: Found, start: Tensor, restarts: int) -> Found:
+        """Return the results from the best points and from `restarts` even starts, row by row."""
+        starts = even_starts(self.settings, start, torch.zeros_like(best.error), restarts)
+        starts = torch.cat([best.q[:, None], starts.expand(len(start), -1, -1)], dim=1)
+        target = best.target.repeat_interleave(restarts + 1, 0)
+        found = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
+        if self.settings.has_posture:
+            self._to_posture(found)
         return found
 
     def _to_posture(self, found: Found) -> None:
@@ -181,7 +196,8 @@ class Search:
         n_starts = starts.shape[1]
         if rows.numel() == 0 or n_starts == 0:
             return
-        q, target = starts.flatten(0, 1), found.target[rows].repeat_interleave(n_starts, 0)
+        q = starts.flatten(0, 1)
+        target = found.target[rows].repeat_interleave(n_starts, 0)
         again = self._attempt(self.settings.start_at(q), target)
         n_iter = found.n_iter[rows] + again.n_iter.view(-1, n_starts).sum(1)
         n_tried = found.n_starts[rows] + n_starts
@@ -204,53 +220,58 @@ class Search:
     def _start(self, q: Tensor, target: Tensor) -> Found:
         point = self._point(q, target)
         no = torch.zeros(len(q), dtype=torch.bool, device=q.device)
-        parts = (*vars(point).values(), self._within(point.e), no, no, no.long(), (~no).long())
-        return Found(*(part.clone() for part in parts))
+        outcome = (self._within(point.e), no, no, no.long(), (~no).long())
+        return Found(*(part.clone() for part in (*vars(point).values(), *outcome)))
 
     def _lower(self, q: Tensor, target: Tensor) -> Found:
         """Lower the error until it is within tol or cannot be lowered."""
         found = self._start(q, target)
-        one = torch.ones_like(found.error)
-        own = {"start": found.error, "nu": _FIRST_DAMPING * one, "growth": 2.0 * one}
-        live = _Descent(**vars(found), **own, slow=0.0 * one)
-        rows, half = torch.arange(len(q), device=q.device), 0.5 * self.settings.periods.to(q)
-        turning = torch.isfinite(half)
+        rows = torch.arange(len(q), device=q.device)
+        damping = torch.full_like(found.error, _FIRST_DAMPING)
+        none = torch.zeros_like(damping)
+        live = _Descent(**vars(found), start=found.error, nu=damping, growth=2.0 + none, slow=none)
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
             live.stationary = self._blocked(live)
             live.stationary |= (live.nu > IK_LAST_DAMPING) | (live.slow >= IK_SLOW_STEPS)
             live.n_iter = torch.full_like(live.n_iter, iteration)
-            going = (~live.reached & ~live.stationary) & (iteration < self.max_iter)
+            going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
             if not going.all():
-                done, going = ((~going).nonzero()[:, 0], going.nonzero()[:, 0])
-                found.put(rows[done], live.take(done))
-                if going.numel() == 0:
-                    break
-                rows, live = rows[going], live.take(going)
-            error = live.error
-            # Damping proportional to the error: the last iterations are Gauss-Newton steps.
-            trust = live.nu * (error / live.start)
-            bounds = self.settings.step_bounds(live.q)
-            # A turning joint may pass its limit and continue at the other one.
-            bounds = (a.where(~turning, b) for a, b in zip(bounds, (-half, half), strict=True))
-            step = limited_step(self.settings, live.J, live.e, None, *bounds, trust, quick=True)
-            new = self._point(self.settings.inside(live.q + step.dq), live.target)
-            error_new = new.error
-            predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
-            # The damping follows the ratio of actual to predicted gain.
-            gained = error.square() - error_new.square()
-            quality = gained / (error.square() - predicted.square()).clamp_min(1e-30)
-            better = error_new < error
-            less = live.nu * (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
-            live.nu = torch.where(better, less, live.nu * live.growth)
-            live.growth = torch.where(better, 2.0, 2.0 * live.growth)
-            metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
-            little = better & (error - error_new < IK_SLOW * metres)
-            live.slow = torch.where(little, live.slow + 1.0, 0.0)
-            live.held = step.saturated.any(-1)
-            taken = better.nonzero()[:, 0]
-            live.put(taken, new.take(taken))
+                found.put(rows[~going], live.take(~going))
+                rows = rows[going]
+                live = live.take(going)
+            if rows.numel() == 0:
+                break
+            self._lower_once(live)
         return found
+
+    def _lower_once(self, live: _Descent) -> None:
+        """Try a step of all rows, and take it where it lowers the error."""
+        settings = self.settings
+        error = live.error
+        # Damping proportional to the error: the last iterations are Gauss-Newton steps.
+        trust = live.nu * (error / live.start)
+        lower, upper = settings.step_bounds(live.q)
+        # A turning joint may pass its limit and continue at the other one.
+        half_turn = 0.5 * settings.periods.to(live.q)
+        stays = torch.isinf(half_turn)
+        bounds = lower.where(stays, -half_turn), upper.where(stays, half_turn)
+        step = limited_step(settings, live.J, live.e, None, *bounds, trust, quick=True)
+        new = self._point(settings.inside(live.q + step.dq), live.target)
+        error_new = new.error
+        predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
+        # The damping follows the ratio of actual to predicted gain.
+        gain = error.square() - error_new.square()
+        quality = gain / (error.square() - predicted.square()).clamp_min(1e-30)
+        factor = (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
+        better = error_new < error
+        live.nu = live.nu * torch.where(better, factor, live.growth)
+        live.growth = torch.where(better, 2.0, 2.0 * live.growth)
+        metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
+        little = better & (error - error_new < IK_SLOW * metres)
+        live.slow = torch.where(little, live.slow + 1.0, 0.0)
+        live.held = step.saturated.any(-1)
+        live.put(better, new.take(better))
 
     def _inward(self, q: Tensor) -> Tensor:
         """Return Newton's step to a domain distance slightly below 1.
@@ -280,7 +301,8 @@ class Search:
         all_rows = rows = found.reached.nonzero()[:, 0]
         if rows.numel() == 0:
             return
-        task, unit = self.settings.task, self.settings.unit(found.q)
+        task = self.settings.task
+        unit = self.settings.unit(found.q)
         inside = task.in_domain(found.q)
         live = self._slide(found.take(rows), wanted, torch.ones_like(found.e[rows, 0]))
         for iteration in range(IK_NULL_STEPS):
@@ -291,7 +313,8 @@ class Search:
             gain = 0.5 * ((live.free + new.free) / unit * way).sum(-1)
             moved = live.J.flatten(1).norm(dim=-1) * step.dq.norm(dim=-1)
             loose = new.error <= IK_NULL_SLIP * moved
-            reached, reached_new = self._within(live.e), self._within(new.e)
+            reached = self._within(live.e)
+            reached_new = self._within(new.e)
             ok = ((loose | reached_new) & (gain > 0.0)) | last
             ok |= ~reached & (new.error < 0.5 * live.error)
             ok &= task.in_domain(new.q) | ~inside[rows]
@@ -306,7 +329,8 @@ class Search:
             new.share = new.share.clamp(0.1, 4.0)
             live.share = 0.25 * live.share
             live.put(ok, new.take(ok))
-            rows, live = rows[going], live.take(going)
+            rows = rows[going]
+            live = live.take(going)
             if rows.numel() == 0:
                 break
         _, ended = self._try_step(found.take(all_rows), None, hold=True)
@@ -334,7 +358,8 @@ class Search:
 
     def _blocked(self, at: Point) -> Tensor:
         """Return whether no motion within the limits lowers the error to first order."""
-        q, (lower, upper) = at.q, self.settings.box(at.q)
+        q = at.q
+        lower, upper = self.settings.box(at.q)
         pull = apply_columns(at.J, at.e)
         out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
         out &= torch.isinf(self.settings.periods.to(q.device))
@@ -348,7 +373,8 @@ class Search:
         stationary but not minimal. A second-order motion is needed, which is large even for small
         errors: 5 % of the limits, or the motion that moves a regular tip by a tenth of the error.
         """
-        n, settings = found.q.shape[-1], self.settings
+        n = found.q.shape[-1]
+        settings = self.settings
         size = 0.1 * _per_tip(found.J, found.error)[:, None].expand_as(found.q)
         span = 0.05 * (settings.q_max - settings.q_min).to(found.q)
         size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)

@@ -63,7 +63,9 @@ def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
 
 def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
     """Return tip limits, a pair (A, b) with A x <= b, as half-spaces with unit normals."""
-    need, m, got = "`tip_limits` must be a pair (A, b)", task.shape[0], type(task).__name__
+    need = "`tip_limits` must be a pair (A, b)"
+    m = task.shape[0]
+    got = type(task).__name__
     require(isinstance(task, PositionTask), f"`tip_limits` needs a PositionTask, got a {got}.")
     require(isinstance(given, Sequence) and len(given) == 2, f"{need}, got {given!r:.200}.")
     A, b = (as_tensor(a, "tip_limits").cpu().double() for a in given)
@@ -108,8 +110,10 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
         raise NoKernel("the kernels for poses support rigid arms only")
     names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
     vectors = [stored.array(name, [n], finite=False) for name in names]
-    weights, pulls = stored.array("weights", [n]), stored.array("pulls", [n])
-    periods, normals = stored.array("periods", [n], finite=False), stored.array("normals").T
+    weights = stored.array("weights", [n])
+    pulls = stored.array("pulls", [n])
+    periods = stored.array("periods", [n], finite=False)
+    normals = stored.array("normals").T
     if len(normals) > IK_NORMALS:
         raise NoKernel(f"the log leaves {len(normals)} directions of q out, more than {IK_NORMALS}")
     gain = -1.0 if settings["gain"] is None else settings["gain"]
@@ -158,11 +162,13 @@ class StepSettings(Portable):
 
     def __post_init__(self) -> None:
         """Check the settings; without `q_pref` the posture is the middle of the limits."""
-        sizes, one = self._sizes(), "give scalars or one value per actuator"
+        sizes = self._sizes()
+        one = "give scalars or one value per actuator"
         good = len(set(sizes.values())) < 2
         names = ", ".join(f"`{name}`" for name in sizes)
         require(good, f"{names} must have the same number of actuators, got {sizes}; {one}.")
-        low, high = self.q_min.tolist(), self.q_max.tolist()
+        low = self.q_min.tolist()
+        high = self.q_max.tolist()
         good = (self.q_min <= self.q_max).all()
         require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
         posture = self.middle if self.q_pref is None else self.q_pref
@@ -173,7 +179,8 @@ class StepSettings(Portable):
         require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
         self.rates()
         share = 0.0 if self.damping == "adaptive" else self.damping
-        good, text = not isinstance(share, str) and 0.0 <= share < math.inf, '"adaptive" or'
+        good = not isinstance(share, str) and 0.0 <= share < math.inf
+        text = '"adaptive" or'
         require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
         models = self.task.models
         turns = torch.stack([torch.as_tensor(model.turns, device="cpu") for model in models])
@@ -187,7 +194,8 @@ class StepSettings(Portable):
         task = self.task.present()
         if task is self.task:
             return self
-        n, before = task.n_actuators, self.task.n_actuators
+        n = task.n_actuators
+        before = self.task.n_actuators
         way = "make a new InverseKinematics"
         require(n == before, f"`model` must keep its {before} actuators, but now has {n}; {way}.")
         return replace(self, task=task, **limits_of(task, self.of_model))
@@ -210,7 +218,8 @@ class StepSettings(Portable):
 
     def unit_messages(self) -> list[str]:
         """Return warnings if limits or a posture seem to have another unit than the model."""
-        found, n = [], self.n_actuators
+        found = []
+        n = self.n_actuators
         for name in ("q_min", "q_max", "dq_max", "q_pref"):
             value = vars(self)[name]
             if isinstance(value, Tensor) and n is not None and name not in self.of_model:
@@ -281,7 +290,8 @@ class StepSettings(Portable):
             If they could only be stored as code: tasks other than a `PositionTask` or a
             `PoseTask`, a posture that is a function, or tip limits; or if n is not known.
         """
-        model, n = self.task.models[0], self.n_actuators
+        model = self.task.models[0]
+        n = self.n_actuators
         if type(self.task) not in (PositionTask, PoseTask):
             raise TypeError(f"a {type(self.task).__name__} has no kernel")
         if callable(self.posture):
@@ -411,8 +421,10 @@ class StepSettings(Portable):
         dq <= 2 d / (1 + sqrt(1 + 2 d / (a period^2))). Braking in the next period preserves this.
         """
         q_min, q_max = self.box(q)
-        lower, upper = q_min - q, q_max - q
-        up, down = torch.full_like(q, math.inf), torch.full_like(q, -math.inf)
+        lower = q_min - q
+        upper = q_max - q
+        up = torch.full_like(q, math.inf)
+        down = torch.full_like(q, -math.inf)
         upper = torch.where(q + upper > q_max, torch.nextafter(upper, down), upper)
         lower = torch.where(q + lower < q_min, torch.nextafter(lower, up), lower)
         if self.limits == "off" or period is None:
@@ -421,7 +433,8 @@ class StepSettings(Portable):
         ends = -most, most
         if self.accelerates:
             change = self.change(q, period)
-            lower, upper = -stopping(-lower, change), stopping(upper, change)
+            lower = -stopping(-lower, change)
+            upper = stopping(upper, change)
             ends = [torch.clamp(end, last - change, last + change) for end in ends]
         return torch.clamp(lower, *ends), torch.clamp(upper, *ends)
 
@@ -451,7 +464,8 @@ class StepSettings(Portable):
 
         `lead` gives the leading axes: "..." any, "T" one, "" none.
         """
-        x, one = as_tensor(value, name, self.task.device), shape or self.task.shape
+        x = as_tensor(value, name, self.task.device)
+        one = shape or self.task.shape
         check_shape(x, name, [*filter(None, [lead]), *one], "one point [m] per row")
         if shape is None:
             self.task.check(x, name)
@@ -459,7 +473,8 @@ class StepSettings(Portable):
 
     def times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
         """Return the times of a path's points, and the period after each point."""
-        n, dt = len(target), self.dt
+        n = len(target)
+        dt = self.dt
         if t is None:
             return dt * torch.arange(n, dtype=target.dtype, device=target.device), [dt] * n
         times = as_tensor(t, "t", target.device)
@@ -476,7 +491,8 @@ class StepSettings(Portable):
             return 1
         require(not differentiable, "`n_solutions` must be None for differentiable=True.")
         n_solutions = whole(n_solutions, "n_solutions", 1, 10_000)
-        good, way = torch.isfinite(self.spans).all(), "give finite `q_min` and `q_max`"
+        good = torch.isfinite(self.spans).all()
+        way = "give finite `q_min` and `q_max`"
         require(good, f"`n_solutions` needs finite ranges of q to compare configurations; {way}.")
         return n_solutions
 
@@ -486,6 +502,7 @@ class StepSettings(Portable):
         require(bool((given > 0.0).all()), f"`tol` must be positive [m], got {tol!r}.")
         if np.ndim(tol) == 0:
             return float(given[0])
-        n, parts = len(self.task.parts), "one for every part of the task"
+        n = len(self.task.parts)
+        parts = "one for every part of the task"
         require(given.shape == (n,), f"`tol` must be one number [m] or {n}, {parts}, got {tol!r}.")
         return tuple(given.tolist())

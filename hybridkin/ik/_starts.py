@@ -38,7 +38,8 @@ def nearest_starts(
     Tensor of shape (N, count, n)
         Starts, the nearest one first.
     """
-    task, n = settings.task, q.shape[-1]
+    task = settings.task
+    n = q.shape[-1]
     k = max(count, _SHARED if torch.isfinite(settings.q_max - settings.q_min).all() else _OWN)
     sample = even_starts(settings, q, size, k)
     sample = settings.start_at(sample)
@@ -60,7 +61,8 @@ def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> 
         lower = torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size)
         high = torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size)
         low = lower
-    low, high = low[:, None], high[:, None]
+    low = low[:, None]
+    high = high[:, None]
     shares = _even_shares(q.shape[-1], count, q.device).to(q)
     return torch.lerp(low, high, shares).clamp(low, high)
 

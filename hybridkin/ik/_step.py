@@ -28,7 +28,9 @@ from hybridkin.ik._gram import (
 )
 from hybridkin.ik._settings import StepSettings, stopping
 
-_PROJECTIONS, _EXCESS = 8, 1.5  # for a step that would leave the tip limits
+# for a step that would leave the tip limits
+_PROJECTIONS = 8
+_EXCESS = 1.5
 
 
 class StepRows(NamedTuple):
@@ -82,13 +84,17 @@ def control_step(
     """
     gain, beta, seconds = settings.rates(period)
     v = gain * e if feed_forward is None else feed_forward + gain * e
-    sizes = [a.norm(dim=-1, keepdim=True) for a in (e, v)]
-    given = [a for a in (q, J.flatten(1), *sizes, last) if a is not None]
-    before = 0.0 if last is None else torch.where(torch.isfinite(last).all(-1)[:, None], last, 0.0)
-    fine = torch.stack([torch.isfinite(a).all(-1) for a in given]).all(0)[:, None]
-    at, e = torch.where(fine, q, 0.0), torch.where(fine, e, 0.0)
-    J, posture = _only_taut(settings, torch.where(fine[..., None], J, 0.0)), None
+    sizes = torch.stack([e.norm(dim=-1), v.norm(dim=-1)], dim=-1)
+    fine = _finite(q) & _finite(J.flatten(1)) & _finite(sizes)
+    before = 0.0
+    if last is not None:
+        fine = fine & _finite(last)
+        before = torch.where(_finite(last), last, 0.0)
+    at = torch.where(fine, q, 0.0)
+    e = torch.where(fine, e, 0.0)
+    J = _only_taut(settings, torch.where(fine[..., None], J, 0.0))
     limits = None if tip is None else settings.tip_limits
+    posture = None
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
     change = settings.change(q, seconds)
@@ -114,7 +120,7 @@ def control_step(
         v = v + limits.way_in(margin - limits.along(v))
     if settings.pulls.any():
         step = _arriving(settings, at, J, v, step, *bounds)
-    fine = fine & torch.isfinite(step.dq).all(-1, keepdim=True)
+    fine = fine & _finite(step.dq)
     still = torch.where(torch.isfinite(q), torch.clamp(torch.zeros_like(q), *bounds), 0.0)
     held = (still <= bounds[0]) | (still >= bounds[1])
     return step._replace(
@@ -123,6 +129,11 @@ def control_step(
         damping=torch.where(fine[:, 0], step.damping, 0.0),
         saturated=torch.where(fine, step.saturated, held),
     )
+
+
+def _finite(rows: Tensor) -> Tensor:
+    """Return whether all numbers of rows (N, k) are finite, shape (N, 1)."""
+    return torch.isfinite(rows).all(-1, keepdim=True)
 
 
 def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
@@ -141,7 +152,9 @@ def _step_inside(
     end. A remaining violation is removed by taking a fraction of the way from a safe step, one
     that stays or returns, to this step.
     """
-    limits, close = settings.tip_limits, 32.0 * torch.finfo(v.dtype).eps  # [m]
+    # [m]
+    limits = settings.tip_limits
+    close = 32.0 * torch.finfo(v.dtype).eps
     assert limits is not None
 
     def taken(way: Tensor, z: Tensor | None = z) -> tuple[StepRows, Tensor]:
@@ -184,9 +197,12 @@ def limited_step(
     so it can use estimates of the singular values (`quick`), and `trust`,
     lambda^2 / sigma_max^2, in place of the damping.
     """
-    box, unit = (lower, upper), settings.unit(v)
+    box = (lower, upper)
+    unit = settings.unit(v)
     if settings.weights is not None:
-        J, lower, upper = J * unit, lower / unit, upper / unit
+        J = J * unit
+        lower = lower / unit
+        upper = upper / unit
         posture = None if posture is None else posture / unit
     gram = quick_gram(J, trust is not None) if quick else row_gram(J)
     if trust is not None:
@@ -249,12 +265,17 @@ class _End(NamedTuple):
 
     @property
     def distance(self) -> Tensor:
-        return self.missing.norm(dim=-1, keepdim=True)
+        return _norm(self.missing)
 
     def where(self, better: Tensor, other: _End) -> _End:
         """Return the ends of `other` in the rows (N, 1) where it is better."""
         pairs = zip(other, self, strict=True)
         return _End(*(a.where(better if a.ndim == 2 else better[..., None], b) for a, b in pairs))
+
+
+def _norm(rows: Tensor) -> Tensor:
+    """Return the lengths (N, 1) of rows."""
+    return rows.norm(dim=-1, keepdim=True)
 
 
 def _arriving(
@@ -272,7 +293,9 @@ def _arriving(
     Newton's method corrects it within the bounds. Where the result is less than half of the motion
     v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
     """
-    pulls, task, x = settings.pulls.to(q), settings.task, settings.evaluate(q)[0]
+    pulls = settings.pulls.to(q)
+    task = settings.task
+    x = settings.evaluate(q)[0]
 
     def end_of(dq: Tensor, motion: Tensor) -> _End:
         tip, slope = settings.evaluate(q + dq)
@@ -284,7 +307,8 @@ def _arriving(
             going = best.distance > close
             if not going.any():
                 break
-            low, high = lower - end.dq, upper - end.dq
+            low = lower - end.dq
+            high = upper - end.dq
             more = limited_step(settings, end.J, end.missing, None, low, high).dq
             dq = torch.clamp(end.dq + more, lower, upper)
             dq = torch.where(more <= low, lower, torch.where(more >= high, upper, dq))
@@ -292,15 +316,13 @@ def _arriving(
             best = best.where(going & (end.distance < best.distance), end)
         return best
 
-    size = J.flatten(1).norm(dim=-1, keepdim=True)
-    moved = [a.norm(dim=-1, keepdim=True) for a in (step.dq, q)]
     eps = torch.finfo(q.dtype).eps
-    slip = size * (IK_SLIP * moved[0] + 32.0 * eps * moved[1])
+    slip = _norm(J.flatten(1)) * (IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q))
     promised = apply_rows(J, step.dq)
-    close = torch.maximum(0.5 * promised.norm(dim=-1, keepdim=True), slip)
+    close = torch.maximum(0.5 * _norm(promised), slip)
     end = approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)
-    weak = end.distance > torch.maximum(0.5 * v.norm(dim=-1, keepdim=True), slip)
+    weak = end.distance > torch.maximum(0.5 * _norm(v), slip)
     to = torch.where(pulls < 0.0, lower, upper)
     slack = (end.J == 0.0).all(-2) & (pulls != 0.0)
     to = torch.where(slack & torch.isfinite(to), to, end.dq)

@@ -227,7 +227,8 @@ class Track(Generic[ArrayT]):
 
     def _repr_html_(self) -> str:
         """Return the outcome of the points, the errors and the commands as an HTML table."""
-        q, margin = as_array(self.q), as_array(self.limit_margin).min(initial=np.inf)
+        q = as_array(self.q)
+        margin = as_array(self.limit_margin).min(initial=np.inf)
         tip = "tip of the model" if self.x_measured is None else "measured tip"
         ends = zip(q.min(0, initial=np.inf), q.max(0, initial=-np.inf), strict=True)
         commands = {f"q[{k}]": tuple(map(numbers, pair)) for k, pair in enumerate(ends)}

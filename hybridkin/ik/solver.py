@@ -42,7 +42,9 @@ from hybridkin.ik.tasks import Tolerance, as_task
 from hybridkin.ik.tracker import Plant, Tracker
 from hybridkin.ik.trajectories import Trajectory
 
-_TOL, _MEASURED = 1e-4, 1e-3  # of points of a path, by the model and measured [m]
+# of points of a path, by the model and measured [m]
+_TOL = 1e-4
+_MEASURED = 1e-3
 _GUESSES = 16  # configurations from which the first point of a path is solved
 
 
@@ -154,7 +156,8 @@ class InverseKinematics:
         weights: Array | None = None,
         tip_limits: Sequence[Array] | None = None,
     ) -> None:
-        self.model, task = model, as_task(model)
+        self.model = model
+        task = as_task(model)
         good = 0 not in np.shape(task.models[0].robot.limits["q_min"])
         require(good, "`model` must have an actuator, but all its joints are fixed.")
         given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
@@ -250,8 +253,11 @@ class InverseKinematics:
 
     @torch.no_grad()
     def _steps(self, core: Core | None, q: Array, x_target: Array, *more: Array | None) -> Step:
-        settings, task, (dx, tip, last) = self.settings, self.settings.task, more
-        as_numpy, axes = is_numpy(q), len(task.shape)
+        settings = self.settings
+        task = self.settings.task
+        dx, tip, last = more
+        as_numpy = is_numpy(q)
+        axes = len(task.shape)
         rows = settings.configurations(q, "q")
         given = [(rows, 1), (settings.points(x_target, "x_target", rows), axes)]
         if tip is not None:
@@ -332,11 +338,13 @@ class InverseKinematics:
         those where such a direction exists only at the solution, e.g. a stretched arm. The model
         must be twice differentiable by torch.
         """
-        settings, task = self.settings, self.settings.task
+        settings = self.settings
+        task = self.settings.task
         tolerance = settings.tolerance(tol)
         max_iter = whole(max_iter, "max_iter", 1, 1_000_000)
         restarts = whole(restarts, "restarts", 0, 1_000_000)
-        as_numpy, axes = is_numpy(x_target), len(task.shape)
+        as_numpy = is_numpy(x_target)
+        axes = len(task.shape)
         places = settings.places(n_solutions, differentiable)
         good = isinstance(x_target, Tensor) or not differentiable
         require(good, "`x_target` must be a torch tensor for differentiable=True.")
@@ -346,18 +354,23 @@ class InverseKinematics:
         q = settings.start(target) if q0 is None else settings.configurations(q0, "q0", target)
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
-        q, target = rows_of(q, lead), rows_of(target, lead, axes)
+        q = rows_of(q, lead)
+        target = rows_of(target, lead, axes)
         q = torch.where(torch.isfinite(q), q, torch.nan)  # limits must not make it finite
         core = core_of(settings, search=True) if as_numpy and q.dtype == torch.float64 else None
         search = Search(settings, tolerance, max_iter)
         if core is not None:
-            search, settings = core.search(tolerance, max_iter), core.settings
+            search = core.search(tolerance, max_iter)
+            settings = core.settings
             task = settings.task
         found = search.solve(q, target, q0 is None, restarts)
         if n_solutions is not None:
-            found, lead = search.several(found, q, restarts, places), (*lead, places)
+            found = search.several(found, q, restarts, places)
+            lead = (*lead, places)
             target = target.repeat_interleave(places, 0)
-        q, moved = found.q, (found.target != target).flatten(1).any(-1)  # by tip limits
+        # by tip limits
+        q = found.q
+        moved = (found.target != target).flatten(1).any(-1)
         if differentiable:
             with torch.enable_grad():
                 goal = rows_of(torch.as_tensor(x_target, device=q.device).to(q), lead, axes)
@@ -365,7 +378,8 @@ class InverseKinematics:
         # Error and status refer to the returned q.
         x, J = settings.evaluate(q.detach())
         e = task.difference(x, target)
-        error, gram = e.norm(dim=-1), row_gram(J)
+        error = e.norm(dim=-1)
+        gram = row_gram(J)
         reached = task.reached(e, tolerance)
         status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
         missed = ~reached & torch.isfinite(error)
@@ -443,14 +457,17 @@ class InverseKinematics:
             t = path.t
         if tol is None:
             tol = _MEASURED if feedback == "measured" else _TOL
-        as_numpy, tolerance = is_numpy(points), settings.tolerance(tol)
+        as_numpy = is_numpy(points)
+        tolerance = settings.tolerance(tol)
         target = settings.points(points, "path", lead="T")
         require(len(target) > 0, f"`path` must hold at least one point, got {tuple(target.shape)}.")
         starts = None if q0 is None else settings.configurations(q0, "q0", target)
-        good = starts is None or (starts.ndim < 3 and starts.numel() > 0)
-        require(good, f"`q0` must have shape (n,) or (K, n), got {np.shape(q0)}.")
+        if starts is not None:
+            good = starts.ndim < 3 and starts.numel() > 0
+            require(good, f"`q0` must have shape (n,) or (K, n), got {tuple(starts.shape)}.")
         t, periods = settings.times(t, target)
-        way, loop = (target, t, periods, tolerance), (plant, feedback, memory)
+        way = (target, t, periods, tolerance)
+        loop = (plant, feedback, memory)
         if starts is not None and starts.ndim == 1:
             for message in settings.far_messages(target, "path"):
                 warnings.warn(message, stacklevel=3)
@@ -467,7 +484,8 @@ class InverseKinematics:
 
     def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
-        settings, given = self.settings, q0 is not None
+        settings = self.settings
+        given = q0 is not None
         if q0 is None:
             start = settings.start(target)[None]
             q0 = nearest_starts(settings, start, start[:, 0], target, _GUESSES)[0]
@@ -498,14 +516,16 @@ class InverseKinematics:
         progress: Callable[[int, int], None] | None,
     ) -> Track:
         """Return the track from one start (n,)."""
-        settings, task = self.settings, self.settings.task
+        settings = self.settings
+        task = self.settings.task
         q = settings.configurations(q0, "q0", target)
         target = target.to(q.dtype)
         tracker = Tracker(settings, as_array(q) if as_numpy else q, tol, memory)
         parts = tracker.follow(target, periods, plant, feedback, progress)
         q, x, measured, sigma_min, held, damped = parts
         e_model, e = (task.difference(a, target) for a in (x, measured))
-        judged, error = e if feedback == "measured" else e_model, e.norm(dim=-1)
+        judged = e if feedback == "measured" else e_model
+        error = e.norm(dim=-1)
         reached = task.reached(judged, tol)
         status = statuses(task, q, judged.norm(dim=-1), reached, held, damped)
         status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT

@@ -68,7 +68,8 @@ class Task:
     def _follow(self, model: object) -> None:
         """Take the model of the task, and remember its estimator."""
         if isinstance(model, Fitted) and not isinstance(model, nn.Module):
-            self.estimator, self.module = model, model.module_
+            self.estimator = model
+            self.module = model.module_
         self.models = (self._suitable(as_forward_model(model)),)
 
     def _suitable(self, model: ForwardModel) -> ForwardModel:
@@ -90,7 +91,8 @@ class Task:
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return distances (N, k) of x ``(1 or N, k, *shape)`` to targets ``(N, *shape)``."""
-        n, k = len(x_target), x.shape[1]
+        n = len(x_target)
+        k = x.shape[1]
         x = x.expand(n, k, *self.shape).flatten(0, 1)
         return self.difference(x, x_target.repeat_interleave(k, 0)).norm(dim=-1).view(n, k)
 
@@ -160,7 +162,9 @@ class PositionTask(Task):
 
     def __init__(self, model: object, size: int = 3) -> None:
         count = whole(size, "size")
-        self.shape, self.parts, self.units = (count,), (count,), (1.0,)
+        self.shape = (count,)
+        self.parts = (count,)
+        self.units = (1.0,)
         self._follow(model)
 
     def _suitable(self, model: ForwardModel) -> ForwardModel:
@@ -234,7 +238,9 @@ class PoseTask(Task):
     def __init__(self, model: object, radian: float = 0.1) -> None:
         if not 0.0 < number(radian, "radian") < math.inf:
             raise ValueError(f"`radian` must be a positive length [m], got {radian!r}.")
-        self.shape, self.parts, self.units = (4, 4), (3, 3), (1.0, float(radian))
+        self.shape = (4, 4)
+        self.parts = (3, 3)
+        self.units = (1.0, float(radian))
         self._follow(model)
 
     def _suitable(self, model: ForwardModel) -> ForwardModel:
@@ -318,12 +324,14 @@ class PointsTask(Task):
             raise TypeError(
                 f"`chain` must have with_tip(at), e.g. a chain of arcs, got {type(chain).__name__}."
             )
-        self.models, n = tuple(chain.with_tip(number(a, "at")) for a in at), len(at)
+        self.models = tuple(chain.with_tip(number(a, "at")) for a in at)
+        n = len(at)
         self.units = (1.0,) * n if weights is None else tuple(number(w, "weights") for w in weights)
         if n == 0 or len(self.units) != n or not all(0.0 < w < math.inf for w in self.units):
             need = "positive, one for every point of `at`"
             raise ValueError(f"`weights` must be {need}, got {self.units} for {n} points.")
-        self.shape, self.parts = (n, 3), (3,) * n
+        self.shape = (n, 3)
+        self.parts = (3,) * n
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points (N, P, 3) and the weighted J (N, 3 P, n)."""

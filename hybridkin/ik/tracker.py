@@ -25,15 +25,6 @@ from hybridkin.ik.tasks import Tolerance
 Plant = Callable[["NDArray | Tensor"], Array]
 
 
-def _seen(name: str, text: str) -> Any:
-    def read(self: Tracker) -> Any:
-        with self._lock:
-            return getattr(self._robot, name)
-
-    read.__doc__ = text
-    return property(read)
-
-
 class Tracker(Portable):
     """Inverse kinematics step by step: each target gives the next command.
 
@@ -78,7 +69,9 @@ class Tracker(Portable):
         memory = None if memory is None else number(memory, "memory")
         good = memory is None or 0.0 < memory < math.inf
         require(good, f"`memory` must be a positive time [s], got {memory!r}.")
-        self._settings, self._tol, self._memory = settings, tol, memory
+        self._settings = settings
+        self._tol = tol
+        self._memory = memory
         self._as_numpy = is_numpy(q0)
         self._lock = Lock()  # of the state, for threads that share the tracker
         self.reset(q0)
@@ -92,13 +85,48 @@ class Tracker(Portable):
         n = len(self.q)
         return f"Tracker({n} actuators, {self.status.name}, error {self.error:.3g} m)"
 
-    backend = _seen("backend", '"compiled", or "torch: " and the reason.')
-    q = _seen("command", "The present command, shape (n,).")
-    x = _seen("x", "The model's tip before the last step [m], in the shape of the task.")
-    error = _seen("error", "Distance from the tip, measured or the model's, to the target [m].")
-    saturated = _seen("saturated", "Actuators that the last step held at a limit, bool (n,).")
-    sigma_min = _seen("sigma_min", "Smallest singular value of the Jacobian before the last step.")
-    damping = _seen("damping", "Damping lambda of the last step, in the unit of `sigma_min`.")
+    @property
+    def backend(self) -> str:
+        """What computes the steps: "compiled", or "torch: " and the reason."""
+        return self._robot.backend
+
+    @property
+    def q(self) -> NDArray | Tensor:
+        """The present command, shape (n,)."""
+        with self._lock:
+            return self._robot.command
+
+    @property
+    def x(self) -> NDArray | Tensor:
+        """The model's tip before the last step [m], in the shape of the task."""
+        return self._given_back(self._last().x)
+
+    @property
+    def saturated(self) -> NDArray | Tensor:
+        """Actuators that the last step held at a limit, bool (n,)."""
+        return self._given_back(self._last().step.saturated)
+
+    @property
+    def error(self) -> float:
+        """Distance from the tip, measured or the model's, to the target [m]."""
+        return float(self._last().e.norm())
+
+    @property
+    def sigma_min(self) -> float:
+        """Smallest singular value of the Jacobian before the last step."""
+        return float(self._last().step.sigma_min)
+
+    @property
+    def damping(self) -> float:
+        """Damping lambda of the last step, in the unit of `sigma_min`."""
+        return float(self._last().step.damping)
+
+    def _last(self) -> Tick:
+        with self._lock:
+            return self._robot.last()
+
+    def _given_back(self, rows: Tensor) -> NDArray | Tensor:
+        return as_array(rows[0]).copy() if self._as_numpy else rows[0].clone()
 
     @property
     def status(self) -> IKStatus:
@@ -109,16 +137,19 @@ class Tracker(Portable):
         was damped or no motion is possible, MAX_ITER otherwise. INVALID_INPUT before the first
         step, and if the target, the measured tip or the model's output was not finite.
         """
-        with self._lock:
-            robot = self._robot
-            if not math.isfinite(robot.error + robot.sigma_min):
-                return IKStatus.INVALID_INPUT
-            if robot.reached(self._tol):
-                return IKStatus.CONVERGED if robot.in_domain() else IKStatus.OUT_OF_DOMAIN
-            if robot.saturated.any() or robot.stopped:
-                return IKStatus.AT_LIMITS
-            damped = robot.damping > 0.0 or robot.sigma_min == 0.0
-            return IKStatus.SINGULAR if damped else IKStatus.MAX_ITER
+        last = self._last()
+        task = self._robot.task
+        step = last.step
+        if not torch.isfinite(last.e.norm() + step.sigma_min):
+            return IKStatus.INVALID_INPUT
+        if task.reached(last.e, self._tol):
+            with torch.no_grad():
+                inside = task.in_domain(last.q)
+            return IKStatus.CONVERGED if inside else IKStatus.OUT_OF_DOMAIN
+        if step.saturated.any() or step.stopped:
+            return IKStatus.AT_LIMITS
+        damped = step.damping > 0.0 or step.sigma_min == 0.0
+        return IKStatus.SINGULAR if damped else IKStatus.MAX_ITER
 
     def reset(self, q: Array) -> None:
         """Restart at rest from an actuator vector, as read from the robot.
@@ -140,14 +171,17 @@ class Tracker(Portable):
     def _start(self, q: Tensor, dq: Tensor) -> None:
         """Read the model, and start at q (n,) after a step dq (n,)."""
         self._settings = settings = self._settings.present()
-        core, task = core_of(settings), settings.task
+        core = core_of(settings)
+        task = settings.task
         if core is not None and self._as_numpy and q.dtype == torch.float64:
             robot = Follower(core, self._memory)
         else:
             reason = "`q0` is no float64 array of NumPy" if core else why_torch(settings)
             robot = _InTorch(settings, self._memory, self._as_numpy, reason)
         robot.start(q[None], dq[None])
-        self._estimator, self._module, self._robot = task.estimator, task.module, robot
+        self._estimator = task.estimator
+        self._module = task.module
+        self._robot = robot
 
     def step(
         self, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
@@ -182,9 +216,11 @@ class Tracker(Portable):
 
     def _step(self, x_target: Array, dx: Array | None, x_measured: Array | None) -> None:
         """Do a step with arguments that need full checks."""
-        settings, like = self._settings, self._like
+        settings = self._settings
+        like = self._like
         target = settings.points(x_target, "x_target", like, lead="")[None]
-        feed_forward, tip = None, None
+        feed_forward = None
+        tip = None
         if dx is not None:
             rows = (sum(settings.task.parts),)
             feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)[None]
@@ -205,7 +241,8 @@ class Tracker(Portable):
         Rows are the points of the path (T, ...). Held and damped refer to the step to the point,
         all others to the state at the point.
         """
-        task, n = self._settings.task, len(targets)
+        task = self._settings.task
+        n = len(targets)
         ahead = task.difference(targets, torch.cat([targets[1:], targets[-1:]]))
         ahead = torch.where(torch.isfinite(ahead).all(-1, keepdim=True), ahead, 0.0)
         known = torch.isfinite(targets.flatten(1)).all(-1).tolist()
@@ -217,7 +254,8 @@ class Tracker(Portable):
                 progress(i, n)
             tip = None if plant is None else self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
-            ahead_now, target = ahead[i : i + 1], target if known[i] else None
+            ahead_now = ahead[i : i + 1]
+            target = target if known[i] else None
             tick = self._robot.advance(periods[i], target, ahead_now, used)
             rows.append((tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped))
             held = tick.step.saturated.any(-1) | tick.step.stopped
@@ -244,16 +282,20 @@ class _InTorch:
     def __init__(
         self, settings: StepSettings, memory: float | None, as_numpy: bool, reason: str
     ) -> None:
-        self._memory, self._as_numpy, self.backend = memory, as_numpy, f"torch: {reason}"
+        self._memory = memory
+        self._as_numpy = as_numpy
+        self.backend = f"torch: {reason}"
         self.task = settings.task.frozen()
         self._settings = replace(settings, task=self.task)
 
     @torch.no_grad()
     def start(self, q: Tensor, dq: Tensor) -> None:
         """Set the initial configuration (1, n), and the step that led to it."""
-        self._q, (x, J) = q, self._settings.evaluate(q)
+        self._q = q
+        x, J = self._settings.evaluate(q)
         self._offset = x.new_zeros(1, sum(self.task.parts))  # last measured minus model
-        unknown, none = torch.full_like(self._offset, math.nan), torch.zeros_like(q)
+        unknown = torch.full_like(self._offset, math.nan)
+        none = torch.zeros_like(q)
         step = StepRows(dq, unknown[:, 0], none[:, 0], none > 0.0)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
@@ -274,9 +316,11 @@ class _InTorch:
 
         If `tip` is None the model's is used. Without a target the step is feed-forward only.
         """
-        settings, task = self._settings, self.task
+        settings = self._settings
+        task = self.task
         x, J = settings.evaluate(self._q)
-        error, used = torch.full_like(self._offset, math.nan), torch.zeros_like(self._offset)
+        error = torch.full_like(self._offset, math.nan)
+        used = torch.zeros_like(self._offset)
         if target is not None:
             error = used = task.difference(x, target)
             if tip is not None:
@@ -294,7 +338,8 @@ class _InTorch:
         step = control_step(settings, self._q, J, used, feed_forward, seconds, last, at)
         if self._memory is not None:
             self._offset = math.exp(-seconds / self._memory) * self._offset
-        self._last, self._period = Tick(self._q, x, J, error, step), seconds
+        self._last = Tick(self._q, x, J, error, step)
+        self._period = seconds
         self._q = self._q + step.dq
         return self._last
 
@@ -302,22 +347,7 @@ class _InTorch:
         """Return the results of the last tick."""
         return self._last
 
-    def reached(self, tol: Tolerance) -> bool:
-        """Return whether the error is within the tolerance."""
-        return bool(self.task.reached(self._last.e, tol))
-
-    @torch.no_grad()
-    def in_domain(self) -> bool:
-        """Return whether the last step began inside the domain of the models."""
-        return bool(self.task.in_domain(self._last.q))
-
-    command = property(lambda self: self._given_back(self._q))
-    x = property(lambda self: self._given_back(self._last.x))
-    saturated = property(lambda self: self._given_back(self._last.step.saturated))
-    stopped = property(lambda self: bool(self._last.step.stopped))
-    error = property(lambda self: float(self._last.e.norm(dim=-1)))
-    sigma_min = property(lambda self: float(self._last.step.sigma_min))
-    damping = property(lambda self: float(self._last.step.damping))
-
-    def _given_back(self, row: Tensor) -> NDArray | Tensor:
-        return as_array(row[0]).copy() if self._as_numpy else row[0].clone()
+    @property
+    def command(self) -> NDArray | Tensor:
+        """The present command (n,)."""
+        return as_array(self._q[0]).copy() if self._as_numpy else self._q[0].clone()

@@ -50,7 +50,8 @@ class Trajectory:
             raise ValueError(f"`t` and `x` must be finite; drop the {rows} that are not.")
         late = np.flatnonzero(np.diff(t) <= 0)
         if late.size:
-            row, pair = late[0] + 1, f"{t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s"
+            row = late[0] + 1
+            pair = f"{t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s"
             raise ValueError(f"`t` must increase, got {pair} in row {row}; sort, drop repeats.")
         largest = float(np.abs(x).max())
         if largest > _FAR:

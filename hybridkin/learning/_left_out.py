@@ -43,9 +43,12 @@ class LeftOut:
 
     def __init__(self, elm, stats, X, y, weights, fit_intercept):
         n_features = len(elm.output_weights)
-        self._elm, self._X, self._intercept = elm, X, fit_intercept
+        self._elm = elm
+        self._X = X
+        self._intercept = fit_intercept
         mean, G, C, _ = moments(stats, n_features, fit_intercept)
-        self._n, self._center = stats.n, mean[:n_features]
+        self._n = stats.n
+        self._center = mean[:n_features]
         self._root = np.sqrt(weights)
         self._y = (y - mean[n_features:]) * self._root[:, None]
         self._wide = len(X) <= n_features
@@ -56,7 +59,8 @@ class LeftOut:
                 gram += (1 + np.trace(gram)) * np.outer(self._root, self._root) / self._n
             eigenvalues, self._basis = linalg.eigh(gram)
             if fit_intercept:
-                eigenvalues, self._basis = eigenvalues[:-1], self._basis[:, :-1]
+                eigenvalues = eigenvalues[:-1]
+                self._basis = self._basis[:, :-1]
             self._Zy = self._basis.T @ self._y
         else:
             eigenvalues, self._basis = linalg.eigh(G)
@@ -74,7 +78,8 @@ class LeftOut:
         D = self._d(alphas)
         for batch in gen_batches(len(self._X), self._rows_at_a_time(len(alphas))):
             rows = np.arange(batch.start, batch.stop)
-            Z, root = self._z(rows), self._root[rows]
+            Z = self._z(rows)
+            root = self._root[rows]
             p = D @ (Z * Z).T
             if not self._wide:
                 p += 1.0 - (root**2 / self._n if self._intercept else 0.0)
@@ -94,8 +99,8 @@ class LeftOut:
         for part in self._in_parts(splits, self._rows_at_a_time(len(alphas))):
             rows = np.concatenate([out for out, _ in part])
             if not self._wide and len(rows) > len(self._center) and len(part) == 1:
-                (split,) = part
-                yield split[1], self._refitted(*split, alphas)
+                out, asked = part[0]
+                yield asked, self._refitted(out, asked, alphas)
                 continue
             Z = self._z(rows)
             residuals = self._residuals(Z, D, rows)
@@ -111,13 +116,15 @@ class LeftOut:
 
         A split of more rows than features is single, see `_refitted`.
         """
-        part, size = [], 0
+        part = []
+        size = 0
         for split in splits:
             count = len(split[0])
             single = not self._wide and count > len(self._center)
             if part and (single or size + count > n_rows):
                 yield part
-                part, size = [], 0
+                part = []
+                size = 0
             part.append(split)
             size = n_rows if single else size + count
         if part:
@@ -167,7 +174,8 @@ class LeftOut:
         n_features = len(self._center)
         scatter = np.diag(np.append(self.eigenvalues, np.zeros(self._y.shape[1])))
         scatter[:n_features, n_features:] = self._Zy
-        total, weight = np.zeros(len(scatter)), self._n
+        total = np.zeros(len(scatter))
+        weight = self._n
         for batch in gen_batches(len(out), self._rows_at_a_time(0)):
             rows = out[batch]
             z = np.hstack([self._z(rows), self._y[rows]])
@@ -182,7 +190,8 @@ class LeftOut:
         errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
         for batch in gen_batches(len(asked), self._rows_at_a_time(len(alphas))):
             root = self._root[asked[batch], None]
-            z, y = self._z(asked[batch]) / root, self._y[asked[batch]] / root
+            z = self._z(asked[batch]) / root
+            y = self._y[asked[batch]] / root
             errors[:, batch] = y - mean[n_features:] - (z - mean[:n_features]) @ W
         return errors
 

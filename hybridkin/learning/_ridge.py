@@ -30,12 +30,14 @@ def gather(stats, elm, X, y, sample_weight, block_size):
     Each block is centred about its own mean. The step from the old mean to the block's mean is
     added as one more row, so each block needs one symmetric product, and the result is exact.
     """
-    n_features, device = len(elm.output_weights), elm.input_center.device
+    n_features = len(elm.output_weights)
+    device = elm.input_center.device
     n_columns = n_features + y.shape[1]
     if stats is None:
         stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
     block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
-    n, mean = stats.n, torch.tensor(stats.mean, device=device)
+    n = stats.n
+    mean = torch.tensor(stats.mean, device=device)
     scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is updated
     buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
     for rows in gen_batches(len(X), block_size):
@@ -66,7 +68,8 @@ def gather(stats, elm, X, y, sample_weight, block_size):
 @np.errstate(over="ignore", invalid="ignore")
 def merge(a, b):
     """Return the statistics of the rows of `a` and `b` (parallel variance formula)."""
-    n, step = a.n + b.n, b.mean - a.mean
+    n = a.n + b.n
+    step = b.mean - a.mean
     scatter = a.scatter + b.scatter + np.outer(step, step) * (a.n / n * b.n)
     return Statistics(n, a.mean + step * (b.n / n), scatter)
 
@@ -113,7 +116,8 @@ def moments(stats, n_features, fit_intercept):
             "`X` and `y` must give finite sums of products of features and targets in float64, "
             "got an overflow; change their unit, or scale the inputs with `input_scaling`."
         )
-    G, C = scatter[:n_features, :n_features], scatter[:n_features, n_features:]
+    G = scatter[:n_features, :n_features]
+    C = scatter[:n_features, n_features:]
     return mean, G, C, scatter.diagonal()[n_features:]
 
 
@@ -123,9 +127,13 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
 
     The leverage belongs to the smallest entry of `alpha`, a number or an array of shape (m,).
     """
-    n, (mean, G, C, yy) = stats.n, moments(stats, n_features, fit_intercept)
+    n = stats.n
+    mean, G, C, yy = moments(stats, n_features, fit_intercept)
     alphas = np.broadcast_to(np.asarray(alpha, dtype=np.float64), yy.shape)
-    W, dof, solvers, R = np.empty(C.shape), np.empty(yy.shape), set(), None
+    W = np.empty(C.shape)
+    dof = np.empty(yy.shape)
+    solvers = set()
+    R = None
     for value in np.unique(alphas)[::-1]:
         of = alphas == value
         W[:, of], R, dof[of], solver = ridge(G, C[:, of], value)
@@ -135,6 +143,7 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
     dof_left = n - dof - fit_intercept
     resolved = (dof_left > np.sqrt(np.finfo(np.float64).eps) * n) & np.isfinite(dof_left)
     noise = np.maximum(rss, 0.0) / np.where(resolved, dof_left, np.nan)
-    mu, offset = mean[:n_features], np.float64(1 / n if fit_intercept else 0)
+    mu = mean[:n_features]
+    offset = np.float64(1 / n if fit_intercept else 0)
     arrays = (W, mean[n_features:] - mu @ W, mu, R, offset)
     return dict(zip(READOUT, arrays, strict=True)), noise, max(solvers)  # "eigh" if any

@@ -327,17 +327,21 @@ class ELMRegressor(FittedNetwork):
         X, y, sample_weight = check_rows(self, X, y, sample_weight, reset=first)
         if sample_weight is not None and not sample_weight.all():
             X, y, sample_weight = (part[sample_weight > 0] for part in (X, y, sample_weight))
-        y_ndim, y = y.ndim, y.reshape(len(y), -1)
+        y_ndim = y.ndim
+        y = y.reshape(len(y), -1)
         if first:
-            elm, stats = draw_layer(self, X, sample_weight), None
+            elm = draw_layer(self, X, sample_weight)
+            stats = None
         else:
-            elm, (n, mean, scatter) = self.module_, self._stats
+            elm = self.module_
+            n, mean, scatter = self._stats
             if y.shape[1] != elm.n_outputs:
                 raise ValueError(
                     f"`y` must have {elm.n_outputs} columns as in earlier calls, got "
                     f"{y.shape[1]}; call `fit` to start again."
                 )
-            stats, y_ndim = Statistics(decay * n, mean, decay * scatter), self._y_ndim
+            stats = Statistics(decay * n, mean, decay * scatter)
+            y_ndim = self._y_ndim
         elm = elm.to(device_named(self.device))
         stats = gather(stats, elm, X, y, sample_weight, self.block_size)
         self._solve(stats, elm)
@@ -371,7 +375,9 @@ class ELMRegressor(FittedNetwork):
 
     def _hold(self, module, stats):
         """Store a fitted network, and its arrays as learned attributes."""
-        self.module_, self._stats, self.n_samples_seen_ = module, stats, stats.n
+        self.module_ = module
+        self._stats = stats
+        self.n_samples_seen_ = stats.n
         for name in LAYER + READOUT:
             setattr(self, f"{name}_", module.get_buffer(name).numpy(force=True))
         return self
@@ -398,9 +404,11 @@ class ELMRegressor(FittedNetwork):
         elm._validate_params()
         network = restore(stored.part("network"))
         n_both = sum(network.output_weights.shape)
-        mean, scatter = stored.array("mean", (n_both,)), stored.array("scatter", (n_both, n_both))
+        mean = stored.array("mean", (n_both,))
+        scatter = stored.array("scatter", (n_both, n_both))
         shape = (network.n_outputs,)
         elm.noise_variance_ = stored.array("noise_variance", shape, finite=False)
-        elm.solver_, elm._y_ndim = stored.value("solver", str), stored.value("y_ndim", int)
+        elm.solver_ = stored.value("solver", str)
+        elm._y_ndim = stored.value("y_ndim", int)
         restore_columns(elm, stored, network.n_actuators)
         return elm._hold(network, Statistics(stored.value("n_samples_seen", float), mean, scatter))

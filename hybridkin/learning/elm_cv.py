@@ -174,7 +174,9 @@ class ELMRegressorCV(FittedNetwork):
         # Listed splits are used as given, even if equal rows fall into different splits.
         apart = np.arange(len(X)) if isinstance(self.cv, (Iterable, PredefinedSplit)) else groups
         first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
-        X, y, groups = X[first], y[first], None if groups is None else groups[first]
+        X = X[first]
+        y = y[first]
+        groups = None if groups is None else groups[first]
         if len(y) < 2:
             raise ValueError(
                 f"`X` must have at least 2 different rows of positive weight, so that one can be "
@@ -189,7 +191,8 @@ class ELMRegressorCV(FittedNetwork):
         shared = {name: vars(self)[name] for name in _SHARED} | {"random_state": seed}
         sizes = _positive(self.n_hidden, "n_hidden", integer=True)
         scales = _positive(self.weight_scales, "weight_scales")
-        untouched, tried = np.ones(X.shape[1]), []
+        untouched = np.ones(X.shape[1])
+        tried = []
         for size, scale in product(sizes, scales):
             params = {**shared, "n_hidden": int(size), "weight_scale": float(scale)}
             tried.append(_candidate(params, untouched, task))
@@ -211,10 +214,13 @@ class ELMRegressorCV(FittedNetwork):
                 break
             best = tried[-1]
         self.alpha_ = best.params["alpha"]
-        self.best_params_, self.best_score_ = best.params, -best.score
+        self.best_params_ = best.params
+        self.best_score_ = -best.score
         chosen = ELMRegressor(**best.params).fit(X, y, sample_weight)
-        self.best_estimator_, self.module_ = chosen, chosen.module_
-        self.noise_variance_, self._y_ndim = chosen.noise_variance_, y.ndim
+        self.best_estimator_ = chosen
+        self.module_ = chosen.module_
+        self.noise_variance_ = chosen.noise_variance_
+        self._y_ndim = y.ndim
         self.left_out_errors_ = at_place(_left_out_errors(best, task).reshape(y.shape), place)
         names = ("n_hidden", "weight_scale", "relevance", "alphas", "mean_squared_error")
         rows = [{**candidate.params, **candidate._asdict()} for candidate in tried]
@@ -260,7 +266,8 @@ def _candidate(params, relevance, task):
     left_out = LeftOut(elm, stats, X, targets, weights, asked.fit_intercept)
     largest = left_out.eigenvalues[-1] or 1.0
     alphas = _AUTO_ALPHAS * largest if isinstance(alphas, str) else _positive(alphas, "alphas")
-    total, weight = np.zeros((len(alphas), targets.shape[1])), 0.0
+    total = np.zeros((len(alphas), targets.shape[1]))
+    weight = 0.0
     for rows, errors in _errors(left_out, splits, alphas):
         total += np.einsum("r, lrm -> lm", weights[rows], errors * errors)
         weight += weights[rows].sum()
@@ -275,7 +282,8 @@ def _errors(left_out, splits, alphas):
 
 
 def _left_out_errors(best, task):
-    total, count = np.zeros(task.targets.shape), np.zeros((len(task.X), 1))
+    total = np.zeros(task.targets.shape)
+    count = np.zeros((len(task.X), 1))
     alpha = np.array([best.params["alpha"]])
     for rows, errors in _errors(best.left_out, task.splits, alpha):
         total[rows] += errors[0]
@@ -293,12 +301,15 @@ def _relevance(best, task):
         model.module_.get_buffer(name).numpy(force=True) for name in ("input_center", "input_scale")
     )
     scale = scale * best.relevance
-    total, squares, weight = 0.0, 0.0, 0.0
+    total = 0.0
+    squares = 0.0
+    weight = 0.0
     for batch in gen_batches(len(task.X), _ROWS_OF_JACOBIANS):
         J = model.jacobian(task.X[batch]) * scale
         w = task.weights[batch]
         total = total + np.tensordot(w, J, 1)
-        squares, weight = squares + np.tensordot(w, J * J, 1), weight + w.sum()
+        squares = squares + np.tensordot(w, J * J, 1)
+        weight = weight + w.sum()
     spread = np.sqrt(np.maximum(squares / weight - (total / weight) ** 2, 0.0).sum(axis=0))
     relevance = np.maximum(spread / (spread.max() or 1.0), _LEAST_RELEVANCE)
     half = scale / relevance
@@ -319,7 +330,8 @@ def _splits(cv, groups, n_rows, place):
         cv = GroupKFold(int(cv))
     if not isinstance(cv, (Iterable, PredefinedSplit)):
         place = np.arange(n_rows)
-    splits, rows = [], np.arange(len(place))
+    splits = []
+    rows = np.arange(len(place))
     splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
     with TURNS.filters:
         found = [*splitter.split(rows, rows, groups)]
@@ -329,7 +341,8 @@ def _splits(cv, groups, n_rows, place):
                 "`cv` must not test on rows that it trains on, but one of its splits does; use a "
                 "splitter of sklearn.model_selection."
             )
-        out, asked = np.ones(n_rows + 1, dtype=bool), np.zeros(n_rows + 1, dtype=bool)
+        out = np.ones(n_rows + 1, dtype=bool)
+        asked = np.zeros(n_rows + 1, dtype=bool)
         out[place[train]], asked[place[test]] = False, True  # the last: rows of weight 0
         splits.append((np.flatnonzero((out | asked)[:-1]), np.flatnonzero(asked[:-1])))
     return [split for split in splits if len(split[1])]

@@ -13,7 +13,8 @@ DTYPES = (np.float64, np.float32)
 
 def _scaling(X, sample_weight, input_scaling):
     """Return center and scale (d,) that map the columns of `X` to about [-1, 1]."""
-    n_inputs, eps = X.shape[1], np.finfo(X.dtype).eps
+    n_inputs = X.shape[1]
+    eps = np.finfo(X.dtype).eps
     if input_scaling is None:
         return np.zeros(n_inputs), np.ones(n_inputs)
     if isinstance(input_scaling, str):
@@ -28,7 +29,8 @@ def _scaling(X, sample_weight, input_scaling):
             f'give the limits of each column of `X`, or use "minmax".'
         )
     low, high = bounds / 2  # halved first: the widest range must not overflow
-    center, scale = low + high, high - low
+    center = low + high
+    scale = high - low
     # Do not divide by the range of a column that is constant up to rounding.
     constant = scale <= 4 * eps * np.abs(center)
     scale = np.where(constant, 1.0, scale)
@@ -36,7 +38,8 @@ def _scaling(X, sample_weight, input_scaling):
         u = (X - center) / scale
         mean = np.average(u, axis=0, weights=sample_weight)
         std = np.sqrt(np.average((u - mean) ** 2, axis=0, weights=sample_weight))
-        center, scale = center + mean * scale, scale * np.where(constant, 1.0, std)
+        center = center + mean * scale
+        scale = scale * np.where(constant, 1.0, std)
     return center, scale
 
 
@@ -90,7 +93,8 @@ def _validated(estimator, X, *y, good=True, **checks):
 
 def draw_layer(params, X, sample_weight):
     """Return the hidden layer for an estimator's parameters, with a readout of zeros."""
-    rng, shape = check_random_state(params.random_state), (params.n_hidden, X.shape[1])
+    rng = check_random_state(params.random_state)
+    shape = (params.n_hidden, X.shape[1])
     W = rng.uniform(-params.weight_scale, params.weight_scale, shape)
     b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
     layer = (W, b, *_scaling(X, sample_weight, params.input_scaling))

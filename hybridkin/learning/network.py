@@ -46,12 +46,14 @@ def write_units(plan, kind, activation, scaling, readout, hidden, lever=()):
     center, scale = scaling
     intercept, direct, output = readout
     W, b = hidden
-    (m, n), n_hidden = direct.shape, len(b)
+    m, n = direct.shape
+    n_hidden = len(b)
     units = np.zeros((-(-n_hidden // HK_GROUP) * HK_GROUP, n + 1 + m))
     units[:n_hidden] = np.column_stack([W, b, output.T])
     groups = units.reshape(-1, HK_GROUP, n + 1 + m).swapaxes(1, 2)
     numbers = [center, 1.0 / scale, intercept, direct, groups]
-    n_features, full = 0, False
+    n_features = 0
+    full = False
     if lever:
         n_features = len(lever[1])
         full, leverage = lever_numbers(plan, *lever)
@@ -80,7 +82,8 @@ def lever_numbers(plan, offset, center, factor):
 
 def write_network(plan, stored, leverage=False):
     """Write the node of an `ELM`, with its leverage if a guard needs it, and return its place."""
-    W, b = stored.array("input_weights"), stored.array("input_bias")
+    W = stored.array("input_weights")
+    b = stored.array("input_bias")
     weights = stored.array("output_weights")
     n_hidden = len(b)
     direct = np.zeros((W.shape[1], weights.shape[1]))
@@ -150,7 +153,8 @@ class ELM(LeverageModule):
         if n_features not in (n_hidden, n_hidden + self.n_actuators):
             raise ValueError(f"{n_hidden} hidden neurons cannot have {n_features} features")
         # J = T @ sigma' with T = w_out (x) w_in
-        w_in, w_out = self.input_weights / self.input_scale, self.output_weights[:n_hidden]
+        w_in = self.input_weights / self.input_scale
+        w_out = self.output_weights[:n_hidden]
         self.register_buffer("tangent", (w_out.T[:, None] * w_in.T).flatten(0, 1))
 
     def extra_repr(self):
@@ -163,7 +167,8 @@ class ELM(LeverageModule):
         check_vectors(q, n_inputs, "q", f"this ELM was fitted on {n_inputs} inputs")
         # Merging the scaling into W and b would lose digits if the range is narrow.
         u = (q - self.input_center.to(q)) / self.input_scale.to(q)
-        W, b = self.input_weights.to(q), self.input_bias.to(q)
+        W = self.input_weights.to(q)
+        b = self.input_bias.to(q)
         a = nn.functional.linear(u, W, b) if out is None else torch.addmm(b, u, W.T, out=out)
         return u, a, ACTIVATIONS[self.activation][0](a, out=out)
 
@@ -178,7 +183,8 @@ class ELM(LeverageModule):
         return torch.cat((s, u), -1) if len(self.output_weights) > s.shape[-1] else s
 
     def _readout(self, u, s):
-        weights, intercept = self.output_weights.to(s), self.intercept.to(s)
+        weights = self.output_weights.to(s)
+        intercept = self.intercept.to(s)
         return nn.functional.linear(self._features(u, s), weights.T, intercept)
 
     def _slope(self, a, s):

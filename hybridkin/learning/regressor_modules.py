@@ -44,9 +44,11 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     if isinstance(getattr(regressor, "module_", None), nn.Module):
         return as_forward_model(regressor)
     steps = [*regressor.named_steps.values()] if isinstance(regressor, Pipeline) else [regressor]
-    center, scale = np.zeros(q.shape[1]), np.ones(q.shape[1])
+    center = np.zeros(q.shape[1])
+    scale = np.ones(q.shape[1])
     while len(steps) > 1 and (found := _affine(steps[0])) is not None:
-        center, scale = center + scale * found[0], scale * found[1]
+        center = center + scale * found[0]
+        scale = scale * found[1]
         steps = steps[1:]
     readout = steps[-1]
     if isinstance(readout, _LINEAR):
@@ -70,7 +72,8 @@ def _register(module: nn.Module, **arrays: ArrayLike) -> None:
 
 
 def _write_affine(plan: Plan, stored: Stored) -> int:
-    coef, bias = stored.array("coef"), stored.array("bias")
+    coef = stored.array("coef")
+    bias = stored.array("bias")
     m, n = coef.shape
     readout = bias, coef, np.zeros((m, 0))
     hidden = np.zeros((0, n)), np.zeros(0)
@@ -107,7 +110,8 @@ class AffineModule(ForwardModel):
 
 def _write_polynomial(plan: Plan, stored: Stored) -> int:
     """Write the node of a polynomial: for each monomial the places of its powers in a table."""
-    powers, readout = stored.array("powers").astype(int), stored.array("readout")
+    powers = stored.array("powers").astype(int)
+    readout = stored.array("readout")
     n_monomials, n = powers.shape
     degrees = int(powers.max()) + 1
     plan.limit("powers", n * degrees)
@@ -147,10 +151,12 @@ class PolynomialModule(ForwardModel):
         self, powers: ArrayLike, readout: ArrayLike, center: ArrayLike, scale: ArrayLike
     ) -> None:
         super().__init__()
-        exponents, coef = np.asarray(powers), np.asarray(readout)
+        exponents = np.asarray(powers)
+        coef = np.asarray(readout)
         if not np.isin(exponents, range(_MOST_POWER)).all():
             raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
-        self.n_actuators, self.n_outputs = exponents.shape[1], coef.shape[1]
+        self.n_actuators = exponents.shape[1]
+        self.n_outputs = coef.shape[1]
         k, j = np.nonzero(exponents)  # monomial k has a derivative along input j
         lower = exponents[k] - np.eye(self.n_actuators)[j]
         both = np.vstack([exponents, lower])
@@ -191,7 +197,8 @@ class PolynomialModule(ForwardModel):
 
 
 def _write_kernel(plan: Plan, stored: Stored) -> int:
-    rows, weights = stored.array("rows"), stored.array("weights")
+    rows = stored.array("rows")
+    weights = stored.array("weights")
     direct = np.zeros((weights.shape[1], rows.shape[1]))
     hidden = rows, -0.5 * (rows * rows).sum(1)
     scaling = stored.array("center"), stored.array("scale")
@@ -229,8 +236,10 @@ class KernelModule(ForwardModel):
         scale: ArrayLike,
     ) -> None:
         super().__init__()
-        at, heights = np.asarray(rows), np.asarray(weights)
-        (n_rows, self.n_actuators), self.n_outputs = at.shape, heights.shape[1]
+        at = np.asarray(rows)
+        heights = np.asarray(weights)
+        n_rows, self.n_actuators = at.shape
+        self.n_outputs = heights.shape[1]
         self._block = max(1, _KERNEL_BLOCK // n_rows)
         tangent = (heights[:, :, None] * at[:, None, :]).reshape(n_rows, -1)
         bias = np.broadcast_to(bias, self.n_outputs)
@@ -239,7 +248,8 @@ class KernelModule(ForwardModel):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""
-        weights, bias = self.weights.to(q), self.bias.to(q)
+        weights = self.weights.to(q)
+        bias = self.bias.to(q)
         return in_blocks(lambda q: (self._kernel(q)[1] @ weights + bias,), q, self._block)[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -248,7 +258,8 @@ class KernelModule(ForwardModel):
         return x, J
 
     def _kernel(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        u, rows = (q - self.center.to(q)) / self.scale.to(q), self.rows.to(q)
+        u = (q - self.center.to(q)) / self.scale.to(q)
+        rows = self.rows.to(q)
         squares = u.square().sum(-1, keepdim=True) + rows.square().sum(-1)
         distances = (squares - 2.0 * (u @ rows.mT)).clamp(min=0.0)
         return u, torch.exp(-0.5 * distances)
@@ -274,7 +285,8 @@ class RegressorModule(ForwardModel):
         self.regressor = regressor
         width = (q.amax(0) - q.amin(0)).numpy()
         self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(width > 0, width, 1.0)
-        self.n_actuators, self.n_outputs = q.shape[1], self.evaluate(q[:1]).shape[1]
+        self.n_actuators = q.shape[1]
+        self.n_outputs = self.evaluate(q[:1]).shape[1]
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the regressor's prediction, shape (..., m)."""
@@ -286,7 +298,8 @@ class RegressorModule(ForwardModel):
 
     def differences(self, q: Tensor) -> Tensor:
         """Return dx/dq without a graph, shape (..., m, n)."""
-        at, steps = q.detach().cpu().double(), torch.from_numpy(np.diag(self._step))
+        at = q.detach().cpu().double()
+        steps = torch.from_numpy(np.diag(self._step))
         changes = [self.evaluate(at + step) - self.evaluate(at - step) for step in steps]
         return (torch.stack(changes, dim=-1) / (2 * steps.diag())).to(q)
 
@@ -327,7 +340,8 @@ def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
     """Return rows, weights, widths and bias of a regressor with a Gaussian kernel."""
     kind = type(fitted)
     if kind is KernelRidge and fitted.kernel == "rbf":
-        rows, weights = fitted.X_fit_, fitted.dual_coef_
+        rows = fitted.X_fit_
+        weights = fitted.dual_coef_
         gamma = fitted.gamma if fitted.gamma is not None else 1.0 / rows.shape[1]
         return rows, weights.reshape(len(rows), -1), (2.0 * gamma) ** -0.5, 0.0
     if kind is GaussianProcessRegressor:

@@ -31,7 +31,9 @@ _RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "hal
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
 _NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
 _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
-_STEPS, _MEMORY = 4, 5.0  # steps per run of the test; memory in periods
+# steps per run of the test; memory in periods
+_STEPS = 4
+_MEMORY = 5.0
 # Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
 _OPERATIONS = {
     "arcs": lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
@@ -193,7 +195,8 @@ def _operations(plan: Plan) -> int:
     work = 0
     for place, end in zip(plan.places, [*ends, len(plan.data)], strict=True):
         n, m = plan.lengths(place)
-        count, kind = end - plan.begin(place), plan.kind(place)
+        count = end - plan.begin(place)
+        kind = plan.kind(place)
         if kind in _OPERATIONS:
             work += _OPERATIONS[kind](count, n, m, plan.largest["segments"])
         else:  # learned parts use each number once for x, and at most m times for J
@@ -206,7 +209,8 @@ def _limits(plan: Plan) -> tuple[NDArray, float]:
 
     What a step does not keep is infinite.
     """
-    n, numbers = plan.n_inputs, plan.data[plan.begin(plan.root) :]
+    n = plan.n_inputs
+    numbers = plan.data[plan.begin(plan.root) :]
     limits = numbers[: 4 * n].reshape(4, n)
     if not plan.entry(plan.root, 1) & IK_LIMITED:
         limits = np.repeat(_NO_LIMITS, n, axis=1)
@@ -227,11 +231,13 @@ def _vectors(
     module: ForwardModel, plan: Plan, controller: _Controller | None, dtype: str
 ) -> dict[str, Any]:
     """Return the data of the test: inputs, and the outputs that torch computes."""
-    double, rng = copy.deepcopy(module).double(), np.random.default_rng(0)
+    double = copy.deepcopy(module).double()
+    rng = np.random.default_rng(0)
     center, half = _usual(double, plan.n_inputs)
     if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
         low, high, *_ = _limits(plan)[0]
-        center, half = 0.5 * (low + high), 0.5 * (high - low)
+        center = 0.5 * (low + high)
+        half = 0.5 * (high - low)
     # Eight usual rows, then rows at growing distance from the center; the last one is NaN.
     far = np.concatenate([np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]])
     rows = center + half * far[:, None] * rng.uniform(-1.0, 1.0, (17, len(half)))
@@ -256,7 +262,8 @@ def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
         center, half = (buffers.get(name, np.empty(0)) for name in pair)
         if center.shape == half.shape == (n,):
             return center, half
-    radii, gains = buffers.get("radii", np.full(1, 2.0)), buffers.get("gains", np.ones(n))
+    radii = buffers.get("radii", np.full(1, 2.0))
+    gains = buffers.get("gains", np.ones(n))
     extensible = "gains" in buffers and "lengths" not in buffers
     middle = (3.0 * radii.mean() if extensible else 0.0) / gains
     return middle + buffers.get("actuator_zeros", 0.0), 0.5 * radii.min() / np.abs(gains)
@@ -266,8 +273,10 @@ def _runs(
     controller: _Controller, plan: Plan, starts: NDArray, tips: NDArray, dtype: str
 ) -> dict[str, NDArray]:
     """Return runs of steps that start inside the limits and at them, and their results."""
-    rng, ((low, high, *_), dt) = np.random.default_rng(1), _limits(plan)
-    low, high = low.astype(dtype), high.astype(dtype)
+    rng = np.random.default_rng(1)
+    (low, high, *_), dt = _limits(plan)
+    low = low.astype(dtype)
+    high = high.astype(dtype)
     starts = starts.clip(low, high)
     starts[4:, ::2] = np.where(np.isfinite(high), high, starts[4:])[:, ::2]
     # Short steps in single precision: at limits and in weak directions its steps can differ.
@@ -294,7 +303,8 @@ def _measured(source: Path) -> str:
     """Return the size of the code and of its stack, measured by the compiler of this machine."""
     if shutil.which("cc") and shutil.which("size"):
         with tempfile.TemporaryDirectory() as home:
-            built, usage = Path(home) / "a.o", Path(home) / "a.su"
+            built = Path(home) / "a.o"
+            usage = Path(home) / "a.su"
             options = ["-std=c99", "-Os", "-fstack-usage", "-c", source, "-o", built]
             done = subprocess.run(["cc", *options], capture_output=True)
             if done.returncode == 0 and usage.exists():

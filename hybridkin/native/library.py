@@ -53,7 +53,8 @@ def available() -> bool:
 
 def backend(model: ForwardModel) -> str:
     """Return how a model is computed for NumPy arrays: "compiled", or "torch: " and a reason."""
-    missing, reason = library() is None, _opened()[1]
+    missing = library() is None
+    reason = _opened()[1]
     if not missing:
         program_of(model)
         reason = vars(model)["_program"].reason
@@ -99,7 +100,9 @@ def _fault(opened: ctypes.CDLL) -> str:
 def _is_right(opened: ctypes.CDLL) -> bool:
     """Return whether arcs and logistic units match their closed forms and finite differences."""
     # Two equal segments form one arc of length r [m] that bends by t [rad] in the direction a.
-    r, a, t = 0.7, 0.3, np.array([0.5, 2.0, 3.0, 5.0, 9.0])
+    r = 0.7
+    a = 0.3
+    t = np.array([0.5, 2.0, 3.0, 5.0, 9.0])
     side = r * (1.0 - np.cos(t)) / t
     x = np.stack([side * np.cos(a), side * np.sin(a), r * np.sin(t) / t], 1)
     q = np.stack([t * np.cos(a), t * np.sin(a), 0.0 * t + r], 1)
@@ -195,10 +198,13 @@ class Program:
         distance : bool, default=False
             Whether to compute the domain distance.
         """
-        lead, (n, m) = q.shape[:-1], self._sizes
+        lead = q.shape[:-1]
+        n, m = self._sizes
         if q.shape == (n,):
-            a, size = np.empty(m + m * n + 1), m + m * n
-            at, row = _address(a) or 0, np.asarray(q, np.float64).tobytes()
+            a = np.empty(m + m * n + 1)
+            size = m + m * n
+            at = _address(a) or 0
+            row = np.asarray(q, np.float64).tobytes()
             places = at + 8 * m if jacobian else None, at + 8 * size if distance else None
             self._evaluate(self._call.place, row, 1, at, *places)
             J = a[m:size].reshape(m, n) if jacobian else None
@@ -211,7 +217,8 @@ class Program:
 
     def domain(self, q: NDArray, slope: bool = False) -> tuple[NDArray, NDArray | None]:
         """Return the domain distance (...) at q (..., n), and its gradient (..., n) or None."""
-        d, slopes = np.empty(q.shape[:-1]), np.empty(q.shape) if slope else None
+        d = np.empty(q.shape[:-1])
+        slopes = np.empty(q.shape) if slope else None
         self._fill(q, [(None, 0), (slopes, self._sizes[0]), (d, 1)])
         return d, slopes
 
@@ -264,7 +271,8 @@ def play(rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool) -> list
     n = rows.shape[1]
     vectors = np.empty((3, n))
     vectors[0], vectors[1], vectors[2] = half, *state
-    at, found = _address(vectors), np.empty_like(rows)
+    at = _address(vectors)
+    found = np.empty_like(rows)
     places = at, _address(rows), at + 8 * n, at + 16 * n, _address(found)
     opened_library().hk_play(len(rows), n, lead, *places)
     return [found, vectors[1], vectors[2]]
@@ -285,22 +293,27 @@ class _Compiled:
     """
 
     def __init__(self, model: ForwardModel) -> None:
-        self.program, self.reason = None, ""
-        self.tensors, self.views = [], []
+        self.program = None
+        self.reason = ""
+        self.tensors = []
+        self.views = []
         modules = [*model.modules()]
         dicts = [d for m in modules for d in (m._modules, m._buffers, m._parameters)]
         self.dicts = [d for d in dicts if d]
         self.parts = [dict(d) for d in self.dicts]
         portable = [m for m in modules if isinstance(m, PortableModule)]
         self.settings = [(vars(m), name) for m in portable for name in m.layout.settings]
-        self.content, self.state = [], self._state()
+        self.content = []
+        self.state = self._state()
         try:
             _check_classes(modules)
             tensors = [*model.buffers(), *model.parameters()]
             if any(a.device.type != "cpu" or a.is_inference() for a in tensors):
                 raise NoKernel("the compiled core needs tensors on the CPU, no inference tensors")
-            self.tensors, self.views = tensors, [*map(_memory, tensors)]
-            self.content, self.state = [*map(bytearray, self.views)], self._state()
+            self.tensors = tensors
+            self.views = [*map(_memory, tensors)]
+            self.content = [*map(bytearray, self.views)]
+            self.state = self._state()
             self.program = Program(Plan(model.stored()))
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
@@ -359,7 +372,8 @@ def evaluate(
         return (program.domain(q)[0],)
     if program is not None:
         return tuple(a for a in program.evaluate(q, jacobian, distance) if a is not None)
-    rows, found = torch.from_numpy(q), ()
+    rows = torch.from_numpy(q)
+    found = ()
     with torch.no_grad():
         if jacobian:
             found = model.forward_and_jacobian(rows)

@@ -116,7 +116,7 @@ def test_forces_balance_where_it_rests(chain, rng):
     assert_close(moments / scale, 0 * moments, rtol=0, atol=1e-14)
 
 
-WAYS = [(_slack, "_WHOLE_STEPS"), (tendons, "_TABLE")]
+WAYS = [(_slack, "HK_WHOLE_STEPS"), (tendons, "_TABLE")]
 
 
 @pytest.mark.parametrize(("module", "limit"), WAYS)

@@ -2,8 +2,8 @@
 
    The file holds int32 numbers: lengths of code and data, place of the root, rows of q; then code
    (int32), data (float64) and q (float64). Prints the largest difference of x, J, the domain
-   distance and its slope between both ways, relative to the largest number of each. Every array is as long as
-   it must be, so that a sanitizer finds any access beside it. */
+   distance and its slope between both ways, relative to the largest number of each. Every array is
+   as long as it must be, so that a sanitizer finds any access beside it. */
 
 #include "hk.c"
 

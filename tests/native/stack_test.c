@@ -2,7 +2,8 @@
 
    The functions run in threads whose stack was painted before. With EXPORTED these are those of an
    export named "robot"; else of a library, the first argument, on a plan from a file, the second,
-   as for kernels_test.c (q: NaN among them). Functions of steps for a plan of inverse kinematics. */
+   as for kernels_test.c (q: NaN among them). Functions of steps for a plan of inverse kinematics.
+ */
 
 #include <pthread.h>
 #include <stdio.h>
@@ -86,17 +87,24 @@ static void (*steps)(const call_t *, int64_t, int32_t, const double *, const dou
 static void (*find)(const call_t *, int64_t, int32_t, int32_t, double, double, const double *,
                     double *, double *, double *, int32_t *, int32_t *);
 
-static void *value(void *count) { return evaluate(&call, q, *(int64_t *)count, x, NULL, NULL), NULL; }
+static void *value(void *count) {
+    return evaluate(&call, q, *(int64_t *)count, x, NULL, NULL), NULL;
+}
 static void *slope(void *count) { return evaluate(&call, q, *(int64_t *)count, x, J, NULL), NULL; }
-static void *all(void *count) { return evaluate(&call, q, *(int64_t *)count, x, J, distance), NULL; }
-static void *domain(void *count) { return evaluate(&call, q, *(int64_t *)count, NULL, J, distance), NULL; }
+static void *all(void *count) {
+    return evaluate(&call, q, *(int64_t *)count, x, J, distance), NULL;
+}
+static void *domain(void *count) {
+    return evaluate(&call, q, *(int64_t *)count, NULL, J, distance), NULL;
+}
 static void *ticks(void *none) { return tick(&call), none; }
 static void *many_steps(void *none) {
     return steps(&call, rows, 15, q, x, x, x, q, J, (unsigned char *)distance), none;
 }
 static void *search(void *mode) {
-    return find(&call, rows, *(int32_t *)mode, 30, 1e-9, 0.0, x, q, J, distance, (int32_t *)(distance + 6 * rows),
-                (int32_t *)(distance + 7 * rows)), NULL;
+    return find(&call, rows, *(int32_t *)mode, 30, 1e-9, 0.0, x, q, J, distance,
+                (int32_t *)(distance + 6 * rows), (int32_t *)(distance + 7 * rows)),
+           NULL;
 }
 
 static void *filled(FILE *file, size_t size, size_t count) {

@@ -1,4 +1,4 @@
-/* Chains of circular arcs. Arcs are the lengths of all segments, then the x-, then the y-bendings. */
+/* Chains of circular arcs. Arcs are lengths of all segments, then their x-, then y-bendings. */
 
 #define HK_FRAME 13 /* numbers of a frame before its offsets */
 
@@ -48,8 +48,8 @@ static inline HK(stumpff_t) HK(stumpff)(V s) {
 /* The tip x (3) of arcs z (3 S) in the measuring frame, and its derivative C (3, 3 S) if asked for.
    `frame` holds the rotation of the base (3, 3), its position (3), the robot's reach and the rigid
    offsets (S). */
-HK_INLINE void HK(arcs_tip_of)(
-    int S, const real *frame, const V *restrict z, V *restrict x, V *restrict C) {
+HK_INLINE void HK(arcs_tip_of)(int S, const real *frame, const V *restrict z, V *restrict x,
+                               V *restrict C) {
     const real *turn = frame, *origin = frame + 9, *offsets = frame + HK_FRAME;
     HK(stumpff_t) arc[HK_MAX_S];
     V across[HK_MAX_S], rest[HK_MAX_S], tail[HK_MAX_S][3];
@@ -117,8 +117,7 @@ typedef struct {
 } HK(linear_arcs);
 
 /* The arcs z (3 S) of q. */
-HK_INLINE void HK(arcs_of)(
-    HK(linear_arcs) a, const V *q, V *z) {
+HK_INLINE void HK(arcs_of)(HK(linear_arcs) a, const V *q, V *z) {
     for (int k = 0; k < a.S; k++)
         for (int part = 0; part < 3; part++) {
             const real *row = a.matrix + (3 * k + part) * a.width;
@@ -129,8 +128,7 @@ HK_INLINE void HK(arcs_of)(
 }
 
 /* J (rows, n) += C dz/dq, for C (rows, 3 S). */
-HK_INLINE void HK(pull_arcs)(
-    HK(linear_arcs) a, int rows, int n, const V *C, V *J) {
+HK_INLINE void HK(pull_arcs)(HK(linear_arcs) a, int rows, int n, const V *C, V *J) {
     for (int i = 0; i < rows; i++, J += n, C += 3 * a.S)
         for (int k = 0; k < a.S; k++) {
             const real *row = a.matrix + 3 * k * a.width;

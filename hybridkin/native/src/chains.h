@@ -29,7 +29,8 @@ static inline const real *HK(couplings)(const hk_plan *p, int at) {
 }
 
 /* The inner coordinates z of q, and what `pull` needs. */
-static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, const HK(inside) *in) {
+static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z,
+                                   const HK(inside) * in) {
     (void)in;
     if (HK_CHAIN_IS(p, at, HK_RIGID)) {
         const int n = p->code[at + HK_N];
@@ -58,8 +59,7 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z, c
 }
 
 /* The tip x (3) of inner coordinates z, and its derivative C (3, k) where not NULL. */
-static inline void HK(from_coordinates)(
-    const hk_plan *p, int at, const V *z, V *x, V *C, V *work) {
+static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V *x, V *C, V *work) {
     const int32_t *more = p->code + at + HK_MORE;
     (void)work;
     if (HK_CHAIN_IS(p, at, HK_RIGID))
@@ -69,8 +69,8 @@ static inline void HK(from_coordinates)(
 }
 
 /* J (rows, n) += C dz/dq, for C (rows, k). */
-HK_INLINE void HK(pull_rows)(
-    const hk_plan *p, int at, const HK(inside) *in, int rows, const V *C, V *J) {
+HK_INLINE void HK(pull_rows)(const hk_plan *p, int at, const HK(inside) * in, int rows, const V *C,
+                             V *J) {
     const int n = p->code[at + HK_N];
     (void)in, (void)n;
     if (HK_CHAIN_IS(p, at, HK_RIGID)) {
@@ -78,8 +78,7 @@ HK_INLINE void HK(pull_rows)(
         const real *A = HK(couplings)(p, at);
         for (int i = 0; i < rows * n; i++) {
             if (!A) J[i] = J[i] + C[i];
-            for (int l = 0; A && l < k; l++)
-                J[i] = J[i] + C[i / n * k + l] * A[n * l + i % n];
+            for (int l = 0; A && l < k; l++) J[i] = J[i] + C[i / n * k + l] * A[n * l + i % n];
         }
     } else if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
         HK(elastic_t) e = HK(elastic_of)(p, at);
@@ -101,7 +100,7 @@ HK_INLINE void HK(pull_rows)(
 }
 
 /* J (3, n) += C dz/dq, for C (3, k). */
-static inline void HK(pull)(const hk_plan *p, int at, const HK(inside) *in, const V *C, V *J) {
+static inline void HK(pull)(const hk_plan *p, int at, const HK(inside) * in, const V *C, V *J) {
     HK(pull_rows)(p, at, in, 3, C, J);
 }
 

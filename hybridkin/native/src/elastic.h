@@ -1,8 +1,8 @@
 /* Tendons that can only pull on an elastic backbone: which are taut, and the shape at balance.
 
    The length change and bendings y of segment k stretch a tendon by w . t_k - d, where t_k is y_k,
-   and with the routing "base" the sum of y_0 to y_k; d is how far the tendon is paid out. At balance
-       D_k t_k - E_k t_{k-1} - E_{k+1} t_{k+1} = sum of w d over the taut tendons of segment k,
+   and with the routing "base" the sum of y_0 to y_k; d is how far the tendon is paid out. At
+   balance D_k t_k - E_k t_{k-1} - E_{k+1} t_{k+1} = sum of w d over the taut tendons of segment k,
    a block tridiagonal system with diagonal E. It is reduced from the last segment to the first:
    what the later segments add to D_k is their stiffness in series with the backbone's. */
 
@@ -15,8 +15,9 @@ typedef struct {
 #define HK_INSIDE_WORK(n, S) (HK_USES(HK_ELASTIC) * (6 * (S) + (n)))
 
 /* Sizes and numbers of a node. Of a segment these are its stiffnesses (3), its E (3), the arc at
-   rest up to the tip (3), and the shares of t_k and of t_{k-1} in what is up to the tip; of a tendon its zero [m], the x and y of
-   its w = (1, x, y), xx, xy, yy, and its gain [m per unit of q]. */
+   rest up to the tip (3), and the shares of t_k and of t_{k-1} in what is up to the tip; of a
+   tendon its zero [m], the x and y of its w = (1, x, y), xx, xy, yy, and its gain [m per unit of
+   q]. */
 typedef struct {
     int n, S, tip, same;   /* tendons; segments, and up to the tip; tendons of each if all alike */
     const int32_t *counts; /* tendons that end at each segment */
@@ -29,7 +30,7 @@ typedef struct {
 #define HK_BEHIND 10
 #define HK_SEGMENT 11 /* numbers of a segment */
 #define HK_GAIN 6
-#define HK_TENDON 7   /* numbers of a tendon */
+#define HK_TENDON 7 /* numbers of a tendon */
 
 static inline HK(elastic_t) HK(elastic_of)(const hk_plan *p, int at) {
     const int32_t *more = p->code + at + HK_MORE;
@@ -62,8 +63,7 @@ HK_INLINE void HK(symmetric)(const V *A, const V *x, V *y) {
 
 /* What tendons with the stiffness A are behind springs E: E D^-1 A for D = E + A, which takes no
    difference of large numbers. */
-HK_INLINE void HK(in_series)(
-    const real *E, const V *inverse, const V *A, V *passed) {
+HK_INLINE void HK(in_series)(const real *E, const V *inverse, const V *A, V *passed) {
     V y[3];
     HK(symmetric)(inverse, (const V[3]){A[0], A[1], A[2]}, y);
     passed[0] = y[0] * E[0];
@@ -75,25 +75,25 @@ HK_INLINE void HK(in_series)(
 }
 
 /* Solve the system in place: t (3 S) comes as its right-hand side. */
-HK_INLINE void HK(balance)(
-    HK(elastic_t) e, const HK(inside) *in, V *t) {
+HK_INLINE void HK(balance)(HK(elastic_t) e, const HK(inside) * in, V *t) {
     for (int k = e.S - 1; k > 0; k--) {
         V moved[3];
         HK(symmetric)(in->inverse + 6 * k, t + 3 * k, moved);
         for (int i = 0; i < 3; i++)
-            t[3 * k - 3 + i] = t[3 * k - 3 + i] + moved[i] * e.segments[HK_SEGMENT * k + HK_PASSED + i];
+            t[3 * k - 3 + i] =
+                t[3 * k - 3 + i] + moved[i] * e.segments[HK_SEGMENT * k + HK_PASSED + i];
     }
     HK(symmetric)(in->inverse, t, t);
     for (int k = 1; k < e.S; k++) {
         for (int i = 0; i < 3; i++)
-            t[3 * k + i] = t[3 * k + i] + t[3 * k - 3 + i] * e.segments[HK_SEGMENT * k + HK_PASSED + i];
+            t[3 * k + i] =
+                t[3 * k + i] + t[3 * k - 3 + i] * e.segments[HK_SEGMENT * k + HK_PASSED + i];
         HK(symmetric)(in->inverse + 6 * k, t + 3 * k, t + 3 * k);
     }
 }
 
 /* Factor the system of the taut tendons, and solve it: t (3 S). */
-HK_INLINE void HK(shape)(
-    HK(elastic_t) e, const V *q, const HK(inside) *in, V *t) {
+HK_INLINE void HK(shape)(HK(elastic_t) e, const V *q, const HK(inside) * in, V *t) {
     int first = e.n;
     V passed[6] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
     for (int k = e.S - 1; k >= 0; k--) {
@@ -126,15 +126,15 @@ HK_INLINE void HK(shape)(
 /* Whether a tendon is still to change its role, `found` being the right one now: the first that is
    not wrong by rounding alone. `none` tells whether there was none before it. */
 static inline M HK(first_wrong)(M found, M was, V stretch, V size, M *none) {
-    const M wrong = (found != was) & (HK(max)(stretch, -stretch) > size * (R(4.0) * HK_EPS)) & *none;
+    const M wrong =
+        (found != was) & (HK(max)(stretch, -stretch) > size * (R(4.0) * HK_EPS)) & *none;
     *none = *none & NOT(wrong);
     return wrong;
 }
 
-/* Find the taut tendons by block principal pivoting from all taut (Murty 1974, Judice & Pires 1994),
-   and the shape t (3 S) at balance. */
-HK_INLINE void HK(settle)(
-    HK(elastic_t) e, const V *q, const HK(inside) *in, V *t) {
+/* Find the taut tendons by block principal pivoting from all taut (Murty 1974, Judice & Pires
+   1994), and the shape t (3 S) at balance. */
+HK_INLINE void HK(settle)(HK(elastic_t) e, const V *q, const HK(inside) * in, V *t) {
     const int most = HK_WHOLE_STEPS + (1 << (e.n < HK_MOST_TURNS ? e.n : HK_MOST_TURNS));
     for (int i = 0; i < e.n; i++) in->taut[i] = SPLAT(1.0);
     for (int step = 0; step < most; step++) {
@@ -143,13 +143,14 @@ HK_INLINE void HK(settle)(
         for (int k = 0, i = 0; k < e.S; k++)
             for (int last = i + (e.same ? e.same : e.counts[k]); i < last; i++) {
                 const real *of = e.tendons + HK_TENDON * i;
-                const V d = q[i] * of[HK_GAIN] - of[0], y = t[3 * k + 1] * of[1], z = t[3 * k + 2] * of[2];
+                const V d = q[i] * of[HK_GAIN] - of[0], y = t[3 * k + 1] * of[1],
+                        z = t[3 * k + 2] * of[2];
                 const V stretch = t[3 * k] + y + z - d;
                 const M found = stretch >= SPLAT(0.0), was = in->taut[i] > SPLAT(0.0);
                 M turned = found != was;
                 if (step >= HK_WHOLE_STEPS) {
-                    const V size = HK(max)(d, -d) + HK(max)(t[3 * k], -t[3 * k]) +
-                                   HK(max)(y, -y) + HK(max)(z, -z);
+                    const V size = HK(max)(d, -d) + HK(max)(t[3 * k], -t[3 * k]) + HK(max)(y, -y) +
+                                   HK(max)(z, -z);
                     turned = HK(first_wrong)(found, was, stretch, size, &none);
                 }
                 in->taut[i] = SELECT(turned, SPLAT(1.0) - in->taut[i], in->taut[i]);
@@ -160,8 +161,7 @@ HK_INLINE void HK(settle)(
 }
 
 /* The arcs z (3 tip) of q. */
-HK_INLINE void HK(elastic_arcs)(
-    HK(elastic_t) e, const V *q, const HK(inside) *in, V *z) {
+HK_INLINE void HK(elastic_arcs)(HK(elastic_t) e, const V *q, const HK(inside) * in, V *z) {
     V t[3 * HK_MAX_S];
     HK(settle)(e, q, in, t);
     for (int i = 0; i < 3; i++)
@@ -173,8 +173,8 @@ HK_INLINE void HK(elastic_arcs)(
 }
 
 /* J (rows, n) += C dz/dq, for C (rows, 3 tip): one balance of forces per row. */
-HK_INLINE void HK(pull_tendons)(
-    HK(elastic_t) e, const HK(inside) *in, int rows, const V *C, V *J) {
+HK_INLINE void HK(pull_tendons)(HK(elastic_t) e, const HK(inside) * in, int rows, const V *C,
+                                V *J) {
     for (int row = 0; row < rows; row++, J += e.n, C += 3 * e.tip) {
         V t[3 * HK_MAX_S];
         for (int k = 0; k < e.S; k++)

@@ -77,7 +77,8 @@ static inline V HK(leverage)(int f, int full, const real *lever, V *phi, V *whit
 }
 
 /* The slope (n) of the leverage by the features, slope = 2 R white. */
-static inline void HK(leverage_slope)(int f, int full, const real *lever, const V *white, V *slope) {
+static inline void HK(leverage_slope)(int f, int full, const real *lever, const V *white,
+                                      V *slope) {
     const real *block = lever + HK_LEVER(f);
     for (int i = 0; i < f; i++) slope[i] = SPLAT(0.0);
     for (int at = 0; at < f; at += HK_GROUP) {
@@ -91,7 +92,8 @@ static inline void HK(leverage_slope)(int f, int full, const real *lever, const 
     }
 }
 
-/* Where the numbers of a model's leverage begin, how many features it has, and whether R is full. */
+/* Where the numbers of a model's leverage begin, how many features it has, and whether R is full.
+ */
 static inline const real *HK(lever)(const hk_plan *p, int at, int *f, int *full) {
     const int32_t *node = p->code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M], network = HK_IS(p, at, HK_ELM);
@@ -102,7 +104,7 @@ static inline const real *HK(lever)(const hk_plan *p, int at, int *f, int *full)
 }
 
 /* The leverage of q by the features of a network, or by [1, u, u^2]. */
-static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *work) {
+static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *work) {
     const int n = p->code[at + HK_N];
     int f, full;
     const real *lever = HK(lever)(p, at, &f, &full);
@@ -122,8 +124,8 @@ static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *
 }
 
 /* Its slope (n) by q, after `leverage_at`. */
-static inline void HK(leverage_slope_at)(
-    const hk_plan *p, int at, const V *q, HK(seen) *seen, V *slope, V *work) {
+static inline void HK(leverage_slope_at)(const hk_plan *p, int at, const V *q, HK(seen) * seen,
+                                         V *slope, V *work) {
     const int32_t *node = p->code + at;
     const int n = node[HK_N], m = node[HK_M];
     const real *center = hk_numbers(p, at), *w = center + 2 * n + m + m * n;
@@ -149,14 +151,15 @@ static inline void HK(leverage_slope_at)(
 }
 
 /* How far q is from the training rows of a guard, at most 1 among them. */
-static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *work) {
+static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *work) {
     const int n = p->code[at + HK_N];
     const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
     if (HK_IS(p, at, HK_LEVERAGE_GUARD))
         return HK(leverage_at)(p, p->code[at + HK_MORE], q, seen, work) / numbers[1];
     V sum = SPLAT(1.0);
     for (int j = 0; j < n; j++) {
-        const V below = HK(max)(low[j] - q[j], SPLAT(0.0)), above = HK(max)(q[j] - high[j], SPLAT(0.0));
+        const V below = HK(max)(low[j] - q[j], SPLAT(0.0)),
+                above = HK(max)(q[j] - high[j], SPLAT(0.0));
         const V out = (below + above) * high[n + j];
         sum = sum + HK_BOX_STEEPNESS * out * out;
     }
@@ -164,8 +167,8 @@ static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen
 }
 
 /* Its slope (n), after `guard_distance`. */
-static inline void HK(guard_slope)(
-    const hk_plan *p, int at, const V *q, HK(seen) *seen, V *slope, V *work) {
+static inline void HK(guard_slope)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *slope,
+                                   V *work) {
     const int n = p->code[at + HK_N];
     const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
     if (HK_IS(p, at, HK_LEVERAGE_GUARD)) {
@@ -174,7 +177,8 @@ static inline void HK(guard_slope)(
         return;
     }
     for (int j = 0; j < n; j++) {
-        const V below = HK(max)(low[j] - q[j], SPLAT(0.0)), above = HK(max)(q[j] - high[j], SPLAT(0.0));
+        const V below = HK(max)(low[j] - q[j], SPLAT(0.0)),
+                above = HK(max)(q[j] - high[j], SPLAT(0.0));
         slope[j] = R(2.0) * HK_BOX_STEEPNESS * (above - below) * high[n + j] * high[n + j];
     }
 }
@@ -182,7 +186,7 @@ static inline void HK(guard_slope)(
 /* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. By a leverage the
    excess begins farther out than by a box. Returns whether any row fades; else g is 1
    and the slope is not written. */
-static inline int HK(fading)(const hk_plan *p, int at, const V *q, HK(seen) *seen, V *distance,
+static inline int HK(fading)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *distance,
                              V *g, V *slope, V *work) {
     const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? HK_FULL_LEVERAGE : HK_FULL;
     *g = SPLAT(1.0);
@@ -205,7 +209,7 @@ typedef struct {
 
 /* Whether any correction x (m) is longer than the longest of the training rows, and then how it is
    shortened, to less than HK_LONGEST times that. */
-static inline int HK(is_long)(const hk_plan *p, int at, int m, const V *x, HK(shortening) *how) {
+static inline int HK(is_long)(const hk_plan *p, int at, int m, const V *x, HK(shortening) * how) {
     const real least = HK_MATH(sqrt)(HK_MATH(sqrt)(HK_TINY)), largest = hk_numbers(p, at)[0];
     const real unit = largest > least ? largest : least;
     V squares = SPLAT(0.0);
@@ -225,7 +229,7 @@ static inline int HK(is_long)(const hk_plan *p, int at, int m, const V *x, HK(sh
 }
 
 /* The derivative J (m, k) of a correction after its shortening. */
-static inline void HK(shorten)(const HK(shortening) *how, int m, int k, V *J) {
+static inline void HK(shorten)(const HK(shortening) * how, int m, int k, V *J) {
     for (int j = 0; j < k; j++) {
         V along = SPLAT(0.0);
         for (int i = 0; i < m; i++) along = along + how->along[i] * J[k * i + j];
@@ -255,7 +259,8 @@ static inline V HK(group_distance)(const hk_plan *p, int at, const V *q, V *slop
                 s[l] = s[l] + d * d;
             }
         for (int l = 0; l < HK_GROUP; l++) {
-            const M closer = g + l ? s[l] < nearest : NOT(s[l] < SPLAT(0.0)); /* the first, or NaN */
+            const M closer =
+                g + l ? s[l] < nearest : NOT(s[l] < SPLAT(0.0)); /* the first, or NaN */
             nearest = SELECT(closer, s[l], nearest);
             for (int i = 0; slope && i < k; i++)
                 to[i] = SELECT(closer, y[i] - rows[HK_GROUP * i + l], to[i]);
@@ -269,5 +274,5 @@ static inline V HK(group_distance)(const hk_plan *p, int at, const V *q, V *slop
 }
 
 /* What the functions of guards take at most besides `seen`. */
-#define HK_GUARD_WORK(n, S, m, powers) \
+#define HK_GUARD_WORK(n, S, m, powers)                                                             \
     (HK_USES(HK_GROUP_DISTANCE) * 2 * (n) + (m) + HK_REGRESS_WORK(n, S, powers))

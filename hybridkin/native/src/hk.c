@@ -70,7 +70,8 @@ static void hk_block(const hk_plan *p, int at, V *work, const real *q, int rows,
                      real *distance) {
     const int n = p->code[at + HK_N], m = x ? p->code[at + HK_M] : 1;
     V *vq = hkv_take(&work, n), *vx = hkv_take(&work, m), *vJ = hkv_take(&work, m * n), far;
-    EACH(i) for (int j = 0; j < n; j++) vq[j][i] = q[(i < rows ? i : rows - 1) * n + j];
+    EACH(i)
+        for (int j = 0; j < n; j++) vq[j][i] = q[(i < rows ? i : rows - 1) * n + j];
     if (x)
         hkv_model(p, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL, work);
     else
@@ -94,8 +95,9 @@ HK_API void hk_evaluate(const hk_call *call, const real *q, int64_t rows, real *
         hk_model(&plan, at, q, x, J, distance, call->work);
     else
         for (int64_t r = 0; r < rows; r += HK_LANES)
-            hk_block(&plan, at, hkv_aligned(call->work), q + r * n, (int)(rows - r < HK_LANES ? rows - r : HK_LANES),
-                     x ? x + r * m : NULL, J ? J + r * m * n : NULL, distance ? distance + r : NULL);
+            hk_block(&plan, at, hkv_aligned(call->work), q + r * n,
+                     (int)(rows - r < HK_LANES ? rows - r : HK_LANES), x ? x + r * m : NULL,
+                     J ? J + r * m * n : NULL, distance ? distance + r : NULL);
 }
 
 /* Rows through the play of tendons, see play.h. */
@@ -120,10 +122,11 @@ HK_API void hk_ik_tick(const ik_follower *f) {
 }
 
 /* Single ticks for rows of q (rows, n), targets, and with the mode their motions and measured tips
-   (rows, 3); `last` (rows, n) are the steps before. `out` (rows, n + 6) holds dq, x, |e|, sigma_min, damping; held (rows, n). */
-HK_API void hk_ik_steps(const hk_call *call, int64_t rows, int32_t mode,
-                     const real *q, const real *target, const real *feed, const real *tip,
-                     const real *last, real *out, unsigned char *held) {
+   (rows, 3); `last` (rows, n) are the steps before. `out` (rows, n + 6) holds dq, x, |e|,
+   sigma_min, damping; held (rows, n). */
+HK_API void hk_ik_steps(const hk_call *call, int64_t rows, int32_t mode, const real *q,
+                        const real *target, const real *feed, const real *tip, const real *last,
+                        real *out, unsigned char *held) {
     const ik_settings ik = ik_settings_in(call);
     const int n = ik.n;
     real state[IK_STATE] = {mode, ik.dt};
@@ -150,9 +153,9 @@ HK_API void hk_ik_steps(const hk_call *call, int64_t rows, int32_t mode,
 }
 
 /* The search, see ik_search.h. */
-HK_API void hk_ik_find(const hk_call *call, int64_t rows, int32_t mode, int32_t max_iter,
-                    real tol, real turn_tol, const real *target, real *q, real *J, real *e,
-                    int32_t *found, int32_t *n_iter) {
+HK_API void hk_ik_find(const hk_call *call, int64_t rows, int32_t mode, int32_t max_iter, real tol,
+                       real turn_tol, const real *target, real *q, real *J, real *e, int32_t *found,
+                       int32_t *n_iter) {
     ik_search_t search = {ik_settings_in(call), mode, max_iter, tol, turn_tol};
     ik_search(&search, rows, target, q, J, e, found, n_iter);
 }

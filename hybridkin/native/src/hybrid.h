@@ -1,38 +1,41 @@
 /* x = f(q) + sum_k w_k s_k(q) + t(q) d(q): a mechanical model f, corrections s_k in front of the
-   tip or inside the robot, each faded and shortened by its guard, and a drift d with its trust t. */
+   tip or inside the robot, each faded and shortened by its guard, and a drift d with its trust t.
+ */
 
 /* What all corrections of a row add to. C and its own `pull` hold df/dq in inner coordinates. */
 typedef struct {
-    V *x, *J;         /* x (m), and dx/dq without what C brings, or NULL */
-    V *z, f[3];       /* inner coordinates (k) of q, and their tip */
-    V *C0;            /* df/dz (3, k), if it was needed */
-    V *C;             /* the total derivative (3, k) by z */
-    V trust, *slope;  /* of the drift, (n) */
-    V farthest;       /* distance of any guard */
+    V *x, *J;        /* x (m), and dx/dq without what C brings, or NULL */
+    V *z, f[3];      /* inner coordinates (k) of q, and their tip */
+    V *C0;           /* df/dz (3, k), if it was needed */
+    V *C;            /* the total derivative (3, k) by z */
+    V trust, *slope; /* of the drift, (n) */
+    V farthest;      /* distance of any guard */
     int has_C0, fades;
     HK(inside) in;
     HK(seen) seen;
 } HK(total);
 
 /* What the sum takes, then the largest of its terms: at the tip, inside, and what they call. */
-#define HK_SUM_WORK(n, S, m, features) \
+#define HK_SUM_WORK(n, S, m, features)                                                             \
     ((m) + 7 * HK_MOST_Z(n, S) + (n) + HK_INSIDE_WORK(n, S) + HK_SEEN_WORK(n, features))
-#define HK_TERM_WORK(n, S, m) \
-    ((m) * ((n) + 2) > HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3 \
-         ? (m) * ((n) + 2) : HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3)
-#define HK_HYBRID_WORK(n, S, m, features, powers) \
-    (HK_USES(HK_HYBRID) * (HK_SUM_WORK(n, S, m, features) + HK_TERM_WORK(n, S, m) + (n) + \
+#define HK_TERM_WORK(n, S, m)                                                                      \
+    ((m) * ((n) + 2) > HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3                                   \
+         ? (m) * ((n) + 2)                                                                         \
+         : HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3)
+#define HK_HYBRID_WORK(n, S, m, features, powers)                                                  \
+    (HK_USES(HK_HYBRID) * (HK_SUM_WORK(n, S, m, features) + HK_TERM_WORK(n, S, m) + (n) +          \
                            HK_GUARD_WORK(n, S, m, powers)))
 
 /* df/dz, computed once. */
-static inline const V *HK(base_slope)(const hk_plan *p, int base, HK(total) *sum, V *work) {
+static inline const V *HK(base_slope)(const hk_plan *p, int base, HK(total) * sum, V *work) {
     V f[3];
     if (!sum->has_C0) HK(from_coordinates)(p, base, sum->z, f, sum->C0, work);
     sum->has_C0 = 1;
     return sum->C0;
 }
 
-/* Fades x (m) and its derivatives: J (m, k) by q with the slope (n = k), or any D (m, k) without. */
+/* Fades x (m) and its derivatives: J (m, k) by q with the slope (n = k), or any D (m, k) without.
+ */
 static inline void HK(fade)(int m, int k, V g, const V *slope, const V *x, V *J) {
     for (int i = 0; i < m; i++)
         for (int j = 0; j < k; j++) {
@@ -42,11 +45,12 @@ static inline void HK(fade)(int m, int k, V g, const V *slope, const V *x, V *J)
 }
 
 /* The guard's weight of a correction; keeps its part of trust and domain. */
-static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, HK(total) *sum, V *g,
-                              V *slope, V *work) {
+static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, HK(total) * sum,
+                              V *g, V *slope, V *work) {
     V distance;
     if (guard < 0) return 0;
-    const int fades = HK(fading)(p, guard, q, &sum->seen, &distance, g, sum->J ? slope : NULL, work);
+    const int fades =
+        HK(fading)(p, guard, q, &sum->seen, &distance, g, sum->J ? slope : NULL, work);
     /* NaN is the farthest. */
     sum->farthest = SELECT(NOT(distance <= sum->farthest), distance, sum->farthest);
     if (!fades) return 0;
@@ -58,10 +62,11 @@ static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, H
 }
 
 /* Adds a correction at the tip, w s(q). */
-static inline void HK(tip_correction)(
-    const hk_plan *p, const int32_t *part, const V *q, int m, real w, HK(total) *sum, V *work) {
+static inline void HK(tip_correction)(const hk_plan *p, const int32_t *part, const V *q, int m,
+                                      real w, HK(total) * sum, V *work) {
     const int at = part[HK_REGRESSOR], guard = part[HK_GUARD], n = p->code[at + HK_N];
-    const int own = guard >= 0 && HK_IS(p, guard, HK_LEVERAGE_GUARD) && p->code[guard + HK_MORE] == at;
+    const int own =
+        guard >= 0 && HK_IS(p, guard, HK_LEVERAGE_GUARD) && p->code[guard + HK_MORE] == at;
     V *x = HK(take)(&work, m), *J = HK(take)(&work, m * n), *slope = HK(take)(&work, n), g;
     HK(shortening) how;
     how.along = HK(take)(&work, m);
@@ -82,8 +87,8 @@ static inline void HK(tip_correction)(
 /* Adds a correction inside the robot, w (f + s(q)) with s = F(z + delta(q)) - f. Rows that fade or
    are too long need df/dz as well. All is linear in the columns, so one `pull` at the end serves
    all corrections: C takes what multiplies dz/dq, J the rest. */
-static inline void HK(inner_correction)(
-    const hk_plan *p, int base, const int32_t *part, const V *q, real w, HK(total) *sum, V *work) {
+static inline void HK(inner_correction)(const hk_plan *p, int base, const int32_t *part, const V *q,
+                                        real w, HK(total) * sum, V *work) {
     const int guard = part[HK_GUARD], n = p->code[base + HK_N], k = HK(n_coordinates)(p, base);
     V *z = HK(take)(&work, k), *turn = HK(take)(&work, k * n), *C = HK(take)(&work, 3 * k);
     V *J = HK(take)(&work, 3 * n), *slope = HK(take)(&work, n), along[3], x[3], g;
@@ -118,8 +123,8 @@ static inline void HK(inner_correction)(
     if (sum->J) HK(add)(3 * n, w, J, sum->J);
 }
 
-static inline void HK(hybrid)(
-    const hk_plan *p, int at, const V *q, V *x, V *J, V *distance, V *work) {
+static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance,
+                              V *work) {
     const int32_t *node = p->code + at, *more = node + HK_MORE, *part = more + HK_FIRST;
     const int n = node[HK_N], m = node[HK_M], base = more[HK_BASE], count = more[HK_COUNT];
     const real *w = hk_numbers(p, at), share = w[count]; /* of f beside inner corrections */
@@ -168,8 +173,8 @@ static inline void HK(hybrid)(
 }
 
 /* The largest distance of any guard and of the groups, and its slope (n) by q where not NULL. */
-static inline void HK(farthest)(
-    const hk_plan *p, int at, const V *q, V *distance, V *slope, V *work) {
+static inline void HK(farthest)(const hk_plan *p, int at, const V *q, V *distance, V *slope,
+                                V *work) {
     const int32_t *node = p->code + at, *part = node + HK_MORE + HK_FIRST;
     const int n = node[HK_N], count = HK_IS(p, at, HK_HYBRID) ? node[HK_MORE + HK_COUNT] : 0;
     V *own = HK(take)(&work, n);
@@ -186,8 +191,8 @@ static inline void HK(farthest)(
         for (int j = 0; j < n; j++) slope[j] = SELECT(farther, own[j], slope[j]);
     }
     if (HK_IS(p, at, HK_HYBRID) && node[HK_MORE + HK_TESTED] >= 0) {
-        const V here = HK(group_distance)(
-            p, node[HK_MORE + HK_TESTED], q, slope ? own : NULL, work);
+        const V here =
+            HK(group_distance)(p, node[HK_MORE + HK_TESTED], q, slope ? own : NULL, work);
         const M farther = NOT(here <= *distance);
         *distance = SELECT(farther, here, *distance);
         for (int j = 0; slope && j < n; j++) slope[j] = SELECT(farther, own[j], slope[j]);

@@ -8,7 +8,7 @@ enum { IK_ROWS = 3 };
 #define IK_OF(m, f, ...) ((m) == 3 ? f(3, __VA_ARGS__) : f(m, __VA_ARGS__))
 #else
 enum { IK_ROWS = 6 };
-#define IK_OF(m, f, ...) \
+#define IK_OF(m, f, ...)                                                                           \
     ((m) == 3 ? f(3, __VA_ARGS__) : (m) == 6 ? f(6, __VA_ARGS__) : f(m, __VA_ARGS__))
 #endif
 enum {
@@ -45,8 +45,7 @@ HK_INLINE void ik_rows_of(int m, int n, const real *J, const real *step, real *r
 }
 
 /* y (n) = z + J^T mu. */
-HK_INLINE void ik_columns_of(
-    int m, int n, const real *J, const real *mu, const real *z, real *y) {
+HK_INLINE void ik_columns_of(int m, int n, const real *J, const real *mu, const real *z, real *y) {
     for (int j = 0; j < n; j++) {
         real sum = J[j] * mu[0];
         for (int i = 1; i < m; i++) sum += J[n * i + j] * mu[i];
@@ -207,8 +206,7 @@ HK_INLINE void ik_box_of(int m, int n, const real *J, const real *v, const real 
             going |= ik_abs(residual[i]) > R(4.0) * HK_EPS * scale[i];
         }
         if (!going) return;
-        for (int j = 0; j < n; j++)
-            free[j] = y[j] > lower[j] && y[j] < upper[j] ? R(1.0) : R(0.0);
+        for (int j = 0; j < n; j++) free[j] = y[j] > lower[j] && y[j] < upper[j] ? R(1.0) : R(0.0);
         ik_products(m, n, J, free, g);
         const ik_factors f = ik_factor(m, g, damping_sq);
         ik_solve(m, &f, residual, newton);
@@ -226,7 +224,8 @@ HK_INLINE void ik_box_of(int m, int n, const real *J, const real *v, const real 
         for (int j = 0; j < n; j++) {
             const real full = y[j] + slope[j];
             settled &= (((full > lower[j]) == (y[j] > lower[j])) &
-                        ((full < upper[j]) == (y[j] < upper[j]))) | (lower[j] == upper[j]);
+                        ((full < upper[j]) == (y[j] < upper[j]))) |
+                       (lower[j] == upper[j]);
             end += slope[j] * (ik_clip(full, lower[j], upper[j]) - dq[j]);
         }
         if (end > R(0.0) && !settled)
@@ -260,9 +259,10 @@ static void ik_proximal_box(int m, int n, const real *J, const real *v, const re
 }
 
 /* The step in the box whose task part does not depend on the preferred step z: near a singularity
-   the damped task is solved for z = 0 first, then z chooses among the steps that move the tip so. */
-static void ik_strict_box(int m, int n, const real *J, const real *g, const real *v,
-                          const real *z, const real *lower, const real *upper, real damping_sq, real *dq) {
+   the damped task is solved for z = 0 first, then z chooses among the steps that move the tip so.
+ */
+static void ik_strict_box(int m, int n, const real *J, const real *g, const real *v, const real *z,
+                          const real *lower, const real *upper, real damping_sq, real *dq) {
     real sum = R(0.0);
     for (int k = 0, at = 0; k < m; k++)
         for (int i = k; i < m; i++, at++) sum += (i == k ? g[at] : R(2.0) * g[at]) * g[at];

@@ -1,6 +1,8 @@
-/* The search for configurations that reach positions, or poses of rigid arms, one row per target, HK_LANES rows at a time.
+/* The search for configurations that reach positions, or poses of rigid arms, one row per target,
+   HK_LANES rows at a time.
 
-   Every row is a state machine: it requests the model at a configuration and processes the result. */
+   Every row is a state machine: it requests the model at a configuration and processes the result.
+ */
 
 /* Modes: lower the error; if the target is reached, slide into the domain, or to the posture. */
 enum { IK_FIRST, IK_LOWER, IK_SLIDE, IK_POLISH, IK_DONE };
@@ -32,7 +34,8 @@ static inline void ik_keep(const ik_settings *ik, ik_point *to, const ik_point *
     to->error = from->error, to->distance = from->distance;
 }
 
-/* Request the point after a step. A turning joint may pass its limit and continue at the other one. */
+/* Request the point after a step. A turning joint may pass its limit and continue at the other one.
+ */
 static inline void ik_ask(const ik_settings *ik, ik_row *r, int phase) {
     r->phase = phase;
     for (int j = 0; j < ik->n; j++) {
@@ -102,7 +105,8 @@ static void ik_wish(const ik_search_t *s, const ik_point *at, real *wish, real *
         hk_domain(&ik->plan, ik->model, at->q, &distance, wish, ik->work);
         for (int j = 0; j < n; j++) square += wish[j] * wish[j];
         const real beyond = distance - IK_INSIDE;
-        const real share = (beyond < R(0.0) ? R(0.0) : beyond) / (square > R(0.0) ? square : R(1.0));
+        const real share =
+            (beyond < R(0.0) ? R(0.0) : beyond) / (square > R(0.0) ? square : R(1.0));
         for (int j = 0; j < n; j++) wish[j] = -share * wish[j];
     } else
         for (int j = 0; j < n; j++) wish[j] = ik->posture[j] - at->q[j];
@@ -145,8 +149,8 @@ static void ik_settle(const ik_search_t *s, ik_row *r) {
 /* Levenberg and Marquardt: ask for the next point, or settle. */
 static void ik_lower_on(const ik_search_t *s, ik_row *r) {
     const int n = s->ik.n, m = s->ik.m, reached = ik_reached(s, &r->live);
-    const int rests = ik_blocked(&s->ik, &r->live) || r->nu > IK_LAST_DAMPING ||
-                      r->slow >= IK_SLOW_STEPS;
+    const int rests =
+        ik_blocked(&s->ik, &r->live) || r->nu > IK_LAST_DAMPING || r->slow >= IK_SLOW_STEPS;
     r->n_iter = r->iteration;
     r->found = (r->found & IK_HELD) | (reached ? IK_REACHED : 0) | (rests ? IK_AT_REST : 0);
     if (reached || rests || r->iteration >= s->max_iter) {
@@ -210,8 +214,8 @@ static void ik_slid(const ik_search_t *s, ik_row *r, const ik_point *now) {
     r->n_iter++, r->iteration++;
     if (ok) {
         const real curvature = bend / square;
-        r->share = ik_clip(curvature > R(0.0) ? R(1.0) / curvature : R(2.0) * r->share, R(0.1),
-                           R(4.0));
+        r->share =
+            ik_clip(curvature > R(0.0) ? R(1.0) / curvature : R(2.0) * r->share, R(0.1), R(4.0));
         ik_keep(&s->ik, &r->live, now);
         for (int j = 0; j < n; j++) r->wish[j] = wish[j], r->free[j] = free[j];
         if (reached_now) ik_keep(&s->ik, &r->best, now);
@@ -228,7 +232,7 @@ static void ik_take(const ik_search_t *s, ik_row *r, const ik_point *now) {
         r->start = now->error;
         r->nu = R(1.0), r->growth = R(2.0), r->slow = 0, r->iteration = 0, r->n_iter = 0;
         r->found = ik_reached(s, now) ? IK_REACHED : 0;
-        s->mode & IK_LOWERS ? ik_lower_on(s, r) : ik_settle(s, r);
+        s->mode &IK_LOWERS ? ik_lower_on(s, r) : ik_settle(s, r);
         break;
     case IK_LOWER: ik_lowered(s, r, now); break;
     case IK_SLIDE: ik_slid(s, r, now); break;
@@ -240,13 +244,14 @@ static void ik_take(const ik_search_t *s, ik_row *r, const ik_point *now) {
 
 /* Memory of a search besides that of the model: q, x, J, then z and C of poses, and the rows. */
 #define IK_ROW_LANES (int)((sizeof(ik_row) * HK_LANES + sizeof(V) - 1) / sizeof(V))
-#define IK_SEARCH_WORK(n, S) \
-    ((n) + 3 + IK_ROWS * (n) + (IK_ROWS + 1) * HK_MOST_Z(n, S) + HK_INSIDE_WORK(n, S) + IK_ROW_LANES)
+#define IK_SEARCH_WORK(n, S)                                                                       \
+    ((n) + 3 + IK_ROWS * (n) + (IK_ROWS + 1) * HK_MOST_Z(n, S) + HK_INSIDE_WORK(n, S) +            \
+     IK_ROW_LANES)
 
 /* Search `rows` rows from q (rows, n), which becomes the best configurations; J (rows, m, n) there,
    errors e (rows, m), what was found (rows), and the iterations (rows). */
-static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q, real *J,
-                      real *e, int32_t *found, int32_t *n_iter) {
+static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q, real *J, real *e,
+                      int32_t *found, int32_t *n_iter) {
     const int n = s->ik.n, m = s->ik.m, pose = m == 6, width = pose ? 16 : 3;
     const hk_plan *plan = &s->ik.plan;
     const int32_t *more = plan->code + s->ik.model + HK_MORE;
@@ -288,8 +293,7 @@ static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q,
             if (r->phase == IK_DONE) continue;
             for (int j = 0; j < n; j++) now.q[j] = r->ask[j];
             for (int j = 0; j < 3 * n; j++) now.J[j] = vJ[j][i];
-            for (int j = 0; j < 3; j++)
-                now.e[j] = r->target[pose ? 4 * j + 3 : j] - vx[j][i];
+            for (int j = 0; j < 3; j++) now.e[j] = r->target[pose ? 4 * j + 3 : j] - vx[j][i];
             if (pose) {
                 real turn[9];
                 for (int j = 0; j < 9; j++) turn[j] = frame[j][i];

@@ -1,5 +1,5 @@
-/* One step of inverse kinematics for a position (m = 3 rows) or, in a search, a pose (6): the damped
-   inverse, a posture in its null space, and limits inside the step. One row at a time. */
+/* One step of inverse kinematics for a position (m = 3 rows) or, in a search, a pose (6): the
+   damped inverse, a posture in its null space, and limits inside the step. One row at a time. */
 
 #include "ik_box.h"
 
@@ -7,7 +7,7 @@
    a weight. */
 typedef struct {
     hk_plan plan;
-    real *work; /* memory of a call */
+    real *work;                        /* memory of a call */
     int model, n, m, flags, n_normals; /* last: of the plane to keep to */
     const real *low, *high, *speed, *accel, *posture, *unit, *period, *pulls, *normals;
     real gain, beta, dt, damping; /* gain < 0: 1 / dt; damping < 0: adaptive */
@@ -21,13 +21,34 @@ typedef struct {
     unsigned char held[HK_MAX_N];
 } ik_step_t;
 
-static inline ik_settings ik_settings_of(const int32_t *code, const real *data, int at, real *work) {
+static inline ik_settings ik_settings_of(const int32_t *code, const real *data, int at,
+                                         real *work) {
     const int32_t *node = code + at;
     const int n = node[HK_N];
     const real *a = data + node[HK_DATA], *b = a + 6 * n;
-    const ik_settings ik = {{code, data}, work, node[HK_MORE], n, node[HK_M], node[HK_MORE + 1],
-                      node[HK_MORE + 2], a, a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n, b + 5,
-                      b + 5 + n, b + 5 + 2 * n, b[0], b[1], b[2], b[3], b[4]};
+    const ik_settings ik = {
+        .plan = {code, data},
+        .work = work,
+        .model = node[HK_MORE],
+        .n = n,
+        .m = node[HK_M],
+        .flags = node[HK_MORE + 1],
+        .n_normals = node[HK_MORE + 2],
+        .low = a,
+        .high = a + n,
+        .speed = a + 2 * n,
+        .accel = a + 3 * n,
+        .posture = a + 4 * n,
+        .unit = a + 5 * n,
+        .gain = b[0],
+        .beta = b[1],
+        .dt = b[2],
+        .damping = b[3],
+        .radian = b[4],
+        .period = b + 5,
+        .pulls = b + 5 + n,
+        .normals = b + 5 + 2 * n,
+    };
     return ik;
 }
 
@@ -104,10 +125,12 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     if (slides) ik_null_projection(m, n, J, g, z);
     ik_columns_of(m, n, J, mu, z, dq);
     if (ik->flags & IK_LIMITED) {
-        int over = ik->n_normals > 0 && ik->flags & IK_WEIGHTS; /* weights turn J out of the plane */
+        int over =
+            ik->n_normals > 0 && ik->flags & IK_WEIGHTS; /* weights turn J out of the plane */
         for (int j = 0; j < n; j++) over |= ik_clip(dq[j], lower[j], upper[j]) != dq[j];
         if (over && ik->n_normals > 0)
-            ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, damping_sq, dq);
+            ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, damping_sq,
+                                dq);
         else if (over)
             ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, dq);
     }
@@ -259,8 +282,8 @@ static int ik_pull_in(const ik_settings *ik, const ik_step_t *s, real share, ik_
 static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const real *J,
                       const real *v, ik_step_t *s) {
     const int n = ik->n;
-    const real slip = ik_norm(3 * n, J) *
-                      (IK_SLIP * ik_norm(n, s->dq) + R(32.0) * HK_EPS * ik_norm(n, q));
+    const real slip =
+        ik_norm(3 * n, J) * (IK_SLIP * ik_norm(n, s->dq) + R(32.0) * HK_EPS * ik_norm(n, q));
     real promised[3], left[3];
     ik_end end;
     ik_rows_of(3, n, J, s->dq, promised);
@@ -290,7 +313,8 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
                                    const real *J, const real *e, const real *feed, real seconds,
                                    const real *last, ik_step_t *s) {
     const int n = ik->n;
-    real taut[3 * HK_MAX_N], v[3], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds, beta = ik->beta * seconds;
+    real taut[3 * HK_MAX_N], v[3], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds,
+                                   beta = ik->beta * seconds;
     gain = gain > R(1.0) ? R(1.0) : gain;
     beta = beta > R(1.0) ? R(1.0) : beta;
     for (int i = 0; i < 3; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));

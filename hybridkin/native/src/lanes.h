@@ -81,9 +81,7 @@ static inline V hkv_logistic(V x) {
     return e / (1.0 + e);
 }
 
-static inline V hkv_tanh(V x) {
-    return 1.0 - 2.0 / (hkv_exp(2.0 * x) + 1.0);
-}
+static inline V hkv_tanh(V x) { return 1.0 - 2.0 / (hkv_exp(2.0 * x) + 1.0); }
 
 /* sin and cos by x = k pi / 2 + r and Taylor's series in r, up to pi / 4; huge x one by one. */
 static inline void hkv_sincos(V x, V *s, V *c) {
@@ -110,8 +108,9 @@ static inline void hkv_sincos(V x, V *s, V *c) {
     *c = (V)((M)SELECT(odd, sine, cosine) ^ sign_c);
     const M huge = (x > SPLAT(1e5)) | (x < SPLAT(-1e5));
     if (hkv_any(huge))
-        EACH(i) if (huge[i]) {
-            (*s)[i] = sin(x[i]);
-            (*c)[i] = cos(x[i]);
-        }
+        EACH(i)
+            if (huge[i]) {
+                (*s)[i] = sin(x[i]);
+                (*c)[i] = cos(x[i]);
+            }
 }

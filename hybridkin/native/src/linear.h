@@ -1,8 +1,8 @@
 /* Memory of a call, and small dense products with constant matrices.
 
-   What a function needs on its way, sized by the model, stands in memory that the caller owns, not on
-   the stack: threads may have 128 KiB. `work` points to numbers that are free. A function takes from
-   the front and passes the rest on; when it returns, all is free again. HK_..._WORK beside the
+   What a function needs on its way, sized by the model, stands in memory that the caller owns, not
+   on the stack: threads may have 128 KiB. `work` points to numbers that are free. A function takes
+   from the front and passes the rest on; when it returns, all is free again. HK_..._WORK beside the
    functions tell how many numbers they take at most. */
 
 static inline V *HK(take)(V **work, int count) {
@@ -12,8 +12,7 @@ static inline V *HK(take)(V **work, int count) {
 }
 
 /* y (m) = A (m, n) x (n) + b (m). */
-HK_INLINE void HK(affine)(
-    int m, int n, const real *A, const real *b, const V *x, V *y) {
+HK_INLINE void HK(affine)(int m, int n, const real *A, const real *b, const V *x, V *y) {
     for (int i = 0; i < m; i++) {
         V sum = SPLAT(b[i]);
         for (int j = 0; j < n; j++) sum = sum + x[j] * A[n * i + j];
@@ -22,8 +21,7 @@ HK_INLINE void HK(affine)(
 }
 
 /* J (3, n) = C (3, k) T (k, n), for a T that differs from row to row. */
-HK_INLINE void HK(multiply)(
-    int k, int n, const V *restrict C, const V *restrict T, V *restrict J) {
+HK_INLINE void HK(multiply)(int k, int n, const V *restrict C, const V *restrict T, V *restrict J) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < n; j++) {
             V sum = SPLAT(0.0);

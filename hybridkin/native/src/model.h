@@ -11,8 +11,8 @@
 #include "guards.h"
 #include "hybrid.h"
 
-#define HK_MODEL_WORK(n, S, m, features, powers) \
-    ((n) + HK_CHAIN_WORK(n, S) + HK_REGRESS_WORK(n, S, powers) + \
+#define HK_MODEL_WORK(n, S, m, features, powers)                                                   \
+    ((n) + HK_CHAIN_WORK(n, S) + HK_REGRESS_WORK(n, S, powers) +                                   \
      HK_HYBRID_WORK(n, S, m, features, powers))
 
 /* The q (n) of the fit for one of a robot that has changed since, and the place of the fit. */
@@ -33,8 +33,8 @@ static inline void HK(turn)(int n, const real *R, V *a) {
 
 /* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. Of a robot that has
    changed since the fit it is x = R f(q + shift) + p. */
-static inline void HK(model)(
-    const hk_plan *p, int at, const V *q, V *x, V *J, V *distance, V *work) {
+static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance,
+                             V *work) {
     const int n = p->code[at + HK_N], adapted = HK_IS(p, at, HK_ADAPTED);
     const real *R = adapted && p->code[at + HK_M] == 3 ? hk_numbers(p, at) + n : NULL;
     V *then = HK(take)(&work, n);
@@ -56,8 +56,8 @@ static inline void HK(model)(
 }
 
 /* The largest distance of any guard, and its slope (n) by q where not NULL. */
-static inline void HK(domain)(
-    const hk_plan *p, int at, const V *q, V *distance, V *slope, V *work) {
+static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope,
+                              V *work) {
     V *then = HK(take)(&work, p->code[at + HK_N]);
     if (HK_IS(p, at, HK_ADAPTED)) {
         at = HK(before)(p, at, q, then);

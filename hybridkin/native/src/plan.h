@@ -52,7 +52,8 @@ enum { HK_KIND, HK_N, HK_M, HK_DATA, HK_MORE };
 #define HK_CHAIN_IS(p, at, kind) (HK_IS_ONLY_CHAIN(kind) || HK_IS(p, at, kind))
 
 /* A hybrid adds the places of mechanical model, drift and distance from other groups, the number of
-   corrections, and of each whether it acts inside, its regressor and its guard; -1 stands for none. */
+   corrections, and of each whether it acts inside, its regressor and its guard; -1 stands for none.
+ */
 enum { HK_BASE, HK_DRIFT, HK_TESTED, HK_COUNT, HK_FIRST };
 enum { HK_INNER, HK_REGRESSOR, HK_GUARD, HK_STRIDE };
 

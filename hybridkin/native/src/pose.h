@@ -1,10 +1,11 @@
 /* Readouts of pose features: weights on the axes of a robot's frames, and on moments about them. */
 
-/* What a readout needs of segment k: the frame before it, the features of the frame after it, and in
-   the frame before it how the end of its arc moves and turns by its length and bendings. */
+/* What a readout needs of segment k: the frame before it, the features of the frame after it, and
+   in the frame before it how the end of its arc moves and turns by its length and bendings. */
 typedef struct {
-    V before[9];        /* axes of the frame before the segment, in the base frame */
-    V vectors[6][3];    /* axes of the frame after it, then these x d, d the lever to the robot's end */
+    V before[9]; /* axes of the frame before the segment, in the base frame */
+    V vectors[6]
+             [3]; /* axes of the frame after it, then these x d, d the lever to the robot's end */
     V arc_end[3], end[3]; /* end of the arc, and with its rigid offset */
     V moves[3][3], spins[3][3];
 } HK(posed);
@@ -15,8 +16,8 @@ static inline void HK(cross)(const V *a, const V *b, V *c) {
 }
 
 /* Follow one arc with a rigid offset from the frame `axes`, `at`, which become those after it. */
-static inline void HK(follow)(
-    V length, V bx, V by, real offset, V axes[3][3], V *at, HK(posed) *s) {
+static inline void HK(follow)(V length, V bx, V by, real offset, V axes[3][3], V *at,
+                              HK(posed) * s) {
     const HK(stumpff_t) a = HK(stumpff)(bx * bx + by * by);
     const V slope_f = (a.c3 - a.g) * length, slope_g = (a.c4 + a.c4 - a.c3) * length;
     const V zero = SPLAT(0.0), one = SPLAT(1.0), gl = a.g * length, across = slope_g * bx * by;
@@ -48,7 +49,7 @@ static inline void HK(follow)(
    for forces w on the lever from the base (3), then on the vectors of every frame (18; the last has
    no moments). Forces on a frame turn as one with every segment before it; every segment after it
    moves the end of its lever. */
-static inline V HK(virtual_work)(int S, const HK(posed) *s, V reach, const real *w, V *by_arcs) {
+static inline V HK(virtual_work)(int S, const HK(posed) * s, V reach, const real *w, V *by_arcs) {
     const V *end = s[S - 1].end;
     V pulls[HK_MAX_S][3], turns[HK_MAX_S][3], value = SPLAT(0.0), turned[3], pull[3];
     for (int i = 0; i < 3; i++) {
@@ -102,9 +103,8 @@ static inline V HK(virtual_work)(int S, const HK(posed) *s, V reach, const real 
 
 /* value (n_out) += W phi(q) and slope (n_out, n), where not NULL, += its derivative, for weights W
    (n_out, 18 S - 6) of the pose features of a chain of arcs, which ends at the robot's end. */
-static inline void HK(pose_readout)(
-    const hk_plan *p, int at, int n_out, const real *weights, const V *q, V *value, V *slope,
-    V *work) {
+static inline void HK(pose_readout)(const hk_plan *p, int at, int n_out, const real *weights,
+                                    const V *q, V *value, V *slope, V *work) {
     const int S = p->code[at + HK_MORE], n = p->code[at + HK_N];
     const real *frame = hk_numbers(p, at);
     const V reach = SPLAT(frame[HK_FRAME - 1]);

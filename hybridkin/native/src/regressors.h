@@ -1,8 +1,7 @@
 /* Learned models q (n) -> x (m) with their Jacobians J (m, n). */
 
 /* sigma(a) of `count` hidden units in place of a, and sigma'(a) in d. */
-HK_INLINE void HK(activate)(
-    int activation, int count, V *a, V *d) {
+HK_INLINE void HK(activate)(int activation, int count, V *a, V *d) {
     switch (activation) {
     case HK_LOGISTIC:
         for (int i = 0; i < count; i++) {
@@ -30,9 +29,8 @@ HK_INLINE void HK(activate)(
 
 /* Adds the share of `count` hidden units in x (m) and in its slope J (m, n) by u (n), where not
    NULL, and writes their sigma into `features`, where not NULL. */
-HK_INLINE void HK(group_of)(
-    int n, int m, int count, int activation, const real *w, const V *u, V shift, V *x, V *J,
-    V *features) {
+HK_INLINE void HK(group_of)(int n, int m, int count, int activation, const real *w, const V *u,
+                            V shift, V *x, V *J, V *features) {
     const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
     V s[HK_GROUP], d[HK_GROUP];
     for (int i = 0; i < count; i++) s[i] = shift + bias[i];
@@ -56,9 +54,8 @@ HK_INLINE void HK(group_of)(
 
 /* All hidden units. The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP),
    b (HK_GROUP), output weights (m, HK_GROUP). */
-HK_INLINE void HK(units_of)(
-    int n, int m, int units, int activation, const real *w, const V *u, V shift, V *x, V *J,
-    V *features) {
+HK_INLINE void HK(units_of)(int n, int m, int units, int activation, const real *w, const V *u,
+                            V shift, V *x, V *J, V *features) {
     for (; units > HK_GROUP / 2; units -= HK_GROUP, w += HK_GROUP * (n + 1 + m)) {
         HK(group_of)(n, m, HK_GROUP, activation, w, u, shift, x, J, features);
         if (features) features += HK_GROUP;
@@ -86,9 +83,8 @@ static inline real HK(sum)(V v) {
 
 #define HK_BLOCK 64 /* units whose weights stay in the first cache */
 
-HK_INLINE void hkr_units_of(
-    int n, int m, int units, int activation, const real *w, const real *u, real shift, real *x,
-    real *J, real *features, real *work) {
+HK_INLINE void hkr_units_of(int n, int m, int units, int activation, const real *w, const real *u,
+                            real shift, real *x, real *J, real *features, real *work) {
     const int each = HK_GROUP / HK_LANES, stride = HK_GROUP * (n + 1 + m);
     V s[HK_BLOCK / HK_LANES], d[HK_BLOCK / HK_LANES], *lanes = HK(aligned)(work);
     V *value = HK(take)(&lanes, m), *slope = HK(take)(&lanes, m * n);
@@ -108,7 +104,8 @@ HK_INLINE void hkr_units_of(
             const real *out = w + HK_GROUP * (n + 1 + o);
             V row[HK_MAX_N];
             for (int i = 0; i < count; i++)
-                value[o] = value[o] + s[i] * HK(load)(out + i / each * stride + i % each * HK_LANES);
+                value[o] =
+                    value[o] + s[i] * HK(load)(out + i / each * stride + i % each * HK_LANES);
             if (!J) continue;
             for (int j = 0; j < n; j++) row[j] = slope[n * o + j];
             for (int i = 0; i < count; i++) {
@@ -158,8 +155,7 @@ static inline void HK(scaled)(int n, const real *center, const V *q, V *u) {
 
    Writes the features too where asked: the hidden units', then u. A Gaussian at u_i is the unit
    exp(u_i . u - |u_i|^2 / 2 - |u|^2 / 2). */
-static inline void HK(elm)(
-    const hk_plan *p, int at, const V *q, V *x, V *J, V *features, V *work) {
+static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features, V *work) {
     const int32_t *node = p->code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M], n_hidden = more[0], activation = more[1];
     const int gaussian = activation == HK_GAUSSIAN;
@@ -205,9 +201,8 @@ static inline void HK(polynomial)(const hk_plan *p, int at, const V *q, V *x, V 
 }
 
 /* value = c + D u + u' A u / 2 with symmetric A, output by output; its slope by u is D + A u. */
-HK_INLINE void HK(quadratic_of)(
-    int n, int m, const real *c, const real *inverse, const V *restrict u, V *restrict x,
-    V *restrict J) {
+HK_INLINE void HK(quadratic_of)(int n, int m, const real *c, const real *inverse,
+                                const V *restrict u, V *restrict x, V *restrict J) {
     for (int o = 0; o < m; o++, c += 1 + n + n * n) {
         V slope[HK_MAX_N], sum = SPLAT(0.0);
         for (int j = 0; j < n; j++) slope[j] = SPLAT(c[1 + j]);
@@ -240,8 +235,8 @@ static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J,
 }
 
 /* A regressor of q itself. `features` is for networks alone. */
-static inline void HK(regress_all)(
-    const hk_plan *p, int at, const V *q, V *x, V *J, V *features, V *work) {
+static inline void HK(regress_all)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features,
+                                   V *work) {
     if (HK_IS(p, at, HK_POLYNOMIAL))
         HK(polynomial)(p, at, q, x, J, work);
     else if (HK_IS(p, at, HK_READOUT))
@@ -250,12 +245,12 @@ static inline void HK(regress_all)(
         HK(elm)(p, at, q, x, J, features, work);
 }
 
-#define HK_REGRESS_WORK(n, S, powers) \
+#define HK_REGRESS_WORK(n, S, powers)                                                              \
     ((1 + HK_USES(HK_PROJECTED)) * (n) + HK_POSE_WORK(n, S) + HK_USES(HK_POLYNOMIAL) * (powers))
 
 /* Any regressor, also one of A q + b, the part of q that its training rows moved; A (n, n). */
-static inline void HK(regress)(
-    const hk_plan *p, int at, const V *q, V *x, V *J, V *features, V *work) {
+static inline void HK(regress)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features,
+                               V *work) {
     if (!HK_IS(p, at, HK_PROJECTED)) {
         HK(regress_all)(p, at, q, x, J, features, work);
         return;

@@ -7,8 +7,8 @@
    (3)); of the first one in the measuring frame; then position and rotation of the tip in the last
    one. `slides` (n): which joints are prismatic. Where `frame` is not NULL it becomes the
    rotation (3, 3) of the tip, and J (6, n) has the rows of its angular velocity. */
-static inline void HK(rigid)(
-    int n, const int32_t *slides, const real *numbers, const V *q, V *x, V *J, V *frame, V *work) {
+static inline void HK(rigid)(int n, const int32_t *slides, const real *numbers, const V *q, V *x,
+                             V *J, V *frame, V *work) {
     V turn[9], at[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
     V *axes = HK(take)(&work, 3 * n), *points = HK(take)(&work, 3 * n); /* (n, 3) */
     for (int i = 0; i < 9; i++) turn[i] = SPLAT(i % 4 == 0 ? 1.0 : 0.0);

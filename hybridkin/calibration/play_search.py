@@ -1,0 +1,85 @@
+"""The search for the backlash (also called play) whose held-out error is least."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+_CLOSE = 0.02  # tolerance of a refined width, relative to it
+
+
+class WidthSearch(NamedTuple):
+    """Result of `search_width`.
+
+    Attributes
+    ----------
+    width : float
+        The best width [unit of q].
+    widths : list of float
+        Widths tried, ascending; without those of a refinement.
+    errors : list of float
+        Their mean held-out errors [m].
+    gain, gain_std_error : float
+        Mean reduction of the errors of the parts by the best width, and its standard error [m].
+    """
+
+    width: float
+    widths: list[float]
+    errors: list[float]
+    gain: float
+    gain_std_error: float
+
+    @property
+    def kept(self) -> bool:
+        """Whether the width lowers the error: `gain` is above `gain_std_error`."""
+        return self.width > 0.0 and self.gain > self.gain_std_error
+
+
+def search_width(
+    errors_by_part: Callable[[float], NDArray],
+    mean: Callable[[NDArray], float],
+    widths: list[float],
+    widest: float,
+    *,
+    refine: bool = False,
+) -> WidthSearch:
+    """Return the width of the play with the least held-out error.
+
+    Parameters
+    ----------
+    errors_by_part : callable
+        Maps a width to the held-out errors (K,) of folds or motions [m].
+    mean : callable
+        Maps these errors to their mean, which is compared.
+    widths : list of float
+        Widths to try, ascending from zero. While the largest is the best, twice that width is
+        tried too.
+    widest : float
+        Largest width to try.
+    refine : bool, default=False
+        Whether to minimise the error between the neighbours of the best width.
+    """
+    errors_of = cache(errors_by_part)
+
+    def error(width: float) -> float:
+        return float(mean(errors_of(width)))
+
+    widths = list(widths)
+    best = min(widths, key=error)
+    while 0.0 < best == widths[-1] < widest:
+        widths.append(min(2.0 * best, widest))
+        best = min(widths, key=error)
+    if refine and best > 0.0:
+        place = widths.index(best)
+        bounds = widths[place - 1], widths[min(place + 1, len(widths) - 1)]
+        options = {"xatol": _CLOSE * best}
+        found = minimize_scalar(error, bounds=bounds, method="bounded", options=options)
+        best = min(best, float(found.x), key=error)
+    gains = errors_of(0.0) - errors_of(best)
+    std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
+    return WidthSearch(best, widths, [*map(error, widths)], float(gains.mean()), std_error)
