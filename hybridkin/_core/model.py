@@ -18,7 +18,7 @@ from torch.autograd import grad
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_tensor
 from hybridkin._core.html import html_table
-from hybridkin._core.stored import WRITERS, Layout, Restore, Stored
+from hybridkin._core.stored import KINDS_OF_MODELS, Layout, Restore, Stored
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
@@ -41,11 +41,11 @@ class Portable:
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Register the plan writer of a class that sets a `layout`."""
+        """Register a class that sets a `layout`, for plans and for files."""
         super().__init_subclass__(**options)
         layout = vars(cls).get("layout")
-        if layout is not None and layout.write_plan is not None:
-            WRITERS[layout.kind] = layout.write_plan
+        if layout is not None and layout.kind:
+            KINDS_OF_MODELS[layout.kind] = cls
 
     def __getstate__(self) -> dict[str, Any]:
         own = vars(self).copy()  # one copy: another thread may add its program

@@ -17,7 +17,7 @@ from hybridkin._core.kernel_numbers import (
     HK_MAX_S,
     KINDS,
 )
-from hybridkin._core.stored import WRITERS, Stored
+from hybridkin._core.stored import KINDS_OF_MODELS, Stored
 
 CHAINS = KINDS[:3]
 # Largest sizes that the kernels support, in the order in which a plan begins.
@@ -90,9 +90,10 @@ class Plan:
 
     def node_of(self, stored: Stored) -> int:
         """Write the node of a description after its parts, and return its place."""
-        if stored.kind not in WRITERS:
+        model = KINDS_OF_MODELS.get(stored.kind)
+        if model is None or model.layout.write_plan is None:
             raise NoKernel(f"a part of the kind {stored.kind!r} has no kernel")
-        return WRITERS[stored.kind](self, stored)
+        return model.layout.write_plan(self, stored)
 
     def node(
         self,

@@ -180,8 +180,8 @@ class Stored:
 
 
 WritePlan = Callable[["Plan", Stored], int]
-WRITERS: dict[str, WritePlan] = {}
-"""The plan writer of each kind that has a kernel; a class with a `layout` registers its own."""
+KINDS_OF_MODELS: dict[str, Any] = {}
+"""The classes with a layout, by its kind."""
 
 Restore = Callable[[Stored], Any]
 """A function that returns the model of a description, and a list for a list of them."""

@@ -62,7 +62,8 @@ def _error_model(model: Any) -> str:
 def _error(model: Any) -> dict[str, str]:
     """Return the error on held-out rows or, where it is not known, on training rows."""
     if (results := model.cv_results_) is not None:
-        alone = f", mechanical model alone {_mm(results['mean_distance'][0])}"
+        first = "a linear model" if model.mechanical_model is None else "mechanical model"
+        alone = f", {first} alone {_mm(results['mean_distance'][0])}"
         return {"held-out error": f"mean {_mm(results['expected_distance'])}{alone}"}
     error = model.error_model_
     held_out = isinstance(error[0] if type(error) is tuple else error, _HELD_OUT)

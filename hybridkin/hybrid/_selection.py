@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.linear_model import LinearRegression
 
 from hybridkin.calibration.choice import Errors
 from hybridkin.calibration.measured import distance, inner_and_outer
@@ -19,6 +20,7 @@ from hybridkin.hybrid._error_models import (
     NamedFeatures,
     NetworkModelCV,
     NoCorrection,
+    RegressorModel,
     WeightedModels,
 )
 from hybridkin.hybrid._fit import Spec, calibrated, fit_hybrid
@@ -80,7 +82,7 @@ def select(
     spec = calibrated(spec, rows)
     candidates = _candidates(spec)
     if len(y) > _MOST:
-        del candidates["parallel kernel"]
+        candidates.popitem()  # the kernel
     settled: list[ErrorModel] = []
     modules: dict[str, HybridModule] = {}
     tests = np.concatenate([test for _, test in splits])
@@ -212,6 +214,13 @@ def _means_by(labels: NDArray, distances: NDArray, counts: NDArray) -> NDArray:
 
 def _candidates(spec: Spec) -> dict[str, ErrorModel]:
     """Return the error models by name; of equal candidates the first, simplest one wins."""
+    network = ELMRegressorCV(250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state))
+    if spec.mechanical is None:
+        return {
+            "linear": RegressorModel(LinearRegression()),
+            "ELM": NetworkModelCV(network),
+            "kernel": KernelModel(),
+        }
     features = ["linear", "quadratic"]
     if isinstance(spec.mechanical, ArcChain):
         features.append("pose")
@@ -222,7 +231,6 @@ def _candidates(spec: Spec) -> dict[str, ErrorModel]:
     for coupling in ("serial", "parallel"):
         for name in features:
             candidates[f"{coupling} {name}"] = NamedFeatures(name, coupling)
-    network = ELMRegressorCV(250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state))
     candidates["parallel ELM"] = NetworkModelCV(network)
     candidates["parallel kernel"] = KernelModel()
     return candidates

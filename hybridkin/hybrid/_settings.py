@@ -69,7 +69,8 @@ def check_settings(estimator: BaseEstimator) -> None:
             f"got {error_model!r}; use coupling='parallel'."
         )
     if mechanical is None:
-        if serial or (isinstance(error_model, str) and error_model not in _REGRESSORS):
+        named = isinstance(error_model, str)
+        if serial or (named and error_model not in ("auto", *_REGRESSORS)):
             raise ValueError(
                 f"`mechanical_model` must be given with coupling={model.coupling!r} and "
                 f"error_model={error_model!r}, which correct a mechanical model. "

@@ -13,16 +13,22 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import LARGEST
 from hybridkin._core.model import PortableModule, as_forward_model
-from hybridkin._core.stored import Restore, Stored, estimator_of, params_of, plain, restore_columns
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin._core.stored import (
+    KINDS_OF_MODELS,
+    Restore,
+    Stored,
+    estimator_of,
+    params_of,
+    plain,
+    restore_columns,
+)
+
+# Their chains are among the kinds that a description may hold.
+from hybridkin.chains import constant_curvature, elastic_tendons, rigid  # noqa: F401
 from hybridkin.chains.play import PlayOperator
-from hybridkin.chains.rigid import RigidChain
-from hybridkin.hybrid import _features, _guards, _module
-from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
+from hybridkin.hybrid._adapted import AdaptedPoseModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._error_models import Blend
-from hybridkin.hybrid._marked import MarkedHybridModule
 from hybridkin.hybrid._pose import PoseHybridModule
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
@@ -31,24 +37,7 @@ from hybridkin.hybrid._settings import check_settings
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.learning.network import ELM
-from hybridkin.learning.regressor_modules import AffineModule, KernelModule, PolynomialModule
 
-# Every module that a description may hold, by its kind.
-_MODULES: dict[str, type[PortableModule]] = {
-    module.layout.kind: module
-    for module in (
-        *(ConstantCurvatureChain, ElasticTendonChain, RigidChain),
-        *(ELM, AffineModule, PolynomialModule, KernelModule, _features.Readout),
-        *(_features.Features, _features.QuadraticFeatures),
-        *(_features.HiddenFeatures, _features.PoseFeatures, _features.Projected),
-        *(_guards.BoxGuard, _guards.LeverageGuard, _guards.QuadraticLeverage),
-        *(_guards.GroupDistance, _guards.Plane),
-        *(_module.TipCorrection, _module.InnerCorrection),
-        *(_module.HybridModule, PoseHybridModule, MarkedHybridModule),
-        *(AdaptedModel, AdaptedPoseModel),
-    )
-}
 # Fitted error models with their own description, and other regressors that a hybrid accepts.
 _FITS = {"elm_regressor": ELMRegressor.from_stored, "readout_fit": ReadoutFit.from_stored}
 _REGRESSORS = {
@@ -58,16 +47,17 @@ _REGRESSORS = {
 
 def restorer() -> Restore:
     """Return a function from descriptions to models; one description always gives one object."""
-    found: dict[int, Any] = {}
+    restored: dict[int, Any] = {}
 
     def restore(stored: Stored) -> Any:
         if stored.kind == "list":
             return [restore(part) for part in stored.parts.values()]
-        if stored.kind not in _MODULES:
+        model = KINDS_OF_MODELS.get(stored.kind)
+        if model is None or not issubclass(model, PortableModule):
             raise ValueError(f"unknown kind {stored.kind!r:.60}")
-        if id(stored) not in found:
-            found[id(stored)] = _MODULES[stored.kind].from_stored(stored, restore)
-        return found[id(stored)]
+        if id(stored) not in restored:
+            restored[id(stored)] = model.from_stored(stored, restore)
+        return restored[id(stored)]
 
     return restore
 

@@ -70,7 +70,8 @@ class HybridForwardModel(HybridPredictor):
         - "auto": the blend of these models, features in both couplings, with the least error on
           held-out groups, or rows; rows outside the fitted ones have a small weight in it. Kernel
           ridge takes part up to 2000 rows. If the gain over the mechanical model is within its
-          standard error, nothing is added. Group rows by what will be new in use.
+          standard error, nothing is added. Group rows by what will be new in use. Without a
+          mechanical model: a linear function, a network and kernel ridge.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the correction acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial":
         inside the robot, f_mech(z(q) + delta(q)). z holds the lengths and bendings of a chain's

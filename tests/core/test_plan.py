@@ -10,7 +10,7 @@ import hybridkin
 from hybridkin._core import kernel_numbers
 from hybridkin._core.model import PortableModule
 from hybridkin._core.plan import MOST, NoKernel, Plan
-from hybridkin._core.stored import WRITERS, Layout, Stored
+from hybridkin._core.stored import KINDS_OF_MODELS, Layout, Stored
 
 SOURCES = Path(hybridkin.__file__).parent / "native" / "src"
 
@@ -25,7 +25,7 @@ def constant():
         layout = Layout("constant", {"value": "n"}, write_plan=write_constant)
 
     yield Stored("constant", arrays={"value": np.arange(3.0)})
-    del WRITERS[Constant.layout.kind]
+    del KINDS_OF_MODELS[Constant.layout.kind]
 
 
 def test_a_class_with_a_layout_registers_its_writer(constant):

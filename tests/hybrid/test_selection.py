@@ -243,7 +243,7 @@ def test_clear_errors(trunk):
     with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
         HybridForwardModel(bha(), "auto").fit(q, x, groups=np.zeros(len(q)))
     with pytest.raises(ValueError, match="`mechanical_model` must be given"):
-        HybridForwardModel(None, "auto").fit(q, x)
+        HybridForwardModel(None, "quadratic").fit(q, x)
 
 
 @pytest.mark.slow
@@ -256,3 +256,19 @@ def test_auto_takes_two_rows(groups):
         model.fit(data.q[:2], data.x[:2], groups=groups)
     assert np.isfinite(model.predict(data.q[:50])).all()
     assert sum(model.cv_results_["weights"].values()) == pytest.approx(1.0)
+
+
+def test_auto_without_a_mechanical_model():
+    """A linear function, a network and a kernel; each wins where the data are of its kind."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(0.0, 1.0, (120, 2))
+    bent = np.stack([np.sin(5.0 * q[:, 0]), q.prod(axis=1), np.cos(4.0 * q[:, 1])], axis=1)
+    straight = q @ rng.standard_normal((2, 3)) + 0.01 * rng.standard_normal((120, 3))
+    model = HybridForwardModel(None, "auto", random_state=0).fit(q, bent)
+    assert [*model.candidates_] == ["linear", "ELM", "kernel"]
+    assert model.cv_results_["weights"]["linear"] == 0.0
+    assert np.abs(model.predict(q) - bent).max() < 0.05
+    linear = HybridForwardModel(None, "auto", random_state=0).fit(q, straight)
+    assert linear.cv_results_["mean_distance"][-1] < 1.1 * 0.01 * 1.6
+    with pytest.raises(ValueError, match="`mechanical_model` must be given"):
+        HybridForwardModel(None, "auto", coupling="serial").fit(q, bent)
