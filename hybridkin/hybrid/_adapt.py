@@ -14,7 +14,7 @@ from hybridkin._core.rotations import cross_matrix, rotation, rotation_vector
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import MISFITS, SWITCH, too_far
-from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pose import PoseHybridModule
 from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import evaluate
@@ -29,12 +29,12 @@ _SINGULAR = np.linalg.LinAlgError, torch.linalg.LinAlgError  # pyright: ignore
 
 
 def adapted(
-    fitted: HybridModule,
+    fitted: Hybrid,
     rows: Rows,
     noise: float,
     scale: NDArray,
     parameters: Sequence[str],
-) -> tuple[HybridModule | AdaptedModel, str | None]:
+) -> tuple[Hybrid | AdaptedModel, str | None]:
     """Return the model after the most probable change, given new rows, and a warning or None.
 
     The change theta = (rotation, translation, shift) is in natural units: a rotation about the base
@@ -44,7 +44,7 @@ def adapted(
 
     Parameters
     ----------
-    fitted : HybridModule
+    fitted : Hybrid
         The model of the fit.
     rows : Rows
         New rows. The errors of the rows of a group have a common part.
@@ -119,7 +119,7 @@ def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
 class _Problem:
     """The new rows, and the model as a function of the change of the robot."""
 
-    def __init__(self, fitted: HybridModule, rows: Rows, scale: NDArray) -> None:
+    def __init__(self, fitted: Hybrid, rows: Rows, scale: NDArray) -> None:
         self.fitted, self.q, self.y = fitted, rows.q, torch.from_numpy(rows.tips)
         self.measured = ~np.isnan(rows.tips)
         robot, self.pivot, self.reach = fitted.robot, self.q.new_zeros(3), 1.0

@@ -14,7 +14,7 @@ from hybridkin._core.plan import Plan
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains.chain import Chain
-from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pose import PoseHybridModule
 
 
@@ -32,7 +32,7 @@ class AdaptedModel(ForwardModel):
 
     Parameters
     ----------
-    fitted : HybridModule
+    fitted : Hybrid
         f, as it was fitted. If T is not the identity, its outputs are tips or poses in space.
     shift : Tensor of shape (n,)
         Shift of the actuator zeros [unit of q].
@@ -43,9 +43,9 @@ class AdaptedModel(ForwardModel):
     layout = Layout(
         "adapted_model", {"shift": "n", "motion": "44"}, parts=("fitted",), write_plan=_write_plan
     )
-    fitted: HybridModule
+    fitted: Hybrid
 
-    def __init__(self, fitted: HybridModule, shift: Tensor, motion: Tensor) -> None:
+    def __init__(self, fitted: Hybrid, shift: Tensor, motion: Tensor) -> None:
         super().__init__()
         self.fitted = fitted
         self.register_buffer("shift", shift)
@@ -84,9 +84,9 @@ class AdaptedModel(ForwardModel):
     @property
     def tip_model(self) -> ForwardModel:
         """The model of the tip alone, after the change."""
-        return self.of(cast(HybridModule, self.fitted.tip_model))
+        return self.of(cast(Hybrid, self.fitted.tip_model))
 
-    def of(self, fitted: HybridModule) -> Self:
+    def of(self, fitted: Hybrid) -> Self:
         """Return another hybrid after the same change."""
         return type(self)(fitted, self.shift, self.motion)
 

@@ -23,10 +23,10 @@ from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._error_models import ErrorModel, FittedError, PerMarker, Residuals
 from hybridkin.hybrid._guards import GroupDistance, Plane
-from hybridkin.hybrid._marked import MarkedHybridModule
-from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._module import Hybrid, HybridModule
 from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
 from hybridkin.hybrid._rows import Rows, rare_marker
+from hybridkin.hybrid._stacked import Stacked
 
 _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
@@ -60,7 +60,7 @@ class FittedHybrid(NamedTuple):
     mechanical: ForwardModel | None
     calibration: CalibrationResult | None
     error: FittedError
-    module: HybridModule
+    module: Hybrid
     messages: tuple[str, ...]
 
     def predict(self, X: NDArray) -> NDArray:
@@ -114,7 +114,7 @@ def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], left: Residuals) -
     for k, (tip, model) in enumerate(zip(tips, models, strict=True)):
         marker = replace(spec, mechanical=tip, error_model=model)
         fits.append(fit_hybrid(marker, left.rows.marker(k)))
-    module = MarkedHybridModule(spec.mechanical, [fit.module for fit in fits])
+    module = Stacked(spec.mechanical, [fit.module for fit in fits])
     results = tuple(fit.error.result for fit in fits)
     fitted = FittedError(
         None if results[0] is None else results,

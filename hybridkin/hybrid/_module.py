@@ -176,7 +176,84 @@ def _content(stored: Stored) -> tuple:
     return stored.kind, stored.settings, arrays
 
 
-class HybridModule(ForwardModel):
+class Hybrid(ForwardModel):
+    """A mechanical model f plus what was learned of its residual; the interface of all hybrids.
+
+    Attributes
+    ----------
+    mechanical : ForwardModel or None
+        f; None: zero.
+    drift : AffineModule or None
+        The change of the robot since the fit.
+    tested : GroupDistance or None
+        Distance up to which held-out groups have tested the model.
+    """
+
+    mechanical: ForwardModel | None
+    drift: AffineModule | None
+    tested: GroupDistance | None
+
+    @property
+    def robot(self) -> ForwardModel:
+        """The mechanical model, or the module itself without one."""
+        return self if self.mechanical is None else self.mechanical
+
+    @property
+    def corrects_inside(self) -> bool:
+        """Whether a correction acts inside the robot, see `InnerCorrection`."""
+        raise NotImplementedError
+
+    @property
+    def fitted(self) -> Hybrid:
+        """The model of the fit: this one, since the robot has not changed; see `AdaptedModel`."""
+        return self
+
+    @property
+    def shift(self) -> Tensor:
+        """Shift of the actuator zeros since the fit [unit of q]."""
+        return torch.zeros((), dtype=torch.float64)
+
+    @property
+    def longest_correction(self) -> Tensor | float:
+        """Upper bound of the distance from f(q) to x, infinite without guards, () [m]."""
+        raise NotImplementedError
+
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return how much farther targets are than f reaches with the longest correction."""
+        if self.mechanical is None:
+            return super().misses(x, largest)
+        return self.mechanical.misses(x, largest) - self.longest_correction
+
+    def of(self, fitted: Hybrid) -> Hybrid:
+        """Return another hybrid after the same change of the robot: none."""
+        return fitted
+
+    def before(self, q: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rows q (N, n) and y (N, m) as they were before the change."""
+        return q, y
+
+    def with_drift(self, drift: AffineModule | None) -> Self:
+        """Return the same model with another drift; this model does not change."""
+        raise NotImplementedError
+
+    def rows(self) -> Hybrid:
+        """Return the module whose outputs are the columns of measured y; for tips this module."""
+        return self
+
+    def mechanical_part(self, q: Tensor) -> Tensor:
+        """Return f(q), zero without a mechanical model, shape (..., m) [m]."""
+        return 0.0 * self.error_part(q) if self.mechanical is None else self.mechanical(q)
+
+    def error_part(self, q: Tensor) -> Tensor:
+        """Return what is added to f(q), shape (..., m) [m]."""
+        raise NotImplementedError
+
+    def error_weight(self, q: Tensor) -> Tensor:
+        """Return the weight of the learned part, shape (...)."""
+        raise NotImplementedError
+
+
+class HybridModule(Hybrid):
     """The sum x = f(q) + sum_k w_k s_k(q) + t(q) d(q) as a torch module q (..., n) -> x (..., m).
 
     f is the mechanical model. s_k is a learned correction c_k times the weight g_k of its guard,
@@ -230,32 +307,9 @@ class HybridModule(ForwardModel):
             self.n_actuators, self.n_outputs = model.n_actuators, model.n_outputs
 
     @property
-    def robot(self) -> ForwardModel:
-        """The mechanical model, or the module itself without one."""
-        return self if self.mechanical is None else self.mechanical
-
-    @property
     def corrects_inside(self) -> bool:
         """Whether a correction acts inside the robot, see `InnerCorrection`."""
         return any(isinstance(correction, InnerCorrection) for correction in self.corrections)
-
-    @property
-    def fitted(self) -> HybridModule:
-        """The model of the fit: this one, since the robot has not changed; see `AdaptedModel`."""
-        return self
-
-    @property
-    def shift(self) -> Tensor:
-        """Shift of the actuator zeros since the fit [unit of q]."""
-        return self.weights.new_zeros(())
-
-    def of(self, fitted: HybridModule) -> HybridModule:
-        """Return another hybrid after the same change of the robot: none."""
-        return fitted
-
-    def before(self, q: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return rows q (N, n) and y (N, m) as they were before the change."""
-        return q, y
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
@@ -274,22 +328,12 @@ class HybridModule(ForwardModel):
             )
         return longest
 
-    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
-        """Return how much farther targets are than f reaches with the longest correction."""
-        if self.mechanical is None:
-            return super().misses(x, largest)
-        return self.mechanical.misses(x, largest) - self.longest_correction
-
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this model does not change."""
         corrections = [c for _, c in self._parts()]
         return type(self)(
             self.mechanical, corrections, self.weights, drift, self.tested, self.log_plane
         )
-
-    def rows(self) -> HybridModule:
-        """Return the module whose outputs are the columns of measured y; for tips this module."""
-        return self
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m) [m]."""
@@ -299,10 +343,6 @@ class HybridModule(ForwardModel):
         """Return x (..., m) and dx/dq (..., m, n), in closed form where the parts have one."""
         x, J = in_blocks(self._forward_and_jacobian, q)
         return x, J
-
-    def mechanical_part(self, q: Tensor) -> Tensor:
-        """Return f(q), zero without a mechanical model, shape (..., m) [m]."""
-        return 0.0 * self.error_part(q) if self.mechanical is None else self.mechanical(q)
 
     def error_part(self, q: Tensor) -> Tensor:
         """Return the sum of corrections and drift, which is added to f(q), (..., m) [m]."""

@@ -23,7 +23,7 @@ from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
-from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
@@ -35,7 +35,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The prediction methods of a `HybridForwardModel`; they use only the results of `fit`."""
 
     output: str
-    module_: HybridModule | AdaptedModel
+    module_: Hybrid | AdaptedModel
     mechanical_model_: ForwardModel | None
     play_: PlayOperator | None
     radius_: Radius | None
@@ -175,7 +175,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _evaluated(
         self,
-        function: Callable[[HybridModule | AdaptedModel, NDArray], Sequence[NDArray]],
+        function: Callable[[Hybrid | AdaptedModel, NDArray], Sequence[NDArray]],
         X: Any,
         groups: ArrayLike | None,
         warn: bool = True,
@@ -195,14 +195,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
-def _method(name: str) -> Callable[[HybridModule | AdaptedModel, NDArray], Sequence[NDArray]]:
+def _method(name: str) -> Callable[[Hybrid | AdaptedModel, NDArray], Sequence[NDArray]]:
     """Return a function that evaluates a method of a module at rows q."""
     return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
 
 
-def _with_domain(
-    module: HybridModule | AdaptedModel, q: NDArray, value: bool = True
-) -> list[NDArray]:
+def _with_domain(module: Hybrid | AdaptedModel, q: NDArray, value: bool = True) -> list[NDArray]:
     """Return x of rows q if `value`, and whether they lie in the domain."""
     *x, distance = evaluate(module, q, value, distance=True)
     return [*x, distance <= 1.0]

@@ -25,7 +25,7 @@ from hybridkin.hybrid._error_models import (
 )
 from hybridkin.hybrid._fit import Spec, calibrated, fit_hybrid
 from hybridkin.hybrid._kernel import folds_of
-from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
@@ -41,7 +41,7 @@ def select(
     spec: Spec,
     rows: Rows,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Spec, dict[str, Any], dict[str, HybridModule]]:
+) -> tuple[Spec, dict[str, Any], dict[str, Hybrid]]:
     """Return the specification with the error model of least held-out error, or a blend.
 
     Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
@@ -65,7 +65,7 @@ def select(
         Calibrated, with its parts.
     results : dict
         Errors of all candidates, see `HybridForwardModel.cv_results_`.
-    modules : dict of str to HybridModule
+    modules : dict of str to Hybrid
         Every candidate, fitted to all rows.
     """
     y, counts, folds = rows.tips, rows.counts, folds_of(rows.X, rows.groups)
@@ -84,7 +84,7 @@ def select(
     if len(y) > _MOST:
         candidates.popitem()  # the kernel
     settled: list[ErrorModel] = []
-    modules: dict[str, HybridModule] = {}
+    modules: dict[str, Hybrid] = {}
     tests = np.concatenate([test for _, test in splits])
     predicted = np.empty((len(candidates), len(tests), y.shape[1]))
     for i, (name, candidate) in enumerate(candidates.items()):

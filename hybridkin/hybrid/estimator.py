@@ -33,7 +33,7 @@ from hybridkin.hybrid._fit import (
     residuals,
     with_geometry_chosen,
 )
-from hybridkin.hybrid._module import HybridModule
+from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -276,7 +276,7 @@ class HybridForwardModel(HybridPredictor):
             spec = replace(spec, commanded=moved_directions(rows.X))
             rows = replace(given, X=self._effective(given.X, given.groups)).distinct()
         self.cv_results_: dict[str, Any] | None = None
-        self.candidates_: dict[str, HybridModule] | None = None
+        self.candidates_: dict[str, Hybrid] | None = None
         if spec.error_model is None:
             spec, self.cv_results_, self.candidates_ = select(spec, rows, progress)
         fitted = fit_hybrid(spec, rows)
