@@ -10,7 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin._core.arrays import identity
-from hybridkin._core.rotations import cross_matrix, rotation, rotation_vector
+from hybridkin._core.rotations import (
+    cross_matrix,
+    nearest_rotation,
+    rotation,
+    rotation_vector,
+)
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import MISFITS, SWITCH, too_far
@@ -146,10 +151,9 @@ class _Problem:
         measured = ~y.isnan().any(1)
         x, y = x.reshape(-1, 3)[measured], y[measured]
         moments = (y - y.mean(0)).mT @ (x - x.mean(0)) + noise**2 * identity(3, x)
-        left, _, right = torch.linalg.svd(moments)
-        left[:, 2] *= torch.linalg.det(left @ right).sign()
-        theta[:3] = rotation_vector(left @ right)
-        way = y.mean(0) - self.pivot - left @ right @ (x.mean(0) - self.pivot)
+        R, _ = nearest_rotation(moments)
+        theta[:3] = rotation_vector(R)
+        way = y.mean(0) - self.pivot - R @ (x.mean(0) - self.pivot)
         theta[3:6] = way / self.reach
         return theta.numpy()
 
