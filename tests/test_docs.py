@@ -104,7 +104,7 @@ def test_code_of_every_page_is_python(page):
 
 @pytest.mark.slow
 def test_models_of_the_page_on_the_inside_run_as_printed(capsys):
-    mechanical, error, kernel = blocks("how_it_works.md", "python")
+    mechanical, error, writer, layout = blocks("how_it_works.md", "python")
     space = {}
     exec(compile(mechanical, "how_it_works.md", "exec"), space)
     printed = capsys.readouterr().out
@@ -119,7 +119,10 @@ def test_models_of_the_page_on_the_inside_run_as_printed(capsys):
     q = torch.from_numpy(space["data"].q[:2])
     x, J = ForwardModel.forward_and_jacobian(waves, q)
     torch.testing.assert_close(waves.forward_and_jacobian(q), (x, J))
-    assert "WAVES" in kernel
+    exec(
+        compile(writer + "from hybridkin._core.stored import Layout\n" + layout, "", "exec"), space
+    )
+    assert space["layout"].write_plan is space["write_plan"]
 
 
 def cells_of(page):

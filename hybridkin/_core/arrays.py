@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
 from torch import Tensor
 
-from hybridkin._core.turns import THREADS
+from hybridkin._core.forks import THREADS
 
 
 @runtime_checkable

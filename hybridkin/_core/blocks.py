@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import check_shape
-from hybridkin._core.turns import THREADS
+from hybridkin._core.forks import THREADS
 
 
 def in_blocks(

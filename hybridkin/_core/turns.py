@@ -1,4 +1,4 @@
-"""Locks for state that all threads of the process share, and threads of torch after a fork."""
+"""Locks for state that all threads of the process share."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import torch
 from threadpoolctl import threadpool_limits
 
 
@@ -22,32 +21,9 @@ class _Turns:
         self.filters, self.limits = threading.RLock(), threading.RLock()
 
 
-class _Threads:
-    """The number of torch's threads in a forked child.
-
-    The child has no OpenMP threads, and would wait for them forever. Before it first computes with
-    hybridkin, torch is set to one thread, unless the child has chosen another number itself.
-    """
-
-    inherited: int | None = None  # number at the fork, until the first check in a child
-
-    def after_fork(self) -> None:
-        """Note the number of threads of a new child."""
-        self.inherited = torch.get_num_threads()
-
-    def check(self) -> None:
-        """Set torch to one thread if this is a child that would wait."""
-        if self.inherited is not None:
-            if torch.get_num_threads() == self.inherited:
-                torch.set_num_threads(1)
-            self.inherited = None
-
-
 TURNS = _Turns()
-THREADS = _Threads()
 if hasattr(os, "register_at_fork"):  # a child lacks the threads that may hold a lock
     os.register_at_fork(after_in_child=TURNS.__init__)
-    os.register_at_fork(after_in_child=THREADS.after_fork)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -113,9 +114,9 @@ def export_c(
     except (NoKernel, TypeError) as error:
         way = "use it from Python, or a model and a task that have kernels"
         raise NoKernel(f"`model` cannot be written in C: {error}; {way}.") from None
-    files = {f"{name}.h": "model.h", f"{name}.c": "model.c", f"{name}_test.c": "check.c"}
-    files |= {file: file for file in ("CMakeLists.txt", "README.md")}
-    paths = [Path(folder) / file for file in files]
+    sources = {f"{name}.h": "model.h", f"{name}.c": "model.c", f"{name}_test.c": "check.c"}
+    sources["CMakeLists.txt"] = "CMakeLists.txt"
+    paths = [Path(folder) / file for file in (*sources, "README.md")]
     for path in paths:
         if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
             raise FileExistsError(f"`folder` has a {path.name} of another origin; use another.")
@@ -130,12 +131,10 @@ def export_c(
     for key, template in parts.items():
         entries[key] = "" if controller is None else _filled(template, entries)
 
-    def write(path: Path, template: str) -> None:
-        if template == "README.md":
-            entries["MEASURED"] = _measured(path.with_name(f"{name}.c"))
-        path.write_text(_filled(template, entries))
-
-    write_files(folder, {file: partial(write, template=files[file]) for file in files})
+    texts = {file: _filled(template, entries) for file, template in sources.items()}
+    entries["MEASURED"] = _measured(f"{name}.c", texts)
+    texts["README.md"] = _filled("README.md", entries)
+    write_files(folder, {file: partial(Path.write_text, data=text) for file, text in texts.items()})
     return paths
 
 
@@ -299,13 +298,15 @@ def _runs(
     return found | {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
 
 
-def _measured(source: Path) -> str:
+def _measured(source: str, texts: dict[str, str]) -> str:
     """Return the size of the code and of its stack, measured by the compiler of this machine."""
     if shutil.which("cc") and shutil.which("size"):
-        with tempfile.TemporaryDirectory() as home:
+        with suppress(OSError), tempfile.TemporaryDirectory() as home:  # it may have no room
+            for name, text in texts.items():
+                Path(home, name).write_text(text)
             built = Path(home) / "a.o"
             usage = Path(home) / "a.su"
-            options = ["-std=c99", "-Os", "-fstack-usage", "-c", source, "-o", built]
+            options = ["-std=c99", "-Os", "-fstack-usage", "-c", Path(home, source), "-o", built]
             done = subprocess.run(["cc", *options], capture_output=True)
             if done.returncode == 0 and usage.exists():
                 stack = sum(int(line.split("\t")[1]) for line in usage.read_text().splitlines())

@@ -283,7 +283,7 @@ def test_files_are_replaced_once_all_are_written(tmp_path, monkeypatch):
     """Another process may write or read them at the same time."""
     before = {path: path.read_text() for path in export_c(tendon_chain(), tmp_path)}
 
-    def stopped(source):
+    def stopped(source, texts):
         raise OSError("stopped")
 
     monkeypatch.setattr("hybridkin.native.export._measured", stopped)
