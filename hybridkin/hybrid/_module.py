@@ -211,7 +211,7 @@ class Hybrid(ForwardModel):
     @property
     def shift(self) -> Tensor:
         """Shift of the actuator zeros since the fit [unit of q]."""
-        return torch.zeros((), dtype=torch.float64)
+        return torch.zeros((), dtype=torch.float64, device="cpu")
 
     @property
     def longest_correction(self) -> Tensor | float:
