@@ -18,7 +18,8 @@ _PLACES = 48  # places that are tried for a path
 def placed(domain: Domain, path: Trajectory, tol: float) -> tuple[Trajectory, float]:
     """Return a path moved to where it lies in the domain, and the share of its points that does.
 
-    Of equally good places it is the one nearest to the path.
+    Of equally good places it is the one with the least error to expect, or, for a model without
+    held-out errors, the one nearest to the path.
     """
     commands, tips = domain.sample
     center = 0.5 * (path.x.min(axis=0) + path.x.max(axis=0))
@@ -29,7 +30,10 @@ def placed(domain: Domain, path: Trajectory, tol: float) -> tuple[Trajectory, fl
     nearest = np.linalg.norm(tips - x[..., None, :], axis=-1).argmin(axis=-1)
     solution = solver(domain).solve(x, q0=commands[nearest], tol=tol, max_iter=100, restarts=0)
     inside = (solution.status == IKStatus.CONVERGED).mean(axis=1)
-    best = int(inside.argmax())
+    good = np.flatnonzero(inside == inside.max())
+    best = int(good[0])
+    if promised := domain.loaded.promised_errors(solution.q[good].reshape(-1, commands.shape[1])):
+        best = int(good[promised["mean"].reshape(len(good), -1).mean(axis=1).argmin()])
     return Trajectory(path.t, path.x + shifts[best]), float(inside[best])
 
 

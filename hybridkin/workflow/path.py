@@ -112,8 +112,8 @@ def shape_path(
         Width (along the x-axis of the tips) and height of a figure eight; first and last radius of
         a spiral; x, y and z from end to end of a line [m].
     center : array-like of shape (3,), optional
-        Centre of the shape [m]. Default: near the middle of the tips in the domain of the model,
-        where the whole shape lies in the domain, if possible.
+        Centre of the shape [m]. Default: a tip in the domain of the model about which the whole
+        shape lies in the domain, if possible, with the least error to expect.
     normal : array-like of shape (3,), optional
         Normal of its plane. Default: that of the plane nearest to these tips.
     turns : float, default=3.0
