@@ -4,7 +4,7 @@ Robots drawn at random (`motor_robot`), with motors that take whole counts and h
 
     python examples/studies/motor_tracks.py --out results/motor_tracks
 
-Six minutes of CPU time for each robot. Robot k has the seed k: its log (30 motions of 40 rows)
+Three minutes of CPU time for each robot. Robot k has the seed k: its log (30 motions of 40 rows)
 and the errors of its ruler, too. `hybridkin fit` and `hybridkin track` run with their default
 settings on a circle or a figure eight near measured tips; a path that is refused is made smaller
 as the message says. The commands are rounded to counts and sent
