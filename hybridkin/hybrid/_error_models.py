@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf, nan
 from typing import Any, NamedTuple
 
@@ -65,7 +66,7 @@ class Residuals:
     guard: str | None = None  # see `fit_guard`
     left_out: bool = True  # whether held-out residuals are needed as well
 
-    @property
+    @cached_property
     def directions(self) -> Directions:
         """The directions of q that the rows move."""
         return moved_directions(self.rows.X)

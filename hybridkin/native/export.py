@@ -301,7 +301,7 @@ def _runs(
 def _measured(source: str, texts: dict[str, str]) -> str:
     """Return the size of the code and of its stack, measured by the compiler of this machine."""
     if shutil.which("cc") and shutil.which("size"):
-        with suppress(OSError), tempfile.TemporaryDirectory() as home:  # it may have no room
+        with suppress(OSError), tempfile.TemporaryDirectory() as home:  # the disk may be full
             for name, text in texts.items():
                 Path(home, name).write_text(text)
             built = Path(home) / "a.o"
