@@ -52,7 +52,9 @@ from hybridkin import (
     save_model,
     trajectories,
 )
+from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.workflow import open_model
+from hybridkin.workflow._promise import Promise
 from hybridkin.workflow.report import Report
 
 FIT = "fit"  # models that begin so are made by the command line
@@ -191,16 +193,18 @@ def _fit_in_python(setup: Setup, error_model: str) -> dict[str, float]:
         raise ValueError("the description lacks [log].")
     data = datasets.load_log(setup.folder / "log.csv", **robot.log.reading)
     hybrid = HybridForwardModel(robot.chain, error_model, calibrate=robot.calibrate, random_state=0)
-    errors = np.empty(len(data.q))
+    errors, far = np.empty(len(data.q)), np.empty(len(data.q))
     for train, test in GroupKFold(_FOLDS).split(data.q, groups=data.groups):
         hybrid.fit(data.q[train], data.x[train], groups=data.groups[train])
         predicted = hybrid.predict(data.q[test], groups=data.groups[test])
         errors[test] = np.linalg.norm(predicted - data.x[test], axis=1)
+        far[test] = held_out_distances(data.q[train], data.groups[train], data.q[test])
     held_out = {"mean": float(errors.mean()), "p95": float(np.quantile(errors, 0.95))}
     hybrid.fit(data.q, data.x, groups=data.groups)
     folder = _model_folder(setup, error_model)
     folder.mkdir(exist_ok=True)
     training = {"saved": "hybrid", "held_out": {"hybrid": held_out}}
+    training["promise"] = vars(Promise.of(errors, far))
     save_model(hybrid, folder / "model.safetensors", training=training)
     (folder / "robot.toml").write_bytes((setup.folder / "robot.toml").read_bytes())
     return held_out
