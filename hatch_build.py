@@ -37,7 +37,8 @@ AVX2 = "-mavx2 -mfma"
 X86 = {
     "v2": "-msse4.2 -O2",  # for old processors: compiled in half the time
     "v3": AVX2,
-    "v4": AVX2 + " -mavx512f -mavx512cd -mavx512bw -mavx512dq -mavx512vl -mprefer-vector-width=512",
+    "v4": AVX2
+    + " -mavx512f -mavx512cd -mavx512bw -mavx512dq -mavx512vl -mprefer-vector-width=512",
 }
 
 
@@ -63,7 +64,12 @@ def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
     variants = X86 if target.endswith(("x86_64", "amd64")) else {"generic": ""}
     shared = runpy.run_path(str(PACKAGE / "_core" / "kernel_numbers.py"))
     stamp = shared["checksum"](NATIVE / "src")
-    command = [*compiler(), *FLAGS, f"-DHK_SOURCES={stamp}u", *([] if windows else ["-fPIC"])]
+    command = [
+        *compiler(),
+        *FLAGS,
+        f"-DHK_SOURCES={stamp}u",
+        *([] if windows else ["-fPIC"]),
+    ]
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as work:
         Path(work, "kinds.h").write_text(shared["c_header"]())
@@ -71,7 +77,13 @@ def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
         running = {}
         for name in names or variants:
             path = Path(work, f"hk_{name}{suffix}")
-            options = [*variants[name].split(), "-o", str(path), str(NATIVE / "src/hk.c"), "-lm"]
+            options = [
+                *variants[name].split(),
+                "-o",
+                str(path),
+                str(NATIVE / "src/hk.c"),
+                "-lm",
+            ]
             running[path] = subprocess.Popen(
                 [*command, *options], stderr=subprocess.PIPE, text=True
             )
@@ -79,7 +91,9 @@ def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
         made = [path for path, process in running.items() if process.returncode == 0]
         sys.stderr.write("".join(said[path] for path in made))
         if not made:
-            raise OSError(f"the C compiler failed: {next(iter(said.values())).strip()[-500:]}")
+            raise OSError(
+                f"the C compiler failed: {next(iter(said.values())).strip()[-500:]}"
+            )
         # Replaced at once: another process may have the old one in use.
         return [path.replace(folder / path.name) for path in made]
 
@@ -95,14 +109,18 @@ class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssue
         try:
             made = compile_into(folder, target, [])
         except OSError as error:
-            sys.stderr.write(f"hybridkin: installed without compiled kernels; {error}\n")
+            sys.stderr.write(
+                f"hybridkin: installed without compiled kernels; {error}\n"
+            )
             return
         if version != "editable":
             build_data.update(pure_python=False, tag=f"py3-none-{target}")
             places = {str(path): f"hybridkin/native/lib/{path.name}" for path in made}
             build_data["force_include"].update(places)
 
-    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+    def finalize(
+        self, version: str, build_data: dict[str, Any], artifact_path: str
+    ) -> None:
         """Remove what was compiled for the wheel alone."""
         shutil.rmtree(self.work)
 

@@ -36,7 +36,9 @@ suppress_warnings = ["config.cache"]
 # Reference: from the docstrings.
 default_role = "py:obj"
 autosummary_generate = True
-shutil.rmtree(ROOT / "docs" / "api", ignore_errors=True)  # or pages of names that are gone stay
+shutil.rmtree(
+    ROOT / "docs" / "api", ignore_errors=True
+)  # or pages of names that are gone stay
 autosummary_ignore_module_all = False
 autodoc_typehints = "none"
 autodoc_class_signature = "mixed"
@@ -74,8 +76,14 @@ html_title = f"hybridkin {release}"
 html_static_path = ["_static"]
 html_css_files = ["hybridkin.css"]
 html_theme_options = {
-    "light_css_variables": {"color-brand-primary": "#0072B2", "color-brand-content": "#0072B2"},
-    "dark_css_variables": {"color-brand-primary": "#56B4E9", "color-brand-content": "#56B4E9"},
+    "light_css_variables": {
+        "color-brand-primary": "#0072B2",
+        "color-brand-content": "#0072B2",
+    },
+    "dark_css_variables": {
+        "color-brand-primary": "#56B4E9",
+        "color-brand-content": "#56B4E9",
+    },
 }
 html_show_sourcelink = False
 html_math_renderer = "mathml"

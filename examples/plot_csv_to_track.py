@@ -11,7 +11,14 @@ tip along a figure eight. The log of a **simulated** trunk comes with the packag
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hybridkin import HybridForwardModel, InverseKinematics, datasets, plots, robots, trajectories
+from hybridkin import (
+    HybridForwardModel,
+    InverseKinematics,
+    datasets,
+    plots,
+    robots,
+    trajectories,
+)
 
 # %%
 # A log holds actuator vectors q (N, 9) and tip positions x (N, 3), all in metres. Your own comes
@@ -24,7 +31,9 @@ train, test = datasets.paper_split(data, random_state=0)
 # `fit` first calibrates the radii of the rings and the pose of the base. The network then learns
 # the residual. The errors are those of held-out rows.
 
-model = HybridForwardModel(robots.bionic_handling_assistant(), calibrate="default", random_state=0)
+model = HybridForwardModel(
+    robots.bionic_handling_assistant(), calibrate="default", random_state=0
+)
 model.fit(data.q[train], data.x[train])
 predictions = {
     "mechanical, calibrated": model.predict_mechanical(data.q[test]),
@@ -60,6 +69,8 @@ plt.show()
 
 figure = plt.figure(figsize=(6, 4.6), layout="constrained")
 chain = model.mechanical_model_
-film = plots.TrackAnimation.from_estimator(chain, track.q, target=path.x, t=path.t, tips=track.x)
+film = plots.TrackAnimation.from_estimator(
+    chain, track.q, target=path.x, t=path.t, tips=track.x
+)
 film.plot(figure.add_subplot(projection="3d"), frame=60)
 plt.show()

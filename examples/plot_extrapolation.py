@@ -25,7 +25,11 @@ def hybrid(guard):
     return model.fit(data.q[train], data.x[train])
 
 
-guards = {"hybrid, no guard": None, "hybrid, box": "box", "hybrid, leverage (default)": "leverage"}
+guards = {
+    "hybrid, no guard": None,
+    "hybrid, box": "box",
+    "hybrid, leverage (default)": "leverage",
+}
 models = {name: hybrid(guard) for name, guard in guards.items()}
 
 # %%
@@ -33,12 +37,16 @@ models = {name: hybrid(guard) for name, guard in guards.items()}
 # guard "leverage" also checks which combinations of lengths are in the training data.
 
 predictions = {
-    "mechanical, calibrated": models["hybrid, no guard"].predict_mechanical(data.q[test])
+    "mechanical, calibrated": models["hybrid, no guard"].predict_mechanical(
+        data.q[test]
+    )
 }
 predictions |= {name: model.predict(data.q[test]) for name, model in models.items()}
 errors = plots.ErrorBoxDisplay.from_predictions(data.x[test], predictions)
 for name, values in errors.errors.items():
-    print(f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.0f} mm")
+    print(
+        f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.0f} mm"
+    )
 
 # %%
 # Length of the learned correction on straight lines from training rows to test rows: median and
@@ -49,7 +57,9 @@ start, end = data.q[rng.choice(train, 60)], data.q[rng.choice(test, 60)]
 share = np.linspace(0.0, 1.0, 41)
 ways = (start + share[:, None, None] * (end - start)).reshape(-1, 9)
 
-figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), width_ratios=(1, 1.1), layout="constrained")
+figure, axes = plt.subplots(
+    1, 2, figsize=(11, 4.2), width_ratios=(1, 1.1), layout="constrained"
+)
 for (name, model), color in zip(
     models.items(), ("0.6", "black", plots.model_color("hybrid")), strict=True
 ):

@@ -24,7 +24,10 @@ chain = robots.bionic_handling_assistant()
 def kernel_ridge():
     """Return kernel ridge whose width and penalty are chosen by three folds."""
     ridge = make_pipeline(StandardScaler(), KernelRidge(kernel="rbf"))
-    grid = {"kernelridge__gamma": [0.003, 0.01, 0.03], "kernelridge__alpha": [1e-3, 1e-2]}
+    grid = {
+        "kernelridge__gamma": [0.003, 0.01, 0.03],
+        "kernelridge__alpha": [1e-3, 1e-2],
+    }
     return GridSearchCV(ridge, grid, scoring="neg_mean_squared_error", cv=3)
 
 
@@ -44,7 +47,12 @@ models = {
 
 split = ShuffleSplit(3, test_size=250, random_state=0)
 display = plots.LearningCurveDisplay.from_estimator(
-    models, data.q[rows], data.x[rows], sizes=(20, 30, 60, 120, 250), cv=split, random_state=0
+    models,
+    data.q[rows],
+    data.x[rows],
+    sizes=(20, 30, 60, 120, 250),
+    cv=split,
+    random_state=0,
 )
 for name, errors in display.errors.items():
     with_60, with_250 = 1e3 * errors.mean(axis=1)[[2, 4]]

@@ -42,7 +42,9 @@ candidates = {
 }
 for name, model in candidates.items():
     errors = -cross_val_score(model, q, x, groups=groups, cv=folds, scoring=score)
-    print(f"{name}: {errors.mean():.1f} mm, folds {errors.min():.1f} to {errors.max():.1f}")
+    print(
+        f"{name}: {errors.mean():.1f} mm, folds {errors.min():.1f} to {errors.max():.1f}"
+    )
 
 # %%
 # A grid over the coupling and over parameters of the network.
@@ -68,13 +70,27 @@ for where in ("parallel", "serial"):
     color = plots.model_color(where)
     for n_hidden, style in ((25, "o--"), (100, "s-")):
         some = (coupling == where) & (size == n_hidden)
-        mean, spread = -results["mean_test_score"][some], results["std_test_score"][some]
-        ax.plot(alpha[some], mean, style, color=color, label=f"{where}, {n_hidden} neurons")
+        mean, spread = (
+            -results["mean_test_score"][some],
+            results["std_test_score"][some],
+        )
+        ax.plot(
+            alpha[some], mean, style, color=color, label=f"{where}, {n_hidden} neurons"
+        )
         if n_hidden == 100:
             ax.fill_between(
-                alpha[some], mean - spread, mean + spread, color=color, alpha=0.15, linewidth=0
+                alpha[some],
+                mean - spread,
+                mean + spread,
+                color=color,
+                alpha=0.15,
+                linewidth=0,
             )
-ax.set(xscale="log", xlabel="penalty of the network", ylabel="mean tip error, held-out groups [mm]")
+ax.set(
+    xscale="log",
+    xlabel="penalty of the network",
+    ylabel="mean tip error, held-out groups [mm]",
+)
 ax.legend(frameon=False)
 ax.set_ylim(bottom=0)
 plt.show()

@@ -38,7 +38,9 @@ def errors(measured):
 draws = [np.random.default_rng(seed).permutation(pool) for seed in range(5)]
 by_choice = np.array([errors(pool[chosen[:n]]) for n in sizes])
 by_chance = np.array([[errors(draw[:n]) for n in sizes] for draw in draws])
-for n, (mean, largest), several in zip(sizes, by_choice, by_chance.swapaxes(0, 1), strict=True):
+for n, (mean, largest), several in zip(
+    sizes, by_choice, by_chance.swapaxes(0, 1), strict=True
+):
     average, spread = several.mean(0), several.std(0)
     print(
         f"{n} rows, mean (largest) error in mm: chosen {mean:.1f} ({largest:.0f}), "
@@ -55,13 +57,24 @@ for k, (ax, what) in enumerate(zip(axes, ("mean", "largest"), strict=True)):
     average, spread = by_chance[..., k].mean(0), by_chance[..., k].std(0)
     ax.plot(sizes, by_choice[:, k], "o-", color="#0072B2", label="chosen rows")
     ax.plot(sizes, average, "s--", color="0.4", label="random rows, five draws")
-    ax.fill_between(sizes, average - spread, average + spread, color="0.4", alpha=0.2, linewidth=0)
-    ax.set(xscale="log", xticks=sizes, xlabel="measured rows", ylabel=f"{what} tip error [mm]")
+    ax.fill_between(
+        sizes, average - spread, average + spread, color="0.4", alpha=0.2, linewidth=0
+    )
+    ax.set(
+        xscale="log",
+        xticks=sizes,
+        xlabel="measured rows",
+        ylabel=f"{what} tip error [mm]",
+    )
     ax.set_xticklabels(map(str, sizes))
     ax.minorticks_off()
     ax.set_ylim(bottom=0)
 axes[0].plot(
-    np.arange(24, 200) + 1, 1e3 * expected[24:], ":", color="black", label="expected, chosen rows"
+    np.arange(24, 200) + 1,
+    1e3 * expected[24:],
+    ":",
+    color="black",
+    label="expected, chosen rows",
 )
 axes[0].legend(frameon=False)
 plt.show()

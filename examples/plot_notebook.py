@@ -12,7 +12,14 @@ that of the **simulated** trunk which comes with the package.
 
 import matplotlib.pyplot as plt
 
-from hybridkin import HybridForwardModel, InverseKinematics, datasets, plots, robots, trajectories
+from hybridkin import (
+    HybridForwardModel,
+    InverseKinematics,
+    datasets,
+    plots,
+    robots,
+    trajectories,
+)
 
 chain = robots.bionic_handling_assistant()
 chain
@@ -24,7 +31,9 @@ chain
 # estimates an error radius. Every fourth row of the log is enough here.
 
 data = datasets.load_trunk()
-model = HybridForwardModel(chain, "pose", coupling="serial", calibrate="default", coverage=0.9)
+model = HybridForwardModel(
+    chain, "pose", coupling="serial", calibrate="default", coverage=0.9
+)
 model.fit(data.q[::4], data.x[::4])
 
 # %%

@@ -17,7 +17,13 @@ import importlib.util
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hybridkin import HybridForwardModel, InverseKinematics, datasets, robots, trajectories
+from hybridkin import (
+    HybridForwardModel,
+    InverseKinematics,
+    datasets,
+    robots,
+    trajectories,
+)
 
 data = datasets.load_trunk()
 path = trajectories.figure_eight(center=(0.0, 0.0, 0.70), size=(0.50, 0.25), dt=0.1)
@@ -28,7 +34,9 @@ payload_from = len(path.x)
 def fitted():
     """Return the serial hybrid model: the error acts inside the robot."""
     chain = robots.bionic_handling_assistant()
-    model = HybridForwardModel(chain, "quadratic", coupling="serial", calibrate="default")
+    model = HybridForwardModel(
+        chain, "quadratic", coupling="serial", calibrate="default"
+    )
     return model.fit(data.q, data.x)
 
 
@@ -71,10 +79,15 @@ def run(learn):
 if importlib.util.find_spec("mujoco") is None:
     print('Skipped: this example needs MuJoCo; pip install "hybridkin[sim]".')
 else:
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), width_ratios=[1, 1.5], layout="constrained")
+    figure, axes = plt.subplots(
+        1, 2, figsize=(9, 3.6), width_ratios=[1, 1.5], layout="constrained"
+    )
     axes[0].plot(100 * targets[:, 0], 100 * targets[:, 1], "k:", label="path")
     time = 0.1 * np.arange(len(targets))
-    for learn, color, name in ((False, "0.4", "fitted once"), (True, "#56B4E9", "partial_fit")):
+    for learn, color, name in (
+        (False, "0.4", "fitted once"),
+        (True, "#56B4E9", "partial_fit"),
+    ):
         tips = run(learn)
         error = 1e3 * np.linalg.norm(tips - targets, axis=1)
         after = slice(payload_from + 20, None)
@@ -86,10 +99,20 @@ else:
         smooth = np.convolve(error, np.ones(5) / 5, "same")
         axes[1].plot(time, error, ".", color=color, alpha=0.3, markersize=3)
         style = "-" if learn else "--"
-        axes[1].plot(time[2:-2], smooth[2:-2], style, color=color, label=name, zorder=3 - learn)
-    axes[0].set(xlabel="x [cm]", ylabel="y [cm]", title="second lap, with payload", aspect="equal")
+        axes[1].plot(
+            time[2:-2], smooth[2:-2], style, color=color, label=name, zorder=3 - learn
+        )
+    axes[0].set(
+        xlabel="x [cm]",
+        ylabel="y [cm]",
+        title="second lap, with payload",
+        aspect="equal",
+    )
     axes[1].axvline(time[payload_from], color="0.6", linewidth=1)
-    for share, words in ((0.25, "first lap, robot of the log"), (0.75, "second lap, payload")):
+    for share, words in (
+        (0.25, "first lap, robot of the log"),
+        (0.75, "second lap, payload"),
+    ):
         place = {"transform": axes[1].transAxes, "ha": "center", "va": "bottom"}
         axes[1].text(share, 0.01, words, color="0.4", fontsize="small", **place)
     axes[1].set(xlabel="time [s]", ylabel="tip error [mm]", xlim=(0, time[-1]))

@@ -12,7 +12,13 @@ import numpy as np
 import torch
 from sklearn.model_selection import cross_val_predict
 
-from hybridkin import HybridForwardModel, InverseKinematics, RigidChain, plots, trajectories
+from hybridkin import (
+    HybridForwardModel,
+    InverseKinematics,
+    RigidChain,
+    plots,
+    trajectories,
+)
 
 URDF = """
 <robot name="six_axes">
@@ -43,8 +49,12 @@ URDF = """
 # The log: 150 configurations. The base of the true arm is 2 cm away from the nominal one, its tool
 # is not in the URDF, and shoulder and elbow sag by up to two degrees under the weight.
 
-MASSES = torch.tensor([0.0, 0.0, 1.4, 0.0, 0.9, 0.6], dtype=torch.float64)  # at each joint [kg]
-COMPLIANCE = torch.tensor([0.0, 0.002, 0.003, 0.0, 0.002, 0.0], dtype=torch.float64)  # [rad/Nm]
+MASSES = torch.tensor(
+    [0.0, 0.0, 1.4, 0.0, 0.9, 0.6], dtype=torch.float64
+)  # at each joint [kg]
+COMPLIANCE = torch.tensor(
+    [0.0, 0.002, 0.003, 0.0, 0.002, 0.0], dtype=torch.float64
+)  # [rad/Nm]
 
 nominal = RigidChain.from_urdf(URDF, "flange")
 base = np.eye(4)
@@ -54,13 +64,22 @@ real = RigidChain.from_urdf(URDF, "flange", base=base, tool=[0.015, 0.0, 0.11])
 
 def settled(q):
     """Return the joint angles (N, 6) at which the arm comes to rest [rad]."""
-    height = torch.func.vmap(torch.func.jacrev(lambda one: nominal.backbone(one)[1:7, 2]))
+    height = torch.func.vmap(
+        torch.func.jacrev(lambda one: nominal.backbone(one)[1:7, 2])
+    )
     torque = -9.81 * (height(q) * MASSES[:, None]).sum(1)
     return q + COMPLIANCE * torque
 
 
 rng = np.random.default_rng(0)
-q = rng.uniform(-1, 1, (150, 6)) * [1.5, 0.8, 1.2, 1.5, 1.2, 1.5] + [0, 0.3, 0.8, 0, 0.5, 0]
+q = rng.uniform(-1, 1, (150, 6)) * [1.5, 0.8, 1.2, 1.5, 1.2, 1.5] + [
+    0,
+    0.3,
+    0.8,
+    0,
+    0.5,
+    0,
+]
 with torch.no_grad():
     x = real(settled(torch.from_numpy(q))).numpy() + rng.normal(0.0, 2e-4, (150, 3))
 
@@ -70,7 +89,9 @@ with torch.no_grad():
 
 models = {
     "mechanical, nominal: URDF": HybridForwardModel(nominal, "drop"),
-    "mechanical, calibrated": HybridForwardModel(nominal, "drop", calibrate=("base", "tool")),
+    "mechanical, calibrated": HybridForwardModel(
+        nominal, "drop", calibrate=("base", "tool")
+    ),
     "hybrid, error at the tip": HybridForwardModel(
         nominal, "quadratic", calibrate=("base", "tool")
     ),
@@ -82,7 +103,9 @@ errors = plots.ErrorBoxDisplay.from_predictions(
     x, {name: cross_val_predict(model, q, x, cv=10) for name, model in models.items()}
 )
 for name, values in errors.errors.items():
-    print(f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.1f} mm")
+    print(
+        f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.1f} mm"
+    )
 
 # %%
 # The last model leads the tip along a circle, by default within the limits of the URDF.
@@ -95,7 +118,9 @@ with torch.no_grad():
     reached = real(settled(torch.from_numpy(track.q))).numpy()
     arm = model.mechanical_model_.backbone(torch.from_numpy(track.q[::12]))
 error = 1e3 * np.linalg.norm(reached - circle.x, axis=1)
-print(f"circle on the simulated arm: mean {error.mean():.1f} mm, largest {error.max():.1f} mm")
+print(
+    f"circle on the simulated arm: mean {error.mean():.1f} mm, largest {error.max():.1f} mm"
+)
 
 figure = plt.figure(figsize=(11, 4.6), layout="constrained")
 left, right = figure.subfigures(1, 2, width_ratios=(1.3, 1))

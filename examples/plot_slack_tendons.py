@@ -47,7 +47,11 @@ ELASTIC = (
     *("bending_stiffness", "axial_stiffness", "tendon_zeros"),
 )
 NAMES = {"tendon": "one\ntendon", "seg1": "segment\n1", "seg2": "segment\n2"}
-NAMES |= {"seg3": "segment\n3", "pair12": "segments\n1 and 2", "pair13": "segments\n1 and 3"}
+NAMES |= {
+    "seg3": "segment\n3",
+    "pair12": "segments\n1 and 2",
+    "pair13": "segments\n1 and 3",
+}
 NAMES |= {"pair23": "segments\n2 and 3"}
 MODELS = ("plain", "plain + kernel", "elastic", "elastic + kernel")
 MODELS += ("elastic + play", "elastic + play + kernel")
@@ -107,7 +111,12 @@ def predictions(data, train, test, models=MODELS, angles=True, thin=1):
             found[name] = model.predict(q[test])
     if "elastic + play" in models:
         fit = fit_play(
-            elastic, q[train], x[train], groups[train], parameters=ELASTIC, loss="soft_l1"
+            elastic,
+            q[train],
+            x[train],
+            groups[train],
+            parameters=ELASTIC,
+            loss="soft_l1",
         )
         y, chain = fit.play.apply_by_group(q, groups), fit.result.chain
         found["elastic + play"], found["play"] = tips(chain, y[test]), fit.width
@@ -126,22 +135,36 @@ def splits_of(data, seeds=5):
         "pairs from single segments and tendons": [(rows[~pair], rows[pair])],
     }
     for n in (20, 10):
-        drawn = [np.random.default_rng(k).permutation(motions)[:n] for k in range(seeds)]
+        drawn = [
+            np.random.default_rng(k).permutation(motions)[:n] for k in range(seeds)
+        ]
         known = [np.isin(data.groups, some) for some in drawn]
         ways[f"{n} motions"] = [(rows[k], rows[~k]) for k in known]
     return ways
 
 
 def compare_tendon_models(
-    data_home=None, ways=("5 folds",), models=MODELS, *, angles=True, thin=1, seeds=5, n_jobs=1
+    data_home=None,
+    ways=("5 folds",),
+    models=MODELS,
+    *,
+    angles=True,
+    thin=1,
+    seeds=5,
+    n_jobs=1,
 ):
     """Return for each way of holding motions out the list of (test rows, predictions) by split."""
     data, found = datasets.load_ftdcr(data_home), {}
     for way in ways:
         splits = splits_of(data, seeds)[way]
-        jobs = (delayed(without_warnings)(data, *split, models, angles, thin) for split in splits)
+        jobs = (
+            delayed(without_warnings)(data, *split, models, angles, thin)
+            for split in splits
+        )
         results = Parallel(n_jobs=n_jobs)(jobs)
-        found[way] = [(test, one) for (_, test), one in zip(splits, results, strict=True)]
+        found[way] = [
+            (test, one) for (_, test), one in zip(splits, results, strict=True)
+        ]
     return data, found
 
 
@@ -159,7 +182,10 @@ def draw(data, results):
     figure, axes = plt.subplots(
         2, figsize=(8.0, 5.4), layout="constrained", sharex=True, sharey=True
     )
-    titles = ("Constant-curvature chain, calibrated", "Elastic chain, tendons that can only pull")
+    titles = (
+        "Constant-curvature chain, calibrated",
+        "Elastic chain, tendons that can only pull",
+    )
     for ax, error, title in zip(axes, errors, titles, strict=True):
         for part in parts[::2]:
             ax.axvspan(part[0], part[-1] + 1, color="0.92", linewidth=0)
@@ -170,22 +196,30 @@ def draw(data, results):
         ):
             rows = np.flatnonzero(many)
             ax.plot(rows, error[rows], ".", markersize=3.5, color=color, label=label)
-        ax.axhline(error.mean(), color="black", linewidth=1.0, linestyle="--", label="mean")
+        ax.axhline(
+            error.mean(), color="black", linewidth=1.0, linestyle="--", label="mean"
+        )
         title = f"{title}: mean {error.mean():.1f} mm, largest {error.max():.0f} mm"
         ax.set_title(title, loc="left", fontsize="medium")
-        ax.set(ylabel="tip error, motion held out [mm]", yscale="log", xlim=(0, len(kinds)))
+        ax.set(
+            ylabel="tip error, motion held out [mm]", yscale="log", xlim=(0, len(kinds))
+        )
         ax.set(ylim=(0.08, 130))
         ax.set_yticks([0.3, 1, 3, 10, 30, 100], ["0.3", "1", "3", "10", "30", "100"])
         ax.minorticks_off()
     for part in parts:
-        axes[1].text(part.mean(), 0.095, NAMES[kinds[part[0]]], ha="center", fontsize="small")
+        axes[1].text(
+            part.mean(), 0.095, NAMES[kinds[part[0]]], ha="center", fontsize="small"
+        )
     axes[0].legend(ncols=4, fontsize="small", loc="upper right", markerscale=2.5)
     axes[1].set(xlabel="row, in the order of time")
     return figure
 
 
 try:
-    data, found = compare_tendon_models(models=("plain", "elastic"), angles=False, thin=2)
+    data, found = compare_tendon_models(
+        models=("plain", "elastic"), angles=False, thin=2
+    )
 except FileNotFoundError as missing:
     print(f"Skipped: {missing}")
 else:

@@ -13,7 +13,14 @@ import importlib.util
 
 import matplotlib.pyplot as plt
 
-from hybridkin import HybridForwardModel, InverseKinematics, datasets, plots, robots, trajectories
+from hybridkin import (
+    HybridForwardModel,
+    InverseKinematics,
+    datasets,
+    plots,
+    robots,
+    trajectories,
+)
 
 data = datasets.load_trunk()
 train, _ = datasets.paper_split(data, random_state=0)

@@ -24,8 +24,18 @@ MODELS = {  # x, y, width, colour, text
     "interface": (0.2, 3.0, 2.1, BLUE, "ForwardModel\nthe one interface"),
 }
 ARROWS = (
-    *(("log", "calibrate"), ("calibrate", "fit"), ("calibrate", "chain"), ("fit", "hybrid")),
-    *(("chain", "hybrid"), ("hybrid", "ik"), ("hybrid", "saving"), ("hybrid", "native")),
+    *(
+        ("log", "calibrate"),
+        ("calibrate", "fit"),
+        ("calibrate", "chain"),
+        ("fit", "hybrid"),
+    ),
+    *(
+        ("chain", "hybrid"),
+        ("hybrid", "ik"),
+        ("hybrid", "saving"),
+        ("hybrid", "native"),
+    ),
 )
 FOLDERS = (  # in one direction: each column imports from those left of it
     ("_core",),
@@ -43,7 +53,9 @@ BESIDE = ("datasets", "plots")
 def box(ax, x, y, width, color, text, height=0.95):
     """Draw a box with its lower left corner at (x, y)."""
     style = "round,pad=0,rounding_size=0.12"
-    ax.add_patch(FancyBboxPatch((x, y), width, height, style, fc=color, ec="0.35", lw=1.0))
+    ax.add_patch(
+        FancyBboxPatch((x, y), width, height, style, fc=color, ec="0.35", lw=1.0)
+    )
     ax.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=9.5)
 
 
@@ -74,7 +86,9 @@ def draw_models(ax):
 def draw_folders(ax):
     """Draw the folders of the package; imports point to the left."""
     ax.set_title(
-        "The folders; a folder imports only from those left of it", loc="left", fontsize=12
+        "The folders; a folder imports only from those left of it",
+        loc="left",
+        fontsize=12,
     )
     width, step = 1.12, 1.31
     for k, names in enumerate(FOLDERS):

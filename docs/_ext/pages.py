@@ -63,7 +63,9 @@ def _resolve(app, env, node, contnode):
 def setup(app):
     """Register the equations' renderer and the look-up of names."""
     app.add_html_math_renderer(
-        "mathml", inline_renderers=(_inline_math, None), block_renderers=(_block_math, None)
+        "mathml",
+        inline_renderers=(_inline_math, None),
+        block_renderers=(_block_math, None),
     )
     app.connect("missing-reference", _resolve)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

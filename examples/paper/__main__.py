@@ -30,11 +30,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder (results)")
-    add("--splits", type=count, default=20, metavar="N", help="number of random test sets (20)")
+    add(
+        "--out",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="folder (results)",
+    )
+    add(
+        "--splits",
+        type=count,
+        default=20,
+        metavar="N",
+        help="number of random test sets (20)",
+    )
     add("--seeds", type=count, default=5, metavar="N", help="random networks (5)")
-    add("--points", type=count, default=151, metavar="N", help="time steps of each path (151)")
-    add("--jobs", type=int, default=-1, metavar="N", help="processes; -1: one per core (-1)")
+    add(
+        "--points",
+        type=count,
+        default=151,
+        metavar="N",
+        help="time steps of each path (151)",
+    )
+    add(
+        "--jobs",
+        type=int,
+        default=-1,
+        metavar="N",
+        help="processes; -1: one per core (-1)",
+    )
     options = parser.parse_args(arguments)
     with contextlib.closing(Stages()) as stages:
         report, paths = run_paper(

@@ -44,7 +44,11 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
     n_random = int((data.part[train] == 3).sum())
     found: dict[str, Any] = {"n_train": len(train), "n_random": n_random}
     found["n_single"] = len(train) - n_random
-    asked = {"asked": ASKED, "identifiable": IDENTIFIABLE, "default": chain.default_parameters}
+    asked = {
+        "asked": ASKED,
+        "identifiable": IDENTIFIABLE,
+        "default": chain.default_parameters,
+    }
     for label, names in asked.items():
         result = calibrate(chain, data.q[train], data.x[train], names)
         with torch.no_grad():
@@ -60,7 +64,9 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
 def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) -> None:
     """Add the results of `identifiability` to a report."""
     report.record["identifiability"] = found
-    asked, fewer, default = (found[label] for label in ("asked", "identifiable", "default"))
+    asked, fewer, default = (
+        found[label] for label in ("asked", "identifiable", "default")
+    )
     n = sum(entry["identified"] for entry in asked["entries"])
     report.text(
         "## Geometry that the data identify",
@@ -72,13 +78,23 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
         "base is given by its rotation from the start and its position.",
     )
     report.geometry(asked["entries"])
-    report.text("Not identified by the data, and the measurement that would identify it:")
+    report.text(
+        "Not identified by the data, and the measurement that would identify it:"
+    )
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
     n = sum(entry["identified"] for entry in fewer["entries"])
-    report.text(f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:")
+    report.text(
+        f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:"
+    )
     report.geometry(fewer["entries"])
     base = {entry["name"]: entry for entry in fewer["entries"]}
-    true = dict(zip("xyz", 1e3 * np.array(data.parameters["plant"]["base_error"][:3]), strict=True))
+    true = dict(
+        zip(
+            "xyz",
+            1e3 * np.array(data.parameters["plant"]["base_error"][:3]),
+            strict=True,
+        )
+    )
     away = {axis: base[f"base[{axis}]"]["value"] - true[axis] for axis in true}
     far = max(abs(away[axis]) / base[f"base[{axis}]"]["std_error"] for axis in away)
     found["base_position_error"] = list(away.values())

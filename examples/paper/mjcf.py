@@ -10,7 +10,10 @@ RELAXATION = 0.2  # damping / stiffness of every joint [s]
 
 
 def trunk_mjcf(
-    gravity: tuple[float, float], mass: float, tip_mass: float, stiffness: tuple[float, ...]
+    gravity: tuple[float, float],
+    mass: float,
+    tip_mass: float,
+    stiffness: tuple[float, ...],
 ) -> str:
     """Return the MJCF of a trunk along z, with sites and tendons for its nine chambers.
 

@@ -136,9 +136,17 @@ class TrunkPlant:
             ) from error
         stiffness = (bending_stiffness, torsional_stiffness, axial_stiffness)
         names = ("bending_stiffness", "torsional_stiffness", "axial_stiffness")
-        numbers = {**dict(zip(names, stiffness, strict=True)), "tilt": tilt, "gravity": gravity}
+        numbers = {
+            **dict(zip(names, stiffness, strict=True)),
+            "tilt": tilt,
+            "gravity": gravity,
+        }
         numbers |= {"mass": mass, "tip_mass": tip_mass, "max_force": max_force}
-        numbers |= {"max_iter": max_iter, "cable_noise": cable_noise, "mocap_noise": mocap_noise}
+        numbers |= {
+            "max_iter": max_iter,
+            "cable_noise": cable_noise,
+            "mocap_noise": mocap_noise,
+        }
         for name, value in numbers.items():
             _check_number(name, value)
         error = np.asarray(base_error, dtype=float)
@@ -148,14 +156,19 @@ class TrunkPlant:
                 f"got {base_error!r}."
             )
         self._max_force, self._max_iter = float(max_force), int(max_iter)
-        self._noise, self._random_state = (float(cable_noise), float(mocap_noise)), random_state
+        self._noise, self._random_state = (
+            (float(cable_noise), float(mocap_noise)),
+            random_state,
+        )
         self._T_mocap_base = np.eye(4)
         self._T_mocap_base[:3, :3] = Rotation.from_rotvec(error[3:]).as_matrix()
         self._T_mocap_base[:3, 3] = error[:3]
 
         down = (gravity * np.sin(tilt), gravity * np.cos(tilt))
         self._mujoco = mujoco
-        self._model = mujoco.MjModel.from_xml_string(trunk_mjcf(down, mass, tip_mass, stiffness))
+        self._model = mujoco.MjModel.from_xml_string(
+            trunk_mjcf(down, mass, tip_mass, stiffness)
+        )
         self._data = mujoco.MjData(self._model)
         self._tip = self._model.site("tip").id
         rings = [[f"s{s}_{i}_{LINKS}" for i in range(3)] for s in range(3)]
@@ -163,7 +176,9 @@ class TrunkPlant:
         # A state holds the joint positions and the forces of the nine chambers.
         self._n_dof = self._model.nv
         straight, lengths = np.zeros(self._n_dof + 9), np.full(9, REST_LENGTH)
-        self._rest, _ = self._equilibrium(straight, lengths, iter(range(self._max_iter)))
+        self._rest, _ = self._equilibrium(
+            straight, lengths, iter(range(self._max_iter))
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -256,7 +271,10 @@ class TrunkPlant:
         mujoco.mj_transmission(model, data)
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_fwdActuation(model, data)
-        return data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator, data.ten_length.copy()
+        return (
+            data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator,
+            data.ten_length.copy(),
+        )
 
     def _derivatives(self, state):
         """Return derivatives by the joints of forces (n_dof, n_dof) and lengths (9, n_dof)."""
@@ -320,7 +338,9 @@ class TrunkPlant:
             state = self._follow(state, target, held, budget)
             force, gap = state[n:], target - self._forces(state)[1]
             saturated = held & (np.abs(force) > limit)
-            released = ~held & (force * gap < 0)  # a push if too long, or a pull if too short
+            released = ~held & (
+                force * gap < 0
+            )  # a push if too long, or a pull if too short
             if not (saturated | released).any():
                 return state, held
             held = (held & ~saturated) | released
@@ -377,7 +397,13 @@ class TrunkPlant:
 
 def _check_number(name: str, value: Any) -> None:
     low = -np.inf if name == "tilt" else 0.0
-    enough = isinstance(value, (int, float, np.number)) and np.isfinite(value) and value >= low
+    enough = (
+        isinstance(value, (int, float, np.number))
+        and np.isfinite(value)
+        and value >= low
+    )
     if not enough or (value == 0 and name not in _MAY_BE_ZERO):
         sign = ">=" if name in _MAY_BE_ZERO else ">"
-        raise ValueError(f"`{name}` must be a finite number {sign} {low:g}, got {value!r}.")
+        raise ValueError(
+            f"`{name}` must be a finite number {sign} {low:g}, got {value!r}."
+        )

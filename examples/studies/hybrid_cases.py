@@ -56,7 +56,9 @@ class Case(NamedTuple):
     name: str
     draw: int
     chain: Any
-    frame: tuple[str, ...]  # calibrated even in the nominal model: where the frame is unknown
+    frame: tuple[
+        str, ...
+    ]  # calibrated even in the nominal model: where the frame is unknown
     calibrate: tuple[str, ...] | str  # of all models but auto, which chooses for itself
     q: NDArray
     x: NDArray
@@ -69,26 +71,39 @@ class Case(NamedTuple):
 def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
     """Return the entries of a case, of the models with these names or all."""
     entries = []
-    with warnings.catch_warnings():  # a plain chain warns of slack tendons, as in ftdcr_v4
+    with (
+        warnings.catch_warnings()
+    ):  # a plain chain warns of slack tendons, as in ftdcr_v4
         warnings.simplefilter("ignore", UserWarning)
         for name, learner in _learners(case).items():
             if names is not None and name not in names:
                 continue
             start = time.process_time()
             model = learner().fit(case.q, case.x, groups=case.groups)
-            entry = {"case": case.name, "draw": case.draw, "n": len(case.q), "model": name}
+            entry = {
+                "case": case.name,
+                "draw": case.draw,
+                "n": len(case.q),
+                "model": name,
+            }
             entry["seconds"] = time.process_time() - start
             if model.cv_results_ is not None:
                 results = model.cv_results_
-                scores = zip(results["candidate"], results["mean_distance"].tolist(), strict=True)
+                scores = zip(
+                    results["candidate"], results["mean_distance"].tolist(), strict=True
+                )
                 entry |= {"chosen": results["chosen"], "scores": dict(scores)}
                 entry["parameters"] = results["parameters"]
                 entry["mechanics"] = results["mechanical_model"]
             errors = {test: _errors(model, *rows) for test, rows in case.tests.items()}
             entries.append({**entry, "errors": errors})
             if name == AUTO:
-                alone = HybridForwardModel(model.mechanical_model_, "drop").fit(case.q, case.x)
-                errors = {test: _errors(alone, *rows) for test, rows in case.tests.items()}
+                alone = HybridForwardModel(model.mechanical_model_, "drop").fit(
+                    case.q, case.x
+                )
+                errors = {
+                    test: _errors(alone, *rows) for test, rows in case.tests.items()
+                }
                 parts = {key: entry[key] for key in ("case", "draw", "n")}
                 entries.append({**parts, "model": AUTO_MECHANICS, "errors": errors})
     return entries
@@ -98,7 +113,11 @@ def _errors(
     model: HybridForwardModel, q: NDArray, x: NDArray, groups: NDArray | None = None
 ) -> dict[str, float]:
     errors = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1)
-    return {"mean": float(errors.mean()), "max": float(errors.max()), "n_test": len(errors)}
+    return {
+        "mean": float(errors.mean()),
+        "max": float(errors.max()),
+        "n_test": len(errors),
+    }
 
 
 def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
@@ -108,20 +127,28 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     if groups is not None:
         splitter = GroupKFold(min(5, len(np.unique(groups))))
     folds = [*splitter.split(q, groups=groups)]
-    calibrated = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate).fit(q, x)
-    hybrid = partial(HybridForwardModel, calibrated.mechanical_model_, random_state=seed)
+    calibrated = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate).fit(
+        q, x
+    )
+    hybrid = partial(
+        HybridForwardModel, calibrated.mechanical_model_, random_state=seed
+    )
     learners: dict[str, Callable[[], HybridForwardModel]] = {
         NOMINAL: lambda: HybridForwardModel(case.chain, "drop", calibrate=case.frame),
         CALIBRATED: lambda: hybrid("drop"),
         DATA_ONLY[0]: lambda: HybridForwardModel(None, _quadratic()),
         DATA_ONLY[1]: lambda: HybridForwardModel(None, _kernel(q, x, folds)),
         PAPER: lambda: hybrid(ELMRegressor(**PAPER_ELM, random_state=seed)),
-        "parallel, kernel ridge": lambda: hybrid(_kernel(q, x - calibrated.predict(q), folds)),
+        "parallel, kernel ridge": lambda: hybrid(
+            _kernel(q, x - calibrated.predict(q), folds)
+        ),
     }
     for coupling in COUPLINGS:
         for kind in READOUTS:
             learners[f"{coupling}, {kind}"] = partial(hybrid, kind, coupling=coupling)
-    learners["serial, pose, no guard"] = partial(hybrid, "pose", coupling="serial", guard=None)
+    learners["serial, pose, no guard"] = partial(
+        hybrid, "pose", coupling="serial", guard=None
+    )
     auto = partial(HybridForwardModel, case.chain, AUTO, random_state=seed)
     learners[AUTO] = auto
     if case.in_time:
@@ -131,7 +158,9 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
 
 def _quadratic() -> Any:
     features = PolynomialFeatures(2, include_bias=False)
-    return make_pipeline(MinMaxScaler((-1, 1)), features, RidgeCV(np.logspace(-6, 3, 19)))
+    return make_pipeline(
+        MinMaxScaler((-1, 1)), features, RidgeCV(np.logspace(-6, 3, 19))
+    )
 
 
 def _kernel(q: NDArray, y: NDArray, folds: list[tuple[NDArray, NDArray]]) -> Any:
@@ -139,7 +168,9 @@ def _kernel(q: NDArray, y: NDArray, folds: list[tuple[NDArray, NDArray]]) -> Any
     ridge = make_pipeline(StandardScaler(), KernelRidge(kernel="rbf"))
     grid = {"alpha": np.logspace(-5, 0, 6), "gamma": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)}
     grid = {f"kernelridge__{name}": values for name, values in grid.items()}
-    search = GridSearchCV(ridge, grid, cv=folds, scoring="neg_mean_squared_error", refit=False)
+    search = GridSearchCV(
+        ridge, grid, cv=folds, scoring="neg_mean_squared_error", refit=False
+    )
     ridge.set_params(**search.fit(q, y - y.mean(0)).best_params_)
     return TransformedTargetRegressor(ridge, transformer=StandardScaler(with_std=False))
 
@@ -157,7 +188,10 @@ def trunk_cases(
     for seed, name in enumerate(PLANTS):
         make = partial(without_noise, name, folder, n_jobs)
         rows = make(n_random=n_test + (n_draws * largest if inner is None else 0))
-        test, data = (rows[0][:n_test], rows[1][:n_test]), (rows[0][n_test:], rows[1][n_test:])
+        test, data = (
+            (rows[0][:n_test], rows[1][:n_test]),
+            (rows[0][n_test:], rows[1][n_test:]),
+        )
         if inner is not None:
             middle, half = 0.5 * (_LOW + _HIGH), 0.5 * inner * (_HIGH - _LOW)
             unit = np.random.default_rng([seed, round(100 * inner)])
@@ -172,7 +206,8 @@ def trunk_cases(
             q, x = _noisy(data[0][drawn], data[1][drawn], [seed, 2, draw])
             chain = robots.bionic_handling_assistant()
             cases += [
-                Case(name, draw, chain, (), "default", q[:n], x[:n], None, tests) for n in sizes
+                Case(name, draw, chain, (), "default", q[:n], x[:n], None, tests)
+                for n in sizes
             ]
     return cases
 
@@ -196,7 +231,10 @@ def without_noise(
 
 def _noisy(q: NDArray, x: NDArray, seed: list[int]) -> tuple[NDArray, NDArray]:
     rng = np.random.default_rng(seed)
-    noise = _CABLE_NOISE * rng.standard_normal(q.shape), _MOCAP_NOISE * rng.standard_normal(x.shape)
+    noise = (
+        _CABLE_NOISE * rng.standard_normal(q.shape),
+        _MOCAP_NOISE * rng.standard_normal(x.shape),
+    )
     return q + noise[0], x + noise[1]
 
 
@@ -275,14 +313,20 @@ def run_cases(data_home: Any, thin: int) -> list[Case]:
     data = recording(datasets.load_asl_trunk, data_home)
     if data is None:
         return []
-    q = np.hstack([SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)])
-    chain = ConstantCurvatureChain(np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12))
+    q = np.hstack(
+        [SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)]
+    )
+    chain = ConstantCurvatureChain(
+        np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12)
+    )
     cases = []
     for k, (train, test) in enumerate(GroupKFold(5).split(q, groups=data.groups)):
         rows = train[::thin]
         part = q[rows], data.x[rows], data.groups[rows]
         tests = {"5 folds": (q[test], data.x[test], data.groups[test])}
-        cases.append(Case("asl_trunk_static", k, chain, ("base",), "default", *part, tests))
+        cases.append(
+            Case("asl_trunk_static", k, chain, ("base",), "default", *part, tests)
+        )
     return cases
 
 
@@ -292,7 +336,9 @@ def motion_cases(data_home: Any, thin: int) -> list[Case]:
     if data is None:
         return []
     families = np.array([label.split("_")[1] for label in data.groups])
-    single, pair = (np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair"))
+    single, pair = (
+        np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair")
+    )
     folds = list(GroupKFold(5).split(data.q, groups=data.groups))
     pairs = [
         (np.flatnonzero(families != name), np.flatnonzero(families == name))
@@ -312,5 +358,7 @@ def motion_cases(data_home: Any, thin: int) -> list[Case]:
                 part = data.q[rows], data.x[rows], groups[rows]
                 tests = {way: (data.q[test], data.x[test], data.groups[test])}
                 in_time = groups is data.groups
-                cases.append(Case(name, k, chain, ("base",), parameters, *part, tests, in_time))
+                cases.append(
+                    Case(name, k, chain, ("base",), parameters, *part, tests, in_time)
+                )
     return cases

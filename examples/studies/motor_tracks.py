@@ -59,8 +59,18 @@ from hybridkin.workflow.report import Report
 
 FIT = "fit"  # models that begin so are made by the command line
 _STILL = 0.02  # of the rms of the direction with the largest motion
-_NEAR = 0.025  # largest distance of a path from a measured tip, relative to their extent
-_SIZES = (0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1)  # of the path, relative to the extent of the tips
+_NEAR = (
+    0.025  # largest distance of a path from a measured tip, relative to their extent
+)
+_SIZES = (
+    0.5,
+    0.4,
+    0.3,
+    0.25,
+    0.2,
+    0.15,
+    0.1,
+)  # of the path, relative to the extent of the tips
 _CENTRES, _NORMALS = 40, 12  # that are tried
 _DURATION, _DT = 20.0, 0.1  # of a path [s]
 _NOISE = 5e-4  # of measured tips along each axis, as in the logs [m]
@@ -86,7 +96,9 @@ class Directions(NamedTuple):
     moved_rms: NDArray  # (n - k,) [counts]
 
 
-def set_up(seed: int, folder: Path, tendons: int = 3, commands: str = "rounded") -> Setup:
+def set_up(
+    seed: int, folder: Path, tendons: int = 3, commands: str = "rounded"
+) -> Setup:
     """Write the log and the description of a random robot and return them.
 
     Parameters
@@ -147,7 +159,9 @@ def _shape(shape: str, centre: NDArray, size: float, normal: NDArray) -> NDArray
     timing = {"duration": _DURATION, "dt": _DT, "normal": normal}
     if shape == "circle":
         radius = 0.5 * size
-        return trajectories.spiral(centre, (radius, radius), turns=1.0, rise=0.0, **timing).x
+        return trajectories.spiral(
+            centre, (radius, radius), turns=1.0, rise=0.0, **timing
+        ).x
     return trajectories.figure_eight(centre, (size, 0.5 * size), **timing).x
 
 
@@ -174,7 +188,14 @@ def fit(setup: Setup, model: str) -> dict[str, Any]:
     if model.startswith(FIT):
         command = shlex.split(model)
         log, robot = setup.folder / "log.csv", setup.folder / "robot.toml"
-        options = ["--robot", robot, "--out", _model_folder(setup, model), "--jobs", "1"]
+        options = [
+            "--robot",
+            robot,
+            "--out",
+            _model_folder(setup, model),
+            "--jobs",
+            "1",
+        ]
         record, error = _run([command[0], log, *options, *command[1:]])
         if error:
             raise RuntimeError(f"`{model}` of robot {setup.seed}: {error}")
@@ -183,7 +204,11 @@ def fit(setup: Setup, model: str) -> dict[str, Any]:
     else:
         held_out = _fit_in_python(setup, model)
         saved = model
-    return {"saved": saved, "held_out_mean": held_out["mean"], "fit_cpu_s": _cpu() - began}
+    return {
+        "saved": saved,
+        "held_out_mean": held_out["mean"],
+        "fit_cpu_s": _cpu() - began,
+    }
 
 
 def _fit_in_python(setup: Setup, error_model: str) -> dict[str, float]:
@@ -192,7 +217,9 @@ def _fit_in_python(setup: Setup, error_model: str) -> dict[str, float]:
     if robot.log is None:
         raise ValueError("the description lacks [log].")
     data = datasets.load_log(setup.folder / "log.csv", **robot.log.reading)
-    hybrid = HybridForwardModel(robot.chain, error_model, calibrate=robot.calibrate, random_state=0)
+    hybrid = HybridForwardModel(
+        robot.chain, error_model, calibrate=robot.calibrate, random_state=0
+    )
     errors, far = np.empty(len(data.q)), np.empty(len(data.q))
     for train, test in GroupKFold(_FOLDS).split(data.q, groups=data.groups):
         hybrid.fit(data.q[train], data.x[train], groups=data.groups[train])
@@ -222,9 +249,18 @@ def _run(arguments: list[Any]) -> tuple[dict[str, Any], str]:
     kept = Path(arguments[arguments.index("--out") + 1]) / "report.json"
     if kept.is_file():
         return json.loads(kept.read_text(encoding="utf-8")), ""
-    command = [sys.executable, "-m", "hybridkin", *map(str, arguments), "--json", "--quiet"]
+    command = [
+        sys.executable,
+        "-m",
+        "hybridkin",
+        *map(str, arguments),
+        "--json",
+        "--quiet",
+    ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=environment, check=False
+    )
     if done.returncode > 1:  # 1: points were not reached
         return {}, (done.stdout + done.stderr).strip()
     return json.loads(done.stdout), ""
@@ -232,7 +268,10 @@ def _run(arguments: list[Any]) -> tuple[dict[str, Any], str]:
 
 def _cpu() -> float:
     """Return the CPU time of this process and of those that it waited for [s]."""
-    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    usages = (
+        resource.getrusage(who)
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
@@ -270,7 +309,9 @@ def track(setup: Setup, model: str, number: int) -> dict[str, Any]:
         record, error = _run([*command, "--scale", advice.group(1)])
     if error:
         return {**entry, "error": error}
-    sent = np.genfromtxt(out / "track.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    sent = np.genfromtxt(
+        out / "track.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
+    )
     on_path = sent["status"] != "LEAD_IN"
     n = setup.robot.n_tendons
     counts = np.stack([sent[f"q{i + 1}"] for i in range(n)], axis=1)
@@ -278,7 +319,9 @@ def track(setup: Setup, model: str, number: int) -> dict[str, Any]:
     motion = counts
     if "effective_q1" in sent.dtype.names:
         motion = np.stack([sent[f"effective_q{i + 1}"] for i in range(n)], axis=1)
-    target = 1e-3 * np.stack([sent[f"target_{axis}"] for axis in "xyz"], axis=1)[on_path]
+    target = (
+        1e-3 * np.stack([sent[f"target_{axis}"] for axis in "xyz"], axis=1)[on_path]
+    )
     tips = setup.robot.tips(counts, setup.log.pulls, round=True)[on_path]
     errors = np.linalg.norm(tips - target, axis=1)
     noise = _NOISE * np.random.default_rng(number).standard_normal(tips.shape)
@@ -348,7 +391,9 @@ def along_still(setup: Setup, folder: Path, counts: NDArray) -> dict[str, float]
             entry[f"{name}_{kind}"] = _per_count(function, counts[rows], axes)
             entry[f"{name}_{kind}_in_log"] = _per_count(function, projected[rows], axes)
     for name, at in {"model_error": counts, "model_error_projected": projected}.items():
-        distance = np.linalg.norm(functions["model"](at) - functions["robot"](at), axis=1)
+        distance = np.linalg.norm(
+            functions["model"](at) - functions["robot"](at), axis=1
+        )
         entry[name] = float(distance.mean())
     correction = functions["model"](counts) - functions["mechanical"](counts)
     in_log = functions["model"](projected) - functions["mechanical"](projected)
@@ -360,7 +405,11 @@ def along_still(setup: Setup, folder: Path, counts: NDArray) -> dict[str, float]
 def _per_count(function: Any, counts: NDArray, axes: NDArray) -> float:
     """Return the rms motion of the tip for one count along the axes, by central differences."""
     steps = [function(counts + axis) - function(counts - axis) for axis in axes.T]
-    return float(np.sqrt(np.mean(np.sum((0.5 * np.array(steps)) ** 2, axis=-1)))) if steps else 0.0
+    return (
+        float(np.sqrt(np.mean(np.sum((0.5 * np.array(steps)) ** 2, axis=-1))))
+        if steps
+        else 0.0
+    )
 
 
 def one_robot(
@@ -373,7 +422,9 @@ def one_robot(
 ) -> list[dict[str, Any]]:
     """Return the entries of all models and paths of a robot; a refusal is an entry, too."""
     torch.set_num_threads(1)
-    setup = set_up(seed, out / "robots" / f"{seed}_{tendons}_{commands}", tendons, commands)
+    setup = set_up(
+        seed, out / "robots" / f"{seed}_{tendons}_{commands}", tendons, commands
+    )
     entries = []
     for model in models:
         common: dict[str, Any] = {"robot": seed, "model": model, "commands": commands}
@@ -441,7 +492,9 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
         chosen = [entry for entry in done if entry["model"] == model]
         n_robots = len({entry["robot"] for entry in chosen})
         for what in ("true", "measured"):
-            ratios = np.array([e[f"{what}_inside"] / e["expected_mean"] for e in chosen])
+            ratios = np.array(
+                [e[f"{what}_inside"] / e["expected_mean"] for e in chosen]
+            )
             ratios = ratios[np.isfinite(ratios)]  # no point of some paths is inside
             low, median, high = np.quantile(ratios, [0.05, 0.5, 0.95])
             report.text(
@@ -451,7 +504,9 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
             )
     for entry in entries:
         if "error" in entry:
-            report.text(f"Refused: robot {entry['robot']}, {entry['model']}, {entry['error']}")
+            report.text(
+                f"Refused: robot {entry['robot']}, {entry['model']}, {entry['error']}"
+            )
     if done:
         report.figure("motor_tracks", _picture(done), "Promised and true mean errors.")
     numbers = [[*(e[key] for key in keys), *_figures(e), e["saved"]] for e in done]
@@ -462,7 +517,9 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
 def _figures(entry: dict[str, Any]) -> list[float]:
     figures = []
     for key, factor in COLUMNS.values():
-        figures.append(float("nan") if entry[key] is None else factor * float(entry[key]))
+        figures.append(
+            float("nan") if entry[key] is None else factor * float(entry[key])
+        )
     return figures
 
 
@@ -473,7 +530,9 @@ def _cell(figure: float) -> str:
 def _picture(entries: list[dict[str, Any]]) -> Any:
     """Return the figure of true errors against promised ones."""
     figure, ax = plt.subplots(figsize=(5.0, 5.0), layout="constrained")
-    for marker, model in zip("osD^vP*X", dict.fromkeys(e["model"] for e in entries), strict=False):
+    for marker, model in zip(
+        "osD^vP*X", dict.fromkeys(e["model"] for e in entries), strict=False
+    ):
         chosen = [entry for entry in entries if entry["model"] == model]
         promised = [1e3 * entry["expected_mean"] for entry in chosen]
         true = [1e3 * entry["true_mean"] for entry in chosen]
@@ -481,8 +540,12 @@ def _picture(entries: list[dict[str, Any]]) -> Any:
     ends = np.array([ax.get_xlim(), ax.get_ylim()])
     line = np.array([max(ends[:, 0].min(), 0.2), ends[:, 1].max()])
     ax.plot(line, line, color="0.4", linewidth=1.0, label="as promised")
-    ax.plot(line, 1.5 * line, color="0.4", linewidth=1.0, linestyle=":", label="1.5 times")
-    ax.set(xscale="log", yscale="log", xlabel="promised mean [mm]", ylabel="true mean [mm]")
+    ax.plot(
+        line, 1.5 * line, color="0.4", linewidth=1.0, linestyle=":", label="1.5 times"
+    )
+    ax.set(
+        xscale="log", yscale="log", xlabel="promised mean [mm]", ylabel="true mean [mm]"
+    )
     ax.set_title("Commands on simulated robots")
     ax.legend()
     return figure
@@ -495,8 +558,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="seed of the first robot")
     parser.add_argument("--paths", type=int, default=2, help="for each robot")
-    parser.add_argument("--models", nargs="+", default=[FIT], help='such as "fit --play auto" lwpr')
-    parser.add_argument("--tendons", type=int, default=3, help="in a segment; 4: two pairs")
+    parser.add_argument(
+        "--models", nargs="+", default=[FIT], help='such as "fit --play auto" lwpr'
+    )
+    parser.add_argument(
+        "--tendons", type=int, default=3, help="in a segment; 4: two pairs"
+    )
     parser.add_argument("--commands", default=COMMANDS[0], choices=COMMANDS)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args(argv)
@@ -509,8 +576,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         entries += some
         entries.sort(key=lambda entry: entry["robot"])
         n_done = len({entry["robot"] for entry in entries})
-        print(f"{n_done} of {len(seeds)} robots, {time.monotonic() - began:.0f} s", flush=True)
-        written = tracks_report(entries).write(given.out)  # what there is, if it is interrupted
+        print(
+            f"{n_done} of {len(seeds)} robots, {time.monotonic() - began:.0f} s",
+            flush=True,
+        )
+        written = tracks_report(entries).write(
+            given.out
+        )  # what there is, if it is interrupted
     print(*written, sep="\n")
 
 

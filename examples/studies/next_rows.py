@@ -91,20 +91,26 @@ def box_entries(
     chosen, expected = choose_rows(case.chain, case.q, max(sizes))
     ways = {CHOSEN: [chosen], FARTHEST: [_farthest(case.q, max(sizes))]}
     ways[SOBOL] = [_nearest_to_sobol(case.q, max(sizes), case.draw)]
-    ways[RANDOM] = [np.random.default_rng([case.draw, k]).permutation(len(case.q)) for k in (0, 1)]
+    ways[RANDOM] = [
+        np.random.default_rng([case.draw, k]).permutation(len(case.q)) for k in (0, 1)
+    ]
     test = case.tests["without noise"]
     entries = []
     for way, orders in ways.items():
         for order in orders:
             for n in [*sizes, *(more if way == RANDOM else ())]:
                 entries.append(
-                    _entry(case, way, "pose", case.q[order[:n]], case.x[order[:n]], test)
+                    _entry(
+                        case, way, "pose", case.q[order[:n]], case.x[order[:n]], test
+                    )
                 )
                 if way == CHOSEN:
                     entries[-1]["expected"] = expected[n - 1]
             for n in auto if way in (CHOSEN, RANDOM) else ():
                 entries.append(
-                    _entry(case, way, "auto", case.q[order[:n]], case.x[order[:n]], test)
+                    _entry(
+                        case, way, "auto", case.q[order[:n]], case.x[order[:n]], test
+                    )
                 )
     return entries
 
@@ -141,7 +147,9 @@ def along_a_path(
         As of `box`, with the ways "chosen for the path, its own rows too" (with noise),
         "chosen for the path", "chosen" and "random".
     """
-    path = trajectories.figure_eight((0.0, 0.0, 0.70), (0.50, 0.25), duration=n_points / 10, dt=0.1)
+    path = trajectories.figure_eight(
+        (0.0, 0.0, 0.70), (0.50, 0.25), duration=n_points / 10, dt=0.1
+    )
     limits = {"q_min": _LOW, "q_max": _HIGH, "q_pref": 0.25}
     ik = InverseKinematics(robots.bionic_handling_assistant(), dt=0.1, **limits)
     q = ik.track(path).q[:n_points]
@@ -157,7 +165,11 @@ def along_a_path(
         more_rows = tuple(map(np.concatenate, zip(on_path, pool, strict=True)))
         random = np.random.default_rng([case.draw, 0]).permutation(n_pool)
         ways = [
-            (f"{CHOSEN} for the path, its own rows too", more_rows, _chosen(case, more_rows, n, q)),
+            (
+                f"{CHOSEN} for the path, its own rows too",
+                more_rows,
+                _chosen(case, more_rows, n, q),
+            ),
             (f"{CHOSEN} for the path", pool, _chosen(case, pool, n, q)),
             (CHOSEN, pool, _chosen(case, pool, n)),
             *((RANDOM, pool, random[:k]) for k in more),
@@ -174,7 +186,11 @@ def _chosen(
 
 
 def motions(
-    sizes: Sequence[int] = MOTIONS, n_draws: int = 3, *, thin: int = 4, data_home: Any = None
+    sizes: Sequence[int] = MOTIONS,
+    n_draws: int = 3,
+    *,
+    thin: int = 4,
+    data_home: Any = None,
 ) -> list[dict[str, Any]]:
     """Return errors on held-out motions of ftdcr_v4, for motions chosen and at random.
 
@@ -197,7 +213,9 @@ def motions(
     list of dict
         As of `box`; n counts motions.
     """
-    cases = [c for c in motion_cases(data_home, None, 1) if c.name == "elastic tendons"][:1]
+    cases = [
+        c for c in motion_cases(data_home, None, 1) if c.name == "elastic tendons"
+    ][:1]
     if not cases:
         return []
     data, entries = datasets.load_ftdcr(data_home), []
@@ -208,9 +226,14 @@ def motions(
         test, pool = np.isin(data.groups, order[:n_out]), order[n_out:]
         rows = np.isin(data.groups, pool)
         case = cases[0]._replace(name="ftdcr_v4", draw=draw)
-        chosen = choose_rows(case.chain, data.q[rows], max(sizes), groups=data.groups[rows])[0]
+        chosen = choose_rows(
+            case.chain, data.q[rows], max(sizes), groups=data.groups[rows]
+        )[0]
         ways = [(CHOSEN, chosen)]
-        ways += [(RANDOM, np.random.default_rng([draw, k]).permutation(pool)) for k in range(3)]
+        ways += [
+            (RANDOM, np.random.default_rng([draw, k]).permutation(pool))
+            for k in range(3)
+        ]
         for way, some in ways:
             for n in sizes:
                 log = [np.flatnonzero(data.groups == name)[::thin] for name in some[:n]]
@@ -234,13 +257,25 @@ def _entry(
     """Return the errors of a serial hybrid, or of "auto", fitted to some rows."""
     coupling = "parallel" if kind == "auto" else "serial"
     model = HybridForwardModel(
-        case.chain, kind, coupling=coupling, calibrate=case.calibrate, random_state=case.draw
+        case.chain,
+        kind,
+        coupling=coupling,
+        calibrate=case.calibrate,
+        random_state=case.draw,
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # few rows; tendons that contradict each other
+        warnings.simplefilter(
+            "ignore", UserWarning
+        )  # few rows; tendons that contradict each other
         model.fit(q, x, groups=groups)
         errors = np.linalg.norm(model.predict(test[0]) - test[1], axis=1)
-    known = {"case": case.name, "draw": case.draw, "way": way, "model": kind, "n": len(q)}
+    known = {
+        "case": case.name,
+        "draw": case.draw,
+        "way": way,
+        "model": kind,
+        "n": len(q),
+    }
     return {**known, "mean": float(errors.mean()), "max": float(errors.max())}
 
 
@@ -265,12 +300,18 @@ def _nearest_to_sobol(q: NDArray, n: int, seed: int) -> NDArray:
     return np.array(rows)
 
 
-def worth(entries: Sequence[dict[str, Any]], case: str, error: float, key: str = "mean") -> float:
+def worth(
+    entries: Sequence[dict[str, Any]], case: str, error: float, key: str = "mean"
+) -> float:
     """Return how many random rows have an error [m], between those that were fitted.
 
     Straight in the logarithms of rows and error; NaN where the error is not between theirs.
     """
-    of = [e for e in entries if (e["case"], e["way"], e["model"]) == (case, RANDOM, "pose")]
+    of = [
+        e
+        for e in entries
+        if (e["case"], e["way"], e["model"]) == (case, RANDOM, "pose")
+    ]
     sizes = sorted({e["n"] for e in of})
     means = [np.mean([e[key] for e in of if e["n"] == n]) for n in sizes]
     means = np.minimum.accumulate(means)
@@ -279,7 +320,9 @@ def worth(entries: Sequence[dict[str, Any]], case: str, error: float, key: str =
 
 
 def next_report(
-    everywhere: list[dict[str, Any]], path: list[dict[str, Any]], moved: list[dict[str, Any]]
+    everywhere: list[dict[str, Any]],
+    path: list[dict[str, Any]],
+    moved: list[dict[str, Any]],
 ) -> Report:
     """Return the report of `box`, `along_a_path` and `motions`.
 
@@ -337,7 +380,10 @@ def _worths(entries: list[dict[str, Any]], case: str) -> list[str]:
     for way in dict.fromkeys(e["way"] for e in entries if e["way"].startswith(CHOSEN)):
         for n in sorted({e["n"] for e in entries if e["way"] == way}):
             some = [e for e in entries if (e["way"], e["n"]) == (way, n)]
-            by = [worth(entries, case, np.mean([e[k] for e in some]), k) for k in ("mean", "max")]
+            by = [
+                worth(entries, case, np.mean([e[k] for e in some]), k)
+                for k in ("mean", "max")
+            ]
             lines.append(
                 f"- {n} rows, {way}: worth {by[0]:.0f} random ones by the mean, {by[1]:.0f} by the "
                 "largest error (nan: not between those fitted)."
@@ -356,11 +402,17 @@ def _cell(entries: list[dict[str, Any]], way: str, n: int) -> str:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", default="results/next_rows", help="folder of the report")
+    parser.add_argument(
+        "--out", default="results/next_rows", help="folder of the report"
+    )
     parser.add_argument("--draws", type=int, default=3)
-    parser.add_argument("--rows", default=None, help="folder that keeps rows of the trunks")
+    parser.add_argument(
+        "--rows", default=None, help="folder that keeps rows of the trunks"
+    )
     parser.add_argument("--data", default=None, help="folder of the recordings")
-    parser.add_argument("--jobs", type=int, default=1, help="processes to simulate with")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="processes to simulate with"
+    )
     given = parser.parse_args(argv)
     torch.set_num_threads(1)
     common = {"n_draws": given.draws, "folder": given.rows, "n_jobs": given.jobs}

@@ -89,7 +89,9 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "elastic tendons, 3 segments": lambda: _elastic(3),
     "elastic tendons, 2 segments": lambda: _elastic(2),
     "hybrid, parallel ELM": lambda: _hybrid(),
-    "hybrid, serial quadratic": lambda: _hybrid(coupling="serial", error_model="quadratic"),
+    "hybrid, serial quadratic": lambda: _hybrid(
+        coupling="serial", error_model="quadratic"
+    ),
     'hybrid, "auto"': lambda: _hybrid(error_model="auto", calibrate=("radii", "base")),
 }
 """Robots of the study, by name."""
@@ -140,7 +142,10 @@ def draw(robot: Robot, kind: str, n: int, rng: torch.Generator) -> Tensor:
     for _ in range(20):  # bisection of the way from a training row
         middle = 0.5 * (inside + outside)
         good = robot.model.in_domain(torch.lerp(anchor, q, middle))[:, None]
-        inside, outside = torch.where(good, middle, inside), torch.where(good, outside, middle)
+        inside, outside = (
+            torch.where(good, middle, inside),
+            torch.where(good, outside, middle),
+        )
     pulled = torch.lerp(anchor, q, inside).clamp(low, high)
     return torch.where(robot.model.in_domain(q)[:, None], q, pulled)
 
@@ -234,7 +239,9 @@ def study(
     for done, (name, make) in enumerate(robots.items(), 1):
         robot = make()
         for label, options in (("0", {"restarts": 0}), ("default", {})):
-            found = reached_targets(name, robot, each, random_state=random_state, **options)
+            found = reached_targets(
+                name, robot, each, random_state=random_state, **options
+            )
             entries += [{**entry, "restarts": label} for entry in found]
         if progress is not None:
             progress(name, done, len(robots))
@@ -257,8 +264,13 @@ def reachable_report(entries: list[dict[str, Any]]) -> Report:
     report = Report("Reachable targets")
     report.record.update(table=entries, tol=TOL)
     for key in ("robot", "kind", "start"):
-        report.text(f"By {key}: targets not reached, with one start and with further ones.")
-        rows = [_row(value, key, entries) for value in dict.fromkeys(e[key] for e in entries)]
+        report.text(
+            f"By {key}: targets not reached, with one start and with further ones."
+        )
+        rows = [
+            _row(value, key, entries)
+            for value in dict.fromkeys(e[key] for e in entries)
+        ]
         report.table(_HEADER, [*rows, _row("all", None, entries)])
     return report
 
@@ -305,7 +317,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=[*ROBOTS])
-    parser.add_argument("--targets", type=int, default=20_000, help="in all; default: 20000")
+    parser.add_argument(
+        "--targets", type=int, default=20_000, help="in all; default: 20000"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the draws; default: 0")
     given = parser.parse_args(arguments)
 

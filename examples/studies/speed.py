@@ -56,7 +56,11 @@ def trunk_cases() -> list[Case]:
         'error_model="auto"': {"error_model": "auto"},
     }
     cases = [
-        Case(name, HybridForwardModel(chain, random_state=0, **given).fit(data.q, data.x), *limits)
+        Case(
+            name,
+            HybridForwardModel(chain, random_state=0, **given).fit(data.q, data.x),
+            *limits,
+        )
         for name, given in settings.items()
     ]
     tendons = ElasticTendonChain([0.005] * 3, [0.06] * 3)
@@ -104,17 +108,30 @@ def measure(case: Case, batches: list[int], seconds: float) -> None:
             jobs.append((what, n, partial(ours, q), partial(torch_call, rows)))
     q, x = draw(1)[0], model.predict(draw(1))[0]
     tracker, in_torch = ik.tracker(q), ik.tracker(torch.from_numpy(q))
-    jobs.append(("step of inverse kinematics", 1, partial(ik.step, q, x), partial(_step, ik, q, x)))
-    jobs.append(("tick of the tracker", 1, partial(tracker.step, x), partial(in_torch.step, x)))
+    jobs.append(
+        (
+            "step of inverse kinematics",
+            1,
+            partial(ik.step, q, x),
+            partial(_step, ik, q, x),
+        )
+    )
+    jobs.append(
+        ("tick of the tracker", 1, partial(tracker.step, x), partial(in_torch.step, x))
+    )
     targets = model.predict(draw(_TARGETS))
     solve, tensors = partial(ik.solve, targets), torch.from_numpy(targets)
     jobs.append(("solve", _TARGETS, solve, partial(ik.solve, tensors)))
     print(f"{name}: {native.backend(module)}, ticks {tracker.backend}")
     with torch.no_grad():
         for what, n, ours, eager in jobs:
-            numpy_time, torch_time = (best_time(job, seconds) / n for job in (ours, eager))
+            numpy_time, torch_time = (
+                best_time(job, seconds) / n for job in (ours, eager)
+            )
             ratio = f"{torch_time / numpy_time:8.1f} x"
-            print(f"  {what:32s} {n:7d} {1e6 * numpy_time:10.3g} {1e6 * torch_time:10.3g} {ratio}")
+            print(
+                f"  {what:32s} {n:7d} {1e6 * numpy_time:10.3g} {1e6 * torch_time:10.3g} {ratio}"
+            )
 
 
 def _step(ik: InverseKinematics, q: NDArray, x: NDArray) -> object:
@@ -123,20 +140,28 @@ def _step(ik: InverseKinematics, q: NDArray, x: NDArray) -> object:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description="Measure how fast models are on this machine.")
+    parser = argparse.ArgumentParser(
+        description="Measure how fast models are on this machine."
+    )
     parser.add_argument("model", nargs="?", help="as for `hybridkin describe`")
     parser.add_argument("--robot", help="robot description (TOML)")
     parser.add_argument("--batches", default="1,1000,10000,100000", help="rows at once")
-    parser.add_argument("--seconds", type=float, default=0.5, help="of every measurement")
+    parser.add_argument(
+        "--seconds", type=float, default=0.5, help="of every measurement"
+    )
     arguments = parser.parse_args()
     if arguments.model is None:
         cases = trunk_cases()
     else:
         loaded = workflow.open_model(arguments.model, arguments.robot)
         limits = workflow.path_limits(loaded)
-        cases = [Case(Path(arguments.model).name, loaded.model, limits.q_min, limits.q_max)]
+        cases = [
+            Case(Path(arguments.model).name, loaded.model, limits.q_min, limits.q_max)
+        ]
     torch.set_num_threads(1)
-    print(f"torch {torch.__version__}, one thread; us per row: NumPy, eager torch, ratio")
+    print(
+        f"torch {torch.__version__}, one thread; us per row: NumPy, eager torch, ratio"
+    )
     for case in cases:
         measure(case, [int(n) for n in arguments.batches.split(",")], arguments.seconds)
 

@@ -46,7 +46,9 @@ def as_tensor(
         return copied(real_array(value, name), device or "cpu")
     if value.is_complex() or value.layout != torch.strided or value.is_meta:
         got = f"{value.dtype} with layout {value.layout} on {value.device}"
-        raise ValueError(f"`{name}` must be a dense tensor that holds real numbers, got {got}.")
+        raise ValueError(
+            f"`{name}` must be a dense tensor that holds real numbers, got {got}."
+        )
     return value.detach() if value.dtype == torch.float32 else value.detach().double()
 
 
@@ -56,9 +58,13 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
     if isinstance(value, (Tensor, Transform)):
         return as_tensor(value, name).numpy(force=True)
     if np.ma.is_masked(value):
-        raise ValueError(f"`{name}` has masked entries; drop these rows, or fill them with NaN.")
+        raise ValueError(
+            f"`{name}` has masked entries; drop these rows, or fill them with NaN."
+        )
     if issparse(value):
-        raise TypeError(f"`{name}` must be dense, got a sparse matrix; use `.toarray()`.")
+        raise TypeError(
+            f"`{name}` must be dense, got a sparse matrix; use `.toarray()`."
+        )
     try:
         array = np.asarray(value)
         if array.dtype.kind in "biufO":
@@ -66,7 +72,9 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
             return np.require(array, kind, ["C", "W"])
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         kind = TypeError if isinstance(error, TypeError) else ValueError
-        raise kind(f"`{name}` must be numeric, got {value!r:.200} ({error}).") from error
+        raise kind(
+            f"`{name}` must be numeric, got {value!r:.200} ({error})."
+        ) from error
     hint = " Complex data not supported." if array.dtype.kind == "c" else ""
     raise ValueError(f"`{name}` must be numeric, got {value!r:.200}.{hint}")
 
@@ -92,7 +100,9 @@ def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
     return int(value)
 
 
-def random_generator(random_state: int | np.random.Generator | None) -> np.random.Generator:
+def random_generator(
+    random_state: int | np.random.Generator | None,
+) -> np.random.Generator:
     """Return the caller's generator, or a new one with the caller's seed."""
     if isinstance(random_state, np.random.Generator):
         return random_state
@@ -104,7 +114,9 @@ def random_generator(random_state: int | np.random.Generator | None) -> np.rando
 def one_of(value: Any, name: str, known: Collection[str], hint: str = "") -> str:
     """Return a caller's choice from the known names."""
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"`{name}` must be one of {[*known]}, got {value!r:.80}{hint}.")
+        raise ValueError(
+            f"`{name}` must be one of {[*known]}, got {value!r:.80}{hint}."
+        )
     return value
 
 
@@ -131,11 +143,14 @@ def check_shape(
     sizes = [str(size) for size in need if size != "..."]
     axes = got[-len(sizes) :] if len(sizes) < len(need) else got
     lengths = {
-        size: int(size) if size.isdigit() else n for size, n in zip(sizes, axes, strict=False)
+        size: int(size) if size.isdigit() else n
+        for size, n in zip(sizes, axes, strict=False)
     }
     if tuple(lengths.get(size) for size in sizes) != axes:
         shape = ", ".join(map(str, need)) + "," * (len(need) == 1)
-        raise ValueError(f"`{name}` must have shape ({shape}), got {got}{why and '; '}{why}.")
+        raise ValueError(
+            f"`{name}` must have shape ({shape}), got {got}{why and '; '}{why}."
+        )
 
 
 def shaped(
@@ -166,7 +181,9 @@ def labels(groups: Any, n_rows: int) -> NDArray:
     """Return the label of the motion of every row, shape (N,)."""
     if isinstance(groups, Tensor):
         as_tensor(groups, "groups")
-    found = groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
+    found = (
+        groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
+    )
     check_shape(found, "groups", [n_rows], "one entry for each row of the log")
     if found.dtype.kind == "f" and not np.isfinite(found).all():
         need = "must name the motion of every row, got NaN or infinity"
@@ -193,7 +210,9 @@ def leading(pairs: Sequence[tuple[Tensor, int]]) -> tuple[int, ...]:
     """Return the common batch shape of tensors, each with its number of trailing axes."""
     shapes = [tuple(a.shape[: a.ndim - trailing]) for a, trailing in pairs]
     try:
-        return np.broadcast_shapes(*shapes)  # torch's version takes half a second to import
+        return np.broadcast_shapes(
+            *shapes
+        )  # torch's version takes half a second to import
     except ValueError as error:
         need = "configurations (`q`) and targets (`x_target`) must agree in their batch shapes"
         raise ValueError(f"{need}, got {shapes}.") from error
@@ -205,7 +224,9 @@ def rows_of(a: Tensor, lead: tuple[int, ...], trailing: int = 1) -> Tensor:
     return a.expand(*lead, *shape).reshape(math.prod(lead), *shape)
 
 
-def give_back(results: Iterable[Tensor], lead: tuple[int, ...], as_numpy: bool) -> list[Any]:
+def give_back(
+    results: Iterable[Tensor], lead: tuple[int, ...], as_numpy: bool
+) -> list[Any]:
     """Return rows (N, ...) in the caller's batch shape and array type."""
     shaped = [a.reshape((*lead, *a.shape[1:])) for a in results]
     return [as_array(a) for a in shaped] if as_numpy else shaped

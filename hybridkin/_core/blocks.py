@@ -25,9 +25,13 @@ def in_blocks(
         return function(q)  # which raises
     blocks = q.reshape(math.prod(q.shape[:-1]), q.shape[-1]).split(size)
     found = [function(rows) for rows in blocks]
-    whole = [torch.cat([a.flatten(1) for a in part]) for part in zip(*found, strict=True)]
+    whole = [
+        torch.cat([a.flatten(1) for a in part]) for part in zip(*found, strict=True)
+    ]
     pairs = zip(whole, found[0], strict=True)
-    return tuple(result.reshape(*q.shape[:-1], *part.shape[1:]) for result, part in pairs)
+    return tuple(
+        result.reshape(*q.shape[:-1], *part.shape[1:]) for result, part in pairs
+    )
 
 
 def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:

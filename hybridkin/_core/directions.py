@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 _EXCITED = 0.01  # of the largest spread
-_ROUNDING = 4.0 * np.finfo(np.float64).eps  # of the largest value: a range below it is none
+_ROUNDING = (
+    4.0 * np.finfo(np.float64).eps
+)  # of the largest value: a range below it is none
 _POINT = 1e-6  # of the largest value: the range of rows of a single configuration
 _COUNTS = 1e-4  # of a step: numbers this close to multiples of a step are whole counts
 _AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished from it
@@ -81,13 +83,17 @@ def few_terms(directions: NDArray) -> NDArray:
 
     def shortest(held: NDArray) -> NDArray:
         equal = np.concatenate([held, np.zeros(P)])[None]
-        found = linprog(cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)).x
+        found = linprog(
+            cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)
+        ).x
         a = held if found is None else found[:K]  # if it fails, the nearest vector
         return a / np.linalg.norm(a)
 
     columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
     candidates = [shortest(held) for held in columns]
-    candidates.sort(key=lambda a: np.abs(a @ directions).sum() / np.abs(a @ directions).max())
+    candidates.sort(
+        key=lambda a: np.abs(a @ directions).sum() / np.abs(a @ directions).max()
+    )
     chosen: list[NDArray] = []
     while len(chosen) < K:
         taken = np.array(chosen).reshape(-1, K)
@@ -103,5 +109,7 @@ def in_terms(directions: NDArray, names: Sequence[str]) -> str:
     for move in few_terms(directions.T):
         lead = np.argmax(np.abs(move) > 0.5 * np.abs(move).max())
         terms = zip(names, move / move[lead], strict=True)
-        words.append(" ".join(f"{at:+.2g} {name}" for name, at in terms if abs(at) > 0.05))
+        words.append(
+            " ".join(f"{at:+.2g} {name}" for name, at in terms if abs(at) > 0.05)
+        )
     return "; ".join(words)

@@ -28,7 +28,9 @@ def write_file(path: str | Path, write: Writer) -> None:
     if not path.parent.is_dir():
         raise FileNotFoundError(f"`path` must lie in a folder that exists, got {path}.")
     if path.exists() and not path.is_file():
-        raise ValueError(f"`path` must name a file, got {path}, which is not one; add a file name.")
+        raise ValueError(
+            f"`path` must name a file, got {path}, which is not one; add a file name."
+        )
     with _staged(path) as staging:
         write(staging)
         _flush(staging)
@@ -68,12 +70,16 @@ def _staged(path: Path) -> Iterator[Path]:
     until its process ends, so an exclusive lock means that no other writer is at work.
     """
     staging = path.with_name(f".{path.name}-{secrets.token_hex(8)}.part{path.suffix}")
-    handle = os.open(os.devnull if sys.platform == "win32" else path.parent, os.O_RDONLY)
+    handle = os.open(
+        os.devnull if sys.platform == "win32" else path.parent, os.O_RDONLY
+    )
     try:
         if sys.platform != "win32":
             with suppress(OSError):  # others write, or the file system has no locks
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                parts = f".{escape(path.name)}-{16 * '[0-9a-f]'}.part{escape(path.suffix)}"
+                parts = (
+                    f".{escape(path.name)}-{16 * '[0-9a-f]'}.part{escape(path.suffix)}"
+                )
                 for left in path.parent.glob(parts):
                     left.unlink(missing_ok=True)
             with suppress(OSError):
@@ -86,6 +92,8 @@ def _staged(path: Path) -> Iterator[Path]:
         reason = error.strerror or str(error)
         raise OSError(error.errno or errno.EIO, reason, str(path)) from error
     finally:
-        with suppress(OSError):  # one on a read-only disk, or with too long a name, is not there
+        with suppress(
+            OSError
+        ):  # one on a read-only disk, or with too long a name, is not there
             staging.unlink(missing_ok=True)
         os.close(handle)

@@ -49,7 +49,9 @@ def numbers(values: Numbers) -> str:
 
 
 def _folding(title: str, rows: Mapping[str, object], state: str = "") -> str:
-    body = "\n".join(_row(name, value) for name, value in rows.items() if value is not None)
+    body = "\n".join(
+        _row(name, value) for name, value in rows.items() if value is not None
+    )
     return (
         f"<details{state}><summary>{escape(title)}</summary>"
         f"<table><tbody>\n{body}\n</tbody></table></details>"

@@ -56,11 +56,17 @@ IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
 IK_NEWTON = 60  # Newton steps in a box; a handful is usual
 IK_PROXIMAL = 2  # rounds that remove the effect of the least damping
 IK_NORMALS = 6  # most normals of the plane of a log
-IK_BALANCE = 30.0  # weight of a motion that leaves the plane, relative to that of the tip
+IK_BALANCE = (
+    30.0  # weight of a motion that leaves the plane, relative to that of the tip
+)
 IK_CORRECTIONS = 3  # corrections of a step whose tip must move as promised
 IK_SLACK = 0.02  # a tendon that moves the tip less, relative to the most, is slack
-IK_SLIP = 1e-4  # motion of the tip that does not count, relative to that of all actuators
-IK_LEAST_PULL = 0.01  # shares of the way by which slack tendons are pulled in: from 1 to this
+IK_SLIP = (
+    1e-4  # motion of the tip that does not count, relative to that of all actuators
+)
+IK_LEAST_PULL = (
+    0.01  # shares of the way by which slack tendons are pulled in: from 1 to this
+)
 IK_PULL_RATIO = 0.125  # ratio of one share to the one before
 
 # The state of a robot that follows targets: one array.
@@ -84,20 +90,28 @@ IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP, IK_MUST_SEE, IK_FROM_REST = 1, 2, 4, 8, 
 IK_LOWERS, IK_TO_DOMAIN, IK_TO_POSTURE = 1, 2, 4  # modes
 IK_REACHED, IK_AT_REST, IK_HELD = 1, 2, 4  # results
 IK_LAST_DAMPING = 1e8  # no descent even with this damping: the point is stationary
-IK_STATIONARY = 1e-4  # sine of the angle between the error and the directions left by limits
+IK_STATIONARY = (
+    1e-4  # sine of the angle between the error and the directions left by limits
+)
 IK_SLOW_STEPS = 8  # consecutive iterations that gain less than IK_SLOW of the tolerance
 IK_SLOW = 0.01
 IK_NULL_STEPS = 30  # iterations of a descent in the null space
-IK_NULL_SLIP = 0.3  # largest error after such a step, per motion of the tip without projection
+IK_NULL_SLIP = (
+    0.3  # largest error after such a step, per motion of the tip without projection
+)
 IK_NULL_GAIN = 1e-8  # smallest gain of such a step, per square of the remaining step
 IK_INSIDE = 0.98  # domain distance that points outside the domain are moved to
 
 
 def c_header() -> str:
     """Return the numbers as a C header, `kinds.h`."""
-    numbers: dict[str, float] = {f"HK_{kind.upper()}": 1 + i for i, kind in enumerate(KINDS)}
+    numbers: dict[str, float] = {
+        f"HK_{kind.upper()}": 1 + i for i, kind in enumerate(KINDS)
+    }
     numbers |= {f"HK_{name.upper()}": i for i, name in enumerate(ACTIVATIONS)}
-    numbers |= {name: n for name, n in globals().items() if name.startswith(("HK_", "IK_"))}
+    numbers |= {
+        name: n for name, n in globals().items() if name.startswith(("HK_", "IK_"))
+    }
     lines = [
         "/* Written by hybridkin/_core/kernel_numbers.py, which says what each number is. */",
         "",
@@ -115,4 +129,6 @@ def c_header() -> str:
 def checksum(sources: Path) -> int:
     """Return a checksum of the C sources in a folder and of the shared numbers."""
     files = sorted(sources.glob("*.[ch]"))
-    return crc32(b"".join([c_header().encode(), *(path.read_bytes() for path in files)]))
+    return crc32(
+        b"".join([c_header().encode(), *(path.read_bytes() for path in files)])
+    )

@@ -49,7 +49,9 @@ class Portable:
 
     def __getstate__(self) -> dict[str, Any]:
         own = vars(self).copy()  # one copy: another thread may add its program
-        return _closed({k: value for k, value in own.items() if "_program" != k != "_lock"})
+        return _closed(
+            {k: value for k, value in own.items() if "_program" != k != "_lock"}
+        )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(_opened(state))
@@ -86,7 +88,9 @@ class PortableModule(Portable, nn.Module):
     A class that sets `layout` can be saved to files and compiled.
     """
 
-    layout: ClassVar[Layout] = Layout("", {})  # no kind: it could only be stored as code
+    layout: ClassVar[Layout] = Layout(
+        "", {}
+    )  # no kind: it could only be stored as code
 
     def stored(self) -> Stored:
         """Return the description of the module: kind, settings, arrays and parts.
@@ -99,7 +103,9 @@ class PortableModule(Portable, nn.Module):
         layout = self.layout
         if not layout.kind:
             raise TypeError(_only_code(self))
-        buffers = {name: None if a is None else a.detach() for name, a in self._buffers.items()}
+        buffers = {
+            name: None if a is None else a.detach() for name, a in self._buffers.items()
+        }
         stored = Stored.of(
             layout.kind,
             {name: buffers[name] for name in layout.arrays},
@@ -116,8 +122,14 @@ class PortableModule(Portable, nn.Module):
         parts = {name: stored.parts.get(name) for name in cls.layout.parts}
         return cls(
             **stored.tensors(**cls.layout.arrays),
-            **{name: stored.value(name, kind) for name, kind in cls.layout.settings.items()},
-            **{name: None if part is None else restore(part) for name, part in parts.items()},
+            **{
+                name: stored.value(name, kind)
+                for name, kind in cls.layout.settings.items()
+            },
+            **{
+                name: None if part is None else restore(part)
+                for name, part in parts.items()
+            },
         )
 
     if TYPE_CHECKING:  # attributes that no statement assigns are buffers
@@ -153,7 +165,11 @@ class ForwardModel(PortableModule):
             "structure": self.extra_repr() or None,
             "actuators": self.n_actuators or "not known",
             "outputs": self.n_outputs or "not known",
-            **{name: part.html_rows() for name, part in parts if isinstance(part, ForwardModel)},
+            **{
+                name: part.html_rows()
+                for name, part in parts
+                if isinstance(part, ForwardModel)
+            },
         }
 
     @property
@@ -295,8 +311,12 @@ class FunctionModel(ForwardModel):
         super().__init__()
         self.function = function
         names = ("jacobian", "forward_and_jacobian", "in_domain", "n_actuators")
-        own, pair, self.own_domain, n = (getattr(function, name, None) for name in names)
-        self.own_jacobian, self.own_pair = (own, pair) if jacobian is None else (jacobian, None)
+        own, pair, self.own_domain, n = (
+            getattr(function, name, None) for name in names
+        )
+        self.own_jacobian, self.own_pair = (
+            (own, pair) if jacobian is None else (jacobian, None)
+        )
         self.n_actuators = int(n or 0)
 
     def frozen(self) -> Self:
@@ -410,7 +430,9 @@ def jacobian(model: Any, q: Tensor) -> Tensor:
     return as_forward_model(model).jacobian(q)
 
 
-def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[Tensor, Tensor]:
+def reverse_jacobian(
+    function: Callable[[Tensor], Tensor], q: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return x and dx/dq by one backward pass per output coordinate."""
     keep = q.requires_grad and torch.is_grad_enabled()
     with torch.enable_grad():
@@ -422,7 +444,9 @@ def reverse_jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> tuple[T
 
 def slopes(x: Tensor, leaf: Tensor, create_graph: bool = False) -> Tensor:
     """Return dx/dq (..., m, n) for rows x (..., m) computed from the rows of a leaf tensor q."""
-    slope = partial(grad, create_graph=create_graph, retain_graph=True, materialize_grads=True)
+    slope = partial(
+        grad, create_graph=create_graph, retain_graph=True, materialize_grads=True
+    )
     return torch.stack([slope(a.sum(), leaf)[0] for a in x.unbind(-1)], dim=-2)
 
 
@@ -440,7 +464,9 @@ def _described(module: nn.Module | None) -> Stored | None:
         return None if module is None else module.stored()
     if not isinstance(module, nn.ModuleList):
         raise TypeError(_only_code(module))
-    return Stored.of("list", parts={str(k): _described(part) for k, part in enumerate(module)})
+    return Stored.of(
+        "list", parts={str(k): _described(part) for k, part in enumerate(module)}
+    )
 
 
 def _only_code(module: nn.Module) -> str:

@@ -13,7 +13,9 @@ def cross_matrix(vector: Tensor) -> Tensor:
     """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(
+        -1, (3, 3)
+    )
 
 
 def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,7 +52,9 @@ def rotation_vector(R: Tensor) -> Tensor:
     It divides by the largest component of the unit quaternion, which is never small.
     """
     r = [[R[..., i, j] for j in range(3)] for i in range(3)]
-    skew = torch.stack([r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]], dim=-1)
+    skew = torch.stack(
+        [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]], dim=-1
+    )
     diagonal = torch.stack([r[0][0], r[1][1], r[2][2]], dim=-1)
     trace = diagonal.sum(-1, keepdim=True)
     # Row k: 4 q_k times the quaternion (w, x, y, z).

@@ -97,8 +97,12 @@ class Stored:
         **settings
             Values that JSON can express; arrays and tuples become lists.
         """
-        numbers = {name: as_array(a) for name, a in (arrays or {}).items() if a is not None}
-        models = {name: part for name, part in (parts or {}).items() if part is not None}
+        numbers = {
+            name: as_array(a) for name, a in (arrays or {}).items() if a is not None
+        }
+        models = {
+            name: part for name, part in (parts or {}).items() if part is not None
+        }
         return cls(kind, plain(settings), numbers, models)
 
     def value(self, key: str, kinds: Any) -> Any:
@@ -118,8 +122,12 @@ class Stored:
         if type(value) is int and float in kinds and int not in kinds:
             value = float(value)
         if (None if value is None else type(value)) not in kinds:
-            names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
-            raise ValueError(f"`{key}` of {self.kind!r} must be {names}, got {value!r:.60}")
+            names = " or ".join(
+                "null" if kind is None else kind.__name__ for kind in kinds
+            )
+            raise ValueError(
+                f"`{key}` of {self.kind!r} must be {names}, got {value!r:.60}"
+            )
         return value
 
     def list_of(self, kind: type, key: str) -> list[Any]:
@@ -131,7 +139,11 @@ class Stored:
         return values
 
     def array(
-        self, name: str, shape: Sequence[int | str] | None = None, *, finite: bool = True
+        self,
+        name: str,
+        shape: Sequence[int | str] | None = None,
+        *,
+        finite: bool = True,
     ) -> NDArray:
         """Return an array of floating-point numbers.
 
@@ -167,7 +179,9 @@ class Stored:
         lengths = {}
         found = {}
         for name, letters in shapes.items():
-            array = self.array(name, [lengths.get(letter, letter) for letter in letters])
+            array = self.array(
+                name, [lengths.get(letter, letter) for letter in letters]
+            )
             lengths |= dict(zip(letters, array.shape, strict=True))
             found[name] = torch.tensor(array, device="cpu")
         return found
@@ -204,7 +218,11 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
     The device, and a random state that is not a number, become None.
     """
     params = plain(estimator.get_params(deep=False))
-    lost = {name for name in ("device", "random_state") if not isinstance(params.get(name), int)}
+    lost = {
+        name
+        for name in ("device", "random_state")
+        if not isinstance(params.get(name), int)
+    }
     return {name: None if name in lost else value for name, value in params.items()}
 
 
@@ -212,7 +230,9 @@ def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
     """Return an estimator with the given parameters; unknown ones are ignored."""
     defaults = cls().get_params(deep=False)
     known = {
-        name: tuple(value) if isinstance(defaults[name], tuple) and type(value) is list else value
+        name: tuple(value)
+        if isinstance(defaults[name], tuple) and type(value) is list
+        else value
         for name, value in params.items()
         if name in defaults
     }

@@ -22,7 +22,9 @@ _TURNS = 4.0 * math.pi  # [rad]; larger joint angles are more likely in degrees
 _SPANS = 10.0  # tips span at most 2 robot lengths; in millimetres it would be 2000
 
 
-def span_message(name: str, tips: Tensor, reach: float, spans: float = _SPANS) -> str | None:
+def span_message(
+    name: str, tips: Tensor, reach: float, spans: float = _SPANS
+) -> str | None:
     """Return a warning if tips (N, 3) span more than `spans` times the reach of the robot."""
     span = float((tips.amax(dim=0) - tips.amin(dim=0)).max())
     if span <= spans * reach:
@@ -33,7 +35,9 @@ def span_message(name: str, tips: Tensor, reach: float, spans: float = _SPANS) -
     )
 
 
-def motion_message(name: str, tips: Tensor, predicted: Tensor, reach: float) -> str | None:
+def motion_message(
+    name: str, tips: Tensor, predicted: Tensor, reach: float
+) -> str | None:
     """Return a warning if tips (N, 3) span 20 times what a model predicts, and two reaches."""
     moved = float((predicted.amax(dim=0) - predicted.amin(dim=0)).detach().max())
     return span_message(name, tips, reach, min(_SPANS, max(2.0, 20.0 * moved / reach)))

@@ -23,7 +23,9 @@ _SCALES = (0.6, 1.0, 1.6)
 _TURNS = tuple(0.5 * math.pi * k for k in range(4))
 _SWEEPS = 2
 _KEPT = 2  # guesses per handedness
-_HOPELESS = 3.0  # times the error of the best guess, before any fit; worse ones are dropped
+_HOPELESS = (
+    3.0  # times the error of the best guess, before any fit; worse ones are dropped
+)
 
 
 class Guess(NamedTuple):
@@ -71,7 +73,9 @@ def aligned(chain: _Chain, rows: Rows) -> _Chain:
     return chain.with_geometry(base=move @ chain.geometry()["base"])
 
 
-def _searched(chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool) -> Iterator[Guess]:
+def _searched(
+    chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool
+) -> Iterator[Guess]:
     """Yield the best guesses of a search ring by ring, for several scales of the radii."""
     found: dict[tuple, tuple[float, Guess]] = {}
     n_segments = len(chain.actuators_per_segment)
@@ -81,7 +85,9 @@ def _searched(chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool) ->
             score = math.inf
             for _ in range(_SWEEPS):
                 for k in range(n_segments):
-                    for option in [(flip, turn) for flip in (hand, not hand) for turn in _TURNS]:
+                    for option in [
+                        (flip, turn) for flip in (hand, not hand) for turn in _TURNS
+                    ]:
                         tried = [*choice[:k], option, *choice[k + 1 :]]
                         rms = _chosen(chain, tried, scale, rows, free_base)[1]
                         if rms < score * (1.0 - 1e-9):
@@ -94,11 +100,17 @@ def _searched(chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool) ->
     ranked = sorted(found.values(), key=lambda pair: pair[0])
     hopeful = [guess for score, guess in ranked if score < _HOPELESS * ranked[0][0]]
     for mirrored in (False, True):
-        yield from [guess for guess in hopeful if any(guess.mirrored) == mirrored][:_KEPT]
+        yield from [guess for guess in hopeful if any(guess.mirrored) == mirrored][
+            :_KEPT
+        ]
 
 
 def _chosen(
-    chain: ArcChain, choice: list[tuple[bool, float]], scale: float, rows: Rows, align: bool
+    chain: ArcChain,
+    choice: list[tuple[bool, float]],
+    scale: float,
+    rows: Rows,
+    align: bool,
 ) -> tuple[Guess, float]:
     """Return a guess, and the root mean square tip distance of its chain with scaled radii."""
     mirrored, turns = zip(*choice, strict=True)
@@ -115,8 +127,14 @@ def _ringed(chain: ArcChain, mirrored: tuple[bool, ...], turns: NDArray) -> ArcC
     counts = chain.actuators_per_segment
     angles = chain.geometry()["angles"]
     sign = angles.new_tensor(np.repeat(np.where(mirrored, -1.0, 1.0), counts))
-    return chain.with_geometry(angles=sign * angles + angles.new_tensor(np.repeat(turns, counts)))
+    return chain.with_geometry(
+        angles=sign * angles + angles.new_tensor(np.repeat(turns, counts))
+    )
 
 
 def _scaled(chain: _Chain, scale: float) -> _Chain:
-    return chain if scale == 1.0 else chain.with_geometry(radii=scale * chain.geometry()["radii"])
+    return (
+        chain
+        if scale == 1.0
+        else chain.with_geometry(radii=scale * chain.geometry()["radii"])
+    )

@@ -25,7 +25,11 @@ _MEDIAN = 2.3660  # of the squared length of a normal vector with three coordina
 # rho(s), rho'(s) and rho''(s), for the squared distance s of a row over its noise.
 LOSSES: dict[str, Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]] = {
     "linear": lambda s: (s, np.ones_like(s), np.zeros_like(s)),
-    "soft_l1": lambda s: (2 * s / (1 + np.sqrt(1 + s)), (1 + s) ** -0.5, -0.5 * (1 + s) ** -1.5),
+    "soft_l1": lambda s: (
+        2 * s / (1 + np.sqrt(1 + s)),
+        (1 + s) ** -0.5,
+        -0.5 * (1 + s) ** -1.5,
+    ),
     "huber": lambda s: _huber(s, np.maximum(s, 1.0)),
     "cauchy": lambda s: (np.log1p(s), 1 / (1 + s), -((1 + s) ** -2.0)),
     "arctan": lambda s: (np.arctan(s), 1 / (1 + s * s), -2 * s / (1 + s * s) ** 2),
@@ -33,7 +37,11 @@ LOSSES: dict[str, Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]] = {
 
 
 def _huber(s: NDArray, far: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    return np.where(s > 1, 2 * np.sqrt(far) - 1, s), far**-0.5, -0.5 * (s > 1) * far**-1.5
+    return (
+        np.where(s > 1, 2 * np.sqrt(far) - 1, s),
+        far**-0.5,
+        -0.5 * (s > 1) * far**-1.5,
+    )
 
 
 class Rows(NamedTuple):
@@ -65,12 +73,18 @@ class Rows(NamedTuple):
         """Return the derivative of the residual, times the roots of the weights, (3 M, P)."""
         with torch.no_grad():
             tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
-            J = chain.geometry_jacobian(self.q, tangents).unflatten(1, (-1, 3)).numpy()[self.seen]
+            J = (
+                chain.geometry_jacobian(self.q, tangents)
+                .unflatten(1, (-1, 3))
+                .numpy()[self.seen]
+            )
             return (np.sqrt(self.weights)[:, None, None] * J).reshape(-1, theta.size)
 
     def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
-        return float(np.sqrt(np.average(_squares(self.residual(chain)), weights=self.weights)))
+        return float(
+            np.sqrt(np.average(_squares(self.residual(chain)), weights=self.weights))
+        )
 
     def noise(self, residual: NDArray, robust: bool) -> float:
         """Return the standard deviation of one coordinate, from the median if robust."""
@@ -119,7 +133,9 @@ class Fit:
         return self.problem.chain_at(self.theta)
 
 
-def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: bool = False) -> Fit:
+def solve(
+    problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: bool = False
+) -> Fit:
     """Return a fit that alternates least squares and the noise level, the weight of the prior.
 
     With `roughly` it stops early, with enough accuracy to compare initial guesses.
@@ -139,7 +155,9 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
         return rows.jacobian(problem, theta, known(theta.tobytes())[0])
 
     def whitened(theta: NDArray, sigma: float) -> NDArray:
-        return np.concatenate([(root * residual(theta)).ravel() / sigma, theta / problem.prior_std])
+        return np.concatenate(
+            [(root * residual(theta)).ravel() / sigma, theta / problem.prior_std]
+        )
 
     def slope(theta: NDArray, sigma: float) -> NDArray:
         return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
@@ -151,7 +169,9 @@ def solve(problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: b
     tol = 1e-5 if roughly else 1e-12
     options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol)
     options |= {"jac": slope, "bounds": (problem.low, problem.high), "max_nfev": 100}
-    options |= {"loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"}
+    options |= {
+        "loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"
+    }
     for _ in range(2 if roughly else _MAX_ROUNDS):
         solution = least_squares(whitened, theta, args=(sigma,), **options)
         theta = solution.x

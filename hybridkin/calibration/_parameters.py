@@ -75,12 +75,18 @@ class Entries(_Named):
 
     def moved(self, part: Tensor) -> Tensor:
         """Return the entry at a point of the free directions (size,)."""
-        change = (torch.from_numpy(self.directions).to(part) @ part).reshape(self.start.shape)
+        change = (torch.from_numpy(self.directions).to(part) @ part).reshape(
+            self.start.shape
+        )
         return self.start * torch.exp(change) if self.log else self.start + change
 
     def tangents(self, part: Tensor) -> Tensor:
         """Return the derivatives of `moved`, shape (size, ...)."""
-        slope = torch.from_numpy(self.directions.T.copy()).to(part).reshape(-1, *self.start.shape)
+        slope = (
+            torch.from_numpy(self.directions.T.copy())
+            .to(part)
+            .reshape(-1, *self.start.shape)
+        )
         return slope * self.moved(part) if self.log else slope
 
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
@@ -92,7 +98,9 @@ class Entries(_Named):
             low = np.minimum(low, origin)
             high = np.maximum(high, origin)
         if not np.all(np.less(low, high)) or (self.log and np.any(np.less(low, 0.0))):
-            need = "(low, high) with low < high" + ", and must not be negative" * self.log
+            need = (
+                "(low, high) with low < high" + ", and must not be negative" * self.log
+            )
             raise ValueError(f"`bounds` of {self.name!r} must be {need}, got {bound}.")
         if not self.log:
             return (low - origin) / self.units, (high - origin) / self.units
@@ -101,7 +109,9 @@ class Entries(_Named):
 
     def value(self, entry: Tensor) -> Tensor:
         """Return the part of the entry that this parameter stands for."""
-        return entry.flatten()[torch.as_tensor(self.shown, device=entry.device)].reshape(self.shape)
+        return entry.flatten()[
+            torch.as_tensor(self.shown, device=entry.device)
+        ].reshape(self.shape)
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         """Return the standard errors of `value` from those of the free directions."""
@@ -122,7 +132,9 @@ class Posed(_Named):
 
     def moved(self, part: Tensor) -> Tensor:
         turned = rotation(part[:3])[0] @ self.start[:3, :3]
-        position = self.start[:3, 3] + part[3:] * torch.from_numpy(self.units[3:]).to(part)
+        position = self.start[:3, 3] + part[3:] * torch.from_numpy(self.units[3:]).to(
+            part
+        )
         pose = torch.cat([turned, position[:, None]], dim=1)
         return torch.cat([pose, self.start[3:]], dim=0)
 
@@ -169,7 +181,9 @@ def parameter(chain: Chain, name: str) -> Parameter:
     shape = tuple(start.shape)
     size = start.numel()
     if name == "base":
-        labels = tuple(f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z"))
+        labels = tuple(
+            f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z")
+        )
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
         return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
     unit = reach
@@ -200,7 +214,9 @@ def parameter(chain: Chain, name: str) -> Parameter:
         kind = "m" if (geometry["gains"] == 1.0).all() else "q"
     directions = unit * np.eye(size)
     shown = np.arange(size)
-    if name == "turns" and isinstance(chain, ArcChain):  # each segment's actuators together
+    if name == "turns" and isinstance(
+        chain, ArcChain
+    ):  # each segment's actuators together
         counts = np.array(chain.actuators_per_segment)
         directions = np.repeat(np.eye(len(counts)), counts, axis=0)
         shown = np.cumsum(counts) - counts
@@ -216,16 +232,29 @@ def parameter(chain: Chain, name: str) -> Parameter:
         shape = ()
     labels = _labels(name, shape)
     size = len(shown)
-    basic = name, entry, start, labels, np.broadcast_to(unit, size), kinds or (kind,) * size
+    basic = (
+        name,
+        entry,
+        start,
+        labels,
+        np.broadcast_to(unit, size),
+        kinds or (kind,) * size,
+    )
     return Entries(*basic, directions, physical, shown, shape, log=entry in SCALED)
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     if len(shape) == 2 and shape[1] in (2, 3):
-        return tuple(f"{name}[{k}, {axis}]" for k in range(shape[0]) for axis in "xyz"[: shape[1]])
+        return tuple(
+            f"{name}[{k}, {axis}]"
+            for k in range(shape[0])
+            for axis in "xyz"[: shape[1]]
+        )
     if not shape:
         return (name,)
-    return tuple(f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(*shape))
+    return tuple(
+        f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(*shape)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +289,9 @@ class Problem:
 
     def start(self, scale: float) -> NDArray:
         """Return the start with all radii times a factor, clipped to the limits."""
-        logs = [np.log(scale) if part.name == "radii" else 0.0 for part in self.parameters]
+        logs = [
+            np.log(scale) if part.name == "radii" else 0.0 for part in self.parameters
+        ]
         sizes = [part.size for part in self.parameters]
         return np.clip(np.repeat(logs, sizes), self.low, self.high)
 
@@ -278,12 +309,15 @@ class Problem:
     def moved(self, theta: Tensor) -> Chain:
         """Return the chain at theta (P,), differentiable in it."""
         pairs = zip(self.parameters, self.parts(theta), strict=True)
-        return self.chain.with_geometry(**{part.entry: part.moved(at) for part, at in pairs})
+        return self.chain.with_geometry(
+            **{part.entry: part.moved(at) for part, at in pairs}
+        )
 
     def tangents(self, theta: Tensor) -> dict[str, Tensor]:
         """Return the derivatives of the geometry by theta, (P, ...) for every changed entry."""
         rows = self.parts(identity(len(theta), theta))
         pairs = zip(self.parameters, self.parts(theta), rows, strict=True)
         return {
-            part.entry: torch.tensordot(own.mT, part.tangents(at), 1) for part, at, own in pairs
+            part.entry: torch.tensordot(own.mT, part.tangents(at), 1)
+            for part, at, own in pairs
         }

@@ -43,7 +43,9 @@ def search(
     with torch.no_grad():
         guesses = initial_guesses(chain, rows, names)
     problems = [Problem.of(guess.chain, names, bounds, stds) for guess in guesses]
-    thetas = [problem.start(g.scale) for problem, g in zip(problems, guesses, strict=True)]
+    thetas = [
+        problem.start(g.scale) for problem, g in zip(problems, guesses, strict=True)
+    ]
     if len(guesses) == 1:
         return Start(problems[0], thetas[0])
     pairs = zip(problems, thetas, strict=True)
@@ -53,7 +55,10 @@ def search(
 
 
 def widened(
-    start: Start, names: tuple[str, ...], prior: Mapping[str, float], elastic: bool = False
+    start: Start,
+    names: tuple[str, ...],
+    prior: Mapping[str, float],
+    elastic: bool = False,
 ) -> Start:
     """Return the start of a fit of more parameters, or of elastic tendons, from another start."""
     chain = start.problem.chain
@@ -66,7 +71,9 @@ def widened(
     return Start(problem, np.concatenate(theta), start.message)
 
 
-def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit, str | None]:
+def _best(
+    fits: list[Fit], guesses: list[Guess], free_angles: bool
+) -> tuple[Fit, str | None]:
     """Return the best fit, and a warning if it is a mirror image although no angles are free.
 
     Among equal fits the first is taken; a mirror image is taken only if it is clearly better.
@@ -78,7 +85,10 @@ def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> tuple[Fit
             best = fit if fit.rmse < _EQUAL * best.rmse else best
         elif image is None or fit.rmse < image.rmse:
             image = fit
-    if image is None or image.rmse >= (_BETTER if free_angles else _FAR_BETTER) * best.rmse:
+    if (
+        image is None
+        or image.rmse >= (_BETTER if free_angles else _FAR_BETTER) * best.rmse
+    ):
         return best, None
     if free_angles:
         return image, None

@@ -19,7 +19,12 @@ _ALIKE = 0.02
 _STILL = 1e-6  # [mm]
 _NO_EFFECT = "does not move the tips"
 _DETERMINED = 0.05  # largest standard error of the logarithm
-_STEPS = {"m": (1e-3, "mm"), "rad": (np.pi / 180.0, "deg"), "-": (0.01, "%"), "q": (1.0, "of q")}
+_STEPS = {
+    "m": (1e-3, "mm"),
+    "rad": (np.pi / 180.0, "deg"),
+    "-": (0.01, "%"),
+    "q": (1.0, "of q"),
+}
 
 
 class _Term(NamedTuple):
@@ -30,7 +35,9 @@ class _Term(NamedTuple):
     place: int  # of its (first) free direction
 
 
-def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float) -> tuple[str, ...]:
+def sentences(
+    fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float
+) -> tuple[str, ...]:
     """Return a sentence for each direction that hardly moves the tips, in few parameters.
 
     `directions` (K, P) are orthonormal changes in units of the prior; `covariance` (P, P) is that
@@ -52,8 +59,12 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
         terms = _terms(problem, move * to_steps, lead)
         shown = [term for term in terms if abs(term.size) > _SMALL][:_N_TERMS]
         n_hidden = sum(noticed[term.place] for term in terms if term not in shown)
-        effect = f"moves the tips by {tips:.2g} mm rms" if tips >= _STILL else _NO_EFFECT
-        words = [f"{label} {size:+.3g} {steps[place][1]}" for label, size, place in shown]
+        effect = (
+            f"moves the tips by {tips:.2g} mm rms" if tips >= _STILL else _NO_EFFECT
+        )
+        words = [
+            f"{label} {size:+.3g} {steps[place][1]}" for label, size, place in shown
+        ]
         advice = _advice(fit, covariance, move * to_steps, shown)
         found.append(f"{_joined(words, n_hidden)} {effect}: {advice}")
     return tuple(found)
@@ -91,12 +102,18 @@ def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) ->
     labels = fit.problem.labels
     geometry = fit.chain().geometry()
     kinds = [kind for part in parts for kind in part.kind]
-    if not kinds[i] == kinds[j] == "-" or abs(abs(move[i]) - abs(move[j])) > _ALIKE * abs(move[i]):
+    if not kinds[i] == kinds[j] == "-" or abs(
+        abs(move[i]) - abs(move[j])
+    ) > _ALIKE * abs(move[i]):
         return ""
     i, j = sorted((i, j), key=labels.__getitem__)
     way = 1 if move[i] * move[j] > 0 else -1
     error = np.sqrt(covariance[i, i] + covariance[j, j] - 2 * way * covariance[i, j])
-    values = [v for part in parts for v in part.value(geometry[part.entry]).flatten()[: part.size]]
+    values = [
+        v
+        for part in parts
+        for v in part.value(geometry[part.entry]).flatten()[: part.size]
+    ]
     value = float(values[i] / values[j] ** way)
     what = f"{labels[i]} {'/' if way > 0 else '*'} {labels[j]}"
     shown = f" The data identify {what} = {value:.4g} (std. error {abs(value) * error:.2g})."
@@ -113,7 +130,9 @@ def _terms(problem: Problem, move: NDArray, lead: int) -> list[_Term]:
             leads = row <= lead < row + part.size
             terms.append((leads, _Term(f"all {part.name}", float(sizes[0]), row)))
         else:
-            for index, (label, size) in enumerate(zip(part.labels, sizes, strict=True), row):
+            for index, (label, size) in enumerate(
+                zip(part.labels, sizes, strict=True), row
+            ):
                 terms.append((index == lead, _Term(label, float(size), index)))
         row += part.size
     terms.sort(key=lambda pair: (not pair[0], -abs(pair[1].size), pair[1]))

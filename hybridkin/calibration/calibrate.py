@@ -15,7 +15,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import LARGEST, Numbers, as_tensor, check_shape, labels, one_of
+from hybridkin._core.arrays import (
+    LARGEST,
+    Numbers,
+    as_tensor,
+    check_shape,
+    labels,
+    one_of,
+)
 from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
@@ -92,7 +99,9 @@ class CalibrationResult(Portable):
     converged: bool
 
     def __repr__(self) -> str:
-        lines = [f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"]
+        lines = [
+            f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"
+        ]
         for name, value in self.values.items():
             lines.append(f"  {name}: {_shown(value)}")
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
@@ -237,7 +246,9 @@ def fit_geometry(
         groups = labels(groups, len(q))
     weights = _check_weights(sample_weight, q)
     first, counts, _ = distinct_rows(q, x, weights, groups)
-    weights = q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
+    weights = (
+        q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
+    )
     rows = Rows(q[first], x[first], weights)
     if start is None:
         stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
@@ -304,8 +315,12 @@ def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
             if part.name in _MEASURED and abs(at) > np.log(_UNPHYSICAL):
                 words.append(f"{label} is {np.exp(at):.2g} times its start")
         if part.entry == "offsets":
-            before, after = (c.geometry()["offsets"] for c in (problem.chain, fit.chain()))
-            worse = (before - after > 1e-3 * part.units[0]) & (after < -0.02 * part.units[0])
+            before, after = (
+                c.geometry()["offsets"] for c in (problem.chain, fit.chain())
+            )
+            worse = (before - after > 1e-3 * part.units[0]) & (
+                after < -0.02 * part.units[0]
+            )
             for k in worse.nonzero().flatten().tolist():
                 label = "tool" if part.name == "tool" else part.labels[k]
                 words.append(f"{label} is {1e3 * float(after[k]):.3g} mm")
@@ -320,14 +335,20 @@ def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
 
 
 def _result(
-    fit: Fit, rows: Rows, cv_rmse: float | None, unphysical: tuple[str, ...], torch_given: bool
+    fit: Fit,
+    rows: Rows,
+    cv_rmse: float | None,
+    unphysical: tuple[str, ...],
+    torch_given: bool,
 ) -> CalibrationResult:
     problem = fit.problem
     chain = fit.chain()
     prior_std = problem.prior_std
     # Singular values of J in units of the prior; those of J'J would lose small ones to rounding.
     J = fit.jacobian * prior_std
-    _, narrowed, directions = np.linalg.svd(J / fit.noise, full_matrices=len(J) < J.shape[1])
+    _, narrowed, directions = np.linalg.svd(
+        J / fit.noise, full_matrices=len(J) < J.shape[1]
+    )
     narrowed = np.pad(narrowed, (0, len(prior_std) - narrowed.size))
     factor = prior_std[:, None] * directions.T / np.sqrt(narrowed**2 + 1.0)
     covariance = factor @ factor.T
@@ -340,7 +361,9 @@ def _result(
     pieces = (problem.parts(part) for part in (std, std < _IDENTIFIED * prior_std))
     for part, error, identified in zip(problem.parameters, *pieces, strict=True):
         value = part.value(geometry[part.entry])
-        error = np.asarray(part.std_errors(error, value.numpy()))  # for one gain a plain number
+        error = np.asarray(
+            part.std_errors(error, value.numpy())
+        )  # for one gain a plain number
         values[part.name] = value if torch_given else value.numpy()
         std_errors[part.name] = torch.from_numpy(error) if torch_given else error
         identifiable[part.name] = np.asarray(part.flags(identified))
@@ -354,7 +377,9 @@ def _result(
         narrowing=prior_std / safe,
         identifiable=identifiable,
         singular_values=narrowed,
-        unidentified=sentences(fit, unidentified, covariance, float(rows.weights.sum())),
+        unidentified=sentences(
+            fit, unidentified, covariance, float(rows.weights.sum())
+        ),
         unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
@@ -365,14 +390,19 @@ def _result(
 def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     squares = 0.0
     for train, test in folds(groups, groups):
-        fit = solve(best.problem, Rows(*(part[train] for part in rows)), best.theta, loss)
+        fit = solve(
+            best.problem, Rows(*(part[train] for part in rows)), best.theta, loss
+        )
         held_out = Rows(*(part[test] for part in rows))
         squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weights.sum())
     return float(np.sqrt(squares / float(rows.weights.sum())))
 
 
 def _check_parameters(
-    chain: Chain, parameters: Sequence[str], bounds: Mapping | None, prior: float | Mapping
+    chain: Chain,
+    parameters: Sequence[str],
+    bounds: Mapping | None,
+    prior: float | Mapping,
 ) -> tuple[str, ...]:
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     available = parameter_names(chain)
@@ -394,7 +424,9 @@ def _check_parameters(
         raise TypeError(f"`bounds` must map names to (low, high), got {bounds!r:.80}.")
     for argument, given in (("bounds", bounds), ("prior", prior)):
         if isinstance(given, Mapping) and not set(given) <= set(names):
-            raise ValueError(f"`{argument}` must name only {names}, got {sorted(given)}.")
+            raise ValueError(
+                f"`{argument}` must name only {names}, got {sorted(given)}."
+            )
     stds = list(prior.values()) if isinstance(prior, Mapping) else [prior]
     if not all(std > 1.0 / LARGEST for std in stds):
         need = f"must be positive standard deviations, over {1.0 / LARGEST:g}"
@@ -402,7 +434,9 @@ def _check_parameters(
     return names
 
 
-def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str | None]]:
+def check_data(
+    chain: Chain, q: Numbers, x: Numbers
+) -> tuple[Tensor, Tensor, list[str | None]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q = as_tensor(q, "q").to("cpu", dtype)
@@ -415,7 +449,11 @@ def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, li
     x = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x"))
     found = chain(q)
     known = torch.where(x.isnan(), found, x)
-    return q, x, [*messages, motion_message("x", known, found, float(chain.reach.detach()))]
+    return (
+        q,
+        x,
+        [*messages, motion_message("x", known, found, float(chain.reach.detach()))],
+    )
 
 
 def _check_weights(sample_weight: Numbers | None, q: Tensor) -> Tensor:

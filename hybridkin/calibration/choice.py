@@ -31,8 +31,15 @@ _FEW = 40  # with fewer rows `io` is not used
 # rows per parameter; with fewer rows a set must be clearly better
 _ROWS = 7
 _CLEARLY = 0.7
-_WORSE = 1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
-_USUAL = ("nothing", "base", "radii + base", "radii + base + gain")  # also from few rows
+_WORSE = (
+    1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
+)
+_USUAL = (
+    "nothing",
+    "base",
+    "radii + base",
+    "radii + base + gain",
+)  # also from few rows
 _EQUAL = 0.007  # of the score: within it the smaller set is taken
 _ALIKE = 0.01  # of the error: within it the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
@@ -54,7 +61,16 @@ _TENDONS = (
 _ELASTIC = (
     ("base", *_STIFF),
     ("turns", "rest_bends", "tool", "base", *_STIFF, "tendon_zeros"),
-    ("turns", "rest_bends", "tool", "base", *_STIFF, "tendon_zeros", "radii", "lengths"),
+    (
+        "turns",
+        "rest_bends",
+        "tool",
+        "base",
+        *_STIFF,
+        "tendon_zeros",
+        "radii",
+        "lengths",
+    ),
 )
 
 
@@ -66,7 +82,9 @@ class Errors(NamedTuple):
 
     def known(self) -> dict[str, float]:
         """Return the errors by name, without those that were not computed."""
-        return {name: error for name, error in self._asdict().items() if not np.isnan(error)}
+        return {
+            name: error for name, error in self._asdict().items() if not np.isnan(error)
+        }
 
 
 @dataclass(frozen=True)
@@ -163,7 +181,9 @@ def choose_geometry(
         groups = labels(groups, len(q))
     kept = np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
     kept = np.sort(kept[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)])
-    counts = q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
+    counts = (
+        q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
+    )
     rows = Rows(q[kept], x[kept], counts[kept])
     with torch.no_grad():
         rungs = _rungs(chain, q, parameters)
@@ -178,7 +198,8 @@ def choose_geometry(
         if outside and len(kept) >= _FEW:
             splits.append((0, *inner_and_outer(rows.q.numpy())))
         found = [
-            _errors(rung, at, rows, splits, loss) for rung, at in zip(rungs, starts, strict=True)
+            _errors(rung, at, rows, splits, loss)
+            for rung, at in zip(rungs, starts, strict=True)
         ]
         free = np.array([0 if at is None else at.theta.size for at in starts])
         sure = (free <= len(kept) / _ROWS) | [rung.name in _USUAL for rung in rungs]
@@ -231,9 +252,16 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
         if elastic is not None:
             own = elastic.default_parameters
             # Lengths and radii of a plain chain compensate for slack; elastic tendons keep them.
-            kept = [name for name in names if name not in ("radii", "lengths", "actuator_zeros")]
+            kept = [
+                name
+                for name in names
+                if name not in ("radii", "lengths", "actuator_zeros")
+            ]
             if names != chain.default_parameters:
-                own = (*kept, *(name for name in own if name not in ("radii", "lengths", *kept)))
+                own = (
+                    *kept,
+                    *(name for name in own if name not in ("radii", "lengths", *kept)),
+                )
             rungs.append(_Rung(_RIVAL + _name(own), elastic, own))
         return rungs
     if not isinstance(chain, ArcChain):
@@ -249,7 +277,9 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
     return rungs
 
 
-def _with_gain(sets: Sequence[tuple[str, ...]], chain: Chain) -> Sequence[tuple[str, ...]]:
+def _with_gain(
+    sets: Sequence[tuple[str, ...]], chain: Chain
+) -> Sequence[tuple[str, ...]]:
     """Return the sets with the gain beside the radii, if the chain has gains.
 
     Tips of tendons determine only their ratio: without the gain, its error moves into the radii.
@@ -272,7 +302,9 @@ def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]
     free rings.
     """
     starts: list[Start | None] = []
-    for chain, names, free in ((rung.chain, rung.parameters, _rings(rung)) for rung in rungs):
+    for chain, names, free in (
+        (rung.chain, rung.parameters, _rings(rung)) for rung in rungs
+    ):
         stds = dict.fromkeys(names, 0.5)
         near = None
         far = None
@@ -288,7 +320,9 @@ def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]
         elif near and enough:
             starts.append(_refitted([widened(near, names, stds)], rows, loss))
         elif far is not None:
-            tried = [widened(start, names, stds, True) for start in (near, far) if start]
+            tried = [
+                widened(start, names, stds, True) for start in (near, far) if start
+            ]
             starts.append(_refitted(tried, rows, loss))
         else:
             starts.append(search(chain, rows, names, loss, {}, stds))
@@ -299,13 +333,17 @@ def _rings(rung: _Rung) -> set[str]:
     """Return the free parameters of the actuator rings that require a search."""
     free = {"angles" if name == "turns" else name for name in rung.parameters}
     return free & (
-        {"angles"} if isinstance(rung.chain, ElasticTendonChain) else {"angles", "radii"}
+        {"angles"}
+        if isinstance(rung.chain, ElasticTendonChain)
+        else {"angles", "radii"}
     )
 
 
 def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
     """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
-    fits = [solve(start.problem, rows, start.theta, loss, roughly=True) for start in starts]
+    fits = [
+        solve(start.problem, rows, start.theta, loss, roughly=True) for start in starts
+    ]
     best = min(range(len(fits)), key=lambda k: fits[k].rmse * (1.0 + (k > 0) * _ALIKE))
     return starts[best]._replace(theta=fits[best].theta)
 
@@ -328,7 +366,10 @@ def _errors(
     """Return the errors of a set; splits are (1, ...) of held-out rows, (0, ...) of outer rows."""
     totals = np.zeros((2, 2))  # of io and cv: weighted distances, and weights
     for kind, train, test in splits:
-        chain, known, new = rung.chain, *(Rows(*(part[i] for part in rows)) for i in (train, test))
+        chain, known, new = (
+            rung.chain,
+            *(Rows(*(part[i] for part in rows)) for i in (train, test)),
+        )
         if start is not None:
             chain = solve(start.problem, known, start.theta, loss, roughly=True).chain()
         residual = new.residual(chain)
@@ -365,7 +406,9 @@ def unmoved(model: ForwardModel | None, q: Tensor) -> tuple[str, ...]:
     )
 
 
-def split_by_effect(model: ForwardModel, q: Tensor, directions: NDArray) -> tuple[NDArray, NDArray]:
+def split_by_effect(
+    model: ForwardModel, q: Tensor, directions: NDArray
+) -> tuple[NDArray, NDArray]:
     """Return combinations (k, a) and (k, k - a) of directions of q (n, k).
 
     Along the first ones the tip of the model moves at some of the rows q (N, n), along the others

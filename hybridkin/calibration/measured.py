@@ -53,7 +53,9 @@ def with_missing_markers(x: NDArray, name: str) -> NDArray:
     """
     missing = np.any(np.isnan(points(x)), axis=2)
     allowed = missing & ~np.all(missing, axis=1, keepdims=True)
-    check_finite(**{name: np.where(allowed[..., None], 0.0, points(x)).reshape(x.shape)})
+    check_finite(
+        **{name: np.where(allowed[..., None], 0.0, points(x)).reshape(x.shape)}
+    )
     return np.where(missing[..., None], np.nan, points(x)).reshape(x.shape)
 
 
@@ -64,7 +66,9 @@ def check_unscaled(name: str, values: NDArray, meant: str) -> None:
     rows = values.astype(np.float64, copy=False)
     low, high, mean, std = (f(rows, axis=0) for f in (np.min, np.max, np.mean, np.std))
     standard = np.abs([mean, std - 1.0]).max() < 1e-3
-    if standard or (np.isin(low, (0.0, -1.0)).all() and np.abs(high - 1.0).max() < 1e-6):
+    if standard or (
+        np.isin(low, (0.0, -1.0)).all() and np.abs(high - 1.0).max() < 1e-6
+    ):
         scaler = "StandardScaler" if standard else "MinMaxScaler"
         raise ValueError(
             f"`{name}` must hold {meant} for this mechanical model, but looks like the output of "
@@ -102,4 +106,6 @@ def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:
     axes, spread, _ = np.linalg.svd(X - X.mean(axis=0), full_matrices=False)
     excited = spread > _EXCITED * spread.max(initial=0.0)
     order = np.argsort(np.linalg.norm(axes[:, excited], axis=1), kind="stable")
-    return np.sort(order[: max(1, int(_INNER * len(X)))]), np.sort(order[int(_BEYOND * len(X)) :])
+    return np.sort(order[: max(1, int(_INNER * len(X)))]), np.sort(
+        order[int(_BEYOND * len(X)) :]
+    )

@@ -122,7 +122,9 @@ def fit_play(
     >>> fit.kept, fit.width
     (True, 0.0004)
     """
-    size = float(chain.gains.detach().abs().mean()) if isinstance(chain, ArcChain) else 1.0
+    size = (
+        float(chain.gains.detach().abs().mean()) if isinstance(chain, ArcChain) else 1.0
+    )
     given = _WIDTHS / size if widths is None else real_array(widths, "widths").ravel()
     tried = np.unique(np.concatenate([[0.0], given])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
@@ -142,10 +144,16 @@ def fit_play(
         y = effective(width)
         squares = []
         for train, test in splits:
-            result, _ = fit_geometry(chain, y[train], x[train], names, **calibrate_options)
+            result, _ = fit_geometry(
+                chain, y[train], x[train], names, **calibrate_options
+            )
             with torch.no_grad():
-                tips = result.chain(torch.from_numpy(y[test]).to(result.chain.base)).numpy()
-            squares.append(np.nansum((tips - x[test]) ** 2) / len(test))  # NaN: missing markers
+                tips = result.chain(
+                    torch.from_numpy(y[test]).to(result.chain.base)
+                ).numpy()
+            squares.append(
+                np.nansum((tips - x[test]) ** 2) / len(test)
+            )  # NaN: missing markers
         return np.sqrt(squares)
 
     def root_mean_square(errors: NDArray) -> float:

@@ -82,4 +82,6 @@ def search_width(
         best = min(best, float(found.x), key=error)
     gains = errors_of(0.0) - errors_of(best)
     std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
-    return WidthSearch(best, widths, [*map(error, widths)], float(gains.mean()), std_error)
+    return WidthSearch(
+        best, widths, [*map(error, widths)], float(gains.mean()), std_error
+    )

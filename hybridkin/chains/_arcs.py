@@ -32,7 +32,9 @@ class _Carried(NamedTuple):
     across: Tensor  # transverse motion of the point per bending
 
 
-def _carried(point: Vector, length: Tensor, b: Bending, arc: Stumpff, offset: Tensor) -> _Carried:
+def _carried(
+    point: Vector, length: Tensor, b: Bending, arc: Stumpff, offset: Tensor
+) -> _Carried:
     """Return a point, given in the frame after a segment's offset, in the segment's start frame."""
     x, y, z = point
     c, f, g, _, _ = arc
@@ -71,7 +73,9 @@ def _turned(v: Sequence[Tensor], b: Bending, arc: Stumpff) -> Vector:
     return fma(v[0], b[0], m), fma(v[1], b[1], m), fms(c * v[2], f, along)
 
 
-def tip(length: Tensor, bending: Tensor, offsets: Tensor, beside: Sequence[float]) -> Tensor:
+def tip(
+    length: Tensor, bending: Tensor, offsets: Tensor, beside: Sequence[float]
+) -> Tensor:
     """Return the tip (3, N) in the base frame, transformed from the last segment to the first.
 
     `beside` is the position of the tip in the frame after the last rigid offset [m].
@@ -94,7 +98,9 @@ def tip_and_columns(
     3 S columns of angular velocity, `rigid` adds S columns for the offsets.
     """
     carried, segments, (x, y), arc = _all_carried(length, bending, offsets, beside)
-    tx, ty, tz = (torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True))
+    tx, ty, tz = (
+        torch.stack(axis) for axis in zip(*(at.tail for at in carried), strict=True)
+    )
     rest = torch.stack([at.rest for at in carried])
     across = torch.stack([at.across for at in carried])
     # Columns of all segments in their own start frames, then turned by all earlier segments.
@@ -122,7 +128,9 @@ def _all_carried(
     x, y = bending.unbind()
     arc = stumpff(torch.addcmul(x * x, y, y))
     bends = [*zip(x.unbind(), y.unbind(), strict=True)]
-    arcs = [Stumpff(*each) for each in zip(*(part.unbind() for part in arc), strict=True)]
+    arcs = [
+        Stumpff(*each) for each in zip(*(part.unbind() for part in arc), strict=True)
+    ]
     segments = [*zip(bends, arcs, strict=True)]
     zero = torch.zeros_like(length[0])
     point = (zero + beside[0], zero + beside[1], zero + beside[2])
@@ -173,7 +181,9 @@ def levers(radii: Tensor, angles: Tensor, counts: Sequence[int]) -> Tensor:
     return torch.stack([radius * angles.cos(), radius * angles.sin()], dim=-2)
 
 
-def reading_matrix(levers: Tensor, counts: Sequence[int], starts: Sequence[int]) -> Tensor:
+def reading_matrix(
+    levers: Tensor, counts: Sequence[int], starts: Sequence[int]
+) -> Tensor:
     """Return the linear map from arcs to actuator lengths, (..., n, 3 S).
 
     Columns are the lengths, then the x- and the y-bendings of all segments. Actuators of segment k
@@ -197,7 +207,9 @@ def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
     return at - at.mean(dim=1, keepdim=True) if extensible else at
 
 
-def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Sequence[int]) -> Tensor:
+def free_arcs(
+    angles: Sequence[Tensor], extensible: Sequence[bool], bends: Sequence[int]
+) -> Tensor:
     """Return the projector (3 S, 3 S) on the arcs that the actuators of each segment determine.
 
     These are its length if it is extensible, and `bends` components of its bending: both, none, or
@@ -206,7 +218,9 @@ def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Seque
     S = len(bends)
     shares = [*map(float, extensible), *(0.5 * n for n in (*bends, *bends))]
     # Not new_tensor: before torch 2.5 it does not work in functional transforms.
-    free = torch.diag(torch.tensor(shares, dtype=angles[0].dtype, device=angles[0].device))
+    free = torch.diag(
+        torch.tensor(shares, dtype=angles[0].dtype, device=angles[0].device)
+    )
     for k in (k for k in range(S) if bends[k] == 1):
         # In a plane at the angle psi: [[1 + cos 2 psi, sin 2 psi], [sin 2 psi, 1 - cos 2 psi]] / 2.
         x, y = bend_readings(angles[k], extensible[k])

@@ -52,16 +52,22 @@ def moving_joints(path: list[Joint]) -> dict[str, Any]:
             moving.append(joint._replace(origin=pending, name=name))
             pending = np.eye(4)
     if len(moving) > _MOST:
-        raise ValueError(f"an arm must have at most {_MOST} moving joints, got {len(moving)}.")
+        raise ValueError(
+            f"an arm must have at most {_MOST} moving joints, got {len(moving)}."
+        )
     drivers = {joint.name: joint for joint in moving}
-    factors = [joint.factor * (joint.name == name) for joint in moving for name in drivers]
+    factors = [
+        joint.factor * (joint.name == name) for joint in moving for name in drivers
+    ]
     couplings = np.reshape(factors, (len(moving), len(drivers)))
     limits = np.array([_limits(joint) for joint in drivers.values()]).reshape(-1, 2)
     return {
         "origins": np.array([joint.origin for joint in moving]).reshape(-1, 4, 4),
         "axes": np.array([joint.axis for joint in moving]).reshape(-1, 3),
         "kinds": [joint.kind for joint in moving],
-        "couplings": None if np.array_equal(couplings, np.eye(len(moving))) else couplings,
+        "couplings": None
+        if np.array_equal(couplings, np.eye(len(moving)))
+        else couplings,
         "names": [*drivers],
         "q_min": limits[:, 0],
         "q_max": limits[:, 1],
@@ -99,7 +105,9 @@ def source_of(text_or_path: str | PathLike[str]) -> str | Path:
             f"{str(path)!r:.200}."
         )
     if path.stat().st_size > _BYTES:
-        raise ValueError(f"`text_or_path` must be at most {_BYTES} bytes long, {path} is longer.")
+        raise ValueError(
+            f"`text_or_path` must be at most {_BYTES} bytes long, {path} is longer."
+        )
     return path
 
 
@@ -107,7 +115,9 @@ def in_robot(name: str, known: Collection[str], what: str) -> str:
     if name not in known:
         close = difflib.get_close_matches(name, list(known)[:_MOST], n=1)
         hint = f"did you mean {close[0]!r}? It has" if close else "it has"
-        raise ValueError(f"{what} {name!r} is not in the robot; {hint} {[*known]!s:.1000}.")
+        raise ValueError(
+            f"{what} {name!r} is not in the robot; {hint} {[*known]!s:.1000}."
+        )
     return name
 
 
@@ -127,11 +137,17 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         else:
             model = mujoco.MjModel.from_xml_string(source)
     except (ValueError, RuntimeError, MemoryError) as error:
-        raise ValueError(f"`text_or_path` must be a valid MJCF: {error!s:.400}.") from error
+        raise ValueError(
+            f"`text_or_path` must be a valid MJCF: {error!s:.400}."
+        ) from error
     bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
     sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
     in_robot(end_link, [*bodies, *sites], "`end_link`")
-    root = 0 if root_link is None else bodies[in_robot(root_link, list(bodies), "`root_link`")]
+    root = (
+        0
+        if root_link is None
+        else bodies[in_robot(root_link, list(bodies), "`root_link`")]
+    )
     path: list[Joint] = []
     body = bodies.get(end_link, -1)
     if body < 0:
@@ -142,7 +158,9 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
         path = [*_mjcf_joints(model, body), *path]
         body = model.body_parentid[body]
     if body != root:
-        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root_link!r} does not.")
+        raise ValueError(
+            f"`root_link` must lead to {end_link!r}, but {root_link!r} does not."
+        )
     return path
 
 
@@ -160,10 +178,14 @@ def _check_sizes(data: bytes) -> None:
         for name, value in attributes.items():
             words = value.lower().split()
             if name in _SIZES or name.startswith("nuser"):
-                size *= math.prod(float(word) for word in words if re.fullmatch(r"\d+", word))
+                size *= math.prod(
+                    float(word) for word in words if re.fullmatch(r"\d+", word)
+                )
             if "nan" in words or size > _MOST_COPIES:
                 need = f"numbers, and sizes within bounds ({_MOST_COPIES:.0g} in all)"
-                raise ValueError(f"`text_or_path` must have {need}, got {name}={value!r:.60}.")
+                raise ValueError(
+                    f"`text_or_path` must have {need}, got {name}={value!r:.60}."
+                )
         copies.append(size if tag == "replicate" else copies[-1])
 
     parser.StartElementHandler = start
@@ -199,14 +221,18 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
         # from MuJoCo's reference to q = 0
         back = -zero * axis
         slides = kind == 2
-        origin = matrix_of(Rotation.from_rotvec((not slides) * back), anchor + slides * back)
+        origin = matrix_of(
+            Rotation.from_rotvec((not slides) * back), anchor + slides * back
+        )
         steps.append(Joint(origin, _MJCF_KINDS[kind], axis, name, limits))
         steps.append(Joint(matrix_of(Rotation.identity(), -anchor)))
     return steps
 
 
 def _mjcf_pose(position: NDArray, quaternion: NDArray) -> NDArray:
-    return matrix_of(Rotation.from_quat(np.roll(quaternion, -1)), position)  # w comes first
+    return matrix_of(
+        Rotation.from_quat(np.roll(quaternion, -1)), position
+    )  # w comes first
 
 
 def matrix_of(turn: Rotation | None = None, position: ArrayLike = 0.0) -> NDArray:
@@ -232,8 +258,12 @@ def chain_path(chain: Chain) -> list[Joint]:
             if offset is not None:
                 origin = origin @ offset.get_matrix()[0].detach().cpu().double().numpy()
         joint = frame.joint
-        joint_name = "" if joint.name in (earlier.name for earlier in path) else joint.name
+        joint_name = (
+            "" if joint.name in (earlier.name for earlier in path) else joint.name
+        )
         axis = joint.axis.detach().cpu().double().numpy()
-        limits = joint.limits if any(joint.limits or ()) else None  # two zeros mean none
+        limits = (
+            joint.limits if any(joint.limits or ()) else None
+        )  # two zeros mean none
         path.append(Joint(origin, joint.joint_type, axis, joint_name, limits))
     return path

@@ -19,27 +19,39 @@ from hybridkin.chains._arcs import bend_readings
 
 _ROUTINGS = ("segment", "base")
 _DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
-_MOST_UNLIKE = 1000.0  # ratio of radii; more leave too few digits with the routing "base"
+_MOST_UNLIKE = (
+    1000.0  # ratio of radii; more leave too few digits with the routing "base"
+)
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
 def float_dtype(dtype: Any) -> torch.dtype:
     """Return the torch dtype given by torch, NumPy or a string."""
-    name = str(np.dtype(dtype) if isinstance(dtype, type) else dtype).removeprefix("torch.")
+    name = str(np.dtype(dtype) if isinstance(dtype, type) else dtype).removeprefix(
+        "torch."
+    )
     if name not in ("float64", "float32"):
-        raise ValueError(f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}.")
+        raise ValueError(
+            f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}."
+        )
     return torch.float64 if name == "float64" else torch.float32
 
 
-def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
+def lengths_of(
+    value: Numbers, name: str, dtype: torch.dtype, size: int | None = None
+) -> Tensor:
     """Return one positive length per segment, shape (S,)."""
     lengths = numeric(value, name, dtype, need="n", length=size)
     if not len(lengths) or not (lengths > 0).all():
-        raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
+        raise ValueError(
+            f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}."
+        )
     return lengths
 
 
-def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+def filled(
+    value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]
+) -> Tensor:
     """Return one number for all, or an array of the shape (also a list of lists), as a tensor."""
     if len(shape) == 1 and _is_nested(value):
         value = torch.cat([numeric(part, name).flatten() for part in value])
@@ -95,7 +107,9 @@ def arc_geometry(
     return counts, extensible, geometry
 
 
-def path_starts(routing: str, counts: Sequence[int], extensible: Sequence[bool]) -> tuple[int, ...]:
+def path_starts(
+    routing: str, counts: Sequence[int], extensible: Sequence[bool]
+) -> tuple[int, ...]:
     """Return the first segment that the actuators of each segment run through.
 
     Actuators carried by a rigid stage start after it.
@@ -113,7 +127,9 @@ def path_starts(routing: str, counts: Sequence[int], extensible: Sequence[bool])
     return tuple(itertools.accumulate((k * stages[k - 1] for k in range(S)), max))
 
 
-def bend_counts(angles: Sequence[Tensor], extensible: Sequence[bool]) -> tuple[int, ...]:
+def bend_counts(
+    angles: Sequence[Tensor], extensible: Sequence[bool]
+) -> tuple[int, ...]:
     """Return the number of directions in which each segment bends: 2, or 1 in a plane.
 
     It is 0 for an extensible segment with a single actuator.
@@ -141,10 +157,14 @@ def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
     counts = stored.list_of(int, "actuators_per_segment")
     may_lack = ("lengths", "gains")
     given: dict[str, Any] = {
-        name: stored.array(name) for name in names if name not in may_lack or name in stored.arrays
+        name: stored.array(name)
+        for name in names
+        if name not in may_lack or name in stored.arrays
     }
     if sum(counts) != len(given["angles"]):
-        raise ValueError(f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}")
+        raise ValueError(
+            f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}"
+        )
     given["angles"] = np.split(given["angles"], np.cumsum(counts)[:-1])
     if "stage" in stored.settings:  # older files have neither stages nor planes
         lengths = iter(given.pop("lengths", ()))
@@ -153,7 +173,9 @@ def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
         given["stage"] = stored.value("stage", (str, None))
         # Planar actuators stay planar, although calibration has moved their angles slightly.
         pairs = zip(given["angles"], stored.list_of(int, "bends"), strict=True)
-        given["angles"] = [math.pi * (np.arange(len(a)) % 2) if n == 1 else a for a, n in pairs]
+        given["angles"] = [
+            math.pi * (np.arange(len(a)) % 2) if n == 1 else a for a, n in pairs
+        ]
     return {**given, "routing": stored.value("routing", str), "n_actuators": counts}
 
 
@@ -170,7 +192,9 @@ def numeric(
 
     With `need` the shape is checked, see `arrays.shaped`. With ``finite=False`` only NaN raises.
     """
-    array = real_array(value, name) if need is None else shaped(value, name, need, length)
+    array = (
+        real_array(value, name) if need is None else shaped(value, name, need, length)
+    )
     tensor = torch.tensor(array, dtype=dtype, device="cpu")
     if (not torch.isfinite(tensor).all() and finite) or torch.isnan(tensor).any():
         raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")
@@ -193,7 +217,9 @@ def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
     return limits
 
 
-def actuator_counts(n_actuators: int | Sequence[int], n_segments: int) -> tuple[int, ...]:
+def actuator_counts(
+    n_actuators: int | Sequence[int], n_segments: int
+) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
     given = np.asarray(n_actuators)
     if given.dtype.kind not in "iu" or given.shape not in ((), (n_segments,)):
@@ -203,7 +229,9 @@ def actuator_counts(n_actuators: int | Sequence[int], n_segments: int) -> tuple[
         )
     counts = tuple(np.broadcast_to(given, n_segments).tolist())
     if min(counts) < 1:
-        raise ValueError(f"`n_actuators` must be at least 1 on every segment, got {counts}.")
+        raise ValueError(
+            f"`n_actuators` must be at least 1 on every segment, got {counts}."
+        )
     return counts
 
 
@@ -212,7 +240,9 @@ def _is_nested(value: object) -> TypeGuard[Sequence[Numbers]]:
     return any(isinstance(part, (list, tuple)) or np.ndim(part) > 0 for part in parts)
 
 
-def flat_angles(angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+def flat_angles(
+    angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dtype
+) -> Tensor:
     """Return the angles of all actuators, segment by segment, shape (n,)."""
     if angles is None:
         rows = [2.0 * math.pi * np.arange(n) / n for n in counts]
@@ -246,10 +276,14 @@ def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Te
     if isinstance(value, Transform) and len(matrix) == 1:
         matrix = matrix[0]
     if matrix.shape != (4, 4):
-        raise ValueError(f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}.")
+        raise ValueError(
+            f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}."
+        )
     rotation = matrix[:3, :3]
     eye = torch.eye(3, dtype=dtype, device=matrix.device)
-    if (rotation.mT @ rotation - eye).abs().max() > 1e-4 or torch.linalg.det(rotation) < 0:
+    if (rotation.mT @ rotation - eye).abs().max() > 1e-4 or torch.linalg.det(
+        rotation
+    ) < 0:
         raise ValueError(
             f"`{name}` must hold a rotation in its upper left 3 x 3 block (orthonormal, "
             f"right-handed), got {rotation.tolist()}."

@@ -22,7 +22,9 @@ from hybridkin.chains.chain import Chain
 FAR = 10.0  # [m]; a joint that slides further is more likely in millimetres
 
 
-def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor) -> Tensor:
+def joint_motions(
+    origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor
+) -> Tensor:
     """Return B_0, B_1, B_2 of every joint, including its origin, shape (n, 3, 4, 4).
 
     `zeros` (n,) are the positions at which the joints are at their origins.
@@ -33,7 +35,9 @@ def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor, zeros: Tensor) 
     along = axes[:, :, None] * axes[:, None, :]
     slide = slides[:, None, None]
     motions[:, 0, :3, :3] = torch.where(slide, eye, along)
-    motions[:, 1, :3, :3] = torch.where(slide, 0.0, torch.linalg.cross(eye[None], axes[:, None]))
+    motions[:, 1, :3, :3] = torch.where(
+        slide, 0.0, torch.linalg.cross(eye[None], axes[:, None])
+    )
     motions[:, 2, :3, :3] = torch.where(slide, 0.0, eye - along)
     motions[:, 1, :3, 3] = torch.where(slides[:, None], axes, 0.0)
     # T(q - zero), from the sine and cosine of a difference of angles.
@@ -67,7 +71,9 @@ def shares(rows: Tensor, slides: Tensor | None) -> tuple[Tensor, Tensor]:
 def carried_tip(u1: Tensor, u2: Tensor, motions: Tensor, end: Tensor) -> Tensor:
     """Return the homogeneous tip (4, N), transformed from the last joint's frame to the base."""
     p = end[:, None].expand(4, len(u1))
-    joints = zip(motions.flatten(1, 2).unbind(), u1.T.unbind(), u2.T.unbind(), strict=True)
+    joints = zip(
+        motions.flatten(1, 2).unbind(), u1.T.unbind(), u2.T.unbind(), strict=True
+    )
     for motion, of_u1, of_u2 in reversed([*joints]):
         still, by_u1, by_u2 = (motion @ p).split(4)
         p = torch.addcmul(torch.addcmul(still, of_u1, by_u1), of_u2, by_u2)
@@ -80,7 +86,9 @@ def frames(u1: Tensor, u2: Tensor, motions: Tensor) -> Tensor:
     u1, u2 = (part[..., None, None] for part in (u1, u2))
     still, by_u1, by_u2 = motions.unbind(1)
     steps = torch.addcmul(torch.addcmul(still, u1, by_u1), u2, by_u2).unbind(1)
-    return torch.stack([*itertools.accumulate(steps, torch.matmul, initial=first)], dim=1)
+    return torch.stack(
+        [*itertools.accumulate(steps, torch.matmul, initial=first)], dim=1
+    )
 
 
 def last_frame_and_joints(
@@ -93,15 +101,21 @@ def last_frame_and_joints(
     n_rows, n = u1.shape
     # With the three coordinates of all rows side by side, a joint costs one small product.
     u1, u2 = (part.T.repeat(1, 3) for part in (u1, u2))
-    frame = torch.eye(4, dtype=u1.dtype, device=u1.device)[:, :3].repeat_interleave(n_rows, 1)
+    frame = torch.eye(4, dtype=u1.dtype, device=u1.device)[:, :3].repeat_interleave(
+        n_rows, 1
+    )
     axes = [frame[:0]]
     points = [frame[:0]]
-    for carrier, of_u1, of_u2 in zip(carriers.unbind(), u1.unbind(), u2.unbind(), strict=True):
+    for carrier, of_u1, of_u2 in zip(
+        carriers.unbind(), u1.unbind(), u2.unbind(), strict=True
+    ):
         still, by_u1, by_u2, axis = (carrier @ frame).split((4, 4, 4, 1))
         frame = torch.addcmul(torch.addcmul(still, of_u1, by_u1), of_u2, by_u2)
         axes.append(axis)
         points.append(frame[3:])
-    joint_axes, joint_points = (torch.cat(part).reshape(n, 3, n_rows) for part in (axes, points))
+    joint_axes, joint_points = (
+        torch.cat(part).reshape(n, 3, n_rows) for part in (axes, points)
+    )
     return frame.unflatten(1, (3, n_rows)), joint_axes, joint_points
 
 
@@ -119,7 +133,9 @@ class JointChain(Chain):
         strokes = torch.maximum(self.q_min.abs(), self.q_max.abs())
         strokes = self._strokes(torch.where(torch.isfinite(strokes), strokes, 0.0))
         links = torch.linalg.vector_norm(self.origins[:, :3, 3], dim=1).sum()
-        ends = torch.linalg.vector_norm(torch.stack([self.tip[:3, 3], self.tool]), dim=1).sum()
+        ends = torch.linalg.vector_norm(
+            torch.stack([self.tip[:3, 3], self.tool]), dim=1
+        ).sum()
         reach = links + strokes.sum() + ends
         return torch.where(reach > 0, reach, 1.0)
 
@@ -149,7 +165,11 @@ class JointChain(Chain):
         if links is not None:
             column = nn.functional.pad(links, (0, 1), value=1.0)[..., None]
             self.origins = torch.cat([self.origins[..., :3], column], dim=-1)
-        zeros = self.joint_zeros if self.couplings is None else self.couplings @ self.joint_zeros
+        zeros = (
+            self.joint_zeros
+            if self.couplings is None
+            else self.couplings @ self.joint_zeros
+        )
         motions = joint_motions(self.origins, self.axes, self.slides, zeros)
         self.register_buffer("motions", motions)
         carriers = column_carriers(motions, self.origins, self.axes)
@@ -186,7 +206,9 @@ class JointChain(Chain):
         """Return the tip (N, 3) and its Jacobian by the joint positions (N, 3, n_joints)."""
         tip, linear, _, _ = self._columns(z)
         base = self.base.to(z)
-        return (base[:3, :3] @ tip + base[:3, 3:]).T, self._in_measuring_frame(linear, z)
+        return (base[:3, :3] @ tip + base[:3, 3:]).T, self._in_measuring_frame(
+            linear, z
+        )
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the tip position.
@@ -202,7 +224,9 @@ class JointChain(Chain):
             Tip position in the measuring frame [m].
         """
         check_vectors(q, self.n_actuators, "q", self._why_shape())
-        return in_blocks(lambda rows: (self.from_coordinates(self._joints(rows)),), q)[0]
+        return in_blocks(lambda rows: (self.from_coordinates(self._joints(rows)),), q)[
+            0
+        ]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (..., 3) [m] and its Jacobian dx/dq (..., 3, n) in one pass.
@@ -223,9 +247,13 @@ class JointChain(Chain):
             *q.shape[:-1], 6, self.n_actuators
         )
         turned = (self.tip.to(q)[:, :3].T @ frame.flatten(1)).unflatten(1, (3, -1))
-        local = torch.cat([turned, tip[None]]).permute(2, 1, 0)  # (N, 3, 4): axes and tip
+        local = torch.cat([turned, tip[None]]).permute(
+            2, 1, 0
+        )  # (N, 3, 4): axes and tip
         last = identity(4, q)[3].expand(len(local), 1, 4)
-        pose = (self.base.to(q) @ torch.cat([local, last], 1)).reshape(*q.shape[:-1], 4, 4)
+        pose = (self.base.to(q) @ torch.cat([local, last], 1)).reshape(
+            *q.shape[:-1], 4, 4
+        )
         return pose, J
 
     def poses(self, q: Tensor) -> Tensor:
@@ -267,11 +295,17 @@ class JointChain(Chain):
         """
         if n_points < 1:
             raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
-        corners = torch.cat([self._frames(q)[..., :3, 3], self(q)[..., None, :]], dim=-2)
+        corners = torch.cat(
+            [self._frames(q)[..., :3, 3], self(q)[..., None, :]], dim=-2
+        )
         start = corners[..., :-1, None, :]
         end = corners[..., 1:, None, :]
-        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
-        return torch.cat([corners[..., :1, :], torch.lerp(start, end, t).flatten(-3, -2)], dim=-2)
+        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[
+            1:, None
+        ]
+        return torch.cat(
+            [corners[..., :1, :], torch.lerp(start, end, t).flatten(-3, -2)], dim=-2
+        )
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if joints turn by more than two turns, or slide too far."""
@@ -282,7 +316,9 @@ class JointChain(Chain):
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
-        joints = f"{len(self.kinds)} joints" + ", coupled" * (self.couplings is not None)
+        joints = f"{len(self.kinds)} joints" + ", coupled" * (
+            self.couplings is not None
+        )
         return f"{joints}: {', '.join(self.names)}"
 
     def _why_shape(self) -> str:
@@ -323,7 +359,9 @@ class JointChain(Chain):
         columns = torch.linalg.cross(axes, tip - points, dim=1)
         if "prismatic" in self.kinds:
             slides = self.slides.to(z.device)[:, None, None]
-            columns = torch.where(slides, axes + (tip - tip), columns)  # NaN in a row of NaN
+            columns = torch.where(
+                slides, axes + (tip - tip), columns
+            )  # NaN in a row of NaN
         return tip, columns, axes, frame
 
     def _in_measuring_frame(self, columns: Tensor, q: Tensor) -> Tensor:

@@ -32,7 +32,9 @@ _MOST = 64  # segments of a robot, actuators of a segment
 _LEAST = 1e-18
 _LARGEST = 1e9
 _DOTS = 600  # between two commas; the time for a key grows with the square of its dots
-_BYTES = 30_000  # of a file; the time to read hostile TOML grows with the square of its size
+_BYTES = (
+    30_000  # of a file; the time to read hostile TOML grows with the square of its size
+)
 _Test = Callable[[Any], bool]
 
 
@@ -49,7 +51,9 @@ def _is_text(value: Any) -> bool:
 
 
 def _many(test: _Test, size: int = 0) -> _Test:
-    return lambda v: type(v) is list and len(v) == (size or len(v)) > 0 and all(map(test, v))
+    return lambda v: (
+        type(v) is list and len(v) == (size or len(v)) > 0 and all(map(test, v))
+    )
 
 
 def _one_or_many(test: _Test) -> _Test:
@@ -63,7 +67,10 @@ def _among(*known: Any) -> tuple[str, _Test]:
 _TABLE = ("be a table of keys", lambda value: isinstance(value, dict))
 _TEXT = ("be text", _is_text)
 _POSITIVE = ("be positive, or a list of positive numbers", _one_or_many(_is_positive))
-_WHOLE = (f"be a whole number from 1 to {_MOST}", lambda v: type(v) is int and 0 < v <= _MOST)
+_WHOLE = (
+    f"be a whole number from 1 to {_MOST}",
+    lambda v: type(v) is int and 0 < v <= _MOST,
+)
 # Tables, their keys, and the requirement on the value of a key, in words and as a test.
 _ROWS: list[tuple[str, str, str, _Test]] = [
     ("file", "name", *_TEXT),
@@ -75,9 +82,19 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
         'be a list of names, "auto" or "default"',
         lambda v: v in ([], "auto", "default") or _many(_is_text)(v),
     ),
-    ("file", "segment", "hold tables, each under the heading [[segment]]", _many(_TABLE[1])),
+    (
+        "file",
+        "segment",
+        "hold tables, each under the heading [[segment]]",
+        _many(_TABLE[1]),
+    ),
     ("file", "base log limits", *_TABLE),
-    ("segment", "radius length " + " ".join(_STIFFNESS), "be a positive number", _is_positive),
+    (
+        "segment",
+        "radius length " + " ".join(_STIFFNESS),
+        "be a positive number",
+        _is_positive,
+    ),
     ("segment", "angle_deg offset", "be a number", _is_number),
     ("segment", "angles_deg zeros", "hold numbers", _many(_is_number)),
     ("segment", "gain spool_radius", *_POSITIVE),
@@ -88,12 +105,22 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("base", "position rotation_vector_deg", "hold 3 numbers", _many(_is_number, 3)),
     ("log", "q", "hold names of columns", _many(_is_text)),
     ("log", "x", "hold names of columns", _many(_is_text)),
-    ("log", "markers", "hold lists [segment, fraction, x, y, z]", _many(_many(_is_number, 5))),
+    (
+        "log",
+        "markers",
+        "hold lists [segment, fraction, x, y, z]",
+        _many(_many(_is_number, 5)),
+    ),
     ("log", "q_unit groups time", *_TEXT),
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
     ("log", "x_unit", *_among(*METRES)),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
-    ("limits", "q_min q_max", "be a number, or a list of numbers", _one_or_many(_is_number)),
+    (
+        "limits",
+        "q_min q_max",
+        "be a number, or a list of numbers",
+        _one_or_many(_is_number),
+    ),
     ("limits", "dq_max ddq_max", *_POSITIVE),
     ("limits", "unit", *_among("m", "log")),
 ]
@@ -108,7 +135,10 @@ def read_tables(path: Path) -> dict[str, Any]:
         if any(part.count(".") > _DOTS for part in re.split(r"[,=\n]", text)):
             raise ValueError(f"a key has more than {_DOTS} dots")
         content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # some numbers raise plain ValueErrors
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # some numbers raise plain ValueErrors
         raise ValueError(f"this is not a TOML file: {error}.") from error
     _check(content, "file", "the file")
     for k, table in enumerate(content.get("segment", ())):
@@ -119,12 +149,18 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
-    rows = [(keys.split(), (words, fits)) for name, keys, words, fits in _ROWS if name == kind]
+    rows = [
+        (keys.split(), (words, fits))
+        for name, keys, words, fits in _ROWS
+        if name == kind
+    ]
     needs = {key: need for keys, need in rows for key in keys}
     for key, value in table.items():
         if key not in needs:
             close = difflib.get_close_matches(key, needs, n=1)
-            hint = f"did you mean `{close[0]}`?" if close else f"known: {sorted(needs)}."
+            hint = (
+                f"did you mean `{close[0]}`?" if close else f"known: {sorted(needs)}."
+            )
             raise ValueError(f"`{key:.40}` in {where} is not known; {hint}")
         words, fits = needs[key]
         if not fits(value):
@@ -144,15 +180,17 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
                 f"`{unused[0]}` in [[segment]] is not a key of model {_PLAIN!r}; remove it, or "
                 f'set model = "{_ELASTIC}".'
             )
-        segments += [_segment(table, f"[[segment]] {i + 1}", elastic, unit)] * table.get(
-            "repeat", 1
-        )
+        segments += [
+            _segment(table, f"[[segment]] {i + 1}", elastic, unit)
+        ] * table.get("repeat", 1)
     if len(segments) > _MOST:
         raise ValueError(
             f"[[segment]] must describe at most {_MOST} segments in all, got "
             f"{len(segments)}; check `repeat`."
         )
-    given: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
+    given: dict[str, Any] = {
+        key: [segment[key] for segment in segments] for key in segments[0]
+    }
     for key in ("gains", *(("length", *_STIFFNESS) if elastic else ())):
         missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
         needed = key == "length"
@@ -174,20 +212,28 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     return ElasticTendonChain(**given) if elastic else ConstantCurvatureChain(**given)
 
 
-def _segment(table: Mapping[str, Any], where: str, elastic: bool, unit: str) -> dict[str, Any]:
+def _segment(
+    table: Mapping[str, Any], where: str, elastic: bool, unit: str
+) -> dict[str, Any]:
     """Return the constructor arguments of one segment; None for optional ones."""
     stage = table.get("stage")
-    if stage is not None and (elastic or not {*table} <= {"stage", "offset", "zeros", "gain"}):
+    if stage is not None and (
+        elastic or not {*table} <= {"stage", "offset", "zeros", "gain"}
+    ):
         raise ValueError(
             f"`stage` in {where} can only be combined with `offset`, `zeros` and `gain`, and not "
             f"with model {_ELASTIC!r}."
         )
     if "radius" not in table and stage is None:
-        raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
+        raise ValueError(
+            f"`radius` is missing in {where}; give the actuator circle's radius [m]."
+        )
     if "angles_deg" in table:
         angles = np.radians(np.array(table["angles_deg"], dtype=float))
         if beside := {"angle_deg", "actuators", "clockwise"} & {*table}:
-            raise ValueError(f"`{min(beside)}` cannot be combined with `angles_deg` in {where}.")
+            raise ValueError(
+                f"`{min(beside)}` cannot be combined with `angles_deg` in {where}."
+            )
     else:
         n = table.get("actuators", 3 if stage is None else 1)
         step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
@@ -211,7 +257,9 @@ def _segment(table: Mapping[str, Any], where: str, elastic: bool, unit: str) -> 
     }
 
 
-def _gains(table: Mapping[str, Any], where: str, n: int, unit: str) -> np.ndarray | None:
+def _gains(
+    table: Mapping[str, Any], where: str, n: int, unit: str
+) -> np.ndarray | None:
     """Return metres per unit of q (n,), for angles per radian; None if q is in metres."""
     gains, spools = (each(table, key, where, n) for key in ("gain", "spool_radius"))
     spun = spools.any()
@@ -237,5 +285,7 @@ def each(table: Mapping[str, Any], key: str, where: str, size: int) -> np.ndarra
     """Return `size` numbers, given as a list or as one number for all; zeros by default."""
     value = np.array(table.get(key, 0.0), dtype=float)
     if value.shape not in ((), (size,)):
-        raise ValueError(f"`{key}` in {where} must hold {size} numbers, got {table[key]!r}.")
+        raise ValueError(
+            f"`{key}` in {where} must hold {size} numbers, got {table[key]!r}."
+        )
     return np.broadcast_to(value, size).copy()

@@ -49,7 +49,9 @@ def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
     pulling = readings.T * taut[:, None]  # (M, 3 S, n)
     hessian = torch.diag(stiffness) + pulling @ readings
     scaled = units[:, None] * hessian * units
-    force = torch.cat([pulling * gains, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1)
+    force = torch.cat(
+        [pulling * gains, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1
+    )
     # Solved for the forces: a product with the inverse loses digits of a soft backbone.
     unit_forces = identity(len(stiffness), force).expand(len(force), -1, -1)
     forces = units[:, None] * torch.cat([force, unit_forces], dim=-1)
@@ -139,7 +141,9 @@ class FindTaut(torch.autograd.Function):
         find = args[0]
         tensors = args[1:]
         dims = in_dims[1:]
-        if all(dim is None for dim in dims[1:]):  # the same robot: the batch is more rows
+        if all(
+            dim is None for dim in dims[1:]
+        ):  # the same robot: the batch is more rows
             rows = tensors[0].movedim(dims[0], 0)
             codes = FindTaut.apply(find, rows.flatten(0, 1), *tensors[1:])
             return codes.unflatten(0, rows.shape[:2]), 0

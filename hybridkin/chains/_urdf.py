@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin.chains._arm_files import UNLIMITED, Joint, in_robot, matrix_of, source_of, unused
+from hybridkin.chains._arm_files import (
+    UNLIMITED,
+    Joint,
+    in_robot,
+    matrix_of,
+    source_of,
+    unused,
+)
 
 _MISSING = (
     "have no <limit>, which URDF requires; they are treated as unlimited. Add <limit>, or set "
@@ -26,7 +33,10 @@ _LOCKED = (
     "Give both if the joints move."
 )
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
-_FREE = {"floating": ("x", "y", "z", "yaw", "pitch", "roll"), "planar": ("x", "y", "yaw")}
+_FREE = {
+    "floating": ("x", "y", "z", "yaw", "pitch", "roll"),
+    "planar": ("x", "y", "yaw"),
+}
 _AXES = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _MOST = 64  # joints that mimic each other in a row
 _SAME = 1e-12  # [m] or [-]: smaller changes of an origin are not written
@@ -78,7 +88,9 @@ def urdf_text(text_or_path: Any) -> str:
     """Return the text of a URDF; `_bytes` restores bytes that are not UTF-8."""
     source = source_of(text_or_path)
     data = source if isinstance(source, str) else source.read_bytes()
-    return data if isinstance(data, str) else data.decode("utf-8-sig", "surrogateescape")
+    return (
+        data if isinstance(data, str) else data.decode("utf-8-sig", "surrogateescape")
+    )
 
 
 def _bytes(text: str) -> bytes:
@@ -95,7 +107,9 @@ def _numbers(element: _Element, tag: str, key: str, default: str) -> list[float]
         pass
     if len(found) != (n := len(default.split())):
         where = f"`{key}` of <{tag}> of joint {element['joint'].get('name', '')!r}"
-        raise ValueError(f"{where} must be {n} numbers, got {text!r}; correct the URDF.")
+        raise ValueError(
+            f"{where} must be {n} numbers, got {text!r}; correct the URDF."
+        )
     return found
 
 
@@ -115,7 +129,9 @@ def _elements(
         path.append((element, _joints(element, by_name)))
         link = element["parent"].get("link", "")
     if root is not None and link != root:
-        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root!r} does not.")
+        raise ValueError(
+            f"`root_link` must lead to {end_link!r}, but {root!r} does not."
+        )
     return path[::-1]
 
 
@@ -140,7 +156,9 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
     for what, given in {"link": links, "joint": named, "<child>": children}.items():
         doubled = sorted(name for name, times in Counter(given).items() if times > 1)
         if doubled:
-            raise ValueError(f"every {what} of a URDF must occur once, got {doubled} repeatedly.")
+            raise ValueError(
+                f"every {what} of a URDF must occur once, got {doubled} repeatedly."
+            )
     known = dict.fromkeys(links)
     for name, parent, child in zip(named, parents, children, strict=True):
         in_robot(parent, known, f"<parent> of joint {name!r}")
@@ -150,7 +168,9 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
         TopologicalSorter({child: [parent] for child, parent in tree}).prepare()
     except CycleError as error:
         loop = " -> ".join(map(repr, error.args[1]))[:400]
-        raise ValueError(f"the links of a URDF must be a tree, got a cycle: {loop}.") from error
+        raise ValueError(
+            f"the links of a URDF must be a tree, got a cycle: {loop}."
+        ) from error
     roots = sorted({*links} - {*children})
     if len(roots) > 1:
         raise ValueError(
@@ -175,7 +195,9 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
         for part in _FREE[kind]:
             move = "prismatic" if len(part) == 1 else "revolute"
             actuator = unused(f"{name}_{part}", names)
-            path.append(Joint(matrix_of(), move, np.eye(3)[_AXES[part]], actuator, UNLIMITED))
+            path.append(
+                Joint(matrix_of(), move, np.eye(3)[_AXES[part]], actuator, UNLIMITED)
+            )
         return path
     driver = element
     factor = 1.0
@@ -187,11 +209,17 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
         factor *= _numbers(driver, "mimic", "multiplier", "1")[0]
         name = mimic.get("joint", "")
         if name in followed:
-            raise ValueError(f"joints must not mimic each other in a circle, got {followed}.")
+            raise ValueError(
+                f"joints must not mimic each other in a circle, got {followed}."
+            )
         followed.append(name)
         if len(followed) > _MOST:
-            raise ValueError(f"joint {followed[0]!r} must mimic via at most {_MOST} other joints.")
-        driver = by_name.get(name) or defaultdict(_Tag, joint=_Tag(type=kind))  # not in the file
+            raise ValueError(
+                f"joint {followed[0]!r} must mimic via at most {_MOST} other joints."
+            )
+        driver = by_name.get(name) or defaultdict(
+            _Tag, joint=_Tag(type=kind)
+        )  # not in the file
     driven_by = driver["joint"].get("type", "")
     if not {kind, driven_by} <= {*_ONE_AXIS, "fixed"}:
         known = (*_ONE_AXIS, "fixed", *_FREE)
@@ -210,7 +238,9 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
         return [Joint(origin)]
     limits = UNLIMITED if driven_by == "continuous" else None
     if driver["limit"] and limits is None:
-        low, high = (_numbers(driver, "limit", side, "0")[0] for side in ("lower", "upper"))
+        low, high = (
+            _numbers(driver, "limit", side, "0")[0] for side in ("lower", "upper")
+        )
         limits = (low, high)
         if math.inf > low > high > -math.inf:
             limits = (high, low)
@@ -223,12 +253,18 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
 
 
 def placed_urdf(
-    text: str, end_link: str, root_link: str | None, names: Sequence[str], origins: NDArray
+    text: str,
+    end_link: str,
+    root_link: str | None,
+    names: Sequence[str],
+    origins: NDArray,
 ) -> str:
     """Return a URDF whose moving joints have new origins (n, 4, 4); the rest is not changed."""
     path = _elements(text, end_link, root_link)
     data = _bytes(text)
-    moving = [joint.name for _, joints in path for joint in joints if joint.kind != "fixed"]
+    moving = [
+        joint.name for _, joints in path for joint in joints if joint.kind != "fixed"
+    ]
     if [*dict.fromkeys(moving)] != [*names] or len(moving) != len(origins):
         need = f"`text_or_path` must be the URDF of this arm, whose actuators are {[*names]}"
         raise ValueError(f"{need}, got {moving} up to {end_link!r}.")
@@ -238,7 +274,9 @@ def placed_urdf(
     for element, (joint, *free) in path:
         origin = _origin(element)
         if free:
-            raise ValueError(f"joint {free[0].name!r} is free; use a `root_link` after it.")
+            raise ValueError(
+                f"joint {free[0].name!r} is free; use a `root_link` after it."
+            )
         if joint.kind == "fixed":
             before = before @ joint.origin
             continue
@@ -248,7 +286,9 @@ def placed_urdf(
         before = matrix_of()
         if np.abs(placed - origin).max() > _SAME:
             changes.append((element["origin"].place, element["joint"].place, placed))
-    for own, around, placed in sorted(changes, key=lambda change: change[1], reverse=True):
+    for own, around, placed in sorted(
+        changes, key=lambda change: change[1], reverse=True
+    ):
         tag = _TAG.match(data, max(own, around))
         assert tag is not None
         end = b">" if own >= 0 and not tag[0].endswith(b"/>") else b"/>"
@@ -267,5 +307,7 @@ def _origin_tag(placed: NDArray) -> bytes:
     pitch = math.atan2(-c[0], cosine * a[0] + sine * b[0])
     roll = math.atan2(sine * a[2] - cosine * b[2], cosine * b[1] - sine * a[1])
     rows = position, (roll, pitch, yaw)
-    xyz, rpy = (" ".join(repr(float(number) + 0.0) for number in row) for row in rows)  # no -0.0
+    xyz, rpy = (
+        " ".join(repr(float(number) + 0.0) for number in row) for row in rows
+    )  # no -0.0
     return f'<origin xyz="{xyz}" rpy="{rpy}"'.encode()

@@ -19,7 +19,14 @@ from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
-from hybridkin.chains._arcs import levers, reading_matrix, rolled, tip, tip_and_columns, transforms
+from hybridkin.chains._arcs import (
+    levers,
+    reading_matrix,
+    rolled,
+    tip,
+    tip_and_columns,
+    transforms,
+)
 from hybridkin.chains._checks import arc_geometry, path_starts, stored_arguments
 from hybridkin.chains.markers import MarkedChain
 
@@ -30,7 +37,12 @@ ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 """Parameters of `calibrate` that change a part of an entry of the geometry, and that entry."""
 
 Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
-STRUCTURE = {"actuators_per_segment": list, "tip_at": float, "markers": list, "routing": str}
+STRUCTURE = {
+    "actuators_per_segment": list,
+    "tip_at": float,
+    "markers": list,
+    "routing": str,
+}
 
 
 def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
@@ -44,7 +56,9 @@ def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, ND
     markers = stored.settings.get("markers", [[tip_at, 0.0, 0.0, 0.0]])
     _, x, y, z = markers[0]
     if len(markers) > 1 or x or y:
-        raise NoKernel("several markers, or a marker beside the backbone, have no kernel")
+        raise NoKernel(
+            "several markers, or a marker beside the backbone, have no kernel"
+        )
     plan.limit("segments", len(offsets))
     m = math.ceil(tip_at)
     parts = np.append(np.ones(m - 1), tip_at - m + 1)
@@ -65,7 +79,9 @@ class Frames(NamedTuple):
 
     axes: Tensor  # (3, 3, S, N): axis, component
     points: Tensor  # (3, S, N) origins [m]
-    moves: Tensor  # (3, 3, S, N): velocity of the robot's end per length, x- and y-bending
+    moves: (
+        Tensor  # (3, 3, S, N): velocity of the robot's end per length, x- and y-bending
+    )
     spins: Tensor  # (3, 3, S, N): its angular velocity per the same
     slope: Tensor  # d arcs / dq, (3 S, n) or (3 S, n, N)
 
@@ -76,7 +92,14 @@ class ArcChain(MarkedChain):
     A subclass defines `_arcs_and_slope` and `_arcs_and_change`.
     """
 
-    _structure = (*STRUCTURE, "n_segments", "n_actuators", "n_outputs", "extensible", "starts")
+    _structure = (
+        *STRUCTURE,
+        "n_segments",
+        "n_actuators",
+        "n_outputs",
+        "extensible",
+        "starts",
+    )
 
     actuators_per_segment: tuple[int, ...]
     routing: str
@@ -166,7 +189,9 @@ class ArcChain(MarkedChain):
         The angular rows give the angular velocity in the measuring frame.
         """
         arcs, slope = self._arcs_and_slope(self._rows(q))
-        _, columns = tip_and_columns(*self._to_point(self.up_to_tip(arcs)), angular=True)
+        _, columns = tip_and_columns(
+            *self._to_point(self.up_to_tip(arcs)), angular=True
+        )
         parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
         J = torch.cat(parts, dim=-2)
         if self.stage is not None:  # the stage turns the tip's frame too
@@ -204,18 +229,24 @@ class ArcChain(MarkedChain):
 
         def along(rows: Tensor) -> tuple[Tensor]:
             arcs, change = self._arcs_and_change(rows)
-            return (torch.cat([one._along(arcs, change, tangents) for one in tips], dim=1),)
+            return (
+                torch.cat([one._along(arcs, change, tangents) for one in tips], dim=1),
+            )
 
         return in_blocks(along, q)[0]
 
-    def _along(self, arcs: Tensor, change: Change, tangents: Mapping[str, Tensor]) -> Tensor:
+    def _along(
+        self, arcs: Tensor, change: Change, tangents: Mapping[str, Tensor]
+    ) -> Tensor:
         """Return the derivative (N, 3, P) of the tip along P changes, at arcs (3 S, N)."""
         place = self._to_point(self.up_to_tip(arcs))
         tail, columns = tip_and_columns(*place, rigid=True)
         columns = self._turned(columns).permute(2, 0, 1).contiguous()
         S = len(place[0])
         by_arcs, by_offsets = columns.split([3 * S, S], dim=2)
-        J = change(by_arcs @ self.up_to_tip(identity(3 * self.n_segments, arcs)), tangents)
+        J = change(
+            by_arcs @ self.up_to_tip(identity(3 * self.n_segments, arcs)), tangents
+        )
         if "offsets" in tangents:
             J = J + by_offsets @ self._tip_offsets(tangents["offsets"]).T
         if "base" in tangents:
@@ -261,7 +292,10 @@ class ArcChain(MarkedChain):
         arcs = self._leading(self.up_to_tip(self._arcs(q)), q)
         beside = identity(4, q)
         beside[:3, 3] = q.new_tensor(self.markers[-1][1:])
-        return self._poses(*arcs, self._tip_offsets(self.offsets), q)[..., -1, :, :] @ beside
+        return (
+            self._poses(*arcs, self._tip_offsets(self.offsets), q)[..., -1, :, :]
+            @ beside
+        )
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)`."""
@@ -278,7 +312,9 @@ class ArcChain(MarkedChain):
         # An arc of length l and bending b moves the end by l c, where c is its derivative with
         # respect to the length, and changes the transverse axes by -b c.
         along = moves[:, :S]
-        x, y = identity(3, arcs)[:2, :, None, None] - (bending[:, None] * along).cumsum(2)
+        x, y = identity(3, arcs)[:2, :, None, None] - (bending[:, None] * along).cumsum(
+            2
+        )
         points = (length * along + offsets[:, None] * z).cumsum(1)
         moves, spins = (part.unflatten(1, (3, S)) for part in (moves, spins))
         return Frames(torch.stack([x, y, z]), points, moves, spins, slope)
@@ -301,7 +337,9 @@ class ArcChain(MarkedChain):
         n_points = whole(n_points, "n_points", most=10**6)
         length, bending = self.arcs(q)
         poses = self._poses(length, bending, self.offsets)
-        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[1:, None]
+        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[
+            1:, None
+        ]
         f, g = stumpff((t * bending[..., None, :]).square().sum(-1))[1:3]
         bend = (g[..., None] * t) * bending[..., None, :]
         arc = (t * length[..., None, None]) * torch.cat([bend, f[..., None]], dim=-1)
@@ -325,7 +363,10 @@ class ArcChain(MarkedChain):
         # Also test q itself, without zeros: `q` may hold speeds, or limits that are absent.
         gains = self.gains.to(q)
         (metres,) = in_blocks(
-            lambda rows: (torch.minimum((gains * rows).abs(), self.metres(rows).abs()),), q
+            lambda rows: (
+                torch.minimum((gains * rows).abs(), self.metres(rows).abs()),
+            ),
+            q,
         )
         pull = LONGEST_PULL * self.reach.detach()
         beyond = metres > factor * torch.where(self.absolute, 10.0, pull).to(q)
@@ -354,13 +395,17 @@ class ArcChain(MarkedChain):
         counts = self.actuators_per_segment
         P = len(next(iter(tangents.values())))
         change = {
-            name: tangents.get(name, torch.zeros_like(value).expand(P, *value.shape)).to(rows)
+            name: tangents.get(
+                name, torch.zeros_like(value).expand(P, *value.shape)
+            ).to(rows)
             for name, value in self.geometry().items()
         }
         at = levers(self.radii, self.angles, counts).to(rows)
         turned = torch.stack([-at[1], at[0]]) * change["angles"][:, None]
         moved = turned + levers(change["radii"], self.angles.to(rows), counts)
-        return change, reading_matrix(moved, counts, self.starts)[..., self.n_segments :]
+        return change, reading_matrix(moved, counts, self.starts)[
+            ..., self.n_segments :
+        ]
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, 3 m) up to the tip and d arcs / dq, (3 m, n) or (N, 3 m, n).
@@ -385,7 +430,9 @@ class ArcChain(MarkedChain):
         """Return `from_coordinates` (N, 3 K) and its derivative (N, 3 K, C)."""
         if len(self.markers) == 1:
             tail, columns = tip_and_columns(*self._to_point(z.mT))
-            return self._in_measuring_frame(tail, z), self._turned(columns).permute(2, 0, 1)
+            return self._in_measuring_frame(tail, z), self._turned(columns).permute(
+                2, 0, 1
+            )
         pairs = []
         for one in self.tips():
             to_tip = one.up_to_tip(identity(3 * self.n_segments, z))
@@ -482,8 +529,12 @@ class ArcChain(MarkedChain):
         chain = chain.with_geometry(angles=torch.from_numpy(angles))
         tip_at = stored.value("tip_at", float)
         places = stored.list_of(list, "markers")
-        if [type(number) for place in places for number in place] != len(places) * [float] * 4:
-            raise ValueError(f"`markers` must hold lists of four numbers, got {places!r:.60}")
+        if [type(number) for place in places for number in place] != len(places) * [
+            float
+        ] * 4:
+            raise ValueError(
+                f"`markers` must hold lists of four numbers, got {places!r:.60}"
+            )
         markers = []
         for at, *beside in [*places[:-1], [tip_at, *places[-1][1:]]]:
             segment = math.ceil(at) - 1

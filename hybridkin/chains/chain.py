@@ -19,7 +19,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Chain"]
 
-_UNITS = {"angles": "rad", "rest_bends": "rad", "gains": "m per unit of q", "axial_stiffness": "-"}
+_UNITS = {
+    "angles": "rad",
+    "rest_bends": "rad",
+    "gains": "m per unit of q",
+    "axial_stiffness": "-",
+}
 _UNITS |= {"bending_stiffness": "m²/rad²"}  # others are in metres
 _UNITS |= dict.fromkeys(("actuator_zeros", "joint_zeros"), "unit of q")
 _FAR = 50.0  # robot sizes; some extensible robots are long and thin
@@ -59,7 +64,10 @@ class Chain(PoseModel):
     def html_rows(self) -> dict[str, object]:
         """Return names and values that a notebook shows of the chain."""
         entries = self.geometry().items()
-        shown = {f"{name} [{_UNITS.get(name, 'm')}]": numbers(a.detach()) for name, a in entries}
+        shown = {
+            f"{name} [{_UNITS.get(name, 'm')}]": numbers(a.detach())
+            for name, a in entries
+        }
         return {**super().html_rows(), **shown}
 
     def with_geometry(self, **geometry: Tensor) -> Self:
@@ -112,7 +120,8 @@ class Chain(PoseModel):
 
         def tip(t: Tensor) -> Tensor:
             moved = {
-                name: current[name] + torch.tensordot(t.to(current[name]), v.to(current[name]), 1)
+                name: current[name]
+                + torch.tensordot(t.to(current[name]), v.to(current[name]), 1)
                 for name, v in tangents.items()
             }
             return self.with_geometry(**moved)(q)

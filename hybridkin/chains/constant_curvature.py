@@ -47,7 +47,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     step = 0  # columns from the actuators of a segment to those of the next one
     if n % n_segments == 0:
         per_segment = n // n_segments
-        blocks = [rows[:, k * per_segment :][:, :per_segment] for k, rows in enumerate(matrix)]
+        blocks = [
+            rows[:, k * per_segment :][:, :per_segment] for k, rows in enumerate(matrix)
+        ]
         diagonal = np.stack(blocks)
         if np.count_nonzero(diagonal) == np.count_nonzero(matrix):
             matrix = diagonal
@@ -119,7 +121,9 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
-    _entries = tuple("radii angles lengths offsets rest_bends actuator_zeros gains base".split())
+    _entries = tuple(
+        "radii angles lengths offsets rest_bends actuator_zeros gains base".split()
+    )
     layout = Layout(
         "constant_curvature",
         dict.fromkeys(_entries, ""),
@@ -150,7 +154,16 @@ class ConstantCurvatureChain(ArcChain):
         super().__init__()
         dtype = float_dtype(dtype)
         geometry = self._checked(
-            routing, radii, lengths, n_actuators, angles, offsets, rest_bends, gains, base, dtype
+            routing,
+            radii,
+            lengths,
+            n_actuators,
+            angles,
+            offsets,
+            rest_bends,
+            gains,
+            base,
+            dtype,
         )
         zeros = filled(actuator_zeros, "actuator_zeros", dtype, (self.n_actuators,))
         self.bends = bend_counts(
@@ -200,7 +213,9 @@ class ConstantCurvatureChain(ArcChain):
         tensor([0.0000, 0.0030], dtype=torch.float64)
         """
         rows = self.metres(self._rows(q))
-        residual = rows - rows @ (self._readings() @ (self.arc_matrix / self.gains)).to(q).T
+        residual = (
+            rows - rows @ (self._readings() @ (self.arc_matrix / self.gains)).to(q).T
+        )
         return self._by_segment(residual, q)
 
     def contradictory(self, q: Tensor) -> Tensor:
@@ -278,8 +293,12 @@ class ConstantCurvatureChain(ArcChain):
             return super().limits
         if self.absolute.all() and self.in_metres and not self.actuator_zeros.any():
             return super().limits | {"q_min": 0.0}
-        low = torch.where(self.absolute & (self.gains > 0), self.actuator_zeros, -torch.inf)
-        high = torch.where(self.absolute & (self.gains < 0), self.actuator_zeros, torch.inf)
+        low = torch.where(
+            self.absolute & (self.gains > 0), self.actuator_zeros, -torch.inf
+        )
+        high = torch.where(
+            self.absolute & (self.gains < 0), self.actuator_zeros, torch.inf
+        )
         return super().limits | {"q_min": low, "q_max": high}
 
     def longest(self, largest: Tensor) -> Tensor:
@@ -315,35 +334,51 @@ class ConstantCurvatureChain(ArcChain):
         inverse = inverse + (free - inverse @ scaled) @ inverse
         matrix = inverse * units[:, None] * self.gains
         straight = self._placed(radii[:0] if self.lengths is None else self.lengths)
-        offset = torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
+        offset = (
+            torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
+        )
         self.register_buffer("arc_matrix", matrix)
         self.register_buffer("arc_offset", offset)
 
     def _by_segment(self, rows: Tensor, q: Tensor) -> Tensor:
         """Return the RMS (..., S) of rows (N, n) over the actuators of each segment."""
         parts = rows.split(self.actuators_per_segment, dim=-1)
-        norms = [torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5 for part in parts]
+        norms = [
+            torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5
+            for part in parts
+        ]
         return torch.stack(norms, dim=-1).reshape(*q.shape[:-1], self.n_segments)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         arcs = self._linear(rows)
         matrix = self.arc_matrix.to(rows)
-        return (arcs, matrix) if self.stage is None else turned_by_first(arcs, matrix[..., None])
+        return (
+            (arcs, matrix)
+            if self.stage is None
+            else turned_by_first(arcs, matrix[..., None])
+        )
 
     def _linear(self, rows: Tensor) -> Tensor:
         """Return the arcs (3 S, N) of rows (N, n) before the stage turns them by length 0."""
-        return torch.addmm(self.arc_offset.to(rows)[:, None], self.arc_matrix.to(rows), rows.T)
+        return torch.addmm(
+            self.arc_offset.to(rows)[:, None], self.arc_matrix.to(rows), rows.T
+        )
 
     def _readings(self) -> Tensor:
         at = levers(self.radii, self.angles, self.actuators_per_segment)
         return reading_matrix(at, self.actuators_per_segment, self.starts)
 
     def _free_arcs(self, angles: Tensor) -> Tensor:
-        return free_arcs(angles.split(self.actuators_per_segment), self.extensible, self.bends)
+        return free_arcs(
+            angles.split(self.actuators_per_segment), self.extensible, self.bends
+        )
 
     def _placed(self, lengths: Tensor) -> Tensor:
         """Return lengths (..., S) of all segments, 0 if extensible, from those that are given."""
-        return lengths @ identity(self.n_segments, lengths)[np.logical_not(self.extensible)]
+        return (
+            lengths
+            @ identity(self.n_segments, lengths)[np.logical_not(self.extensible)]
+        )
 
     def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
         def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
@@ -369,13 +404,21 @@ class ConstantCurvatureChain(ArcChain):
             turns = torch.func.jacfwd(self._free_arcs)(self.angles).to(rows)
             turns = (turns @ change["angles"].mT).permute(2, 0, 1)
             by_reading = by_reading + readings @ turns
-            by_matrix = (identity(len(free), free) - free) @ turns @ readings.mT @ M.mT @ M
+            by_matrix = (
+                (identity(len(free), free) - free) @ turns @ readings.mT @ M.mT @ M
+            )
         contradicted = identity(len(readings), rows) - readings @ M
-        by_matrix = by_matrix + M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
+        by_matrix = (
+            by_matrix + M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
+        )
         straight = self._placed(change.get("lengths", change["radii"][:, :0]))
         rest = torch.cat([straight, *change["rest_bends"].unbind(-1)], dim=-1)
         shift = rest - change["actuator_zeros"] @ self.arc_matrix.to(rows).T
-        moving = (self.metres(rows) @ by_matrix.flatten(0, 1).T).unflatten(1, by_matrix.shape[:2])
+        moving = (self.metres(rows) @ by_matrix.flatten(0, 1).T).unflatten(
+            1, by_matrix.shape[:2]
+        )
         if "gains" in tangents:
-            moving = moving + ((rows - self.rest.to(rows))[:, None] * change["gains"]) @ M.T
+            moving = (
+                moving + ((rows - self.rest.to(rows))[:, None] * change["gains"]) @ M.T
+            )
         return moving + shift

@@ -56,7 +56,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     tendons = np.column_stack([zeros, x, y, x * x, x * y, y * y, stored.array("gains")])
     equal_count = counts[0] if len({*counts}) == 1 else 0
     numbers = [frame, np.hstack(segments), tendons]
-    return plan.node("elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts)
+    return plan.node(
+        "elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts
+    )
 
 
 class ElasticTendonChain(ArcChain):
@@ -139,9 +141,15 @@ class ElasticTendonChain(ArcChain):
 
     _entries = (*_SHAPING, "lengths", "offsets", "base")
     layout = Layout(
-        "elastic_tendons", dict.fromkeys(_entries, ""), STRUCTURE, write_plan=_write_plan
+        "elastic_tendons",
+        dict.fromkeys(_entries, ""),
+        STRUCTURE,
+        write_plan=_write_plan,
     )
-    _structure = (*ArcChain._structure, "_table")  # the table is checked against the geometry
+    _structure = (
+        *ArcChain._structure,
+        "_table",
+    )  # the table is checked against the geometry
 
     def __init__(
         self,
@@ -163,15 +171,30 @@ class ElasticTendonChain(ArcChain):
         super().__init__()
         dtype = float_dtype(dtype)
         if lengths is None or (isinstance(lengths, (list, tuple)) and None in lengths):
-            raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
+            raise ValueError(
+                "`lengths` must hold the backbone length of every segment, got None."
+            )
         geometry = self._checked(
-            routing, radii, lengths, n_actuators, angles, offsets, rest_bends, gains, base, dtype
+            routing,
+            radii,
+            lengths,
+            n_actuators,
+            angles,
+            offsets,
+            rest_bends,
+            gains,
+            base,
+            dtype,
         )
         if self.n_actuators > _slack.MOST:
             raise ValueError(
                 f"`n_actuators` must be at most {_slack.MOST} in all, got {self.n_actuators}."
             )
-        bending = 0.01 * geometry["radii"] ** 2 if bending_stiffness is None else bending_stiffness
+        bending = (
+            0.01 * geometry["radii"] ** 2
+            if bending_stiffness is None
+            else bending_stiffness
+        )
         axial = 10.0 if axial_stiffness is None else axial_stiffness
         for name, value in (("bending_stiffness", bending), ("axial_stiffness", axial)):
             geometry[name] = filled(value, name, dtype, (self.n_segments,))
@@ -183,7 +206,9 @@ class ElasticTendonChain(ArcChain):
         self._set_geometry({**geometry, "tendon_zeros": zeros})
 
     @classmethod
-    def from_chain(cls, chain: ConstantCurvatureChain, **options: Any) -> ElasticTendonChain:
+    def from_chain(
+        cls, chain: ConstantCurvatureChain, **options: Any
+    ) -> ElasticTendonChain:
         """Return an elastic chain with the geometry of a plain chain with tendons.
 
         Parameters
@@ -214,15 +239,26 @@ class ElasticTendonChain(ArcChain):
         counts = chain.actuators_per_segment
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
-        given = {"n_actuators": counts, "routing": chain.routing, "dtype": chain.radii.dtype}
-        return cls(**{**geometry, "angles": angles, **given, **options})._marked(chain.markers)
+        given = {
+            "n_actuators": counts,
+            "routing": chain.routing,
+            "dtype": chain.radii.dtype,
+        }
+        return cls(**{**geometry, "angles": angles, **given, **options})._marked(
+            chain.markers
+        )
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that a calibration fits by default."""
         stiffness = ("bending_stiffness", "axial_stiffness")
         geometry = ("radii", "turns", "rest_bends", "lengths", "tool", "base")
-        return (*geometry, *stiffness, "tendon_zeros", *(() if self.in_metres else ("gain",)))
+        return (
+            *geometry,
+            *stiffness,
+            "tendon_zeros",
+            *(() if self.in_metres else ("gain",)),
+        )
 
     @property
     def pulls(self) -> Tensor:
@@ -270,7 +306,9 @@ class ElasticTendonChain(ArcChain):
         return _slack.Elasticity(
             reading_matrix(at, counts, self.starts),
             torch.cat([one, 1.0 / self.radii, 1.0 / self.radii]),
-            torch.cat([self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]),
+            torch.cat(
+                [self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]
+            ),
             torch.cat([0.0 * one, *self.rest_bends.unbind(-1)]),
             self.tendon_zeros,
             self.gains,
@@ -280,19 +318,35 @@ class ElasticTendonChain(ArcChain):
         """Return the responses of all sets of taut tendons, cached until the geometry changes."""
         geometry = self.geometry()
         shaping = [geometry[name] for name in _SHAPING]
-        learning = torch.is_grad_enabled() and any(value.requires_grad for value in shaping)
+        learning = torch.is_grad_enabled() and any(
+            value.requires_grad for value in shaping
+        )
         passing = learning or any(value.is_inference() for value in shaping)
-        key = None if passing else (rows.dtype, rows.device, *(v._version for v in shaping))
+        key = (
+            None
+            if passing
+            else (rows.dtype, rows.device, *(v._version for v in shaping))
+        )
         if key is not None and self._table is not None:
             kept, kept_key, responses = self._table
-            if key == kept_key and all(a is b for a, b in zip(kept, shaping, strict=True)):
+            if key == kept_key and all(
+                a is b for a, b in zip(kept, shaping, strict=True)
+            ):
                 return responses
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
         # Outside inference mode: derivatives cannot use inference tensors.
-        guard = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
+        guard = (
+            torch.inference_mode(False)
+            if torch.is_inference_mode_enabled()
+            else nullcontext()
+        )
         with guard:
-            elasticity = _slack.Elasticity(*(part.double() for part in self._elasticity()))
-            responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), elasticity)
+            elasticity = _slack.Elasticity(
+                *(part.double() for part in self._elasticity())
+            )
+            responses = _slack.responses_of(
+                _slack.as_mask(codes, self.n_actuators), elasticity
+            )
             responses = _slack.Responses(*(part.to(rows) for part in responses))
         if not passing:
             self._table = (shaping, key, responses)
@@ -309,7 +363,9 @@ class ElasticTendonChain(ArcChain):
         elasticity = _slack.Elasticity(*(part.to(rows) for part in self._elasticity()))
         given = (part.detach() for part in (rows, *elasticity))
         codes = _slack.FindTaut.apply(_slack.find_by_solving, *given)
-        responses = _slack.responses_of(_slack.as_mask(codes, self.n_actuators), elasticity)
+        responses = _slack.responses_of(
+            _slack.as_mask(codes, self.n_actuators), elasticity
+        )
         return codes, torch.arange(len(rows), device=rows.device), responses
 
     def _balance(self, rows: Tensor) -> _slack.Balance:
@@ -324,7 +380,9 @@ class ElasticTendonChain(ArcChain):
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         _, at, responses = self._find(rows)
-        straight = nn.functional.pad(self.get_buffer("lengths").to(rows), (0, 2 * self.n_segments))
+        straight = nn.functional.pad(
+            self.get_buffer("lengths").to(rows), (0, 2 * self.n_segments)
+        )
         maps = responses.shape.index_select(0, at)
         arcs = (_slack.applied(maps, _slack.extended(rows)) + straight).T.contiguous()
         return arcs, maps[..., :-1].permute(1, 2, 0)
@@ -335,7 +393,9 @@ class ElasticTendonChain(ArcChain):
 
         def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
             new, by_bendings = self._changes(rows, tangents)
-            readings, _, stiffness, rest, *_ = (part.to(rows) for part in self._elasticity())
+            readings, _, stiffness, rest, *_ = (
+                part.to(rows) for part in self._elasticity()
+            )
             bending = new["bending_stiffness"]
             by_stiffness = torch.cat([new["axial_stiffness"], bending, bending], dim=-1)
             by_rest = nn.functional.pad(new["rest_bends"].mT.flatten(1), (S, 0))

@@ -100,8 +100,13 @@ class MarkedChain(Chain):
                 need = "tuples (segment, fraction) or (segment, fraction, offset)"
                 raise ValueError(f"`markers` must be {need}, got {marker!r:.80}.")
             segment, fraction, *offset = marker
-            beside = filled(offset[0] if offset else 0.0, "markers", torch.float64, (3,))
-            if segment not in range(self.n_segments) or not 0.0 < number(fraction, "markers") <= 1:
+            beside = filled(
+                offset[0] if offset else 0.0, "markers", torch.float64, (3,)
+            )
+            if (
+                segment not in range(self.n_segments)
+                or not 0.0 < number(fraction, "markers") <= 1
+            ):
                 raise ValueError(
                     "`markers` must be tuples (segment, fraction, offset) with a segment from 0 to "
                     f"{self.n_segments - 1} and a fraction in (0, 1], got {segment}, {fraction}."
@@ -110,7 +115,9 @@ class MarkedChain(Chain):
         if not found:
             raise ValueError("`markers` must hold at least one marker, got none.")
         if getattr(self, "stage", None) and any(x or y for _, x, y, _ in found):
-            raise ValueError("`markers` must lie on the backbone of a robot on a rotation stage.")
+            raise ValueError(
+                "`markers` must lie on the backbone of a robot on a rotation stage."
+            )
         return self._marked(found)
 
     @property
@@ -141,7 +148,9 @@ class MarkedChain(Chain):
         return chain
 
     def _set_markers(self, markers: Sequence[Any]) -> None:
-        self.markers = tuple((float(at), float(x), float(y), float(z)) for at, x, y, z in markers)
+        self.markers = tuple(
+            (float(at), float(x), float(y), float(z)) for at, x, y, z in markers
+        )
         self.tip_at = self.markers[-1][0]
         self.n_outputs = 3 * len(self.markers)
 

@@ -146,7 +146,11 @@ class PlayOperator:
         starts = np.flatnonzero(groups[order][1:] != groups[order][:-1]) + 1
         parts = [self.apply(q[at])[0] for at in np.split(order, starts)]
         back = np.argsort(order)
-        return torch.cat(parts)[back] if isinstance(q, Tensor) else np.concatenate(parts)[back]
+        return (
+            torch.cat(parts)[back]
+            if isinstance(q, Tensor)
+            else np.concatenate(parts)[back]
+        )
 
     def __repr__(self) -> str:
         return f"PlayOperator(width={self.width.tolist()})"
@@ -164,8 +168,14 @@ class PlayOperator:
         if not _is_finite(rows):
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is None and not len(rows):
-            raise ValueError(f"`{name}` must hold at least one row if `state` is not given.")
-        start = PlayState(rows[0], rows[0]) if state is None else _checked(state, rows.shape[1])
+            raise ValueError(
+                f"`{name}` must hold at least one row if `state` is not given."
+            )
+        start = (
+            PlayState(rows[0], rows[0])
+            if state is None
+            else _checked(state, rows.shape[1])
+        )
         if isinstance(rows, Tensor):
             return self._by_torch(rows, start, lead)
         if len(rows) and rows.dtype == np.float64 and available():
@@ -174,8 +184,12 @@ class PlayOperator:
         result, last = self._by_torch(torch.tensor(rows, device="cpu"), start, lead)
         return result.numpy(), PlayState(last.command.numpy(), last.effective.numpy())
 
-    def _by_torch(self, rows: Tensor, start: PlayState, lead: bool) -> tuple[Tensor, PlayState]:
-        command, effective = (torch.as_tensor(a, device=rows.device).to(rows) for a in start)
+    def _by_torch(
+        self, rows: Tensor, start: PlayState, lead: bool
+    ) -> tuple[Tensor, PlayState]:
+        command, effective = (
+            torch.as_tensor(a, device=rows.device).to(rows) for a in start
+        )
         half = as_tensor(self.width / 2, "width").to(rows)
         result = []
         for row in rows:
@@ -184,7 +198,9 @@ class PlayOperator:
                 command = torch.where(row == effective, command, ahead)
                 effective = row
             else:
-                effective = torch.minimum(torch.maximum(effective, row - half), row + half)
+                effective = torch.minimum(
+                    torch.maximum(effective, row - half), row + half
+                )
                 command = row
             result.append(command if lead else effective)
         state = PlayState(command, effective)
@@ -199,7 +215,9 @@ def _checked(state: Any, n: int) -> PlayState:
     """Return a caller's state for n tendons, checked."""
     parts = state if isinstance(state, (tuple, list)) else ()
     vectors = [real_array(part, "state") for part in parts]
-    good = len(vectors) == 2 and all(a.shape == (n,) and np.isfinite(a).all() for a in vectors)
+    good = len(vectors) == 2 and all(
+        a.shape == (n,) and np.isfinite(a).all() for a in vectors
+    )
     if not good:
         need = f"must hold two finite vectors of shape ({n},)"
         raise ValueError(f"`state` {need}, got {state!r:.200}.")

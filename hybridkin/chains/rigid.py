@@ -14,7 +14,14 @@ from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import warn_millimetres
 from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints
-from hybridkin.chains._checks import filled, float_dtype, joint_limits, numeric, pose, rigid_pose
+from hybridkin.chains._checks import (
+    filled,
+    float_dtype,
+    joint_limits,
+    numeric,
+    pose,
+    rigid_pose,
+)
 from hybridkin.chains._joint_motions import FAR, JointChain
 from hybridkin.chains._urdf import placed_urdf, urdf_path, urdf_text
 
@@ -49,7 +56,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     tip = before @ np.append(stored.array("tool"), 1.0)
     couplings = stored.arrays.get("couplings", np.zeros((0, n_joints)))
     numbers += [tip[:3], before[:3, :3], couplings]
-    return plan.node("rigid", couplings.shape[1], 3, numbers, n_joints, len(couplings) > 0, *slides)
+    return plan.node(
+        "rigid", couplings.shape[1], 3, numbers, n_joints, len(couplings) > 0, *slides
+    )
 
 
 class RigidChain(JointChain):
@@ -150,15 +159,21 @@ class RigidChain(JointChain):
         self.n_actuators = n = n_joints if couplings is None else couplings.shape[1]
         for name, value in (("kinds", kinds), ("names", names)):
             if value is not None and not np.iterable(value):
-                raise TypeError(f"`{name}` must be a sequence of strings, got {value!r:.80}.")
-        self.kinds = ("revolute",) * n_joints if kinds is None else tuple(map(str, kinds))
+                raise TypeError(
+                    f"`{name}` must be a sequence of strings, got {value!r:.80}."
+                )
+        self.kinds = (
+            ("revolute",) * n_joints if kinds is None else tuple(map(str, kinds))
+        )
         default = [f"joint_{k + 1}" for k in range(n)]
         self.names = tuple(map(str, default if names is None else names))
         if len(self.kinds) != n_joints or not set(self.kinds) <= set(_KINDS):
             need = f"must hold {n_joints} of {_KINDS}, one per joint"
             raise ValueError(f"`kinds` {need}, got {self.kinds}.")
         if len(self.names) != n:
-            raise ValueError(f"`names` must hold {n} names, one per actuator, got {self.names}.")
+            raise ValueError(
+                f"`names` must hold {n} names, one per actuator, got {self.names}."
+            )
         slides = [kind == "prismatic" for kind in self.kinds]
         geometry = {
             "origins": origins,
@@ -221,10 +236,16 @@ class RigidChain(JointChain):
         UserWarning
             For joints without <limit>, with swapped limits, and with limits that are both zero.
         """
-        return cls(**moving_joints(urdf_path(text_or_path, end_link, root_link)), **options)
+        return cls(
+            **moving_joints(urdf_path(text_or_path, end_link, root_link)), **options
+        )
 
     def to_urdf(
-        self, text_or_path: str | PathLike[str], end_link: str, *, root_link: str | None = None
+        self,
+        text_or_path: str | PathLike[str],
+        end_link: str,
+        *,
+        root_link: str | None = None,
     ) -> str:
         """Return a URDF with the calibrated geometry of this arm: links and joint zeros.
 
@@ -264,7 +285,9 @@ class RigidChain(JointChain):
         <origin xyz="0.0 0.0 0.25" rpy="0.0 0.0 0.0"/> </joint> </robot>
         """
         origins = (self.motions[:, 0] + self.motions[:, 2]).double().numpy(force=True)
-        return placed_urdf(urdf_text(text_or_path), end_link, root_link, self.names, origins)
+        return placed_urdf(
+            urdf_text(text_or_path), end_link, root_link, self.names, origins
+        )
 
     @classmethod
     def from_mjcf(
@@ -304,7 +327,9 @@ class RigidChain(JointChain):
             For text that is not an MJCF, bodies that are missing or not connected, a path without
             a moving joint, a `range` that is not an interval, and free or ball joints.
         """
-        return cls(**moving_joints(mjcf_path(text_or_path, end_link, root_link)), **options)
+        return cls(
+            **moving_joints(mjcf_path(text_or_path, end_link, root_link)), **options
+        )
 
     @classmethod
     def from_chain(cls, chain: KinematicsChain, **options: Any) -> RigidChain:

@@ -113,7 +113,9 @@ class LogFormat:
     def reading(self) -> dict[str, Any]:
         """The arguments of `datasets.load_log` for this format."""
         unit = self.q_unit if self.q_unit in UNITS else "1"
-        return {k: v for k, v in vars(self).items() if k != "group_suffix"} | {"q_unit": unit}
+        return {k: v for k, v in vars(self).items() if k != "group_suffix"} | {
+            "q_unit": unit
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,7 +337,9 @@ def read_description(path: str | Path) -> RobotDescription:
     """
     path = as_path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"`path` must be a robot description, got {path}: no such file.")
+        raise FileNotFoundError(
+            f"`path` must be a robot description, got {path}: no such file."
+        )
     try:
         return replace(_description(read_tables(path), path.stem), path=path)
     except ValueError as error:
@@ -374,16 +378,26 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
 
 def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     if not {"q", "x"} <= {*table}:
-        raise ValueError("`q` or `x` is missing in [log]; name the columns of actuators and tip.")
+        raise ValueError(
+            "`q` or `x` is missing in [log]; name the columns of actuators and tip."
+        )
     if chain is not None and len(table["q"]) != chain.n_actuators:
         raise ValueError(
             f"`q` in [log] must name {chain.n_actuators} columns, one for each actuator of the "
             f"[[segment]] tables, got {len(table['q'])}: {table['q']}."
         )
-    columns = [*table["q"], *table["x"], *(table[key] for key in _COLUMNS if key in table)]
+    columns = [
+        *table["q"],
+        *table["x"],
+        *(table[key] for key in _COLUMNS if key in table),
+    ]
     if doubled := sorted({name for name in columns if columns.count(name) > 1}):
-        raise ValueError(f"[log] must name every column once, got {doubled} repeatedly.")
-    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+        raise ValueError(
+            f"[log] must name every column once, got {doubled} repeatedly."
+        )
+    given: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in table.items()
+    }
     given.pop("markers", None)
     gained = chain is not None and not chain.in_metres
     unit = given.setdefault("q_unit", "1" if gained else "m")
@@ -408,7 +422,9 @@ def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
         why = "without [[segment]]" if robot.chain is None else "with gains"
         why = "without [log]" if log is None else why
         raise ValueError(f'`unit` in [limits] must be "{need}" {why}, got "{unit}".')
-    limits = Limits(**{key: each(given, key, "[limits]", robot.n_actuators) for key in given})
+    limits = Limits(
+        **{key: each(given, key, "[limits]", robot.n_actuators) for key in given}
+    )
     low = limits.q_min
     high = limits.q_max
     if low is not None and high is not None and (low > high).any():

@@ -21,7 +21,9 @@ def write_log(path: Path) -> None:
     """Write postures of the simulated trunk, lengths and tips in millimetres."""
     data = hybridkin.datasets.load_trunk()
     rows = np.flatnonzero(data.part == 3)[:_ROWS]  # where all segments move
-    table = np.column_stack([np.arange(_ROWS) // _BLOCK, 1e3 * data.q[rows], 1e3 * data.x[rows]])
+    table = np.column_stack(
+        [np.arange(_ROWS) // _BLOCK, 1e3 * data.q[rows], 1e3 * data.x[rows]]
+    )
     names = "group,c1,c2,c3,c4,c5,c6,c7,c8,c9,tip_x,tip_y,tip_z"
     np.savetxt(path, table, "%.6g", ",", header=names, comments="")
 
@@ -56,7 +58,9 @@ def summary(out: Path, records: dict[str, dict[str, Any]]) -> Report:
         *(f"{what}\n$ hybridkin {command}" for command, what in steps(out).items()),
         "Errors on held-out rows, which the fit of a model has not seen:",
     )
-    report.errors({name: held_out[name] for name in (*_SHOWN, saved)}, ("mean", "p95", "max"))
+    report.errors(
+        {name: held_out[name] for name in (*_SHOWN, saved)}, ("mean", "p95", "max")
+    )
     report.text(
         "Nominal: geometry as described, pose of the base fitted. Calibrated: geometry fitted. "
         "Quadratic: a polynomial of the data, no mechanics. Hybrid: the calibrated model and a "

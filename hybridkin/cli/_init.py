@@ -15,7 +15,15 @@ from typing import Any, NamedTuple
 
 import hybridkin
 from hybridkin._core.units import METRES
-from hybridkin.cli._values import count, existing, in_millimetres, names, numbers, one_of, positive
+from hybridkin.cli._values import (
+    count,
+    existing,
+    in_millimetres,
+    names,
+    numbers,
+    one_of,
+    positive,
+)
 
 _NEEDED = object()  # the default of what must be given
 _Answers = dict[str, Any]
@@ -44,13 +52,23 @@ QUESTIONS = (
     _Question("kind", _KINDS, one_of(*_MODELS)),
     _Question("segments", "number of segments", count),
     _Question("actuators", "number of actuators in each segment", count, 3),
-    _Question("radius", f"radius of the circle on which the actuators lie {_EACH}", in_millimetres),
+    _Question(
+        "radius",
+        f"radius of the circle on which the actuators lie {_EACH}",
+        in_millimetres,
+    ),
     _Question("length", f"length of the backbone of a segment {_EACH}", in_millimetres),
-    _Question("angle", "angle of the first actuator of a segment [degrees]", numbers, (0,)),
+    _Question(
+        "angle", "angle of the first actuator of a segment [degrees]", numbers, (0,)
+    ),
     _Question("q_unit", _UNIT, str, "mm"),
-    _Question("spool_radius", f"radius of the spools of motors {_EACH}", in_millimetres, None),
+    _Question(
+        "spool_radius", f"radius of the spools of motors {_EACH}", in_millimetres, None
+    ),
     _Question("counts_per_turn", "q of a whole turn of a spool, in its unit", positive),
-    _Question("gain", "change of length for a q of 1, if not from spools [mm]", in_millimetres),
+    _Question(
+        "gain", "change of length for a q of 1, if not from spools [mm]", in_millimetres
+    ),
     _Question("x_unit", f"unit of the tip: {_LENGTHS}", one_of(*METRES), "mm"),
     _Question("q_sign", _SIGN, one_of(1, -1)),
     _Question("q", "columns of the actuators from base to tip, as A,B,...", names),
@@ -77,7 +95,11 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
         if _is_needless(name, answers, given):
             continue
         if name == "q":
-            columns = {"q": (), "x": ()} if missing else _proposed(answers, given["delimiter"])
+            columns = (
+                {"q": (), "x": ()}
+                if missing
+                else _proposed(answers, given["delimiter"])
+            )
         question = question._replace(default=columns.get(name, question.default))
         value = given[name]
         if value is None:
@@ -103,7 +125,9 @@ def _is_needless(name: str, answers: _Answers, given: _Answers) -> bool:
 def _asked(question: _Question) -> Any:
     """Return what the user answers to a question on standard error; empty: the default."""
     name, text, parse, default = question
-    known = ",".join(map(str, default)) if isinstance(default, tuple | list) else default
+    known = (
+        ",".join(map(str, default)) if isinstance(default, tuple | list) else default
+    )
     hint = "" if default is _NEEDED else f" [{known or 'none'}]"
     while True:
         print(f"{name}: {text}{hint}: ", end="", file=sys.stderr, flush=True)
@@ -123,8 +147,14 @@ def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
     if answers["log"] is None:
         return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
     header = hybridkin.datasets.log_columns(answers["log"], delimiter)
-    tips = [three for three in zip(header, header[1:], header[2:], strict=False) if _is_tip(three)]
-    found: _Answers = {"x": max(tips, key=lambda three: "tip" in three[0].lower())} if tips else {}
+    tips = [
+        three
+        for three in zip(header, header[1:], header[2:], strict=False)
+        if _is_tip(three)
+    ]
+    found: _Answers = (
+        {"x": max(tips, key=lambda three: "tip" in three[0].lower())} if tips else {}
+    )
     families: dict[str, list[str]] = {}  # names that differ in numbers only
     for name in header:
         if name not in found.get("x", ()) and re.search(r"\d", name):
@@ -133,7 +163,9 @@ def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
     fitting = [family for family in (*families.values(), every) if len(family) == n]
     found |= {"q": fitting[0]} if fitting else {}
     for key, words in _WORDS.items():
-        named = [name for name in header if re.match(rf"({words})(?![a-z\d])", name.lower())]
+        named = [
+            name for name in header if re.match(rf"({words})(?![a-z\d])", name.lower())
+        ]
         found |= {key: named[0]} if named else {}
     return found
 
@@ -149,7 +181,9 @@ def description(answers: _Answers, name: str) -> str:
     template = (files("hybridkin.cli") / "robot.toml").read_text(encoding="utf-8")
     head, segment, tail = re.split(r"(?=\[\[segment|# The logs)", template)
     if per_turn := answers.get("counts_per_turn"):
-        gains = [float(f"{math.tau * r / per_turn:.9g}") for r in answers["spool_radius"]]
+        gains = [
+            float(f"{math.tau * r / per_turn:.9g}") for r in answers["spool_radius"]
+        ]
         answers = {**answers, "gain": gains, "spool_radius": None}
     sizes = [_of_segments(answers, key) for key in _SIZES]
     segments = [
@@ -165,7 +199,9 @@ def _of_segments(answers: _Answers, key: str) -> Sequence[tuple[str, float | Non
     values, n = answers.get(key) or (None,), answers["segments"]
     if len(values) not in (1, n):
         option = f"--{key.replace('_', '-')}"
-        raise ValueError(f"{option} must be one value, or one for each segment, got {len(values)}.")
+        raise ValueError(
+            f"{option} must be one value, or one for each segment, got {len(values)}."
+        )
     return [(key, value) for value in values] * (n // len(values))
 
 

@@ -17,7 +17,16 @@ from typing import Any, NoReturn
 import hybridkin
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.cli._init import QUESTIONS
-from hybridkin.cli._values import between, count, names, numbers, play, positive, share, start
+from hybridkin.cli._values import (
+    between,
+    count,
+    names,
+    numbers,
+    play,
+    positive,
+    share,
+    start,
+)
 
 EXIT_CODES = """\
 exit codes: 0 success; 1 the result is not as requested (points not reached, errors above
@@ -41,7 +50,9 @@ def parser() -> argparse.ArgumentParser:
     for the mechanical model alone.
     """
     top = _Parser(prog="hybridkin", **_help(parser))
-    top.add_argument("--version", action="version", version=f"hybridkin {hybridkin.__version__}")
+    top.add_argument(
+        "--version", action="version", version=f"hybridkin {hybridkin.__version__}"
+    )
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
     begin, use = (_demo, _init, _describe, _fit, _evaluate), (_track, _verify, _animate)
     for add_options in (*begin, *use, _next, _export):
@@ -50,8 +61,16 @@ def parser() -> argparse.ArgumentParser:
         command = commands.add_parser(add_options.__name__[1:], help=line, **text)
         add_options(command)
         add = command.add_argument
-        add("--json", action="store_true", help="print one JSON document and nothing else")
-        add("--quiet", action="store_true", help="print results, warnings and errors only")
+        add(
+            "--json",
+            action="store_true",
+            help="print one JSON document and nothing else",
+        )
+        add(
+            "--quiet",
+            action="store_true",
+            help="print results, warnings and errors only",
+        )
     return top
 
 
@@ -75,7 +94,11 @@ def failed(message: str, code: int, as_json: bool) -> int:
     """Print why a command failed, with --json also as a document, and return the exit code."""
     print(f"hybridkin: {message}", file=sys.stderr)
     if as_json:
-        print(json.dumps({"error": message.removeprefix("error: "), "exit_code": code}, indent=2))
+        print(
+            json.dumps(
+                {"error": message.removeprefix("error: "), "exit_code": code}, indent=2
+            )
+        )
     return code
 
 
@@ -91,7 +114,13 @@ def _demo(command: argparse.ArgumentParser) -> None:
       hybridkin demo --out first_try
     """
     add = command.add_argument
-    add("--out", type=Path, default=Path("demo"), metavar="DIR", help="new folder (demo)")
+    add(
+        "--out",
+        type=Path,
+        default=Path("demo"),
+        metavar="DIR",
+        help="new folder (demo)",
+    )
 
 
 def _init(command: argparse.ArgumentParser) -> None:
@@ -114,7 +143,14 @@ def _init(command: argparse.ArgumentParser) -> None:
     """
     add = command.add_argument
     name = "robot.toml"
-    add("out", type=Path, nargs="?", default=Path(name), metavar=name, help="file (robot.toml)")
+    add(
+        "out",
+        type=Path,
+        nargs="?",
+        default=Path(name),
+        metavar=name,
+        help="file (robot.toml)",
+    )
     for question in QUESTIONS:
         option = f"--{question.name.replace('_', '-')}"
         value = question.name.rpartition("_")[2].upper()
@@ -144,8 +180,19 @@ def _next(command: argparse.ArgumentParser) -> None:
     _add_model(command)
     add("--out", type=Path, required=True, metavar="DIR", help="folder for next.csv")
     add("-n", type=count, default=50, help="number of configurations (50)")
-    add("--measured", type=Path, dest="log", metavar="LOG", help="log of what is measured so far")
-    add("--path", type=Path, metavar="PATH.csv", help="where the error matters (everywhere)")
+    add(
+        "--measured",
+        type=Path,
+        dest="log",
+        metavar="LOG",
+        help="log of what is measured so far",
+    )
+    add(
+        "--path",
+        type=Path,
+        metavar="PATH.csv",
+        help="where the error matters (everywhere)",
+    )
     add("--dt", type=positive, metavar="S", help="time between points of the path [s]")
     add("--unit", choices=METRES, help="unit of the path (that of x in the log)")
     _add_limits(command)
@@ -191,8 +238,20 @@ def _fit(command: argparse.ArgumentParser) -> None:
     """
     add = command.add_argument
     add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
-    add("--robot", type=Path, required=True, metavar="ROBOT.toml", help="robot description")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for model and report")
+    add(
+        "--robot",
+        type=Path,
+        required=True,
+        metavar="ROBOT.toml",
+        help="robot description",
+    )
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for model and report",
+    )
     _add_log(command)
     add(
         "--loss",
@@ -218,7 +277,13 @@ def _fit(command: argparse.ArgumentParser) -> None:
     few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
     number = between(-1, float("inf"), int)
     add("--max-rows", type=number, default=2000, metavar="N", help=few)
-    add("--jobs", type=int, default=-1, metavar="N", help="processes; -1: one per core (-1)")
+    add(
+        "--jobs",
+        type=int,
+        default=-1,
+        metavar="N",
+        help="processes; -1: one per core (-1)",
+    )
 
 
 def _evaluate(command: argparse.ArgumentParser) -> None:
@@ -239,7 +304,12 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     _add_model(command)
     add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
     add("--out", type=Path, metavar="DIR", help="folder for report and figures (none)")
-    add("--fail-above", type=float, metavar="MM", help="exit with 1 if the mean error is larger")
+    add(
+        "--fail-above",
+        type=float,
+        metavar="MM",
+        help="exit with 1 if the mean error is larger",
+    )
     _add_log(command)
 
 
@@ -271,20 +341,63 @@ def _track(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     _add_model(command)
     add("path", type=Path, nargs="?", metavar="PATH.csv", help="file of points")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for commands and figure")
-    add("--shape", choices=("figure-eight", "spiral", "line"), help="shape instead of a file")
-    add("--center", type=numbers, metavar="X,Y,Z", help="centre of the shape (mid-workspace)")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for commands and figure",
+    )
+    add(
+        "--shape",
+        choices=("figure-eight", "spiral", "line"),
+        help="shape instead of a file",
+    )
+    add(
+        "--center",
+        type=numbers,
+        metavar="X,Y,Z",
+        help="centre of the shape (mid-workspace)",
+    )
     size = "figure eight: width along x, height; spiral: two radii; line: X,Y,Z from end to end"
     add("--size", type=numbers, metavar="A,B", help=size)
-    add("--scale", type=positive, default=1.0, metavar="F", help="factor of the size (1)")
-    add("--normal", type=numbers, metavar="X,Y,Z", help="normal of its plane (of that of the tips)")
+    add(
+        "--scale",
+        type=positive,
+        default=1.0,
+        metavar="F",
+        help="factor of the size (1)",
+    )
+    add(
+        "--normal",
+        type=numbers,
+        metavar="X,Y,Z",
+        help="normal of its plane (of that of the tips)",
+    )
     add("--turns", type=float, default=3.0, metavar="N", help="turns of a spiral (3)")
     add("--rise", type=float, default=0.0, metavar="H", help="height of a spiral (0)")
-    add("--duration", type=positive, default=10.0, metavar="S", help="time for the shape [s] (10)")
-    add("--dt", type=positive, metavar="S", help="time between points [s] (0.02 for a shape)")
+    add(
+        "--duration",
+        type=positive,
+        default=10.0,
+        metavar="S",
+        help="time for the shape [s] (10)",
+    )
+    add(
+        "--dt",
+        type=positive,
+        metavar="S",
+        help="time between points [s] (0.02 for a shape)",
+    )
     add("--unit", choices=METRES, help="unit of path and shape (that of x in the log)")
     _add_limits(command)
-    add("--tol", type=positive, default=0.1, metavar="MM", help="accepted error [mm] (0.1)")
+    add(
+        "--tol",
+        type=positive,
+        default=0.1,
+        metavar="MM",
+        help="accepted error [mm] (0.1)",
+    )
     where = "where the robot stands before the path (rest)"
     stand: Any = {"default": "rest", "dest": "start", "metavar": "rest|path|A,B,..."}
     add("--from", type=start, help=where, **stand)
@@ -327,10 +440,28 @@ def _animate(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     _add_model(command)
     add("track", type=Path, metavar="TRACK", help="track.csv, its folder, or a log")
-    add("--out", type=Path, required=True, metavar="FILE", help="file: .mp4, .gif or .html")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="file: .mp4, .gif or .html",
+    )
     add("--unit", choices=METRES, default="mm", help="unit of the axes (mm)")
-    add("--speed", type=positive, default=1.0, metavar="F", help="speed; 1: real time (1)")
-    add("--frames", type=count, default=150, metavar="N", help="largest number of frames (150)")
+    add(
+        "--speed",
+        type=positive,
+        default=1.0,
+        metavar="F",
+        help="speed; 1: real time (1)",
+    )
+    add(
+        "--frames",
+        type=count,
+        default=150,
+        metavar="N",
+        help="largest number of frames (150)",
+    )
 
 
 def _export(command: argparse.ArgumentParser) -> None:
@@ -348,8 +479,18 @@ def _export(command: argparse.ArgumentParser) -> None:
     _add_model(command)
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the code")
     add("--name", default="model", help="name of files and functions (model)")
-    add("--dtype", choices=("float64", "float32"), default="float64", help="numbers (float64)")
-    add("--dt", type=positive, metavar="S", help="control period [s] of the step (no step)")
+    add(
+        "--dtype",
+        choices=("float64", "float32"),
+        default="float64",
+        help="numbers (float64)",
+    )
+    add(
+        "--dt",
+        type=positive,
+        metavar="S",
+        help="control period [s] of the step (no step)",
+    )
     _add_limits(command)
 
 
@@ -364,16 +505,30 @@ def _describe(command: argparse.ArgumentParser) -> None:
       hybridkin describe robot.toml
       hybridkin describe log.csv --robot robot.toml
     """
-    _add_model(command, "log", "MODEL|ROBOT.toml|LOG", "model, robot description or log")
+    _add_model(
+        command, "log", "MODEL|ROBOT.toml|LOG", "model, robot description or log"
+    )
     _add_log(command)
 
 
 def _add_limits(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    add("--q-min", type=numbers, metavar="A,...", help="least q, in the unit and sign of the log")
+    add(
+        "--q-min",
+        type=numbers,
+        metavar="A,...",
+        help="least q, in the unit and sign of the log",
+    )
     add("--q-max", type=numbers, metavar="A,...", help="largest q")
-    add("--dq-max", type=numbers, metavar="A,...", help="largest speed of q, per second")
-    add("--ddq-max", type=numbers, metavar="A,...", help="largest acceleration, per second squared")
+    add(
+        "--dq-max", type=numbers, metavar="A,...", help="largest speed of q, per second"
+    )
+    add(
+        "--ddq-max",
+        type=numbers,
+        metavar="A,...",
+        help="largest acceleration, per second squared",
+    )
 
 
 def _add_model(
@@ -392,19 +547,34 @@ _DELIMITER = "separator of a text file (comma, semicolon or tab, by the header)"
 
 
 def _add_log(command: argparse.ArgumentParser) -> None:
-    log = command.add_argument_group("log file; options replace [log] of the robot description")
+    log = command.add_argument_group(
+        "log file; options replace [log] of the robot description"
+    )
     add = log.add_argument
     add("--q", type=names, metavar="A,B,...", help="columns of the actuators")
     add("--x", type=names, metavar="X,Y,Z", help="columns of the tip")
     add("--q-unit", choices=UNITS, help="unit of the actuators")
     add("--x-unit", choices=METRES, help="unit of the tip")
-    add("--q-sign", type=int, choices=(1, -1), help="-1: a pulled tendon counts as positive")
-    add("--groups", metavar="COLUMN", help="column that names the motion of a row; or none")
+    add(
+        "--q-sign",
+        type=int,
+        choices=(1, -1),
+        help="-1: a pulled tendon counts as positive",
+    )
+    add(
+        "--groups",
+        metavar="COLUMN",
+        help="column that names the motion of a row; or none",
+    )
     add("--time", metavar="COLUMN", help="column of the time [s]; or none")
     add("--delimiter", metavar="CHAR", help=_DELIMITER)
     some = "leave out motions by name, such as '*tendon*'; may be repeated"
     add("--exclude", action="append", default=[], metavar="PATTERN", help=some)
-    add("--drop-invalid", action="store_true", help="leave out rows with missing values or NaN")
+    add(
+        "--drop-invalid",
+        action="store_true",
+        help="leave out rows with missing values or NaN",
+    )
     add("--drop-frozen", action="store_true", help="leave out rows with a frozen tip")
     despite = f"go on despite errors in the log; {_REPLACE_OTHERS}"
     add("--force", action="store_true", help=despite)

@@ -108,10 +108,16 @@ def _in_words(seconds: float) -> str:
 def shown(report: Report) -> str:
     """Return a report as text, with ruled tables on a terminal and plain ones elsewhere."""
     console = Console()
-    return report.plain(partial(_ruled, console)) if console.is_terminal else report.plain()
+    return (
+        report.plain(partial(_ruled, console))
+        if console.is_terminal
+        else report.plain()
+    )
 
 
-def _ruled(console: Console, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _ruled(
+    console: Console, header: Sequence[str], rows: Sequence[Sequence[str]]
+) -> str:
     first, *others = map(Text, header)
     columns = [Column(first), *(Column(title, justify="right") for title in others)]
     table = Table(*columns, box=box.SIMPLE_HEAD)

@@ -13,7 +13,9 @@ def numbers(text: str) -> Sequence[float]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be numbers, as in 1.5,2, got {text!r}") from None
+        raise argparse.ArgumentTypeError(
+            f"must be numbers, as in 1.5,2, got {text!r}"
+        ) from None
 
 
 def in_millimetres(text: str) -> Sequence[float]:
@@ -37,7 +39,9 @@ def play(text: str) -> float | str:
         return text
     value = float(text)
     if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be auto or a width, zero or more, got {text}")
+        raise argparse.ArgumentTypeError(
+            f"must be auto or a width, zero or more, got {text}"
+        )
     return value
 
 
@@ -71,7 +75,9 @@ def one_of(*known: Any) -> Callable[[str], Any]:
 
     def value(text: str) -> Any:
         if text not in values:
-            raise argparse.ArgumentTypeError(f"must be one of {', '.join(values)}, got {text!r}")
+            raise argparse.ArgumentTypeError(
+                f"must be one of {', '.join(values)}, got {text!r}"
+            )
         return values[text]
 
     return value

@@ -56,12 +56,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         stages = Stages(arguments.quiet)
         # Several threads cost many times the CPU time: the matrices are small.
         _ = hybridkin.workflow  # loads the libraries whose threads are limited
-        with contextlib.closing(stages), warnings.catch_warnings(), _interruptible(), one_thread():
+        with (
+            contextlib.closing(stages),
+            warnings.catch_warnings(),
+            _interruptible(),
+            one_thread(),
+        ):
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
             outcome = _RUN[arguments.command](arguments, stages)
     except (KeyboardInterrupt, EOFError) as stop:  # EOFError: no answer to a question
-        fate = "nothing was written" if _stamps(arguments) == before else "files were written"
+        fate = (
+            "nothing was written"
+            if _stamps(arguments) == before
+            else "files were written"
+        )
         code = 143 if isinstance(stop, _Terminated) else 130
         return failed(f"interrupted; {fate}", code, arguments.json)
     except _OF_INPUT as error:
@@ -75,9 +84,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         print(text, flush=True)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        if not isinstance(error, BrokenPipeError):  # `head`, for example, has what it wants
-            return failed(f"error: the result cannot be printed: {error}", 2, as_json=False)
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # for the flush at exit
+        if not isinstance(
+            error, BrokenPipeError
+        ):  # `head`, for example, has what it wants
+            return failed(
+                f"error: the result cannot be printed: {error}", 2, as_json=False
+            )
     return outcome.code
 
 
@@ -93,11 +108,17 @@ def _interruptible() -> Iterator[None]:
     """
     usual = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
     in_main_thread = threading.current_thread() is threading.main_thread()
-    ours = [n for n, handler in usual.items() if in_main_thread and signal.getsignal(n) is handler]
+    ours = [
+        n
+        for n, handler in usual.items()
+        if in_main_thread and signal.getsignal(n) is handler
+    ]
     caught: list[KeyboardInterrupt] = []
 
     def stop(number: int, _: Any) -> None:
-        caught.append(_Terminated() if number == signal.SIGTERM else KeyboardInterrupt())
+        caught.append(
+            _Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+        )
         raise caught[-1]
 
     for number in ours:
@@ -116,7 +137,11 @@ def _interruptible() -> Iterator[None]:
 def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:
     """Return the files of --out, each with its number and time on the disk."""
     out = vars(arguments).get("out") or Path(os.devnull)
-    files = [file for file in (out.glob("[!.]*") if out.is_dir() else [out]) if file.is_file()]
+    files = [
+        file
+        for file in (out.glob("[!.]*") if out.is_dir() else [out])
+        if file.is_file()
+    ]
     return {file: (file.stat().st_ino, file.stat().st_mtime_ns) for file in files}
 
 
@@ -152,7 +177,9 @@ def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     names = ("loss", "coverage", "n_folds", "auto")
     settings = hybridkin.workflow.FitSettings(
         **{name: vars(arguments)[name] for name in names},
-        play=abs(log_format.q_factor * play).tolist() if isinstance(play, float) else play,
+        play=abs(log_format.q_factor * play).tolist()
+        if isinstance(play, float)
+        else play,
         max_rows=arguments.max_rows or None,
     )
     before = _model_before(arguments)
@@ -177,11 +204,20 @@ def _model_before(arguments: argparse.Namespace) -> str:
     model = arguments.out / "model.safetensors"
     if not model.is_file():
         return ""
-    words = f"the model of {datetime.fromtimestamp(model.stat().st_mtime):%Y-%m-%d %H:%M}"
+    words = (
+        f"the model of {datetime.fromtimestamp(model.stat().st_mtime):%Y-%m-%d %H:%M}"
+    )
     if sys.stdin.isatty() and not arguments.force and not arguments.json:
-        print(f"Replace {words} in {arguments.out}? [y/N]: ", end="", file=sys.stderr, flush=True)
+        print(
+            f"Replace {words} in {arguments.out}? [y/N]: ",
+            end="",
+            file=sys.stderr,
+            flush=True,
+        )
         if input().strip().lower() not in ("y", "yes"):
-            raise FileExistsError(f"{arguments.out} keeps {words}; name another folder by --out.")
+            raise FileExistsError(
+                f"{arguments.out} keeps {words}; name another folder by --out."
+            )
     return words
 
 
@@ -238,7 +274,9 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         progress=stages,
     )
     record = report.record
-    known = arguments.force or record["in_domain"] is None or record["in_domain"] > _INSIDE
+    known = (
+        arguments.force or record["in_domain"] is None or record["in_domain"] > _INSIDE
+    )
     code = 0 if known and record["reached"] == record["n"] else 1
     return _Outcome(record, shown(report), paths, code)
 
@@ -265,7 +303,9 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         progress=stages,
     )
     speed, size = f"{record['fps']:.3g} a second", f"{record['bytes'] / 1e6:.2f} MB"
-    return _Outcome(record, f"{record['frames']} frames, {speed}, {size}", [arguments.out])
+    return _Outcome(
+        record, f"{record['frames']} frames, {speed}, {size}", [arguments.out]
+    )
 
 
 def _export(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
@@ -287,7 +327,9 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         report = hybridkin.workflow.describe(loaded)
         return _Outcome(report.record, shown(report))
     if arguments.robot is None:
-        raise ValueError(f"{arguments.log} is a log; name its robot: --robot ROBOT.toml.")
+        raise ValueError(
+            f"{arguments.log} is a log; name its robot: --robot ROBOT.toml."
+        )
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
     found = _read(arguments, log_format, robot.chain, robot.base_is_free, stages).report
@@ -297,7 +339,9 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
 def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     out, given = arguments.out, vars(arguments)
     if out.exists() and not arguments.force:
-        raise FileExistsError(f"{out} exists; name another file, or replace it with --force.")
+        raise FileExistsError(
+            f"{out} exists; name another file, or replace it with --force."
+        )
     answers, missing = answered(given, ask=False)
     if missing and sys.stdin.isatty() and not arguments.json:
         answers, missing = answered(given, ask=True)
@@ -316,12 +360,19 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     report = hybridkin.workflow.Report(f"{robot.name}: {robot.n_actuators} actuators")
     report.record.update(columns=vars(log_format), log_check=None)
     q, x = ", ".join(log_format.q), ", ".join(log_format.x)
-    report.text(f"Columns: actuators {q}; tip {x}; motion {log_format.groups or '(none)'}.")
+    report.text(
+        f"Columns: actuators {q}; tip {x}; motion {log_format.groups or '(none)'}."
+    )
     if log is not None:
         options = {"base_is_free": robot.base_is_free, "delimiter": arguments.delimiter}
-        read = hybridkin.workflow.read_log(log, log_format, chain=robot.chain, **options)
+        read = hybridkin.workflow.read_log(
+            log, log_format, chain=robot.chain, **options
+        )
         _note(read.report, stages)
-        report.record["log_check"], code = read.report.to_dict(), 0 if read.report.ok else 1
+        report.record["log_check"], code = (
+            read.report.to_dict(),
+            0 if read.report.ok else 1,
+        )
     log_name, robot_name = (shlex.quote(str(path)) for path in (log or "log.csv", out))
     fit = f"hybridkin fit {log_name} --robot {robot_name} --out model"
     report.text(f"Read through {out}, then fit a model:\n$ {fit}")
@@ -332,7 +383,9 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
 def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     out, done = arguments.out, {}
     if out.exists() and not (out.is_dir() and not [*out.iterdir()]):
-        raise FileExistsError(f"{out} is not an empty folder; name another one by --out.")
+        raise FileExistsError(
+            f"{out} is not an empty folder; name another one by --out."
+        )
     out.mkdir(parents=True, exist_ok=True)
     stages.note("The data of this demo are simulated; no robot was measured.")
     demo.write_log(out / "log.csv")
@@ -346,13 +399,28 @@ def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     return _Outcome(report.record, shown(report), [out / "log.csv", *paths], code)
 
 
-_COMMANDS = (_next, _fit, _evaluate, _track, _verify, _animate, _export, _describe, _init, _demo)
+_COMMANDS = (
+    _next,
+    _fit,
+    _evaluate,
+    _track,
+    _verify,
+    _animate,
+    _export,
+    _describe,
+    _init,
+    _demo,
+)
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 
-def _limits(arguments: argparse.Namespace, loaded: LoadedModel, **options: bool) -> PathLimits:
+def _limits(
+    arguments: argparse.Namespace, loaded: LoadedModel, **options: bool
+) -> PathLimits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
-    asked = {name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max", "ddq_max")}
+    asked = {
+        name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max", "ddq_max")
+    }
     scaled = hybridkin.robots.Limits(**asked).scaled(loaded.log_format().q_factor)
     return hybridkin.workflow.path_limits(loaded, **vars(scaled), **options)
 
@@ -378,7 +446,9 @@ def _read(
     )
 
 
-def _log_format(arguments: argparse.Namespace, known: LogFormat | None, source: Path) -> LogFormat:
+def _log_format(
+    arguments: argparse.Namespace, known: LogFormat | None, source: Path
+) -> LogFormat:
     """Return how the log is written: what is known, with what the options say instead."""
     names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time")
     given = {name: vars(arguments)[name] for name in names}

@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin.datasets._log_geometry import geometry_findings, in_metres, zero_findings
-from hybridkin.datasets._log_report import MISREAD, SEVERITIES, LogFinding, LogReport, named_rows
+from hybridkin.datasets._log_report import (
+    MISREAD,
+    SEVERITIES,
+    LogFinding,
+    LogReport,
+    named_rows,
+)
 from hybridkin.datasets._log_residual import residual_findings
 from hybridkin.datasets._logs import Log, column_names
 
@@ -89,7 +95,16 @@ def check_log(
     findings = [*_invalid(log, complete, drop_invalid)]
     if valid.any():
         rows = _Rows(log.rows(valid), np.flatnonzero(valid))
-        for check in (_frozen, _constant, _balanced, _same, _duplicates, _jumps, _times, _motions):
+        for check in (
+            _frozen,
+            _constant,
+            _balanced,
+            _same,
+            _duplicates,
+            _jumps,
+            _times,
+            _motions,
+        ):
             findings += check(rows)
         found = [] if chain is None else [*zero_findings(rows.log, chain)]
         read, chain = in_metres(rows.log, chain)
@@ -125,7 +140,12 @@ class _Rows(NamedTuple):
         return named_rows(places[np.asarray(rows)], kind)
 
     def finding(
-        self, kind: str, message: str, advice: str, rows: ArrayLike = (), severity: str = "warning"
+        self,
+        kind: str,
+        message: str,
+        advice: str,
+        rows: ArrayLike = (),
+        severity: str = "warning",
     ) -> LogFinding:
         """Return a finding about some rows, or all rows."""
         numbers = self.numbers[np.asarray(rows, dtype=int)]
@@ -133,11 +153,15 @@ class _Rows(NamedTuple):
 
     def columns(self, which: str) -> list[tuple[str, NDArray]]:
         """Return the columns of "q" or "x" with their names."""
-        return [*zip(column_names(self.log, which), vars(self.log)[which].T, strict=True)]
+        return [
+            *zip(column_names(self.log, which), vars(self.log)[which].T, strict=True)
+        ]
 
     def same_motion(self) -> NDArray:
         """Return whether each row and the next belong to the same motion, shape (N - 1,)."""
-        groups = np.zeros(len(self.log.q)) if self.log.groups is None else self.log.groups
+        groups = (
+            np.zeros(len(self.log.q)) if self.log.groups is None else self.log.groups
+        )
         return groups[1:] == groups[:-1]
 
 
@@ -152,19 +176,25 @@ def _invalid(log: Log, valid: NDArray, drop_invalid: bool) -> Iterator[LogFindin
     if len(lines) == 0:
         return
     n = len(valid) + len(log.invalid_lines)
-    what = f"{len(lines)} of {n} rows have a missing, NaN or infinite value, or no motion"
+    what = (
+        f"{len(lines)} of {n} rows have a missing, NaN or infinite value, or no motion"
+    )
     what = f"{what} ({named_rows(lines, kind)})"
     if drop_invalid and valid.all():
         advice = "find out why: a marker that is hidden in some poses leaves a gap in the data."
         yield LogFinding("invalid", "warning", f"{what}; they were left out.", advice)
     else:
-        advice = "correct them, or leave them out with --drop-invalid (drop_invalid=True)."
+        advice = (
+            "correct them, or leave them out with --drop-invalid (drop_invalid=True)."
+        )
         yield LogFinding("invalid", "error", f"{what}.", advice, np.flatnonzero(~valid))
 
 
 def _runs(still: NDArray) -> list[tuple[int, int]]:
     """Return first and last row of each run in which all steps (N - 1,) are still."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+    edges = np.flatnonzero(
+        np.diff(np.concatenate([[False], still, [False]]).astype(int))
+    )
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
@@ -181,7 +211,9 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
                 f"{what} does not change at all in {len(found)} rows while the actuators move "
                 f"({rows.named(found)}): the sensor was frozen or lost the marker."
             )
-            advice = "leave these rows out with --drop-frozen, or delete them from the log."
+            advice = (
+                "leave these rows out with --drop-frozen, or delete them from the log."
+            )
             yield rows.finding("frozen tip", message, advice, found, severity)
         tips = np.union1d(tips, found) if what == "the tip" else tips
     moved = np.linalg.norm(np.ptp(x, axis=0))
@@ -195,7 +227,12 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
         share = (last - first) / len(still)
         alone = (column == column[first]).sum() <= last - first + 2
         way = np.linalg.norm(np.ptp(x[first : last + 1], axis=0))
-        if others < 0.05 * len(still) and share < 0.5 and alone and way > _FROZEN_WAY * moved:
+        if (
+            others < 0.05 * len(still)
+            and share < 0.5
+            and alone
+            and way > _FROZEN_WAY * moved
+        ):
             found = np.arange(first, last + 1)
             message = (
                 f"actuator {name!r}, which changes from row to row elsewhere, does not change at "
@@ -212,7 +249,9 @@ def _frozen_rows(q: NDArray, still: NDArray) -> NDArray:
     found = np.zeros(len(q), dtype=bool)
     for first, last in _runs(still):
         way = (np.ptp(q[first : last + 1], axis=0) / spans).max()
-        found[first : last + 1] = last - first + 1 >= _FROZEN_ROWS and way >= _FROZEN_WAY
+        found[first : last + 1] = (
+            last - first + 1 >= _FROZEN_ROWS and way >= _FROZEN_WAY
+        )
     return np.flatnonzero(found)
 
 
@@ -264,7 +303,9 @@ def _same(rows: _Rows) -> Iterator[LogFinding]:
 
 def _first_alike(columns: NDArray) -> NDArray:
     """Return for each row the first row that is equal to it."""
-    _, first, inverse = np.unique(columns, axis=0, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(
+        columns, axis=0, return_index=True, return_inverse=True
+    )
     return first[inverse.ravel()]
 
 
@@ -273,11 +314,17 @@ def _duplicates(rows: _Rows) -> Iterator[LogFinding]:
     original = _first_alike(np.column_stack([q, x]))
     copies = np.flatnonzero(original != np.arange(len(q)))
     if len(copies):
-        n = 0 if groups is None else int((groups[copies] != groups[original[copies]]).sum())
+        n = (
+            0
+            if groups is None
+            else int((groups[copies] != groups[original[copies]]).sum())
+        )
         across = f", {n} of them in another motion" if n else ""
         message = f"{len(copies)} rows are exact copies of earlier ones{across}"
         advice = "delete them: copies in training and test rows make held-out errors too small."
-        yield rows.finding("duplicates", f"{message} ({rows.named(copies)}).", advice, copies)
+        yield rows.finding(
+            "duplicates", f"{message} ({rows.named(copies)}).", advice, copies
+        )
     keep = np.setdiff1d(np.arange(len(q)), copies)
     command = _first_alike(q[keep])
     counts = np.bincount(command)
@@ -286,7 +333,9 @@ def _duplicates(rows: _Rows) -> Iterator[LogFinding]:
         # Standard deviation of the tips about the mean of their command, over repeated commands.
         sums = np.stack([np.bincount(command, c) for c in x[keep].T], axis=1)
         errors = x[keep] - (sums[command] / counts[command, None])
-        spread = np.sqrt((errors[again] ** 2).sum() / (again.sum() - (counts > 1).sum()))
+        spread = np.sqrt(
+            (errors[again] ** 2).sum() / (again.sum() - (counts > 1).sum())
+        )
         message = (
             f"{again.sum()} rows have the same command as another row, as in a motion out and "
             f"back; their tips differ by {1e3 * spread:.3g} mm rms."
@@ -335,7 +384,9 @@ def _times(rows: _Rows) -> Iterator[LogFinding]:
             f"{len(gaps)} gaps in time within a motion, up to {step[gaps - 1].max():.4g} s; the "
             f"usual step is {usual:.4g} s ({rows.named(gaps)})."
         )
-        advice = "rows were lost or the robot waited; if it was touched, name two motions."
+        advice = (
+            "rows were lost or the robot waited; if it was touched, name two motions."
+        )
         yield rows.finding("time", message, advice, gaps)
 
 

@@ -32,13 +32,33 @@ _BEND = (0.02, 1.0, 15.0)
 _LONG = (0.05, 3.0, 100.0)
 _LONGEST = 10.0  # [m] a longer robot, or one with radii of a tenth, is described in millimetres
 _SMALL_SHARE = 0.04  # range of the tip relative to that of the model
-_FAR_BETTER = 0.6  # missed motion of another reading relative to that of the declared one
+_FAR_BETTER = (
+    0.6  # missed motion of another reading relative to that of the declared one
+)
 _GOOD = 0.55  # missed motion of another reading
 _ENOUGH = 0.85  # explained share of the variance
 _TWIST = 120.0  # [deg] least rotation of a base about its axis
 _TILT = 45.0  # [deg] largest tilt of a base
-_BENDS = (0.25, 0.4, 0.5, 0.65, 1.5, 2.0, 2.5, 4.0)  # factors on all bends that are tried
-_SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # offsets, in standard deviations
+_BENDS = (
+    0.25,
+    0.4,
+    0.5,
+    0.65,
+    1.5,
+    2.0,
+    2.5,
+    4.0,
+)  # factors on all bends that are tried
+_SHIFTS = (
+    -2.0,
+    -1.0,
+    -0.5,
+    -0.25,
+    0.25,
+    0.5,
+    1.0,
+    2.0,
+)  # offsets, in standard deviations
 _SHIFTED = 0.87  # relative missed motion; for clean logs, simulated and real, it was above 0.89
 _SIMPLE = 1.1  # an earlier change in the list is chosen if it is nearly as good
 _ADVICE = {
@@ -74,7 +94,11 @@ class _Robot:
     def tips(self, q: NDArray) -> NDArray:
         """Return the tips (N, 3) of rows q [m]."""
         with torch.no_grad():
-            return self.chain(torch.from_numpy(np.ascontiguousarray(q, dtype=float))).cpu().numpy()
+            return (
+                self.chain(torch.from_numpy(np.ascontiguousarray(q, dtype=float)))
+                .cpu()
+                .numpy()
+            )
 
     def changed(self, q: NDArray) -> dict[tuple[str, float, float], NDArray]:
         """Return rows q after each tried change of their values.
@@ -106,7 +130,9 @@ def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
     plain = {"gains": chain.gains / chain.gains}
     if "actuator_zeros" in chain.geometry():
         plain["actuator_zeros"] = 0.0 * chain.gains
-    return replace(log, q=q, units={**log.units, "q": "m"}), chain.with_geometry(**plain)
+    return replace(log, q=q, units={**log.units, "q": "m"}), chain.with_geometry(
+        **plain
+    )
 
 
 def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFinding]:
@@ -180,16 +206,16 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
     x_factor = _factor(reach, _USUAL_REACH) if reach > _REACH else None
     if x_factor is None:
         tips = robot.tips(q[:: max(1, len(q) // _ROWS)] / (q_factor or 1.0))
-        share = spread / max(float(np.linalg.norm(np.ptp(tips, axis=0))), np.finfo(float).tiny)
+        share = spread / max(
+            float(np.linalg.norm(np.ptp(tips, axis=0))), np.finfo(float).tiny
+        )
         x_factor = _factor(share, 1.0) if 0.0 < share < _SMALL_SHARE else None
     if max(robot.length, 10.0 * radii.max()) > _LONGEST and (q_factor or x_factor):
         message = (
             f"the robot is described with a length of {robot.length:g} m and radii up to "
             f"{radii.max():g} m, which look like millimetres; q and x do not fit to them."
         )
-        advice = (
-            "give radii, lengths and offsets of the description in metres: divide them by 1000."
-        )
+        advice = "give radii, lengths and offsets of the description in metres: divide them by 1000."
         yield LogFinding("units", "error", message, advice)
         return
     if q_factor is not None:
@@ -224,7 +250,9 @@ def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
             looks = f"these look like {words}"
             remedy = f'set {name}_unit = "{other}" {where} {other}'
     message = f"columns of {name} are declared as {unit}, but {what}; {looks}."
-    advice = f"{remedy}; or correct the radii and lengths of the description, in metres."
+    advice = (
+        f"{remedy}; or correct the radii and lengths of the description, in metres."
+    )
     return LogFinding("units", "error", message, advice)
 
 
@@ -234,13 +262,17 @@ def _signs(sign: NDArray) -> Way:
 
 def _sign_advice(log: Log, way: Way) -> str:
     """Return the advice to set the signs of a way of reading the columns."""
-    sign = np.array(way.sign) * np.broadcast_to(log.q_sign, len(way.sign))[list(way.order)]
+    sign = (
+        np.array(way.sign) * np.broadcast_to(log.q_sign, len(way.sign))[list(way.order)]
+    )
     if np.ptp(sign) > 0:
         return f"set q_sign = {sign.tolist()} in [log] of the robot description."
     return f"set q_sign = {sign[0]} in [log] of the robot description, or --q-sign={sign[0]}."
 
 
-def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterator[LogFinding]:
+def _orientation_findings(
+    log: Log, robot: _Robot, base_is_free: bool
+) -> Iterator[LogFinding]:
     chain = robot.chain
     flip = _sign_advice(log, _signs(np.where(robot.pulled, -1, 1)))
     pulls = log.q[:, robot.pulled]
@@ -271,7 +303,9 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
     if other < min(good, _FAR_BETTER * least):
         name = column_names(log, "q")[i]
         axis = column_names(log, "x")[j]
-        message = f"{compared}{_share(other)} with columns {name!r} and {axis!r} exchanged."
+        message = (
+            f"{compared}{_share(other)} with columns {name!r} and {axis!r} exchanged."
+        )
         yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
         return
     changed = robot.changed(q[few])
@@ -295,7 +329,9 @@ def _orientation_findings(log: Log, robot: _Robot, base_is_free: bool) -> Iterat
             far = 1e3 * abs(by) * q[:, int(i)].std()
             does = "is off" if kind == "offset" else "drifts"
             what = f"actuator {name!r} {does} by about {far:.1g} mm"
-        message = f"the error of the nominal model falls to {100 * share:.0f} % if {what}."
+        message = (
+            f"the error of the nominal model falls to {100 * share:.0f} % if {what}."
+        )
         yield LogFinding(kind, "warning", message, _ADVICE[kind])
     elif 1 - missed**2 < _ENOUGH:
         explained = f"{_share(missed)} of the tip's motion, in any order and sign of q"
@@ -328,7 +364,9 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
         kind, what = "numbering", ["the actuators numbered in the other direction"]
         first, second = robot.chain.angles[:2].tolist()
         counted = f"set clockwise = {str(np.sin(second - first) > 0).lower()} in every [[segment]]"
-        advice = [f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."]
+        advice = [
+            f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."
+        ]
     elif names != declared:
         kind, what = "order", [f"the columns of q in the order {', '.join(names)}"]
         listed = f"set q = {json.dumps(names)} in [log] of the robot description."
@@ -336,10 +374,14 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
     if min(way.sign) < 0:
         flipped = "q"
         if max(way.sign) > 0:
-            flipped = ", ".join(repr(names[i]) for i in np.flatnonzero(np.less(way.sign, 0)))
+            flipped = ", ".join(
+                repr(names[i]) for i in np.flatnonzero(np.less(way.sign, 0))
+            )
         what.append(f"the sign of {flipped} flipped")
         advice.append(_sign_advice(log, way))
-    return LogFinding(kind, "warning", f"{compared}{' and '.join(what)}.", " ".join(advice))
+    return LogFinding(
+        kind, "warning", f"{compared}{' and '.join(what)}.", " ".join(advice)
+    )
 
 
 def _factor(ratio: float, usual: float) -> float:

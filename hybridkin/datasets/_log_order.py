@@ -74,7 +74,10 @@ def changes(counts: list[int], signed: bool) -> Iterator[Way]:
 
 def _segments(counts: Sequence[int]) -> list[list[int]]:
     """Return the columns of every segment."""
-    return [part.tolist() for part in np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])]
+    return [
+        part.tolist()
+        for part in np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+    ]
 
 
 def _clockwise(counts: list[int]) -> Way:
@@ -137,7 +140,9 @@ def _centred(chain: Any, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
     return tips - tips.mean(dim=1, keepdim=True), measured - measured.mean(dim=0)
 
 
-def better_way(chain: Any, q: NDArray, x: NDArray, base_is_free: bool) -> tuple[Way, float]:
+def better_way(
+    chain: Any, q: NDArray, x: NDArray, base_is_free: bool
+) -> tuple[Way, float]:
     """Return the best found way to read the columns, and its relative error (see `misses`).
 
     Each round tries all changes on the best ways of the previous round.

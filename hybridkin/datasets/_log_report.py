@@ -101,7 +101,9 @@ class LogReport:
         for f in self.findings:
             if f.kind == kind:
                 message = f"{f.message} They were left out."
-                others.append(LogFinding(kind, "note", message, "find out why.", f.rows))
+                others.append(
+                    LogFinding(kind, "note", message, "find out why.", f.rows)
+                )
         return replace(self, findings=tuple(others))
 
     def to_dict(self) -> dict[str, Any]:
@@ -111,7 +113,8 @@ class LogReport:
         for name in ("q_range", "x_range"):
             record[name] = record[name].tolist()
         record["findings"] = [
-            {**vars(f), "rows": f.rows.tolist(), "n_rows": len(f.rows)} for f in self.findings
+            {**vars(f), "rows": f.rows.tolist(), "n_rows": len(f.rows)}
+            for f in self.findings
         ]
         return record
 
@@ -123,9 +126,15 @@ class LogReport:
 
     def __str__(self) -> str:
         """Return the report as text, one paragraph for each finding."""
-        motions = "motions not named" if self.n_motions is None else f"{self.n_motions} motions"
+        motions = (
+            "motions not named"
+            if self.n_motions is None
+            else f"{self.n_motions} motions"
+        )
         spans = 1e3 * np.ptp(self.x_range, axis=1)
-        scale, unit = {"m": (1e3, " mm"), "rad": (180.0 / np.pi, " deg")}.get(self.q_unit, (1, ""))
+        scale, unit = {"m": (1e3, " mm"), "rad": (180.0 / np.pi, " deg")}.get(
+            self.q_unit, (1, "")
+        )
         lines = [
             f"Log {self.source}: {self.n_rows} rows, {motions}, {self.n_actuators} actuators"
             + ("" if self.duration is None else f", {self.duration:.4g} s"),
@@ -150,7 +159,9 @@ def named_rows(places: NDArray, kind: str) -> str:
     """Return places as text, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
     found = np.sort(places)
     runs = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
-    words = [f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:4]]
+    words = [
+        f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:4]
+    ]
     left = sum(map(len, runs[4:]))
     more = f" and {left} more" if left else ""
     return f"{kind}{'s' if len(found) > 1 else ''} {', '.join(words)}{more}"

@@ -33,7 +33,10 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
     features, x = _features(log.q, chain), log.x
     if len(x) < 3 * features.shape[1] or not np.ptp(x, axis=0).any():
         return
-    size, t = 1e3 * np.sqrt(x.var(axis=0).sum()), np.linspace(-1.0, 1.0, len(x))[:, None]
+    size, t = (
+        1e3 * np.sqrt(x.var(axis=0).sum()),
+        np.linspace(-1.0, 1.0, len(x))[:, None],
+    )
     left, drifted = _left(features, x), _left(np.hstack([features, t, t**2]), x)
     if drifted < _DRIFT * left:
         message = (
@@ -47,7 +50,10 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
         yield LogFinding("drift", "warning", message, advice)
     run, lagged = np.concatenate([[0], np.cumsum(~same)]), {0: left}
     for k in range(-_LAGS, _LAGS + 1):
-        early, late = slice(max(-k, 0), min(-k, 0) or None), slice(max(k, 0), min(k, 0) or None)
+        early, late = (
+            slice(max(-k, 0), min(-k, 0) or None),
+            slice(max(k, 0), min(k, 0) or None),
+        )
         kept = run[early] == run[late]
         if k and kept.sum() > 0.3 * len(x):
             lagged[k] = _left(features[early][kept], x[late][kept])

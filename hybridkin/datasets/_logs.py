@@ -16,14 +16,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import as_path, check_shape, countable, labels, one_of, real_array
+from hybridkin._core.arrays import (
+    as_path,
+    check_shape,
+    countable,
+    labels,
+    one_of,
+    real_array,
+)
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
 
 _DELIMITERS = (",", ";", "\t")
-_UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing name of a motion, as text
-_MOST_COLUMNS, _LONGEST = 10_000, 256  # columns of a file; characters of a motion's name
+_UNNAMED = (
+    "",
+    "nan",
+    "NaN",
+    "NaT",
+    "None",
+    "<NA>",
+)  # a missing name of a motion, as text
+_MOST_COLUMNS, _LONGEST = (
+    10_000,
+    256,
+)  # columns of a file; characters of a motion's name
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,7 +90,13 @@ class Log:
             if vars(self)[name] is not None:
                 vars(self)[name] = real_array(vars(self)[name], name)
         q, x = np.shape(self.q), np.shape(self.x)
-        if len(q) != 2 or len(x) != 2 or x[0] != q[0] or x[1] % 3 or 0 in (*q[:1], x[1]):
+        if (
+            len(q) != 2
+            or len(x) != 2
+            or x[0] != q[0]
+            or x[1] % 3
+            or 0 in (*q[:1], x[1])
+        ):
             raise ValueError(
                 f"`Log` needs q of shape (N, n) and x of shape (N, 3), or (N, 3 K) of K markers, "
                 f"got {q} and {x}."
@@ -82,14 +105,18 @@ class Log:
             vars(self)["groups"] = labels(self.groups, q[0])
         for name in ("time", "line"):
             if vars(self)[name] is not None:
-                check_shape(np.asarray(vars(self)[name]), name, [q[0]], "one for each row")
+                check_shape(
+                    np.asarray(vars(self)[name]), name, [q[0]], "one for each row"
+                )
 
     def __repr__(self) -> str:
         """Return a summary of a few lines."""
         tips = self.x[:, -3:]
         sides = np.fmax.reduce(tips) - np.fmin.reduce(tips)
         span = " x ".join(f"{side:.3g}" for side in sides)
-        motions = "" if self.groups is None else f", {len(np.unique(self.groups))} motions"
+        motions = (
+            "" if self.groups is None else f", {len(np.unique(self.groups))} motions"
+        )
         lines = [f"{type(self).__name__} of {self.source}: {len(self.q)} rows{motions}"]
         lines += [f"{self.q.shape[1]} actuators: {', '.join(column_names(self, 'q'))}"]
         lines[-1] += f"; {self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
@@ -100,8 +127,12 @@ class Log:
 
     def rows(self, kept: NDArray | slice) -> Self:
         """Return a log of some of the rows."""
-        columns = {name: vars(self)[name] for name in ("q", "x", "groups", "time", "line")}
-        return replace(self, **{k: v[kept] for k, v in columns.items() if v is not None})
+        columns = {
+            name: vars(self)[name] for name in ("q", "x", "groups", "time", "line")
+        }
+        return replace(
+            self, **{k: v[kept] for k, v in columns.items() if v is not None}
+        )
 
 
 def column_names(log: Log, which: str) -> list[str]:
@@ -197,7 +228,9 @@ def load_log(
             f"`x` must name 3 columns, or 3 for each of several markers, got {len(x)}: {x}."
         )
     factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
-    values, motions = table.rows([*q, *x, *([] if time is None else [time])], time, groups)
+    values, motions = table.rows(
+        [*q, *x, *([] if time is None else [time])], time, groups
+    )
     places = np.arange(len(values)) if table.lines is None else table.lines
     tips = slice(len(q), len(q) + len(x))
     known = countable(values)
@@ -234,13 +267,18 @@ def load_log(
         q_names=q,
         x_names=x,
         q_sign=q_sign,
-        units={"q": "m" if q_unit in METRES else "1" if q_unit == "1" else "rad", "x": "m"},
+        units={
+            "q": "m" if q_unit in METRES else "1" if q_unit == "1" else "rad",
+            "x": "m",
+        },
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )
 
 
-def log_columns(path: str | os.PathLike[str], delimiter: str | None = None) -> list[str]:
+def log_columns(
+    path: str | os.PathLike[str], delimiter: str | None = None
+) -> list[str]:
     """Return the names of the columns of a log file.
 
     Parameters
@@ -258,7 +296,9 @@ def log_columns(path: str | os.PathLike[str], delimiter: str | None = None) -> l
 
 def _read(path: Path, delimiter: str | None) -> _Table:
     if not path.is_file():
-        raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
+        raise FileNotFoundError(
+            f"`path` must be a log file, there is none at {str(path)!r}."
+        )
     read = {".npz": _read_npz, ".parquet": _read_parquet, ".pq": _read_parquet}
     suffix = path.suffix.lower()
     return read[suffix](path) if suffix in read else _read_text(path, delimiter)
@@ -291,7 +331,9 @@ class _Table(NamedTuple):
             raise ValueError(f"`{argument}` names a column twice: {asked}.")
         found: list[str] = []
         for name in asked:
-            parts = [c for c in self.header if re.fullmatch(rf"{re.escape(name)}\[\d+\]", c)]
+            parts = [
+                c for c in self.header if re.fullmatch(rf"{re.escape(name)}\[\d+\]", c)
+            ]
             found += [name] if name in self.header or not parts else parts
         for name in found:
             self.column(name)
@@ -300,10 +342,14 @@ class _Table(NamedTuple):
     def column(self, name: str) -> NDArray | Sequence[str]:
         """Return the column of that name."""
         if not isinstance(name, str):
-            raise TypeError(f"`groups` and `time` must be names of columns, got {name!r:.80}.")
+            raise TypeError(
+                f"`groups` and `time` must be names of columns, got {name!r:.80}."
+            )
         count, path = self.header.count(name), str(self.path)
         if count > 1:
-            raise ValueError(f"Column {name!r} occurs {count} times in {path!r}; rename it.")
+            raise ValueError(
+                f"Column {name!r} occurs {count} times in {path!r}; rename it."
+            )
         if count:
             return self.columns[self.header.index(name)]
         close = [other for other in self.header if other.lower() == name.lower()]
@@ -320,13 +366,17 @@ class _Table(NamedTuple):
         column = self.column(name)
         if self.lines is not None:
             cells = zip(column, self.lines, strict=True)
-            return np.array([_number(str(cell), name, line, self.path) for cell, line in cells])
+            return np.array(
+                [_number(str(cell), name, line, self.path) for cell, line in cells]
+            )
         values = np.asarray(column)
         kind = values.dtype
         try:
             if as_time and kind.kind in "mM":
                 return (values - kind.type(0, "s")) / np.timedelta64(1, "s")
-            if kind.kind in "cVmM":  # astype would use a real part, or ticks of some unit
+            if (
+                kind.kind in "cVmM"
+            ):  # astype would use a real part, or ticks of some unit
                 raise TypeError(kind)
             return values.astype(float)
         except (TypeError, ValueError, OverflowError) as error:
@@ -340,7 +390,9 @@ class _Table(NamedTuple):
         """Return columns as numbers (N, k), that of the time in seconds, and the groups."""
         found, labels = {name: self.numbers(name, name == time) for name in names}, None
         if len(found) < len(names):
-            raise ValueError(f"`q`, `x` and `time` must name a column once, got {names}.")
+            raise ValueError(
+                f"`q`, `x` and `time` must name a column once, got {names}."
+            )
         sizes = {name: len(column) for name, column in found.items()}
         if groups is not None:
             named = [str(value).strip() for value in self.column(groups)]
@@ -368,19 +420,27 @@ def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDAr
     one_of(x_unit, "x_unit", METRES)
     sign = real_array(q_sign, "q_sign")
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
-        raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
+        raise ValueError(
+            f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}."
+        )
     return sign * UNITS[q_unit]
 
 
 def _read_text(path: Path, delimiter: str | None) -> _Table:
-    if delimiter is not None and not (isinstance(delimiter, str) and len(delimiter) == 1):
-        raise ValueError(f"`delimiter` must be one character or None, got {delimiter!r:.80}.")
+    if delimiter is not None and not (
+        isinstance(delimiter, str) and len(delimiter) == 1
+    ):
+        raise ValueError(
+            f"`delimiter` must be one character or None, got {delimiter!r:.80}."
+        )
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
             delimiter = delimiter or max(_DELIMITERS, key=file.readline().count)
             file.seek(0)
             reader = csv.reader(file, delimiter=delimiter)
-            rows = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
+            rows = [
+                (reader.line_num, row) for row in reader if any(map(str.strip, row))
+            ]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(
             f"{str(path)!r} is not a text file in UTF-8, or does not close a quote ({error}); save "
@@ -390,7 +450,9 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
         raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
     n = len(rows[0][1])
     if n > _MOST_COLUMNS:
-        raise ValueError(f"{str(path)!r} must have at most {_MOST_COLUMNS} columns, got {n}.")
+        raise ValueError(
+            f"{str(path)!r} must have at most {_MOST_COLUMNS} columns, got {n}."
+        )
     for line, row in rows:
         if len(row) > n:
             raise ValueError(
@@ -439,8 +501,12 @@ def _read_parquet(path: Path) -> _Table:
             "save the log as CSV or npz."
         ) from error
     except Exception as error:  # pyarrow and pandas have many kinds of them
-        raise ValueError(f"{str(path)!r} is not a parquet file: {error!s:.200}.") from error
-    return _Table(path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns])
+        raise ValueError(
+            f"{str(path)!r} is not a parquet file: {error!s:.200}."
+        ) from error
+    return _Table(
+        path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns]
+    )
 
 
 def _check_rows(path: Path) -> None:

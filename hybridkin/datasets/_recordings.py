@@ -44,7 +44,9 @@ SOURCES = {
 }
 
 
-def load_ftdcr(data_home: str | os.PathLike[str] | None = None, *, subset: str = "train") -> Bunch:
+def load_ftdcr(
+    data_home: str | os.PathLike[str] | None = None, *, subset: str = "train"
+) -> Bunch:
     """Return motion-capture data of a real robot with three segments and nine tendons.
 
     Nominal: segments of 60, 62.5 and 64 mm, tendon circle 4.5 mm. Tendons of distal segments run
@@ -73,7 +75,9 @@ def load_ftdcr(data_home: str | os.PathLike[str] | None = None, *, subset: str =
         If the files do not exist; the message names their source.
     """
     if subset not in FTDCR_FILES:
-        raise ValueError(f"`subset` must be one of {list(FTDCR_FILES)}, got {subset!r}.")
+        raise ValueError(
+            f"`subset` must be one of {list(FTDCR_FILES)}, got {subset!r}."
+        )
     path, origin = _locate(data_home, "ftdcr_v4", FTDCR_FILES[subset])
     log = load_log(path, FTDCR_SERVOS, FTDCR_TIP, "pattern_label", **FTDCR_FORMAT)
     labels = np.asarray(log.groups)
@@ -169,7 +173,9 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     )
 
 
-def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str) -> dict[str, NDArray]:
+def _arrays(
+    path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str
+) -> dict[str, NDArray]:
     """Return the arrays of a recording; raise if their rows do not have these shapes."""
     file = arrays_of(path)
     n = {len(array) for name, array in file.items() if name in shapes and array.ndim}
@@ -180,7 +186,9 @@ def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str) -> d
         right &= array.ndim > 0 and len(n) == 1 and array.dtype.kind in kind
         if not right or (kind != "U" and not np.isfinite(array).all()):
             got = f"of shape {array.shape} and type {array.dtype!s:.40}"
-            raise ValueError(f"{path} is damaged: {name!r} is {got}; copy the file again.")
+            raise ValueError(
+                f"{path} is damaged: {name!r} is {got}; copy the file again."
+            )
     return file
 
 
@@ -192,7 +200,9 @@ def _locate(
     home = os.environ.get(DATA_HOME) if data_home is None else data_home
     path = None if not home else Path(home) / folder / name
     if path is None or not path.is_file():
-        looked = "no data_home was given" if path is None else f"there is no {str(path)!r}"
+        looked = (
+            "no data_home was given" if path is None else f"there is no {str(path)!r}"
+        )
         raise FileNotFoundError(
             f"{folder}/{name} is not part of hybridkin, and {looked}. Its source: {source}. Put "
             f"the file into a folder {folder!r} and give its parent folder as `data_home` or as "

@@ -50,7 +50,10 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
     >>> data.q.shape, data.x.shape
     ((2000, 9), (2000, 3))
     """
-    with as_file(files("hybridkin.datasets") / "data" / "trunk.npz") as path, np.load(path) as file:
+    with (
+        as_file(files("hybridkin.datasets") / "data" / "trunk.npz") as path,
+        np.load(path) as file,
+    ):
         columns = {name: file[name] for name in ("q", "x", "q_target", "part")}
         parameters = json.loads(str(file["parameters"]))
     if return_X_y:
@@ -105,7 +108,9 @@ def paper_split(
     """
     part = getattr(data, "part", data)
     if part is None:
-        raise ValueError("`data` has no parts of the paper's protocol; give data of `load_trunk`.")
+        raise ValueError(
+            "`data` has no parts of the paper's protocol; give data of `load_trunk`."
+        )
     part = shaped(part, "data", ["n_samples"])
     random_rows = np.flatnonzero(part == 3)
     n_test = whole(n_test, "n_test", 1, len(random_rows))

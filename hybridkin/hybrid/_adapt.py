@@ -25,7 +25,9 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import evaluate
 
 PARAMETERS = ("base", "actuator_zeros")
-_SCALES = 10.0 ** np.arange(-3.0, 0.6, 0.5)  # prior standard deviations, in natural units
+_SCALES = 10.0 ** np.arange(
+    -3.0, 0.6, 0.5
+)  # prior standard deviations, in natural units
 _COMMON = 0.5  # share of the variance of a row that its whole group shares
 _ROUNDS, _CHOOSING = 30, 6  # Gauss-Newton rounds; the first ones also choose the scales
 _SETTLED = 1e-9
@@ -110,7 +112,11 @@ def _misfit(rms: float, noise: float) -> str | None:
 
 def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
     """Raise if `parameters` are not allowed; `in_space`: outputs are tips in space or poses."""
-    if isinstance(parameters, str) or not parameters or not {*parameters} <= {*PARAMETERS}:
+    if (
+        isinstance(parameters, str)
+        or not parameters
+        or not {*parameters} <= {*PARAMETERS}
+    ):
         raise ValueError(
             f"`parameters` must be one or both of {PARAMETERS} in a list, got {parameters!r}."
         )
@@ -138,7 +144,11 @@ class _Problem:
         R, motion = rotation(change[:3])[0], identity(4, change)
         motion[:3, :3] = R
         motion[:3, 3] = self.pivot - R @ self.pivot + self.reach * change[3:6]
-        kind = AdaptedPoseModel if isinstance(self.fitted, PoseHybridModule) else AdaptedModel
+        kind = (
+            AdaptedPoseModel
+            if isinstance(self.fitted, PoseHybridModule)
+            else AdaptedModel
+        )
         return kind(self.fitted, self.scale * change[6:], motion)
 
     def registered(self, noise: float) -> NDArray:
@@ -147,7 +157,10 @@ class _Problem:
         Arun, Huang & Blostein (1987); the rotation stays small about axes that are not identified.
         """
         x = torch.from_numpy(evaluate(self.fitted, self.q.numpy())[0])
-        y, theta = self.y[:, : x.shape[1]].reshape(-1, 3), self.q.new_zeros(6 + len(self.scale))
+        y, theta = (
+            self.y[:, : x.shape[1]].reshape(-1, 3),
+            self.q.new_zeros(6 + len(self.scale)),
+        )
         measured = ~y.isnan().any(1)
         x, y = x.reshape(-1, 3)[measured], y[measured]
         moments = (y - y.mean(0)).mT @ (x - x.mean(0)) + noise**2 * identity(3, x)
@@ -170,7 +183,11 @@ class _Problem:
         spin = rotation(torch.from_numpy(theta[:3]))[1]
         pose, K = isinstance(self.fitted, PoseHybridModule), x.shape[1] // 3
         if x.shape[1] % 3 == 0:
-            arm = x.unflatten(1, (K, 3)) - self.pivot - self.reach * torch.from_numpy(theta[3:6])
+            arm = (
+                x.unflatten(1, (K, 3))
+                - self.pivot
+                - self.reach * torch.from_numpy(theta[3:6])
+            )
             A[..., :3] = (-cross_matrix(arm) @ spin).flatten(1, 2)
             A[..., 3:6] = self.reach * identity(3, x).repeat(K, 1)
         if pose:
@@ -195,9 +212,9 @@ def _whitened(values: NDArray, groups: NDArray | None) -> NDArray:
     shape = (-1,) + (1,) * (values.ndim - 1)
     means = (sums / counts.reshape(shape))[of]
     own = 1.0 - _COMMON
-    return (values - means) / own**0.5 + means / ((own + _COMMON * counts) ** 0.5)[of].reshape(
-        shape
-    )
+    return (values - means) / own**0.5 + means / ((own + _COMMON * counts) ** 0.5)[
+        of
+    ].reshape(shape)
 
 
 def _likeliest_scales(
@@ -211,14 +228,18 @@ def _likeliest_scales(
     base, zeros = (name in parameters for name in PARAMETERS)
     scales = _SCALES.tolist()
     bases = [(0.0, 0.0), *(product(scales, scales) if base else ())]
-    tried = np.array([(*pair, own) for pair in bases for own in [0.0, *(scales if zeros else ())]])
+    tried = np.array(
+        [(*pair, own) for pair in bases for own in [0.0, *(scales if zeros else ())]]
+    )
     std = np.repeat(tried, (3, 3, A.shape[1] - 6), axis=1)
     moments = std * (A.T @ target)
     systems = std[:, :, None] * (A.T @ A) * std[:, None]
     evidence = np.empty((len(MISFITS), len(std)))
     for k, misfit in enumerate(MISFITS):
         inner = systems / misfit + np.eye(A.shape[1])
-        explained = (moments * np.linalg.solve(inner, moments[..., None])[..., 0]).sum(1) / misfit
+        explained = (moments * np.linalg.solve(inner, moments[..., None])[..., 0]).sum(
+            1
+        ) / misfit
         left = (target @ target - explained) / misfit + len(A) * np.log(misfit)
         evidence[k] = -0.5 * (left + np.linalg.slogdet(inner)[1])
     evidence -= SWITCH * (tried[:, 1:] > 0.0).sum(1)

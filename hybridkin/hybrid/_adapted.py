@@ -41,7 +41,10 @@ class AdaptedModel(ForwardModel):
     """
 
     layout = Layout(
-        "adapted_model", {"shift": "n", "motion": "44"}, parts=("fitted",), write_plan=_write_plan
+        "adapted_model",
+        {"shift": "n", "motion": "44"},
+        parts=("fitted",),
+        write_plan=_write_plan,
     )
     fitted: Hybrid
 
@@ -70,8 +73,15 @@ class AdaptedModel(ForwardModel):
             return None
         if isinstance(f, Chain):
             geometry = f.geometry()
-            in_unit = {"actuator_zeros": shift, "tendon_zeros": geometry.get("gains", 1.0) * shift}
-            zeros = {name: geometry[name] - in_unit[name] for name in in_unit if name in geometry}
+            in_unit = {
+                "actuator_zeros": shift,
+                "tendon_zeros": geometry.get("gains", 1.0) * shift,
+            }
+            zeros = {
+                name: geometry[name] - in_unit[name]
+                for name in in_unit
+                if name in geometry
+            }
             if zeros or not shift.any():
                 return f.with_geometry(base=self.motion @ geometry["base"], **zeros)
         return self.of(type(self.fitted)(f, [], shift[:0]))
@@ -140,7 +150,9 @@ class AdaptedModel(ForwardModel):
         return self.fitted.domain_distance(self._then(q))
 
     def _then(self, q: Tensor) -> Tensor:
-        check_vectors(q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators")
+        check_vectors(
+            q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators"
+        )
         return q + self.shift.to(q)
 
     def _turned(self, v: Tensor, motion: Tensor) -> Tensor:

@@ -57,7 +57,9 @@ class Drift(NamedTuple):
         none = np.zeros((n_outputs, n, n)), np.zeros((n, n_outputs)), np.zeros(())
         return cls(center.numpy(), scale.numpy(), *none)
 
-    def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
+    def learned(
+        self, q: NDArray, residual: NDArray, weights: NDArray, decay: float
+    ) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.
 
         Each row multiplies the weights of all earlier rows by `decay`, once per repetition. The

@@ -36,7 +36,12 @@ from hybridkin.hybrid._features import (
 from hybridkin.hybrid._guards import fit_guard
 from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._linearised import Pair
-from hybridkin.hybrid._module import Correction, HybridModule, InnerCorrection, TipCorrection
+from hybridkin.hybrid._module import (
+    Correction,
+    HybridModule,
+    InnerCorrection,
+    TipCorrection,
+)
 from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
 from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.elm import ELMRegressor, draw_layer
@@ -104,7 +109,9 @@ class ErrorModel(ABC):
     def fit(self, residuals: Residuals) -> FittedError:
         """Return the error model fitted to residuals; it does not change itself."""
 
-    def for_markers(self, residuals: Residuals, tips: Sequence[Any]) -> list[ErrorModel]:
+    def for_markers(
+        self, residuals: Residuals, tips: Sequence[Any]
+    ) -> list[ErrorModel]:
         """Return the error model of every marker, given the residuals of all and their chains."""
         return [self for _ in tips]
 
@@ -133,7 +140,9 @@ class FeatureModel(ErrorModel):
         See `fit_readout`.
     """
 
-    def __init__(self, coupling: str, alphas: Pair | None = None, noise_ratio: float = inf) -> None:
+    def __init__(
+        self, coupling: str, alphas: Pair | None = None, noise_ratio: float = inf
+    ) -> None:
         self.coupling = coupling
         self.alphas = alphas
         self.noise_ratio = noise_ratio
@@ -166,7 +175,9 @@ class FeatureModel(ErrorModel):
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error
 
-    def for_markers(self, residuals: Residuals, tips: Sequence[Any]) -> list[ErrorModel]:
+    def for_markers(
+        self, residuals: Residuals, tips: Sequence[Any]
+    ) -> list[ErrorModel]:
         """Return the error model of every marker; a serial one is learned once from all."""
         if self.coupling == "parallel" or not residuals.directions.moved.size:
             return super().for_markers(residuals, tips)
@@ -187,7 +198,9 @@ class FeatureModel(ErrorModel):
         else:
             correction = TipCorrection(module)
         noise = fit.rmse / points(fit.residual).shape[2] ** 0.5
-        return FittedError(fit, _guarded(correction, module, residuals), self._settled(fit), noise)
+        return FittedError(
+            fit, _guarded(correction, module, residuals), self._settled(fit), noise
+        )
 
 
 class NamedFeatures(FeatureModel):
@@ -202,7 +215,11 @@ class NamedFeatures(FeatureModel):
     """
 
     def __init__(
-        self, name: str, coupling: str, alphas: Pair | None = None, noise_ratio: float = inf
+        self,
+        name: str,
+        coupling: str,
+        alphas: Pair | None = None,
+        noise_ratio: float = inf,
     ) -> None:
         super().__init__(coupling, alphas, noise_ratio)
         self.name = name
@@ -253,7 +270,9 @@ class HiddenLayer(FeatureModel):
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
         layer = draw_layer(self.layer, q.numpy(), None)
-        return HiddenFeatures.of_range(q, layer.input_weights, layer.input_bias, layer.activation)
+        return HiddenFeatures.of_range(
+            q, layer.input_weights, layer.input_bias, layer.activation
+        )
 
 
 class _ReadOut(ErrorModel):
@@ -332,7 +351,9 @@ class NetworkModel(RegressorModel):
         with torch.no_grad():
             after = rows.tips - network(rows.q).numpy()
             leverage = rows.counts * network.leverage(rows.q).numpy()
-        return _spread(after / (1.0 - leverage.clip(max=_LARGEST_LEVERAGE))[:, None], rows.counts)
+        return _spread(
+            after / (1.0 - leverage.clip(max=_LARGEST_LEVERAGE))[:, None], rows.counts
+        )
 
 
 class NetworkModelCV(RegressorModel):
@@ -385,14 +406,21 @@ class WeightedModels(ErrorModel):
         fits = [model.fit(residuals) for model in self.models]
         corrections = []
         for weight, fitted in zip(self.weights, fits, strict=True):
-            corrections += [(weight * part, correction) for part, correction in fitted.corrections]
+            corrections += [
+                (weight * part, correction) for part, correction in fitted.corrections
+            ]
         blend = Blend(self.weights, tuple(fitted.result for fitted in fits))
         return FittedError(blend, tuple(corrections), self)
 
-    def for_markers(self, residuals: Residuals, tips: Sequence[Any]) -> list[ErrorModel]:
+    def for_markers(
+        self, residuals: Residuals, tips: Sequence[Any]
+    ) -> list[ErrorModel]:
         """Return the weighted mean for every marker."""
         by_model = [model.for_markers(residuals, tips) for model in self.models]
-        return [WeightedModels(self.weights, models) for models in zip(*by_model, strict=True)]
+        return [
+            WeightedModels(self.weights, models)
+            for models in zip(*by_model, strict=True)
+        ]
 
 
 class PerMarker(ErrorModel):
@@ -409,9 +437,13 @@ class PerMarker(ErrorModel):
 
     def fit(self, residuals: Residuals) -> FittedError:
         """Raise: markers are fitted one by one."""
-        raise TypeError("an error model for each marker cannot be fitted to one of them")
+        raise TypeError(
+            "an error model for each marker cannot be fitted to one of them"
+        )
 
-    def for_markers(self, residuals: Residuals, tips: Sequence[Any]) -> list[ErrorModel]:
+    def for_markers(
+        self, residuals: Residuals, tips: Sequence[Any]
+    ) -> list[ErrorModel]:
         """Return the error model of every marker; serial ones have the same settings for all."""
         first = self.models[0]
         if isinstance(first, FeatureModel) and first.coupling == "serial":
@@ -420,7 +452,9 @@ class PerMarker(ErrorModel):
 
 
 def error_model_of(
-    setting: BaseEstimator | str | None, coupling: str, seed: int | np.random.RandomState | None
+    setting: BaseEstimator | str | None,
+    coupling: str,
+    seed: int | np.random.RandomState | None,
 ) -> ErrorModel:
     """Return the error model for the settings of a HybridForwardModel, which are checked already.
 
@@ -469,7 +503,9 @@ def _guarded(
         alone = HybridModule(residuals.mechanical, [correction], q.new_ones(1))
         with torch.no_grad():
             values = alone.error_part(q)
-        correction.guard = fit_guard(residuals.guard, values, module, q, residuals.rows.counts)
+        correction.guard = fit_guard(
+            residuals.guard, values, module, q, residuals.rows.counts
+        )
     return ((1.0, correction),)
 
 

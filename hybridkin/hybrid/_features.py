@@ -99,7 +99,9 @@ class QuadraticFeatures(Features):
     layout = Layout("quadratic_features", {"center": "n", "scale": "n"})
 
     def _bent(self, u: Tensor) -> tuple[Tensor, ...]:
-        i, j = torch.triu_indices(len(self.center), len(self.center), 1, device=u.device)
+        i, j = torch.triu_indices(
+            len(self.center), len(self.center), 1, device=u.device
+        )
         return u[..., i] * u[..., j], 1.5 * u.square() - 0.5
 
     def _bent_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,7 +200,9 @@ class PoseFeatures(Features):
         return in_blocks(self._rows_bent, u, _POSE_BLOCK)
 
     def _bent_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        value, slope = in_blocks(partial(self._rows_readout, weights=weights), u, _POSE_BLOCK)
+        value, slope = in_blocks(
+            partial(self._rows_readout, weights=weights), u, _POSE_BLOCK
+        )
         return value, slope
 
     def _rows_bent(self, u: Tensor) -> tuple[Tensor]:
@@ -209,18 +213,26 @@ class PoseFeatures(Features):
         # Virtual work: the weights are forces on vectors. Each segment before a frame rotates all
         # vectors of that frame; each segment after it moves the end of its lever.
         vectors, lever, frames = self._vectors(u)
-        moves, spins, slope = frames.moves / self.chain.reach.to(u), frames.spins, frames.slope
+        moves, spins, slope = (
+            frames.moves / self.chain.reach.to(u),
+            frames.spins,
+            frames.slope,
+        )
         C = len(weights)
         at_base, *forces = weights.split([3, *(len(part) for part in vectors)], dim=1)
         value = at_base @ lever
-        pulls = [at_base[:, :, None]]  # forces on the end, from the frames before a segment
+        pulls = [
+            at_base[:, :, None]
+        ]  # forces on the end, from the frames before a segment
         turns = []  # moments, from the frames after a segment
         for force, part in zip(forces, vectors, strict=True):
             value = value + force @ part
             turning = _turning(force)
             turns.append((turning @ part).unflatten(0, (C, 3)))
             if len(turns) < len(vectors):
-                pulls.append(pulls[-1] - (turning[:, 9:] @ part[:9]).unflatten(0, (C, 3)))
+                pulls.append(
+                    pulls[-1] - (turning[:, 9:] @ part[:9]).unflatten(0, (C, 3))
+                )
         work = []
         for k in reversed(range(len(turns))):
             if k + 1 < len(turns):
@@ -258,7 +270,12 @@ def _turning(forces: Tensor) -> Tensor:
     fx, fy, fz = forces.unflatten(1, (-1, 3)).unbind(2)
     zero = torch.zeros_like(fx)
     rows = [zero, fz, -fy, -fz, zero, fx, fy, -fx, zero]  # derivative of y x f by y
-    return torch.stack(rows, -1).unflatten(-1, (3, 3)).permute(0, 2, 1, 3).reshape(3 * len(fx), -1)
+    return (
+        torch.stack(rows, -1)
+        .unflatten(-1, (3, 3))
+        .permute(0, 2, 1, 3)
+        .reshape(3 * len(fx), -1)
+    )
 
 
 def _write_readout(plan: Plan, stored: Stored) -> int:
@@ -282,11 +299,17 @@ def _write_readout(plan: Plan, stored: Stored) -> int:
         hessian[:, i, j] = hessian[:, j, i] = crossed
         hessian[:, range(n), range(n)] = 3.0 * squared
         constant = constant - 0.5 * squared.sum(1, keepdims=True)
-        numbers = [center, 1.0 / scale, np.column_stack([constant, linear, hessian.reshape(m, -1)])]
+        numbers = [
+            center,
+            1.0 / scale,
+            np.column_stack([constant, linear, hessian.reshape(m, -1)]),
+        ]
         return plan.node("readout", n, m, numbers, HK_QUADRATIC_FEATURES)
     if features.kind == "pose_features":
         chain = write_whole_chain(plan, features.part("chain"))
-        return plan.node("readout", n, m, [center, 1.0 / scale, *readout], HK_POSE_FEATURES, chain)
+        return plan.node(
+            "readout", n, m, [center, 1.0 / scale, *readout], HK_POSE_FEATURES, chain
+        )
     raise NoKernel(f"a readout of {features.kind!r} has no kernel")
 
 
@@ -301,7 +324,9 @@ class Readout(ForwardModel):
         W [unit of the outputs].
     """
 
-    layout = Layout("readout", {"weights": "cp"}, parts=("features",), write_plan=_write_readout)
+    layout = Layout(
+        "readout", {"weights": "cp"}, parts=("features",), write_plan=_write_readout
+    )
 
     def __init__(self, features: Features, weights: Tensor) -> None:
         super().__init__()

@@ -46,7 +46,9 @@ class Spec:
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
     left_out: bool = True  # whether held-out residuals are computed as well
-    commanded: Directions | None = None  # of the commands, with backlash between them and rows
+    commanded: Directions | None = (
+        None  # of the commands, with backlash between them and rows
+    )
 
     @property
     def learns(self) -> bool:
@@ -103,10 +105,14 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     kind = PoseHybridModule if spec.output == "pose" else HybridModule
     weights = rows.q.new_tensor([weight for weight, _ in fitted.corrections])
     module = kind(spec.mechanical, corrections, weights, None, tested, plane)
-    return FittedHybrid(spec.mechanical, spec.calibration, fitted, module, spec.messages)
+    return FittedHybrid(
+        spec.mechanical, spec.calibration, fitted, module, spec.messages
+    )
 
 
-def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], left: Residuals) -> FittedHybrid:
+def _fit_markers(
+    spec: Spec, tips: Sequence[ArcChain | None], left: Residuals
+) -> FittedHybrid:
     """Return the hybrid of several markers, each fitted to the rows in which it was measured."""
     assert spec.error_model is not None
     models = spec.error_model.for_markers(left, tips)
@@ -122,7 +128,9 @@ def _fit_markers(spec: Spec, tips: Sequence[ArcChain | None], left: Residuals) -
         PerMarker([fit.error.settled for fit in fits]),
         float(np.sqrt(np.mean([fit.error.noise**2 for fit in fits]))),
     )
-    return FittedHybrid(spec.mechanical, spec.calibration, fitted, module, spec.messages)
+    return FittedHybrid(
+        spec.mechanical, spec.calibration, fitted, module, spec.messages
+    )
 
 
 def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
@@ -164,12 +172,16 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
     ]
 
 
-def with_geometry_chosen(spec: Spec, rows: Rows, geometry: GeometryChoice | None = None) -> Spec:
+def with_geometry_chosen(
+    spec: Spec, rows: Rows, geometry: GeometryChoice | None = None
+) -> Spec:
     """Return the specification with the parameters to calibrate, chosen on the rows or given.
 
     For a list and error_model="auto", the choice is between a plain chain and elastic tendons.
     """
-    if not spec.calibrate or (spec.error_model is not None and spec.calibrate != "auto"):
+    if not spec.calibrate or (
+        spec.error_model is not None and spec.calibrate != "auto"
+    ):
         return spec
     if geometry is None:
         geometry = choose_geometry(
@@ -212,7 +224,11 @@ def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
     )
     messages = (*spec.messages, *messages)
     return replace(
-        spec, mechanical=result.chain, calibrate=(), calibration=result, messages=messages
+        spec,
+        mechanical=result.chain,
+        calibrate=(),
+        calibration=result,
+        messages=messages,
     )
 
 
@@ -221,7 +237,9 @@ def _positions(spec: Spec, rows: Rows) -> Tensor:
     return torch.from_numpy(rows.tips[:, :3] if spec.output == "pose" else rows.tips)
 
 
-def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str) -> NDArray:
+def residuals(
+    mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str
+) -> NDArray:
     """Return the residual, measured minus mechanical model, in the form that is learned [m]."""
     if mechanical is None:
         return y

@@ -31,7 +31,10 @@ _ROWS = 128  # number of rows that represent the training rows
 _BLOCK = 4096  # training rows whose distances are computed at once
 _TESTED = 0.98  # share of these rows whose distances from other groups count as tested
 _STEP = 0.2  # least tested distance, and the domain without data; the range of an actuator is 2
-_OFF, _AS_LOGGED = 0.02, 3.0  # domain off the plane of a log: in this unit, and in its rms there
+_OFF, _AS_LOGGED = (
+    0.02,
+    3.0,
+)  # domain off the plane of a log: in this unit, and in its rms there
 
 
 class Guard(PortableModule):
@@ -61,7 +64,9 @@ class Guard(PortableModule):
     def forward(self, q: Tensor) -> Tensor:
         """Return g(q), shape (..., 1)."""
         excess = (self.domain_distance(q) / self.FULL - 1.0).clamp(min=0.0)
-        return (1.0 / (1.0 + excess**3)).nan_to_num()[..., None]  # 0 where the distance overflows
+        return (1.0 / (1.0 + excess**3)).nan_to_num()[
+            ..., None
+        ]  # 0 where the distance overflows
 
     def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return g(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
@@ -72,7 +77,9 @@ class Guard(PortableModule):
         relative = self._relative(correction)
         return correction * (self._kept(relative)[0] / relative)
 
-    def shortened_with_jacobian(self, correction: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
+    def shortened_with_jacobian(
+        self, correction: Tensor, J: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the `shortened` corrections (N, m), and their Jacobians (N, m, n)."""
         long = self.is_long(correction).nonzero()[:, 0]
         if not len(long):
@@ -81,10 +88,15 @@ class Guard(PortableModule):
         relative = self._relative(own)
         kept, slope = self._kept(relative)
         # Derivative along the correction: the slope; across it: the factor.
-        factor, along = kept / relative, (own / own.norm(dim=-1, keepdim=True))[..., None]
+        factor, along = (
+            kept / relative,
+            (own / own.norm(dim=-1, keepdim=True))[..., None],
+        )
         change = (slope - factor)[..., None] * along @ (along.mT @ J_own)
         J_own = factor[..., None] * J_own + change
-        return correction.index_copy(0, long, factor * own), J.index_copy(0, long, J_own)
+        return correction.index_copy(0, long, factor * own), J.index_copy(
+            0, long, J_own
+        )
 
     def is_long(self, correction: Tensor) -> Tensor:
         """Return which corrections (..., m) are longer than `largest`, shape (...)."""
@@ -92,7 +104,9 @@ class Guard(PortableModule):
 
     def _relative(self, correction: Tensor) -> Tensor:
         # Lengths up to `largest` count as one. They are not shortened, and the root stays smooth.
-        unit = self.largest.to(correction).clamp(min=torch.finfo(correction.dtype).tiny ** 0.25)
+        unit = self.largest.to(correction).clamp(
+            min=torch.finfo(correction.dtype).tiny ** 0.25
+        )
         squares = (correction / unit).square().sum(-1, keepdim=True)
         return squares.clamp(min=1.0).sqrt()
 
@@ -164,7 +178,9 @@ class LeverageGuard(Guard):
 def _write_box_guard(plan: Plan, stored: Stored) -> int:
     low, high = stored.array("low"), stored.array("high")
     width = np.where(high > low, high - low, 1.0)
-    return plan.node("box_guard", len(low), 0, [stored.array("largest"), low, high, 1.0 / width])
+    return plan.node(
+        "box_guard", len(low), 0, [stored.array("largest"), low, high, 1.0 / width]
+    )
 
 
 class BoxGuard(Guard):
@@ -179,7 +195,9 @@ class BoxGuard(Guard):
     """
 
     layout = Layout(
-        "box_guard", {"low": "n", "high": "n", "largest": ""}, write_plan=_write_box_guard
+        "box_guard",
+        {"low": "n", "high": "n", "largest": ""},
+        write_plan=_write_box_guard,
     )
 
     def __init__(self, low: Tensor, high: Tensor, largest: Tensor) -> None:
@@ -248,12 +266,18 @@ class QuadraticLeverage(LeverageModule):
 
     def leverage(self, q: Tensor) -> Tensor:
         """Return phi^T (Phi^T Phi + alpha 1)^-1 phi, shape (...)."""
-        white = torch.linalg.solve_triangular(self.factor.to(q), self(q)[..., None], upper=False)
+        white = torch.linalg.solve_triangular(
+            self.factor.to(q), self(q)[..., None], upper=False
+        )
         return white.square().sum((-2, -1))
 
 
 def fit_guard(
-    kind: str | None, corrections: Tensor, model: nn.Module | None, q: Tensor, counts: NDArray
+    kind: str | None,
+    corrections: Tensor,
+    model: nn.Module | None,
+    q: Tensor,
+    counts: NDArray,
 ) -> Guard | None:
     """Return the guard of an error model trained on rows q (N, n).
 
@@ -279,7 +303,10 @@ def fit_guard(
     with torch.no_grad():
         if not isinstance(model, LeverageModule):
             # Every configuration counts once, even if the log repeats it.
-            model, times = QuadraticLeverage.fit(torch.unique(q, dim=0)), torch.ones_like(times)
+            model, times = (
+                QuadraticLeverage.fit(torch.unique(q, dim=0)),
+                torch.ones_like(times),
+            )
         return LeverageGuard.fit(model, q, largest, times)
 
 
@@ -333,7 +360,9 @@ class GroupDistance(PortableModule):
         y = (q - q.mean(0)) @ axes
         # Each added row is the farthest from the rows before.
         picked, gap = [y.square().sum(1).argmax()], y.new_full((len(y),), torch.inf)
-        step = torch.empty_like(y)  # reused: allocating it each time costs more than the sums
+        step = torch.empty_like(
+            y
+        )  # reused: allocating it each time costs more than the sums
         while True:
             torch.sub(y, y[picked[-1]], out=step)
             gap = torch.minimum(gap, step.square_().sum(1))
@@ -347,11 +376,17 @@ class GroupDistance(PortableModule):
             apart = torch.minimum(apart, far.amin(1))
         # All training rows are within the gap of a picked row, so distances differ by at most it.
         # If every motion was repeated, the clamp keeps the domain from being empty.
-        return cls(q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP))
+        return cls(
+            q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP)
+        )
 
     @classmethod
     def of_log(
-        cls, q: Tensor, groups: NDArray | None, directions: Directions, plane: Plane | None
+        cls,
+        q: Tensor,
+        groups: NDArray | None,
+        directions: Directions,
+        plane: Plane | None,
     ) -> GroupDistance | None:
         """Return the distance from the groups, and across the directions that no row moves.
 
@@ -368,7 +403,10 @@ class GroupDistance(PortableModule):
         axes = [tested.axes, still * (tested.farthest / _STEP)]
         if plane is not None:
             half_ranges = (scale * plane.normals).norm(dim=0)
-            off = half_ranges * _OFF + _AS_LOGGED * plane.distances(q).square().mean(0).sqrt()
+            off = (
+                half_ranges * _OFF
+                + _AS_LOGGED * plane.distances(q).square().mean(0).sqrt()
+            )
             axes.append(plane.normals * (tested.farthest / off))
         return cls(tested.rows, torch.cat(axes, 1), tested.farthest)
 

@@ -11,7 +11,11 @@ from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
-_HELD_OUT = (ReadoutFit, ELMRegressor, ELMRegressorCV)  # their errors are those of held-out rows
+_HELD_OUT = (
+    ReadoutFit,
+    ELMRegressor,
+    ELMRegressorCV,
+)  # their errors are those of held-out rows
 
 
 def fitted_rows(model: Any) -> dict[str, object]:
@@ -28,10 +32,13 @@ def fitted_rows(model: Any) -> dict[str, object]:
         "error model": _error_model(model),
         **_error(model),
         "training rows": f"{len(model._fitted_rows)} different rows",
-        "domain": domain + ", as far as held-out groups tested it" * (fitted.tested is not None),
+        "domain": domain
+        + ", as far as held-out groups tested it" * (fitted.tested is not None),
         "radius": None if model.radius_ is None else _radius(model),
         "backlash": None if play is None else f"{numbers(play.width)} (unit of q)",
-        "adapted": "after the fit; the errors are those of the fit" if changed else None,
+        "adapted": "after the fit; the errors are those of the fit"
+        if changed
+        else None,
         "calibration": None if found is None else {"": repr(found)},
         "geometry": None if mechanical is None else mechanical.html_rows(),
         "training range of q": _range(model),
@@ -41,10 +48,15 @@ def fitted_rows(model: Any) -> dict[str, object]:
 def _calibrated(model: Any) -> str:
     found, asked = model.calibration_, model.calibrate
     if found is not None:
-        held_out = "" if found.cv_rmse is None else f", held-out groups {_mm(found.cv_rmse)}"
+        held_out = (
+            "" if found.cv_rmse is None else f", held-out groups {_mm(found.cv_rmse)}"
+        )
         return f"{', '.join(found.values)}; root mean square error {_mm(found.rmse)}{held_out}"
     chosen = (model.cv_results_ or {}).get("parameters")  # of a model from a file
-    return str(chosen or (asked if isinstance(asked, str) else ", ".join(asked or ()) or "nothing"))
+    return str(
+        chosen
+        or (asked if isinstance(asked, str) else ", ".join(asked or ()) or "nothing")
+    )
 
 
 def _error_model(model: Any) -> str:
@@ -56,13 +68,17 @@ def _error_model(model: Any) -> str:
     first = error[0] if type(error) is tuple else error  # of several markers
     name = f'"{asked}"' if isinstance(asked, str) else type(first).__name__
     rejected = isinstance(first, ReadoutFit) and np.isinf(first.alphas).all()
-    return f"{name}, {model.coupling}" + ", rejected by the held-out error" * bool(rejected)
+    return f"{name}, {model.coupling}" + ", rejected by the held-out error" * bool(
+        rejected
+    )
 
 
 def _error(model: Any) -> dict[str, str]:
     """Return the error on held-out rows or, where it is not known, on training rows."""
     if (results := model.cv_results_) is not None:
-        first = "a linear model" if model.mechanical_model is None else "mechanical model"
+        first = (
+            "a linear model" if model.mechanical_model is None else "mechanical model"
+        )
         alone = f", {first} alone {_mm(results['mean_distance'][0])}"
         return {"held-out error": f"mean {_mm(results['expected_distance'])}{alone}"}
     error = model.error_model_
@@ -75,7 +91,9 @@ def _radius(model: Any) -> str:
     radius, share = model.radius_, f"{100 * model.radius_.coverage:g} % of the tips"
     if np.isfinite(radius.inside):
         return f"{_mm(radius.inside)} covers {share} inside the domain"
-    return f"not known: {share} need at least {radius.least_groups} groups in the domain"
+    return (
+        f"not known: {share} need at least {radius.least_groups} groups in the domain"
+    )
 
 
 def _range(model: Any) -> dict[str, object]:

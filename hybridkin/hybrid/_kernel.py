@@ -18,7 +18,14 @@ from hybridkin.calibration.measured import distance, folds
 _MOST = 10_000  # rows; the matrices then take 3 GB
 _FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
-_GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # divided by the mean variance of the inputs
+_GAMMAS = (
+    0.003,
+    0.01,
+    0.03,
+    0.1,
+    0.3,
+    1.0,
+)  # divided by the mean variance of the inputs
 
 
 def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
@@ -58,7 +65,9 @@ def tuned_kernel(
             system = K[np.ix_(train, train)]
             system.flat[:: len(train) + 1] += alpha
             try:
-                dual = cho_solve(cho_factor(system.T, True, True, False), targets[train])
+                dual = cho_solve(
+                    cho_factor(system.T, True, True, False), targets[train]
+                )
             except LinAlgError:
                 return inf
             found = K[np.ix_(test, train)] @ dual / root[test]

@@ -49,7 +49,9 @@ class Products:
             columns = self.phi[rows].T.copy()
             block = np.empty((_pairs(len(columns)), columns.shape[1]))
             for k, column in enumerate(columns):
-                np.multiply(columns[: k + 1], column, out=block[_pairs(k) : _pairs(k + 1)])
+                np.multiply(
+                    columns[: k + 1], column, out=block[_pairs(k) : _pairs(k + 1)]
+                )
             yield rows, block
 
 
@@ -70,19 +72,26 @@ class Linearised:
         Products of the features. Default: they are computed.
     """
 
-    def __init__(self, J: Tensor, phi: Tensor, y: Tensor, products: Products | None = None) -> None:
+    def __init__(
+        self, J: Tensor, phi: Tensor, y: Tensor, products: Products | None = None
+    ) -> None:
         self.J, self.phi, self.y = J, phi, y
         self._products = Products(phi) if products is None else products
         self.gram = _gram(J, self._products)
         self.moment = moment(J, y, phi)
         self._apart: dict[int, Tensor] = {}  # the Gram matrices of large groups
 
-    def factor(self, penalty: Tensor, less: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def factor(
+        self, penalty: Tensor, less: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return which features are used (K,), and the Cholesky factor (D, D) of their system.
 
         `less` is the Gram matrix of rows to subtract.
         """
-        kept, gram = torch.isfinite(penalty), self.gram if less is None else self.gram - less
+        kept, gram = (
+            torch.isfinite(penalty),
+            self.gram if less is None else self.gram - less,
+        )
         system = gram[:, kept][..., kept].flatten(2).flatten(0, 1)
         system.diagonal().add_(penalty[kept].repeat(len(self.gram)))
         return kept, torch.linalg.cholesky(system)
@@ -131,7 +140,9 @@ class Linearised:
         C, at = self.J.shape[2], kept.nonzero()[:, 0].numpy()
         K = int(at.max(initial=-1)) + 1
         whole = np.zeros((C * K, C * K))
-        whole[np.ix_(*[np.add.outer(K * np.arange(C), at).ravel()] * 2)] = inverse.numpy()
+        whole[np.ix_(*[np.add.outer(K * np.arange(C), at).ravel()] * 2)] = (
+            inverse.numpy()
+        )
         (a, b), (k, j) = np.tril_indices(C), np.tril_indices(K)
         blocks = whole.reshape(C, K, C, K)[a, :, b]
         folded = blocks[:, k, j] + blocks[:, j, k]
@@ -222,7 +233,9 @@ def choose(
             if pair not in scores:
                 scores[pair] = score(_penalties(pair))
         good = [p for p in scores if scores[p] <= (1.0 + _EQUAL) * min(scores.values())]
-        return max(good, key=lambda p: (p.count(inf), sum(k for k in p if k < inf), -scores[p]))
+        return max(
+            good, key=lambda p: (p.count(inf), sum(k for k in p if k < inf), -scores[p])
+        )
 
     at = (inf, inf)
     if start is None:
@@ -233,7 +246,11 @@ def choose(
         previous = None
         while at != previous:
             near = [
-                [k for k in (own + step, own, own - step) if k == inf or low <= k <= _HIGH]
+                [
+                    k
+                    for k in (own + step, own, own - step)
+                    if k == inf or low <= k <= _HIGH
+                ]
                 for own, low in zip(at, _LOW, strict=True)
             ]
             previous, at = at, best_of((a, b) for a in near[0] for b in near[1])

@@ -40,7 +40,9 @@ class Inside:
 
 # The weight g(q) of a correction (N, 1), if it is less than one anywhere, and dg/dq (N, 1, n).
 Fading = tuple[Tensor, Tensor]
-Guarded = tuple[Tensor, Tensor, Fading | None]  # a correction, its derivative, its fading
+Guarded = tuple[
+    Tensor, Tensor, Fading | None
+]  # a correction, its derivative, its fading
 
 
 class TipCorrection(PortableModule):
@@ -76,7 +78,10 @@ class TipCorrection(PortableModule):
             x, J, leverage = guard.model.forward_jacobian_and_leverage(q)
             distance = leverage / guard.limit.to(q)
         else:
-            (x, J), distance = self.module.forward_and_jacobian(q), guard.domain_distance(q)
+            (x, J), distance = (
+                self.module.forward_and_jacobian(q),
+                guard.domain_distance(q),
+            )
         fading = _fading(guard, q, distance)
         if fading is not None:
             x, J = _weighed(x, J, *fading)
@@ -101,7 +106,10 @@ class InnerCorrection(PortableModule):
     layout = Layout("inner_correction", {}, parts=("mechanical", "readout", "guard"))
 
     def __init__(
-        self, mechanical: ForwardModel, readout: ForwardModel, guard: Guard | None = None
+        self,
+        mechanical: ForwardModel,
+        readout: ForwardModel,
+        guard: Guard | None = None,
     ) -> None:
         super().__init__()
         self.mechanical = mechanical
@@ -145,7 +153,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
 
     base, drift, tested = place_of("mechanical"), place_of("drift"), place_of("tested")
     if base >= 0 and plan.kind(base) not in CHAINS:
-        raise NoKernel(f"the mechanical part {stored.part('mechanical').kind!r} is not a chain")
+        raise NoKernel(
+            f"the mechanical part {stored.part('mechanical').kind!r} is not a chain"
+        )
     corrections = stored.part("corrections").parts.values()
     inside = [correction.kind == "inner_correction" for correction in corrections]
     entries = []
@@ -155,10 +165,14 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     left = 1.0 - weights[inside].sum()  # weight of f beside inner corrections
     numbers = [weights, [left * (left > _ROUNDING), any(inside)]]
     n, m = plan.lengths(base if base >= 0 else entries[1])
-    return plan.node("hybrid", n, m, numbers, base, drift, tested, len(inside), *entries)
+    return plan.node(
+        "hybrid", n, m, numbers, base, drift, tested, len(inside), *entries
+    )
 
 
-def _entries_of(plan: Plan, correction: Stored, acts_inside: bool) -> tuple[bool, int, int]:
+def _entries_of(
+    plan: Plan, correction: Stored, acts_inside: bool
+) -> tuple[bool, int, int]:
     """Return whether a correction acts inside, and the places of its regressor and its guard."""
     regressor = correction.part("readout" if acts_inside else "module")
     if "guard" not in correction.parts:
@@ -166,7 +180,11 @@ def _entries_of(plan: Plan, correction: Stored, acts_inside: bool) -> tuple[bool
     guard = correction.part("guard")
     place = plan.node_of(guard)
     if [_content(part) for part in guard.parts.values()] == [_content(regressor)]:
-        return False, plan.entry(place, 0), place  # value and leverage share the features
+        return (
+            False,
+            plan.entry(place, 0),
+            place,
+        )  # value and leverage share the features
     return acts_inside, plan.node_of(regressor), place
 
 
@@ -242,7 +260,9 @@ class Hybrid(ForwardModel):
 
     def mechanical_part(self, q: Tensor) -> Tensor:
         """Return f(q), zero without a mechanical model, shape (..., m) [m]."""
-        return 0.0 * self.error_part(q) if self.mechanical is None else self.mechanical(q)
+        return (
+            0.0 * self.error_part(q) if self.mechanical is None else self.mechanical(q)
+        )
 
     def error_part(self, q: Tensor) -> Tensor:
         """Return what is added to f(q), shape (..., m) [m]."""
@@ -309,7 +329,9 @@ class HybridModule(Hybrid):
     @property
     def corrects_inside(self) -> bool:
         """Whether a correction acts inside the robot, see `InnerCorrection`."""
-        return any(isinstance(correction, InnerCorrection) for correction in self.corrections)
+        return any(
+            isinstance(correction, InnerCorrection) for correction in self.corrections
+        )
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
@@ -332,7 +354,12 @@ class HybridModule(Hybrid):
         """Return the same model with another drift; this model does not change."""
         corrections = [c for _, c in self._parts()]
         return type(self)(
-            self.mechanical, corrections, self.weights, drift, self.tested, self.log_plane
+            self.mechanical,
+            corrections,
+            self.weights,
+            drift,
+            self.tested,
+            self.log_plane,
         )
 
     def forward(self, q: Tensor) -> Tensor:
@@ -381,7 +408,10 @@ class HybridModule(Hybrid):
             value, guard = correction.value(q, inside), correction.guard
             if guard is not None:
                 own = guard(q)
-                value, trust = guard.shortened(own * value), trust - weight * (1.0 - own)
+                value, trust = (
+                    guard.shortened(own * value),
+                    trust - weight * (1.0 - own),
+                )
             terms.append(weight * value)
         if self.drift is not None:
             terms.append(trust * self.drift(q))
@@ -393,21 +423,29 @@ class HybridModule(Hybrid):
 
     def _trust(self, q: Tensor) -> Tensor:
         """Return the error weight t(q) at rows q, shape (N, 1)."""
-        guards = [(weight, c.guard) for weight, c in self._parts() if c.guard is not None]
-        return q.new_ones(len(q), 1) - sum(weight * (1.0 - guard(q)) for weight, guard in guards)
+        guards = [
+            (weight, c.guard) for weight, c in self._parts() if c.guard is not None
+        ]
+        return q.new_ones(len(q), 1) - sum(
+            weight * (1.0 - guard(q)) for weight, guard in guards
+        )
 
     def _distance(self, q: Tensor) -> Tensor:
         """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
         guards = [c.guard for _, c in self._parts() if c.guard is not None]
         guards += [] if self.tested is None else [self.tested]
-        distances = [guard.domain_distance(q) for guard in guards] or [q.new_zeros(len(q))]
+        distances = [guard.domain_distance(q) for guard in guards] or [
+            q.new_zeros(len(q))
+        ]
         return torch.stack(distances, 1).amax(1, keepdim=True)
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         inside, total = self._inside(q), None
         if inside is not None:
             # Inner corrections include f. df/dq is needed only if their weights sum to less than 1.
-            inner = (weight for weight, c in self._parts() if isinstance(c, InnerCorrection))
+            inner = (
+                weight for weight, c in self._parts() if isinstance(c, InnerCorrection)
+            )
             share = 1.0 - sum(inner)
             if share > _ROUNDING:
                 total = share * inside.x, share * inside.jacobian
@@ -429,7 +467,10 @@ class HybridModule(Hybrid):
             if fadings:
                 trust, slope = q.new_ones(len(q), 1), q.new_zeros(len(q), 1, q.shape[1])
                 for weight, (own, own_slope) in fadings:
-                    trust, slope = trust + weight * (own - 1.0), slope + weight * own_slope
+                    trust, slope = (
+                        trust + weight * (own - 1.0),
+                        slope + weight * own_slope,
+                    )
                 x, J = _weighed(x, J, trust, slope)
             total = _plus(total, 1.0, x, J)
         assert total is not None, "a hybrid needs a mechanical model or a correction"
@@ -438,7 +479,9 @@ class HybridModule(Hybrid):
 
 def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
     """Return the weights of a correction and their slopes at rows q (N, n), None if all are 1."""
-    rows = (~(distance <= guard.FULL)).nonzero()[:, 0]  # written so that NaN is included
+    rows = (~(distance <= guard.FULL)).nonzero()[
+        :, 0
+    ]  # written so that NaN is included
     if not len(rows):
         return None
     weight, slope = guard.weight_and_jacobian(q[rows])
@@ -455,6 +498,8 @@ def _plus(
     return torch.add(total[0], x, alpha=weight), torch.add(total[1], J, alpha=weight)
 
 
-def _weighed(x: Tensor, J: Tensor, weight: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+def _weighed(
+    x: Tensor, J: Tensor, weight: Tensor, slope: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return x (k, m) and J (k, m, n) times a weight (k, 1) of slope (k, 1, n)."""
     return weight * x, weight[..., None] * J + x[..., None] * slope

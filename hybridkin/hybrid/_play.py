@@ -45,7 +45,9 @@ def play_of(
         ]
     operator = PlayOperator(play)
     if operator.width.size not in (1, len(ranges)):
-        raise ValueError(f"`play` must be a width or {len(ranges)} widths, got {play!r:.200}.")
+        raise ValueError(
+            f"`play` must be a width or {len(ranges)} widths, got {play!r:.200}."
+        )
     if not np.any(operator.width >= ranges):
         return operator, []
     return operator, [

@@ -39,7 +39,12 @@ class PoseHybridModule(HybridModule, PoseModel):
         """Return the same model with poses as rows of six numbers."""
         corrections = [correction for _, correction in self._parts()]
         return PoseRows(
-            self.mechanical, corrections, self.weights, self.drift, self.tested, self.log_plane
+            self.mechanical,
+            corrections,
+            self.weights,
+            self.drift,
+            self.tested,
+            self.log_plane,
         )
 
     def pose(self, q: Tensor) -> Tensor:
@@ -58,7 +63,9 @@ class PoseHybridModule(HybridModule, PoseModel):
         return q.new_zeros(len(q), 6)
 
     def _learned_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        return self._added((self._nothing(q), q.new_zeros(len(q), 6, q.shape[1])), q, None)
+        return self._added(
+            (self._nothing(q), q.new_zeros(len(q), 6, q.shape[1])), q, None
+        )
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         x, J = self.mechanical.forward_and_jacobian(q)
@@ -97,7 +104,9 @@ class PoseRows(PoseHybridModule):
     def error_part(self, q: Tensor) -> Tensor:
         """Return translation [m] and rotation vector [rad] from the mechanical to this pose."""
         error = super().error_part(q)
-        return torch.cat([error[..., :3], error[..., 3:] / reach_of(self.mechanical)], dim=-1)
+        return torch.cat(
+            [error[..., :3], error[..., 3:] / reach_of(self.mechanical)], dim=-1
+        )
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         return (_rows(self._pose(q)[0]),)

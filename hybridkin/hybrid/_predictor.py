@@ -42,7 +42,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _single_output: bool
     _fitted_range: TrainingRange
 
-    def predict(self, X: Any, return_radius: bool = False, groups: ArrayLike | None = None) -> Any:
+    def predict(
+        self, X: Any, return_radius: bool = False, groups: ArrayLike | None = None
+    ) -> Any:
         """Return tip positions f_mech(q) + w(q) eps(q).
 
         Parameters
@@ -75,7 +77,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x, inside = self._evaluated(_with_domain, X, groups)
         return x, self.radius_.at(inside).astype(x.dtype)
 
-    def predict_mechanical(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+    def predict_mechanical(
+        self, X: ArrayLike, groups: ArrayLike | None = None
+    ) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
         chain = None if self.output == "pose" else self.mechanical_model_
         if chain is None:
@@ -86,13 +90,19 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
         return self._evaluated(_method("error_part"), X, groups, warn=False)[0]
 
-    def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
+    def score(
+        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
+    ) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers."""
         x, n = self.predict(X), len(np.asarray(y))
         weights = np.ones(n) if sample_weight is None else np.asarray(sample_weight)
         both = (np.asarray(values, dtype=float).reshape(n, -1).T for values in (y, x))
         found = [(a, b, ~np.isnan(a)) for a, b in zip(*both, strict=True)]
-        return float(np.mean([r2_score(a[k], b[k], sample_weight=weights[k]) for a, b, k in found]))
+        return float(
+            np.mean(
+                [r2_score(a[k], b[k], sample_weight=weights[k]) for a, b, k in found]
+            )
+        )
 
     def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
@@ -108,7 +118,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x, J = self._evaluated(partial(evaluate, jacobian=True), X, groups)
         return x, J
 
-    def in_domain(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray[np.bool_]:
+    def in_domain(
+        self, X: ArrayLike, groups: ArrayLike | None = None
+    ) -> NDArray[np.bool_]:
         """Return whether each row lies in the domain, close to the training rows (see `guard`).
 
         After a fit with groups, a row must also be as close to the nearest training row as 98 % of
@@ -128,7 +140,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside : ndarray of bool of shape (N,)
             Without a guard all True, except along those directions.
         """
-        return self._evaluated(partial(_with_domain, value=False), X, groups, warn=False)[0]
+        return self._evaluated(
+            partial(_with_domain, value=False), X, groups, warn=False
+        )[0]
 
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
@@ -163,7 +177,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(chain := self.mechanical_model_, Chain):
             return
         known, tips = known_tips(chain, rows)
-        message = motion_message("y", torch.cat([tips, known]), tips, float(chain.reach))
+        message = motion_message(
+            "y", torch.cat([tips, known]), tips, float(chain.reach)
+        )
         if message is not None:
             warnings.warn(message, stacklevel=3)
 
@@ -171,7 +187,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the motion of the actuators: with backlash, not the commands X themselves."""
         if self.play_ is None or not len(X):
             return X
-        return self.play_.apply_by_group(X, np.zeros(len(X)) if groups is None else groups)
+        return self.play_.apply_by_group(
+            X, np.zeros(len(X)) if groups is None else groups
+        )
 
     def _evaluated(
         self,
@@ -185,13 +203,20 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X = check_inputs(self, X)
         q = self._effective(X, groups).astype(np.float64)
         if warn and isinstance(chain := self.mechanical_model_, Chain):
-            rows = torch.from_numpy(q)  # finite; negative lengths are extrapolation, no error
-            for message in (*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")):
+            rows = torch.from_numpy(
+                q
+            )  # finite; negative lengths are extrapolation, no error
+            for message in (
+                *chain.unit_messages(rows, "X"),
+                chain.contradiction(rows, "X"),
+            ):
                 if message is not None:
                     warnings.warn(message, stacklevel=3)
         arrays = function(self.module_.rows(), q)
         with np.errstate(over="ignore"):  # too large for float32
-            arrays = [a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays]
+            arrays = [
+                a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays
+            ]
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
@@ -200,7 +225,9 @@ def _method(name: str) -> Callable[[Hybrid | AdaptedModel, NDArray], Sequence[ND
     return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
 
 
-def _with_domain(module: Hybrid | AdaptedModel, q: NDArray, value: bool = True) -> list[NDArray]:
+def _with_domain(
+    module: Hybrid | AdaptedModel, q: NDArray, value: bool = True
+) -> list[NDArray]:
     """Return x of rows q if `value`, and whether they lie in the domain."""
     *x, distance = evaluate(module, q, value, distance=True)
     return [*x, distance <= 1.0]

@@ -37,7 +37,9 @@ class Radius(NamedTuple):
         return ceil(self.coverage / (1.0 - self.coverage) - _ROUNDING)
 
 
-def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, str | None]:
+def conformal_radius(
+    spec: Spec, rows: Rows, coverage: float
+) -> tuple[Radius, str | None]:
     """Return the radius that covers a share `coverage` of held-out tips, and a warning or None.
 
     Whole groups are held out in five folds, and everything, calibration included, is fitted again
@@ -81,7 +83,9 @@ def conformal_radius(spec: Spec, rows: Rows, coverage: float) -> tuple[Radius, s
     )
 
 
-def _quantile(values: NDArray, groups: NDArray, weights: NDArray, coverage: float) -> float:
+def _quantile(
+    values: NDArray, groups: NDArray, weights: NDArray, coverage: float
+) -> float:
     """Return the smallest value that covers the share; infinity if no value does.
 
     Each of the K groups, numbered from 0 (N,), has the mass 1 / (K + 1), divided among its values

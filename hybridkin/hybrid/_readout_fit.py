@@ -26,9 +26,15 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import Program, program_of
 
 _LARGEST = 1000  # most weights; of more features only the strongest directions are kept
-_ROUNDS, _FACTORS, _REFRESH = 200, 4, 10  # steps; the first ones and every tenth factorise
+_ROUNDS, _FACTORS, _REFRESH = (
+    200,
+    4,
+    10,
+)  # steps; the first ones and every tenth factorise
 _SETTLED = 1e-9  # relative to the gradient without a correction
-_RATIOS = torch.from_numpy(np.logspace(-2, 4, 25))  # noise ratios, over the mean of dx/dq squared
+_RATIOS = torch.from_numpy(
+    np.logspace(-2, 4, 25)
+)  # noise ratios, over the mean of dx/dq squared
 
 
 class ReadoutFit(NamedTuple):
@@ -36,10 +42,16 @@ class ReadoutFit(NamedTuple):
 
     readout: Readout
     alphas: Pair  # of the linear and of the other features; infinity: features not used
-    residual: NDArray  # (N, m) [m], of every row from a fit without that row, or its group
+    residual: (
+        NDArray  # (N, m) [m], of every row from a fit without that row, or its group
+    )
     scores: dict[Pair, float]  # mean squared held-out distance [m^2], by alphas
-    gradient: float  # of the objective at the optimum, relative to that without a correction
-    noise_ratio: float = inf  # variance of tips over that of actuators; infinity: tips only
+    gradient: (
+        float  # of the objective at the optimum, relative to that without a correction
+    )
+    noise_ratio: float = (
+        inf  # variance of tips over that of actuators; infinity: tips only
+    )
     rmse: float = nan  # weighted root mean square length of `residual` [m]
 
     def stored(self) -> Stored:
@@ -49,7 +61,9 @@ class ReadoutFit(NamedTuple):
             {"residual": self.residual},
             {"readout": self.readout.stored()},
             alphas=[*map(str, self.alphas)],
-            scores=[[*map(str, alphas), score] for alphas, score in self.scores.items()],
+            scores=[
+                [*map(str, alphas), score] for alphas, score in self.scores.items()
+            ],
             gradient=self.gradient,
             noise_ratio=str(self.noise_ratio),
             rmse=self.rmse,
@@ -63,7 +77,10 @@ class ReadoutFit(NamedTuple):
             restore(stored.part("readout")),
             (first, second),
             stored.array("residual", "Nm", finite=False),
-            {(float(a), float(b)): float(c) for a, b, c in stored.list_of(list, "scores")},
+            {
+                (float(a), float(b)): float(c)
+                for a, b, c in stored.list_of(list, "scores")
+            },
             stored.value("gradient", float),
             float(stored.value("noise_ratio", str)),
             stored.value("rmse", float) if "rmse" in stored.settings else nan,
@@ -80,8 +97,15 @@ def _tips(model: ForwardModel) -> _Tips:
     m = ceil(model.tip_at)
     offsets = model.offsets[:m].numpy(force=True).copy()
     offsets[-1] *= model.tip_at == m
-    arrays = {"base": model.base.numpy(force=True), "offsets": offsets, "radii": np.ones(m)}
-    derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}  # q are the arcs
+    arrays = {
+        "base": model.base.numpy(force=True),
+        "offsets": offsets,
+        "radii": np.ones(m),
+    }
+    derived = {
+        "arc_matrix": np.eye(3 * m),
+        "arc_offset": np.zeros(3 * m),
+    }  # q are the arcs
     place = {"tip_at": float(m), "markers": [[float(m), *model.markers[-1][1:]]]}
     plan = Plan(Stored("constant_curvature", place, arrays, derived=derived))
     program = Program(plan)
@@ -151,7 +175,9 @@ def fit_readout(
     elif rows.groups is not None:
         members = _linearised.members_of(rows.groups)
     with torch.no_grad():
-        problem = _Problem(mechanical, features, rows.q, x, weight, coupling == "serial")
+        problem = _Problem(
+            mechanical, features, rows.q, x, weight, coupling == "serial"
+        )
         if alphas is not None:
             fit = _fitted(problem.in_noise(noise_ratio), members, alphas)
         else:
@@ -192,14 +218,21 @@ def _chosen(
 
 
 def _fitted(
-    problem: _Problem, members: list[Tensor] | None, alphas: Pair, start: Tensor | None = None
+    problem: _Problem,
+    members: list[Tensor] | None,
+    alphas: Pair,
+    start: Tensor | None = None,
 ) -> ReadoutFit:
     """Return the fit with given penalties, from weights `start`; residuals hold out `members`."""
     penalty = problem.penalty(alphas)
-    weights, gradient = problem.minimum(problem.nothing if start is None else start, penalty)
+    weights, gradient = problem.minimum(
+        problem.nothing if start is None else start, penalty
+    )
     left_out = problem.x * nan
     if members != []:
-        left_out = problem.in_metres(problem.linearised(weights).left_out(penalty, members))
+        left_out = problem.in_metres(
+            problem.linearised(weights).left_out(penalty, members)
+        )
     readout, ratio = problem.readout(weights), problem.noise_ratio
     return ReadoutFit(readout, alphas, left_out.numpy(force=True), {}, gradient, ratio)
 
@@ -253,7 +286,11 @@ class _Problem:
         """Return the ratio with the largest likelihood of residuals (N, m) [m] as normal noise."""
         spread, axes = self._principal_noise
         squares = (axes.mT @ residual[..., None])[..., 0].square()
-        weights = self.root.square() * self.seen.all(1, keepdim=True) * torch.ones_like(squares)
+        weights = (
+            self.root.square()
+            * self.seen.all(1, keepdim=True)
+            * torch.ones_like(squares)
+        )
         total, mean = weights.sum(), (weights * spread).sum() / weights.sum()
 
         def unlikely(ratio: float) -> float:
@@ -285,7 +322,9 @@ class _Problem:
     def penalty(self, alphas: Pair) -> Tensor:
         """Return the penalty of every feature (K,)."""
         n = self.features.n_linear
-        return self.phi.new_tensor([alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n))
+        return self.phi.new_tensor(
+            [alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n)
+        )
 
     def linearised(self, readout: Tensor) -> Linearised:
         """Return the ridge problem linearised about a readout (C, K); the last one is cached."""
@@ -296,7 +335,9 @@ class _Problem:
             self._last = readout, Linearised(J, self.phi, y, self.products)
         return self._last[1]
 
-    def score(self, linear: Linearised, members: list[Tensor] | None, alphas: Pair) -> float:
+    def score(
+        self, linear: Linearised, members: list[Tensor] | None, alphas: Pair
+    ) -> float:
         """Return the mean squared held-out distance [m^2]."""
         left = linear.left_out(self.penalty(alphas), members)
         return float(left.square().sum() / self.root.square().sum())
@@ -313,7 +354,10 @@ class _Problem:
         readout = torch.where(taking_part, readout, 0.0)
         weight = torch.where(taking_part, penalty, 0.0)
         value, slope = self._value_and_slope(readout, weight, taking_part)
-        scale = float(self._value_and_slope(self.nothing, weight, taking_part)[1].norm()) or 1.0
+        scale = (
+            float(self._value_and_slope(self.nothing, weight, taking_part)[1].norm())
+            or 1.0
+        )
         pairs: list[tuple[Tensor, Tensor]] = []
         factor: tuple[Tensor, Tensor] | None = None
         for k in range(rounds):
@@ -349,7 +393,9 @@ class _Problem:
         """Return residuals (N, m) [m] and Jacobians (N, m, C) at z, zero for missing markers."""
         tip, J = self._tips(z)
         seen = self.seen
-        return torch.where(seen, self.x - tip, 0.0), torch.where(seen[..., None], J, 0.0)
+        return torch.where(seen, self.x - tip, 0.0), torch.where(
+            seen[..., None], J, 0.0
+        )
 
     def _whitened(self, values: Tensor) -> Tensor:
         """Return values (N, m) or (N, m, C) in units of noise, times the roots of the weights."""

@@ -21,7 +21,9 @@ class Rows:
     y: NDArray  # (N, m) or (N,) [m]
     weights: NDArray | None = None  # (N,), number of times each row counts
     groups: NDArray | None = None  # (N,), motion of every row
-    place: NDArray | None = None  # (M,), the row here of each of the M given rows; -1: none
+    place: NDArray | None = (
+        None  # (M,), the row here of each of the M given rows; -1: none
+    )
 
     def __len__(self) -> int:
         return len(self.X)
@@ -46,7 +48,12 @@ class Rows:
         weights = None if self.weights is None else self.weights[rows]
         groups = None if self.groups is None else self.groups[rows]
         return replace(
-            self, X=self.X[rows], y=self.y[rows], weights=weights, groups=groups, place=None
+            self,
+            X=self.X[rows],
+            y=self.y[rows],
+            weights=weights,
+            groups=groups,
+            place=None,
         )
 
     def marker(self, k: int) -> Self:
@@ -66,7 +73,9 @@ class Rows:
         return self._merged(runs=True)
 
     def _merged(self, runs: bool) -> Self:
-        first, counts, place = distinct_rows(self.X, self.y, self.weights, self.groups, runs)
+        first, counts, place = distinct_rows(
+            self.X, self.y, self.weights, self.groups, runs
+        )
         return replace(self.take(first), weights=counts, place=place)
 
     def thinned(self, most: int) -> Self:
@@ -87,4 +96,6 @@ class Rows:
 
 def rare_marker(k: int) -> ValueError:
     """Return the error for a marker that too few rows hold."""
-    return ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")
+    return ValueError(
+        f"`y` must hold marker {k} in at least 2 rows; remove that marker."
+    )

@@ -33,7 +33,10 @@ _PICKS = 10  # picks of a blend; each is a weight of 0.1
 _EQUAL = 1e-8  # scores this close are equal: readouts end at 1e-9 of their gradient
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their number
-_FEW_MOTIONS, _FEW_ROWS = 40, 100  # with fewer, penalties that were chosen on all rows suit them
+_FEW_MOTIONS, _FEW_ROWS = (
+    40,
+    100,
+)  # with fewer, penalties that were chosen on all rows suit them
 _ANEW = 5  # folds without which penalties are then chosen once more
 
 
@@ -94,8 +97,12 @@ def select(
         modules[name] = fitted.module
         settled.append(fitted.error.settled)
         held_out = []
-        for fold_spec, training_rows, (_, test) in zip(alone, parts, splits, strict=True):
-            fold_fit = fit_hybrid(replace(fold_spec, error_model=settled[-1]), training_rows)
+        for fold_spec, training_rows, (_, test) in zip(
+            alone, parts, splits, strict=True
+        ):
+            fold_fit = fit_hybrid(
+                replace(fold_spec, error_model=settled[-1]), training_rows
+            )
             held_out.append(fold_fit.predict(rows.X[test]))
         predicted[i] = np.concatenate(held_out)
     # Held-out rows first, in the order of the log; then the outer ones.
@@ -110,12 +117,20 @@ def select(
         known = np.tensordot(shares, held_out_rows.predicted, 1)
         before = after = 0.0
         for one, (train, test) in zip(alone[:_ANEW], folds, strict=False):
-            anew = fit_hybrid(replace(one, error_model=without_penalties), by_fold.take(train))
+            anew = fit_hybrid(
+                replace(one, error_model=without_penalties), by_fold.take(train)
+            )
             before += counts[test] @ distance(known[test], y[test])
             after += counts[test] @ distance(anew.predict(rows.X[test]), y[test])
         results["expected_distance"] *= float(after / before)
-    name, errors = ("nothing", {}) if geometry is None else (geometry.name, geometry.errors)
-    own = {name: Errors(*(float(results[key][0]) for key in ("mean_distance", "io_distance")))}
+    name, errors = (
+        ("nothing", {}) if geometry is None else (geometry.name, geometry.errors)
+    )
+    own = {
+        name: Errors(
+            *(float(results[key][0]) for key in ("mean_distance", "io_distance"))
+        )
+    }
     results["parameters"] = name
     results["mechanical_model"] = {n: one.known() for n, one in (errors or own).items()}
     return replace(spec, error_model=_blend(settled, shares)), results, modules
@@ -143,7 +158,9 @@ class _HeldOut(NamedTuple):
     n: int
 
     @classmethod
-    def of(cls, predicted: NDArray, rows: Rows, fold_of: NDArray, outer: NDArray) -> _HeldOut:
+    def of(
+        cls, predicted: NDArray, rows: Rows, fold_of: NDArray, outer: NDArray
+    ) -> _HeldOut:
         """Return both kinds of rows, weighted by the errors of the first candidate, f_mech."""
         n, at = len(rows.X), np.concatenate([np.arange(len(rows.X)), outer])
         y, counts = rows.tips[at], rows.counts[at]
@@ -162,17 +179,25 @@ class _HeldOut(NamedTuple):
         ----------
         Caruana et al., Ensemble selection from libraries of models, ICML 2004.
         """
-        predicted, y, weights = self.predicted[:, rows], self.y[rows], self.weights[rows]
+        predicted, y, weights = (
+            self.predicted[:, rows],
+            self.y[rows],
+            self.weights[rows],
+        )
         picks, total = np.zeros(len(predicted)), np.zeros_like(y)
         for k in range(1, _PICKS + 1):
             means = [weights @ distance((total + x) / k, y) for x in predicted]
-            best = int(np.argmax(means <= (1.0 + _EQUAL) * np.min(means)))  # the first of equals
+            best = int(
+                np.argmax(means <= (1.0 + _EQUAL) * np.min(means))
+            )  # the first of equals
             picks[best] += 1
             total += predicted[best]
         return picks / _PICKS
 
 
-def _chosen(names: list[str], found: _HeldOut, rows: Rows) -> tuple[NDArray, dict[str, Any]]:
+def _chosen(
+    names: list[str], found: _HeldOut, rows: Rows
+) -> tuple[NDArray, dict[str, Any]]:
     """Return the weights of the candidates, and the errors of all candidates and their blend.
 
     If the gain of the blend over the mechanical model, paired by motion or fold, is within its
@@ -188,7 +213,9 @@ def _chosen(names: list[str], found: _HeldOut, rows: Rows) -> tuple[NDArray, dic
     held_out, outer = distances[:, :n], distances[:, n:]
     by_fold = _means_by(found.fold[:n], held_out, counts[:n])
     shares = found.shares(np.ones(len(blend), dtype=bool))
-    units = by_fold if rows.groups is None else _means_by(rows.groups, held_out, counts[:n])
+    units = (
+        by_fold if rows.groups is None else _means_by(rows.groups, held_out, counts[:n])
+    )
     gains = units[0] - units[-1]
     if gains.mean() <= gains.std(ddof=1) / np.sqrt(len(gains)):
         shares = np.eye(len(shares))[0]
@@ -209,12 +236,16 @@ def _chosen(names: list[str], found: _HeldOut, rows: Rows) -> tuple[NDArray, dic
 def _means_by(labels: NDArray, distances: NDArray, counts: NDArray) -> NDArray:
     """Return the mean distances (K, L) of K models for each of L row labels."""
     parts = [labels == label for label in np.unique(labels)]
-    return np.array([np.average(distances[:, k], axis=1, weights=counts[k]) for k in parts]).T
+    return np.array(
+        [np.average(distances[:, k], axis=1, weights=counts[k]) for k in parts]
+    ).T
 
 
 def _candidates(spec: Spec) -> dict[str, ErrorModel]:
     """Return the error models by name; of equal candidates the first, simplest one wins."""
-    network = ELMRegressorCV(250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state))
+    network = ELMRegressorCV(
+        250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state)
+    )
     if spec.mechanical is None:
         return {
             "linear": RegressorModel(LinearRegression()),

@@ -31,7 +31,9 @@ _INSIDE = (str, type(None), *_NETWORKS)  # may act inside the robot
 def missing_markers(estimator: BaseEstimator, y: Any) -> NDArray[np.bool_]:
     """Return which entries of y (N, 3 K) are missing markers; every row must keep one marker."""
     model = SimpleNamespace(**estimator.get_params(deep=False))
-    allowed = model.mechanical_model is None or isinstance(model.mechanical_model, MarkedChain)
+    allowed = model.mechanical_model is None or isinstance(
+        model.mechanical_model, MarkedChain
+    )
     if not allowed or model.output == "pose" or np.ndim(y) != 2 or y.shape[1] % 3:
         return np.zeros(np.shape(y), dtype=bool)
     return np.isnan(with_missing_markers(y, "y"))
@@ -46,15 +48,26 @@ def check_settings(estimator: BaseEstimator) -> None:
     for name, value, allowed in (*chosen, ("output", model.output, _OUTPUTS)):
         if value not in allowed:
             raise ValueError(f"`{name}` must be one of {allowed}, got {value!r}.")
-    if model.coverage is not None and not 0.0 < number(model.coverage, "coverage") < 1.0:
-        raise ValueError(f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}.")
+    if (
+        model.coverage is not None
+        and not 0.0 < number(model.coverage, "coverage") < 1.0
+    ):
+        raise ValueError(
+            f"`coverage` must lie in (0, 1) or be None, got {model.coverage!r}."
+        )
     wanted = model.calibrate
-    by_word = wanted is None or (isinstance(wanted, str) and wanted in ("auto", "default"))
+    by_word = wanted is None or (
+        isinstance(wanted, str) and wanted in ("auto", "default")
+    )
     if not by_word and (isinstance(wanted, str) or not isinstance(wanted, Iterable)):
-        need = "a sequence of names, such as ['radii', 'base'], 'auto', 'default' or None"
+        need = (
+            "a sequence of names, such as ['radii', 'base'], 'auto', 'default' or None"
+        )
         raise ValueError(f"`calibrate` must be {need}, got {wanted!r}.")
     if isinstance(model.play, str) and model.play != "auto":
-        raise ValueError(f"`play` must be a width or n widths, 'auto' or None, got {model.play!r}.")
+        raise ValueError(
+            f"`play` must be a width or n widths, 'auto' or None, got {model.play!r}."
+        )
     if model.output == "pose":
         _check_pose_settings(model)
     if isinstance(error_model, str) and error_model not in names:

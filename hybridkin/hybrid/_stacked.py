@@ -31,7 +31,9 @@ class Stacked(Hybrid):
 
     layout = Layout("stacked", {}, parts=("mechanical", "tips"))
 
-    def __init__(self, mechanical: ForwardModel | None, tips: Sequence[HybridModule]) -> None:
+    def __init__(
+        self, mechanical: ForwardModel | None, tips: Sequence[HybridModule]
+    ) -> None:
         super().__init__()
         self.mechanical = mechanical
         self.tips = nn.ModuleList(tips)
@@ -73,7 +75,11 @@ class Stacked(Hybrid):
         tips = []
         for k, tip in enumerate(self._tips()):
             rows = slice(3 * k, 3 * k + 3)
-            of_tip = None if drift is None else AffineModule(drift.coef[rows], drift.bias[rows])
+            of_tip = (
+                None
+                if drift is None
+                else AffineModule(drift.coef[rows], drift.bias[rows])
+            )
             tips.append(tip.with_drift(of_tip))
         return type(self)(self.mechanical, tips)
 
@@ -93,11 +99,15 @@ class Stacked(Hybrid):
 
     def error_weight(self, q: Tensor) -> Tensor:
         """Return the least error weight of a marker, shape (...)."""
-        return torch.stack([tip.error_weight(q) for tip in self._tips()], dim=-1).amin(-1)
+        return torch.stack([tip.error_weight(q) for tip in self._tips()], dim=-1).amin(
+            -1
+        )
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the largest distance from the training rows of a marker, shape (...)."""
-        return torch.stack([tip.domain_distance(q) for tip in self._tips()], dim=-1).amax(-1)
+        return torch.stack(
+            [tip.domain_distance(q) for tip in self._tips()], dim=-1
+        ).amax(-1)
 
     def _tips(self) -> list[HybridModule]:
         return cast("list[HybridModule]", [*self.tips])

@@ -23,9 +23,15 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 # Standard deviations at the tip, in reaches of the robot. Priors: weights of linear features and of
 # other features, translation of the base, its rotation [rad]. Last: noise of a measured tip.
 _LINEAR, _OTHER, _SHIFT, _TURN, _NOISE = 0.055, 0.0165, 0.033, 0.1, 0.0055
-_LARGEST, _MOST = 1000, 5000  # parameters: above the first, features are reduced; hard limit
+_LARGEST, _MOST = (
+    1000,
+    5000,
+)  # parameters: above the first, features are reduced; hard limit
 _BLOCK = 1000  # rows whose design matrix is in memory at once
-_ROWS, _WORTH = 8, 2.0  # rows that represent a motion; they count as so many independent rows
+_ROWS, _WORTH = (
+    8,
+    2.0,
+)  # rows that represent a motion; they count as so many independent rows
 
 
 def choose_rows(
@@ -132,7 +138,9 @@ def _few_rows_of(groups: NDArray) -> tuple[NDArray, NDArray]:
     """Return the labels of all motions (G,), and R rows of each, from first to last, (G, R)."""
     names, of_row, counts = np.unique(groups, return_inverse=True, return_counts=True)
     order, ends = np.argsort(of_row, kind="stable"), np.cumsum(counts)
-    return names, order[np.rint(np.linspace(ends - counts, ends - 1, _ROWS).T).astype(int)]
+    return names, order[
+        np.rint(np.linspace(ends - counts, ends - 1, _ROWS).T).astype(int)
+    ]
 
 
 def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
@@ -142,7 +150,9 @@ def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
         raise ValueError(f"`{name}` must hold at least one row, got none.")
     check_finite(**{name: q})
     rows = torch.from_numpy(q)
-    for message in robot.check_actuators(rows, name) if isinstance(robot, Chain) else ():
+    for message in (
+        robot.check_actuators(rows, name) if isinstance(robot, Chain) else ()
+    ):
         warnings.warn(message, stacklevel=3)
     return rows
 
@@ -164,7 +174,9 @@ class _TipErrors:
     def __init__(self, robot: ForwardModel, q: Tensor) -> None:
         arcs = isinstance(robot, ArcChain)
         self.robot = robot
-        self.features = PoseFeatures.of_range(q, robot) if arcs else QuadraticFeatures.of_range(q)
+        self.features = (
+            PoseFeatures.of_range(q, robot) if arcs else QuadraticFeatures.of_range(q)
+        )
         tips, J = robot.from_coordinates_and_jacobian(robot.coordinates(q)[0])
         moved = J.square().sum(1).mean(0).sqrt()
         self.units = torch.where(moved > 1e-9 * moved.max(), 1.0 / moved, 0.0)

@@ -39,9 +39,13 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 # Fitted error models with their own description, and other regressors that a hybrid accepts.
-_FITS = {"elm_regressor": ELMRegressor.from_stored, "readout_fit": ReadoutFit.from_stored}
+_FITS = {
+    "elm_regressor": ELMRegressor.from_stored,
+    "readout_fit": ReadoutFit.from_stored,
+}
 _REGRESSORS = {
-    cls.__name__: cls for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
+    cls.__name__: cls
+    for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
 }
 
 
@@ -72,7 +76,9 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     return Stored.of(
         "hybrid",
         {
-            **{f"drift_{name}": array for name, array in model._drift._asdict().items()},
+            **{
+                f"drift_{name}": array for name, array in model._drift._asdict().items()
+            },
             "training_range": model._fitted_range,
             "play_width": None if model.play_ is None else model.play_.width,
             "radius": model.radius_,
@@ -104,8 +110,12 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.error_model = _estimator(asked) if isinstance(asked, dict) else asked
     check_settings(model)
     model.module_ = restore(stored.part("module"))
-    if isinstance(model.module_, (PoseHybridModule, AdaptedPoseModel)) != (model.output == "pose"):
-        raise ValueError(f"`output` {model.output!r} does not fit {stored.part('module').kind!r}")
+    if isinstance(model.module_, (PoseHybridModule, AdaptedPoseModel)) != (
+        model.output == "pose"
+    ):
+        raise ValueError(
+            f"`output` {model.output!r} does not fit {stored.part('module').kind!r}"
+        )
     model.mechanical_model_ = model.module_.mechanical
     model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
     restore_columns(model, stored, n)
@@ -121,7 +131,9 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         raise ValueError("the arrays do not give finite numbers")
     model._fitted_range = TrainingRange(*stored.array("training_range", (2, n)))
     empty = Drift.of_range(center[None], x.shape[1])
-    arrays = [stored.array(f"drift_{name}", a.shape) for name, a in empty._asdict().items()]
+    arrays = [
+        stored.array(f"drift_{name}", a.shape) for name, a in empty._asdict().items()
+    ]
     model._drift = Drift(*arrays)
     if not (model._drift.scale > 1.0 / LARGEST).all():
         raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
@@ -131,13 +143,21 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         one = stored.array("play_width").ndim == 0
         model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))
     if "radius" in stored.arrays:
-        inside, outside, coverage, n_rows = stored.array("radius", (4,), finite=False).tolist()
-        if not (inside >= 0.0 and outside == inf and 0.0 < coverage < 1.0 and n_rows < inf):
-            raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
+        inside, outside, coverage, n_rows = stored.array(
+            "radius", (4,), finite=False
+        ).tolist()
+        if not (
+            inside >= 0.0 and outside == inf and 0.0 < coverage < 1.0 and n_rows < inf
+        ):
+            raise ValueError(
+                "`radius` must hold a radius, a coverage and a number of rows"
+            )
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
     model._fitted_rows = stored.array("fitted_rows", "N")
     results = training.get("cv_results") if isinstance(training, dict) else None
-    model.cv_results_ = {key: _array(value) for key, value in results.items()} if results else None
+    model.cv_results_ = (
+        {key: _array(value) for key, value in results.items()} if results else None
+    )
     model._noise = stored.value("noise", float)
     return model
 
@@ -172,7 +192,10 @@ def _setting(asked: Any, fitted: Any) -> Any:
     if isinstance(fitted, ReadoutFit):
         features = fitted.readout.features.stored()
         if "activation" in features.settings:
-            params = {"n_hidden": len(features.arrays["input_bias"]), **features.settings}
+            params = {
+                "n_hidden": len(features.arrays["input_bias"]),
+                **features.settings,
+            }
             return {"class": "ELMRegressorCV", "params": params}
     raise TypeError(f"`error_model` {asked!r} could only be stored as code.")
 
@@ -198,11 +221,19 @@ def _stored_error(error: Any) -> Stored | None:
     if error is None or isinstance(error, (ReadoutFit, ELMRegressor, ELMRegressorCV)):
         return None if error is None else error.stored()
     if type(error) is tuple:  # one for each marker
-        return Stored.of("list", parts={str(k): _stored_error(one) for k, one in enumerate(error)})
+        return Stored.of(
+            "list", parts={str(k): _stored_error(one) for k, one in enumerate(error)}
+        )
     if isinstance(error, Blend):
-        models = {str(k): _stored_error(one) for k, one in enumerate(error.error_models)}
+        models = {
+            str(k): _stored_error(one) for k, one in enumerate(error.error_models)
+        }
         return Stored.of("blend", parts=models, weights=error.weights)
-    learned = {name: np.asarray(value) for name, value in vars(error).items() if name[-1] == "_"}
+    learned = {
+        name: np.asarray(value)
+        for name, value in vars(error).items()
+        if name[-1] == "_"
+    }
     arrays = {name: value for name, value in learned.items() if value.dtype.kind == "f"}
     return Stored.of("regressor", arrays, **_described(error))
 
@@ -212,15 +243,21 @@ def _restored_error(stored: Stored | None, restore: Restore, n: int) -> Any:
     if stored is None:
         return None
     if stored.kind == "list":
-        return tuple(_restored_error(part, restore, n) for part in stored.parts.values())
+        return tuple(
+            _restored_error(part, restore, n) for part in stored.parts.values()
+        )
     if stored.kind == "blend":
         weights = tuple(stored.list_of(float, "weights"))
         parts = [stored.parts.get(str(k)) for k in range(len(weights))]
-        return Blend(weights, tuple(_restored_error(part, restore, n) for part in parts))
+        return Blend(
+            weights, tuple(_restored_error(part, restore, n) for part in parts)
+        )
     if stored.kind in _FITS:
         return _FITS[stored.kind](stored, restore)
     error = _estimator(stored.settings)
-    vars(error).update({name: stored.array(name) for name in stored.arrays}, n_features_in_=n)
+    vars(error).update(
+        {name: stored.array(name) for name in stored.arrays}, n_features_in_=n
+    )
     if error.predict(np.ones((1, n))).ndim > 2:
         raise ValueError("the arrays of the error model do not fit together")
     return error

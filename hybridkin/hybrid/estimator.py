@@ -280,7 +280,10 @@ class HybridForwardModel(HybridPredictor):
         if spec.error_model is None:
             spec, self.cv_results_, self.candidates_ = select(spec, rows, progress)
         fitted = fit_hybrid(spec, rows)
-        self.mechanical_model_, self.calibration_ = fitted.mechanical, fitted.calibration
+        self.mechanical_model_, self.calibration_ = (
+            fitted.mechanical,
+            fitted.calibration,
+        )
         self.error_model_, self.module_ = fitted.error.result, fitted.module
         self._single_output = rows.y.ndim == 1
         self._fitted_range = TrainingRange.of(rows.X)
@@ -334,7 +337,9 @@ class HybridForwardModel(HybridPredictor):
         """
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
-        given = [("decay", decay, 1.0)] + ([] if alpha is None else [("alpha", alpha, np.inf)])
+        given = [("decay", decay, 1.0)] + (
+            [] if alpha is None else [("alpha", alpha, np.inf)]
+        )
         for name, value, high in given:
             if not 0.0 < number(value, name) <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
@@ -348,7 +353,9 @@ class HybridForwardModel(HybridPredictor):
         fitted = self.module_.fitted.with_drift(None)
         with torch.no_grad():
             error = residuals(fitted.mechanical, rows.q, rows.y, self.output)
-            residual = error.reshape(rows.tips.shape) - fitted.error_part(rows.q).numpy()
+            residual = (
+                error.reshape(rows.tips.shape) - fitted.error_part(rows.q).numpy()
+            )
         self._drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
             alpha = self._drift.likeliest_alpha(self._noise)
@@ -419,7 +426,9 @@ class HybridForwardModel(HybridPredictor):
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         rows = replace(rows, X=self._effective(rows.X, rows.groups))
         self._warn_of_units(rows)
-        self.module_, message = adapted(fitted, rows, self._noise, self._drift.scale, parameters)
+        self.module_, message = adapted(
+            fitted, rows, self._noise, self._drift.scale, parameters
+        )
         if message is not None:
             warnings.warn(message, stacklevel=2)
         self.mechanical_model_ = self.module_.mechanical
@@ -436,7 +445,9 @@ class HybridForwardModel(HybridPredictor):
         check_finite(X=X, y=y)
         X, y, weights = check_rows(self, X, y, weights, reset)
         y = np.where(missing, np.nan, y)
-        X = X if X.flags.writeable else X.copy()  # torch warns of columns of a data frame
+        X = (
+            X if X.flags.writeable else X.copy()
+        )  # torch warns of columns of a data frame
         groups = None if groups is None else labels(groups, len(X))
         return Rows(X, y, cast("NDArray | None", weights), groups)
 
@@ -458,5 +469,9 @@ class HybridForwardModel(HybridPredictor):
                 names = tuple(asked)
         error_model = None
         if self.error_model != "auto":
-            error_model = error_model_of(self.error_model, self.coupling, self.random_state)
-        return Spec(mechanical, error_model, names, self.guard, self.output, self.random_state)
+            error_model = error_model_of(
+                self.error_model, self.coupling, self.random_state
+            )
+        return Spec(
+            mechanical, error_model, names, self.guard, self.output, self.random_state
+        )

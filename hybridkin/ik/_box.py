@@ -70,7 +70,9 @@ class HalfSpaces(NamedTuple):
         J = self.normals.to(margin).T.expand(len(margin), -1, -1)
         way = margin.new_zeros(len(margin), J.shape[1])
         nu = torch.zeros_like(margin)
-        small = margin.new_full((len(margin),), max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps)))
+        small = margin.new_full(
+            (len(margin),), max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps))
+        )
         for _ in range(1 + IK_PROXIMAL):
             z = (self.along(way) - margin) / small[:, None]
             problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
@@ -214,7 +216,12 @@ def _moved(y: Tensor, to: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
 
 
 def _exact_line_search(
-    y: Tensor, slope: Tensor, start: Tensor, curvature: Tensor, lower: Tensor, upper: Tensor
+    y: Tensor,
+    slope: Tensor,
+    start: Tensor,
+    curvature: Tensor,
+    lower: Tensor,
+    upper: Tensor,
 ) -> Tensor:
     """Return t in (0, 1) where start + t curvature + slope . (clip(y + t slope) - clip(y)) = 0.
 

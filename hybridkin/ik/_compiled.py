@@ -118,7 +118,9 @@ class Core:
         self.settings = settings
         self.rows = sum(settings.task.parts)
         if self.rows == 3:
-            self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, model))
+            self.settings = dataclasses.replace(
+                settings, task=_CoreTask(settings.task, model)
+            )
         self._call = Call(self.plan, opened_library())
         self._idle: list[Follower] = []  # one for every thread that has used `step`
         n = self.n
@@ -134,7 +136,9 @@ class Core:
     def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, Program]]:
         return Core, self._made_of
 
-    def step(self, q: Any, target: Any, dx: Any, tip: Any) -> tuple[NDArray, dict] | None:
+    def step(
+        self, q: Any, target: Any, dx: Any, tip: Any
+    ) -> tuple[NDArray, dict] | None:
         """Return the state of a step of one row and the places of its fields; else None."""
         if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
             return None
@@ -143,7 +147,11 @@ class Core:
         except IndexError:  # other threads use them
             follower = Follower(self, None, IK_MUST_SEE + IK_FROM_REST)
         follower.q[...] = q
-        found = (follower.state.copy(), self._places) if follower.tick(target, dx, tip) else None
+        found = (
+            (follower.state.copy(), self._places)
+            if follower.tick(target, dx, tip)
+            else None
+        )
         self._idle.append(follower)
         return found
 
@@ -163,7 +171,9 @@ class Core:
         n = self.n
         out = np.empty((len(q), n + 6))
         held = np.empty((len(q), n), dtype=bool)
-        arrays = [None if a is None else _plain(a) for a in (q, target, feed, tip, last)]
+        arrays = [
+            None if a is None else _plain(a) for a in (q, target, feed, tip, last)
+        ]
         mode = ctypes.c_int32(IK_MUST_SEE | _mode(target, feed, tip))
         self._run("hk_ik_steps", len(q), [mode], [*arrays, out, held])
         dq, x, numbers = torch.from_numpy(out).split([n, 3, 3], dim=1)
@@ -173,7 +183,9 @@ class Core:
         """Return the search for configurations that reach targets."""
         return _CoreSearch(self.settings, tol, max_iter, self)
 
-    def find(self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int) -> Found:
+    def find(
+        self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int
+    ) -> Found:
         """Return the result of `hk_ik_find` for starts q (N, n)."""
         n_rows = len(q)
         best = _plain(q).copy()
@@ -183,14 +195,21 @@ class Core:
         n_iter = np.empty(n_rows, dtype=np.int32)
         metres, radians = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
         tolerances = metres, radians * self.settings.task.units[-1]
-        numbers = [*map(ctypes.c_int32, (mode, max_iter)), *map(ctypes.c_double, tolerances)]
-        self._run("hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter])
+        numbers = [
+            *map(ctypes.c_int32, (mode, max_iter)),
+            *map(ctypes.c_double, tolerances),
+        ]
+        self._run(
+            "hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter]
+        )
         error = torch.from_numpy(e)
         result = torch.from_numpy(outcome)
         iterations = torch.from_numpy(n_iter).long()
         return Found(
             torch.from_numpy(best),
-            target - error if self.rows == 3 else torch.full_like(target, math.nan),  # not used
+            target - error
+            if self.rows == 3
+            else torch.full_like(target, math.nan),  # not used
             torch.from_numpy(J),
             error,
             target.clone(),
@@ -201,13 +220,17 @@ class Core:
             n_starts=torch.ones_like(iterations),
         )
 
-    def _run(self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]) -> None:
+    def _run(
+        self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]
+    ) -> None:
         """Call a function of the library for all rows of arrays."""
         function = getattr(opened_library(), name)
         places = [None if a is None else (a.ctypes.data, a.strides[0]) for a in arrays]
 
         def run(start: int, count: int) -> None:
-            at = [p if p is None else ctypes.c_void_p(p[0] + start * p[1]) for p in places]
+            at = [
+                p if p is None else ctypes.c_void_p(p[0] + start * p[1]) for p in places
+            ]
             call = ctypes.c_void_p(self._call.place)
             function(call, ctypes.c_int64(count), *numbers, *at)
 
@@ -232,7 +255,11 @@ class Follower:
     backend = "compiled"
 
     def __init__(
-        self, core: Core, memory: float | None, mode: int = 0, state: NDArray | None = None
+        self,
+        core: Core,
+        memory: float | None,
+        mode: int = 0,
+        state: NDArray | None = None,
     ) -> None:
         self.core = core
         self._memory = memory
@@ -323,7 +350,9 @@ class Follower:
         n = self.core.n
         _, dq, before, held, J = a[:, IK_Q:].split([n, n, n, n, 3 * n], dim=1)
         step = StepRows(dq, a[:, IK_SIGMA_MIN], a[:, IK_DAMPING], held > 0.0)
-        return Tick(before, a[:, IK_X:IK_ERROR], J.view(1, 3, n), a[:, IK_ERROR:IK_Q], step)
+        return Tick(
+            before, a[:, IK_X:IK_ERROR], J.view(1, 3, n), a[:, IK_ERROR:IK_Q], step
+        )
 
 
 class _CoreTask(PositionTask):

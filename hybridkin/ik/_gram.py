@@ -56,7 +56,11 @@ def row_gram(J: Tensor) -> RowGram:
     c = g33 - mean
     off = g21 * g21 + g31 * g31 + g32 * g32
     radius = ((a * a + b * b + c * c + 2.0 * off) / 6.0).sqrt()
-    det = a * (b * c - g32 * g32) - g21 * (g21 * c - g32 * g31) + g31 * (g21 * g32 - b * g31)
+    det = (
+        a * (b * c - g32 * g32)
+        - g21 * (g21 * c - g32 * g31)
+        + g31 * (g21 * g32 - b * g31)
+    )
     ratio = 0.5 * det / radius.pow(3).clamp_min(torch.finfo(J.dtype).tiny)
     angle = torch.acos(ratio.clamp(-1.0, 1.0)) / 3.0
     low = mean + 2.0 * radius * torch.cos(angle + 2.0 * math.pi / 3.0)
@@ -106,14 +110,20 @@ def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> 
     if len(gram.parts) == 6:
         return _solve_3x3(gram.parts, v, damping_sq)
     if len(gram.parts) == 1:
-        damping_sq = torch.as_tensor(damping_sq, device=v.device).to(v).expand_as(v[..., 0])
+        damping_sq = (
+            torch.as_tensor(damping_sq, device=v.device).to(v).expand_as(v[..., 0])
+        )
         factor = _factor(gram.parts[0], damping_sq)
         return torch.cholesky_solve(v[..., None], factor)[..., 0]
     squares, vectors = gram.parts
-    floor = 8.0 * torch.finfo(v.dtype).eps * squares.clamp_min(0.0).sum(-1, keepdim=True)
+    floor = (
+        8.0 * torch.finfo(v.dtype).eps * squares.clamp_min(0.0).sum(-1, keepdim=True)
+    )
     if isinstance(damping_sq, Tensor):
         damping_sq = damping_sq[..., None]
-    along = (v[..., None, :] @ vectors)[..., 0, :] * _reciprocal(squares + damping_sq, floor)
+    along = (v[..., None, :] @ vectors)[..., 0, :] * _reciprocal(
+        squares + damping_sq, floor
+    )
     return (vectors @ along[..., None])[..., 0]
 
 
@@ -173,7 +183,9 @@ def adaptive_damping(gram: RowGram) -> Tensor:
     Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
     """
     threshold = IK_HEALTHY * gram.sigma_max
-    ratio = gram.sigma_min / torch.where(threshold > 0.0, threshold, torch.ones_like(threshold))
+    ratio = gram.sigma_min / torch.where(
+        threshold > 0.0, threshold, torch.ones_like(threshold)
+    )
     return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
 
 
@@ -200,7 +212,9 @@ def _entries_3x3(J: Tensor) -> tuple[Tensor, ...]:
     return tuple(G[..., i, j] for i, j in pairs)
 
 
-def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float) -> Tensor:
+def _solve_3x3(
+    entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float
+) -> Tensor:
     """Solve a symmetric semidefinite 3 x 3 system plus damping by LDL^T without pivoting."""
     g11, g21, g31, g22, g32, g33 = entries
     v1, v2, v3 = v.unbind(-1)
@@ -226,4 +240,6 @@ def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | floa
 def _reciprocal(pivot: Tensor, floor: Tensor) -> Tensor:
     """Return 1 / pivot, or 0 if the pivot is only rounding error."""
     keep = pivot > floor
-    return torch.where(keep, 1.0 / torch.where(keep, pivot, torch.ones_like(pivot)), 0.0)
+    return torch.where(
+        keep, 1.0 / torch.where(keep, pivot, torch.ones_like(pivot)), 0.0
+    )

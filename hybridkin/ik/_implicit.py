@@ -92,7 +92,9 @@ def _newton(
         wish = (settings.preferred(leaf) - leaf) / unit
         pull = wish - unit * apply_columns(J, apply_columns(inverse, wish.detach()))
         H = unit * slopes(pull, leaf).detach()
-        compliance = null @ torch.linalg.pinv(null @ H @ null, atol=cutoff, rtol=cutoff) @ null
+        compliance = (
+            null @ torch.linalg.pinv(null @ H @ null, atol=cutoff, rtol=cutoff) @ null
+        )
         lacking = torch.cat([step, apply_rows(null, pull)], dim=-1)
         step = step - apply_rows(compliance, pull + apply_rows(H, step))
     size = lacking.detach().norm(dim=-1)

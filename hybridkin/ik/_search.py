@@ -30,7 +30,11 @@ _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
 _OUTSIDE = -1.0
 _DONE = -2.0
 _RETURNS = 30  # attempts to return rows that ended outside the tip limits
-_PARTS = [4, 8, 16]  # where further starts are split; only rows still open use the next part
+_PARTS = [
+    4,
+    8,
+    16,
+]  # where further starts are split; only rows still open use the next part
 _ROWS = 256  # rows searched again at once
 _FINE = 0.01  # factor on tol when configurations are compared
 _SAME = 0.01  # of the ranges: closer configurations count as the same
@@ -106,7 +110,11 @@ class Search:
         settings = self.settings
         q = settings.start_at(q)
         target = settings.allowed(target)
-        if cold and len(q) > 0 and row_gram(settings.evaluate(q[:1])[1]).is_singular.all():
+        if (
+            cold
+            and len(q) > 0
+            and row_gram(settings.evaluate(q[:1])[1]).is_singular.all()
+        ):
             # At a straight backbone, motions that cancel to first order would be missed.
             at_start = self._start(q, target)
             nudged = settings.start_at(self._nudged(at_start))
@@ -115,10 +123,14 @@ class Search:
         found = self._attempt(q, target)
         rows = (~found.reached & row_gram(found.J).is_singular).nonzero()[:, 0]
         self._try_again(found, rows, self._nudged(found)[rows, None])
-        rows = ((self._cost(found) > _DONE) & torch.isfinite(found.error)).nonzero()[:, 0]
+        rows = ((self._cost(found) > _DONE) & torch.isfinite(found.error)).nonzero()[
+            :, 0
+        ]
         for some in rows.split(_ROWS) if restarts * len(rows) > 0 else ():
             size = _per_tip(found.J, found.error)[some]
-            starts = nearest_starts(settings, q[some], size, found.target[some], restarts)
+            starts = nearest_starts(
+                settings, q[some], size, found.target[some], restarts
+            )
             for part in starts.tensor_split(_PARTS, dim=1):
                 open_rows = self._cost(found)[some] > _DONE
                 self._try_again(found, some[open_rows], part[open_rows])
@@ -141,7 +153,9 @@ class Search:
         n_starts = restarts + 1
         spans = settings.spans.to(start)
         tol = (
-            tuple(_FINE * t for t in self.tol) if isinstance(self.tol, tuple) else _FINE * self.tol
+            tuple(_FINE * t for t in self.tol)
+            if isinstance(self.tol, tuple)
+            else _FINE * self.tol
         )
         fine = replace(self, tol=tol)
         rows = torch.arange(len(start), device=start.device)
@@ -171,7 +185,9 @@ class Search:
 
     def _from_even_starts(self, best: Found, start: Tensor, restarts: int) -> Found:
         """Return the results from the best points and from `restarts` even starts, row by row."""
-        starts = even_starts(self.settings, start, torch.zeros_like(best.error), restarts)
+        starts = even_starts(
+            self.settings, start, torch.zeros_like(best.error), restarts
+        )
         starts = torch.cat([best.q[:, None], starts.expand(len(start), -1, -1)], dim=1)
         target = best.target.repeat_interleave(restarts + 1, 0)
         found = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
@@ -203,7 +219,9 @@ class Search:
         n_tried = found.n_starts[rows] + n_starts
         cost = self._cost(again).nan_to_num(torch.inf).view(-1, n_starts)
         best = cost.argmin(1)
-        again = again.take(best + n_starts * torch.arange(len(rows), device=best.device))
+        again = again.take(
+            best + n_starts * torch.arange(len(rows), device=best.device)
+        )
         better = self._cost(again) < self._cost(found)[rows]
         found.put(rows[better], again.take(better))
         found.n_iter[rows], found.n_starts[rows] = n_iter, n_tried
@@ -211,7 +229,9 @@ class Search:
     def _cost(self, found: Found) -> Tensor:
         """Return the error, or -1 for rows reached outside the domain, -2 for inside."""
         inside = self.settings.task.in_domain(found.q)
-        return torch.where(found.reached, torch.where(inside, _DONE, _OUTSIDE), found.error)
+        return torch.where(
+            found.reached, torch.where(inside, _DONE, _OUTSIDE), found.error
+        )
 
     def _point(self, q: Tensor, target: Tensor) -> Point:
         x, J = self.settings.evaluate(q)
@@ -229,11 +249,15 @@ class Search:
         rows = torch.arange(len(q), device=q.device)
         damping = torch.full_like(found.error, _FIRST_DAMPING)
         none = torch.zeros_like(damping)
-        live = _Descent(**vars(found), start=found.error, nu=damping, growth=2.0 + none, slow=none)
+        live = _Descent(
+            **vars(found), start=found.error, nu=damping, growth=2.0 + none, slow=none
+        )
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
             live.stationary = self._blocked(live)
-            live.stationary |= (live.nu > IK_LAST_DAMPING) | (live.slow >= IK_SLOW_STEPS)
+            live.stationary |= (live.nu > IK_LAST_DAMPING) | (
+                live.slow >= IK_SLOW_STEPS
+            )
             live.n_iter = torch.full_like(live.n_iter, iteration)
             going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
             if not going.all():
@@ -284,7 +308,9 @@ class Search:
             leaf = q.detach().requires_grad_(True)
             distance = self.settings.task.domain_distance(leaf)
             if distance.requires_grad:
-                (slope,) = torch.autograd.grad(distance.sum(), leaf, materialize_grads=True)
+                (slope,) = torch.autograd.grad(
+                    distance.sum(), leaf, materialize_grads=True
+                )
         beyond = (distance.detach() - IK_INSIDE).clamp_min(0.0)
         square = slope.square().sum(-1)
         return -(beyond / torch.where(square > 0.0, square, 1.0))[:, None] * slope
@@ -307,7 +333,9 @@ class Search:
         live = self._slide(found.take(rows), wanted, torch.ones_like(found.e[rows, 0]))
         for iteration in range(IK_NULL_STEPS):
             last = iteration == IK_NULL_STEPS - 1
-            step, point = self._try_step(live, None if last else live.share[:, None] * live.free)
+            step, point = self._try_step(
+                live, None if last else live.share[:, None] * live.free
+            )
             new = self._slide(point, wanted, live.share)
             way = (new.q - live.q) / unit
             gain = 0.5 * ((live.free + new.free) / unit * way).sum(-1)
@@ -324,7 +352,9 @@ class Search:
             worth = IK_NULL_GAIN * (live.wish / unit).square().sum(-1)
             far = (gain > worth) | ~reached | ~reached_new
             going = torch.where(ok, far, live.share > 0.01)
-            curvature = (way * (live.free - new.free) / unit).sum(-1) / way.square().sum(-1)
+            curvature = (way * (live.free - new.free) / unit).sum(
+                -1
+            ) / way.square().sum(-1)
             new.share = torch.where(curvature > 0.0, 1.0 / curvature, 2.0 * live.share)
             new.share = new.share.clamp(0.1, 4.0)
             live.share = 0.25 * live.share
@@ -337,7 +367,9 @@ class Search:
         better = (ended.error < found.error[all_rows]) & self._within(ended.e)
         found.put(all_rows[better], ended.take(better))
 
-    def _slide(self, at: Point, wanted: Callable[[Tensor], Tensor], share: Tensor) -> _Slide:
+    def _slide(
+        self, at: Point, wanted: Callable[[Tensor], Tensor], share: Tensor
+    ) -> _Slide:
         wish = wanted(at.q)
         free = null_step(self.settings, at.J, wish)
         return _Slide(at.q, at.x, at.J, at.e, at.target, wish, free, share)
@@ -350,7 +382,9 @@ class Search:
         if hold:
             held = (lower >= 0.0) | (upper <= 0.0)
             lower, upper = (torch.where(held, 0.0, bound) for bound in (lower, upper))
-        step = limited_step(self.settings, at.J, at.e, posture, lower, upper, quick=True)
+        step = limited_step(
+            self.settings, at.J, at.e, posture, lower, upper, quick=True
+        )
         return step, self._point(at.q + step.dq, at.target)
 
     def _within(self, e: Tensor) -> Tensor:

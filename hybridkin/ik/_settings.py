@@ -41,16 +41,22 @@ Array: TypeAlias = Numbers | Transform  # what a caller may pass
 Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 
-def bound(value: Array, name: str, *, finite: bool = False, positive: bool = False) -> Tensor:
+def bound(
+    value: Array, name: str, *, finite: bool = False, positive: bool = False
+) -> Tensor:
     """Return a limit, a posture or weights as a float64 tensor of shape () or (n,)."""
     a = as_tensor(value, name).cpu().double().clone()
     good = a.ndim < 2 and a.numel() > 0 and not torch.isnan(a).any()
-    require(good, f"`{name}` must be a number or of shape (n,), without NaN, got {a.tolist()}.")
+    require(
+        good,
+        f"`{name}` must be a number or of shape (n,), without NaN, got {a.tolist()}.",
+    )
     good = torch.isfinite(a).all() or not finite
     require(good, f"`{name}` must be finite, got {a.tolist()}.")
     lock = "to lock an actuator, give it equal limits"
     require(
-        (a > 0.0).all() or not positive, f"`{name}` must be positive, got {a.tolist()}; {lock}."
+        (a > 0.0).all() or not positive,
+        f"`{name}` must be positive, got {a.tolist()}; {lock}.",
     )
     return a
 
@@ -58,7 +64,9 @@ def bound(value: Array, name: str, *, finite: bool = False, positive: bool = Fal
 def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
     """Return these limits of the model of a task."""
     limits = task.models[0].robot.limits
-    return {name: bound(limits[name], name, positive=name == "dq_max") for name in names}
+    return {
+        name: bound(limits[name], name, positive=name == "dq_max") for name in names
+    }
 
 
 def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
@@ -66,8 +74,13 @@ def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
     need = "`tip_limits` must be a pair (A, b)"
     m = task.shape[0]
     got = type(task).__name__
-    require(isinstance(task, PositionTask), f"`tip_limits` needs a PositionTask, got a {got}.")
-    require(isinstance(given, Sequence) and len(given) == 2, f"{need}, got {given!r:.200}.")
+    require(
+        isinstance(task, PositionTask),
+        f"`tip_limits` needs a PositionTask, got a {got}.",
+    )
+    require(
+        isinstance(given, Sequence) and len(given) == 2, f"{need}, got {given!r:.200}."
+    )
     A, b = (as_tensor(a, "tip_limits").cpu().double() for a in given)
     size = A.norm(dim=-1)
     good = A.shape == (b.numel(), m) and b.ndim == 1 and bool(torch.isfinite(b).all())
@@ -76,7 +89,10 @@ def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
     require(good, f"{need} {shapes}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
     found = HalfSpaces(A / size[:, None], b / size)
     inside = found.margin(found.way_in(found.offsets[None])) >= -1e-9
-    require(inside.all(), "`tip_limits` must have a common point; these half-spaces have none.")
+    require(
+        inside.all(),
+        "`tip_limits` must have a common point; these half-spaces have none.",
+    )
     return found
 
 
@@ -92,7 +108,9 @@ def stopping(way: Tensor, change: Tensor) -> Tensor:
     return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
 
 
-_FAST = 5.0  # largest plausible speed: this many times the largest plausible q per second
+_FAST = (
+    5.0  # largest plausible speed: this many times the largest plausible q per second
+)
 _TURN = 2.0 * math.pi
 _FULL = 0.999  # a range of this share of a turn counts as a whole turn
 PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
@@ -115,7 +133,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     periods = stored.array("periods", [n], finite=False)
     normals = stored.array("normals").T
     if len(normals) > IK_NORMALS:
-        raise NoKernel(f"the log leaves {len(normals)} directions of q out, more than {IK_NORMALS}")
+        raise NoKernel(
+            f"the log leaves {len(normals)} directions of q out, more than {IK_NORMALS}"
+        )
     gain = -1.0 if settings["gain"] is None else settings["gain"]
     # Steps of more than a second end at the posture.
     beta = 1.0 if settings["beta"] is None else settings["beta"]
@@ -166,11 +186,15 @@ class StepSettings(Portable):
         one = "give scalars or one value per actuator"
         good = len(set(sizes.values())) < 2
         names = ", ".join(f"`{name}`" for name in sizes)
-        require(good, f"{names} must have the same number of actuators, got {sizes}; {one}.")
+        require(
+            good, f"{names} must have the same number of actuators, got {sizes}; {one}."
+        )
         low = self.q_min.tolist()
         high = self.q_max.tolist()
         good = (self.q_min <= self.q_max).all()
-        require(good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them.")
+        require(
+            good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them."
+        )
         posture = self.middle if self.q_pref is None else self.q_pref
         if isinstance(posture, Tensor):
             posture = self.on_plane(posture)
@@ -181,11 +205,18 @@ class StepSettings(Portable):
         share = 0.0 if self.damping == "adaptive" else self.damping
         good = not isinstance(share, str) and 0.0 <= share < math.inf
         text = '"adaptive" or'
-        require(good, f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.")
+        require(
+            good,
+            f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.",
+        )
         models = self.task.models
-        turns = torch.stack([torch.as_tensor(model.turns, device="cpu") for model in models])
+        turns = torch.stack(
+            [torch.as_tensor(model.turns, device="cpu") for model in models]
+        )
         full = (self.q_max - self.q_min >= _FULL * _TURN) & (self.limits != "off")
-        periods = torch.where(turns.all(0) & full, self.q_max.new_tensor(_TURN), math.inf)
+        periods = torch.where(
+            turns.all(0) & full, self.q_max.new_tensor(_TURN), math.inf
+        )
         object.__setattr__(self, "periods", periods)
         object.__setattr__(self, "pulls", bound(models[0].robot.pulls, "pulls"))
 
@@ -197,7 +228,10 @@ class StepSettings(Portable):
         n = task.n_actuators
         before = self.task.n_actuators
         way = "make a new InverseKinematics"
-        require(n == before, f"`model` must keep its {before} actuators, but now has {n}; {way}.")
+        require(
+            n == before,
+            f"`model` must keep its {before} actuators, but now has {n}; {way}.",
+        )
         return replace(self, task=task, **limits_of(task, self.of_model))
 
     def shown(self, arguments: Signature, defaults: bool = False) -> dict[str, str]:
@@ -206,7 +240,9 @@ class StepSettings(Portable):
         for name, default in arguments.parameters.items():
             value = vars(self).get(name)
             if isinstance(value, Tensor):
-                ends = dict.fromkeys(f"{float(end):.4g}" for end in (value.min(), value.max()))
+                ends = dict.fromkeys(
+                    f"{float(end):.4g}" for end in (value.min(), value.max())
+                )
                 whose = " of the model" if name in self.of_model else ""
                 if torch.isfinite(value).any():
                     shown[name] = f"{' to '.join(ends)}{whose}"
@@ -222,7 +258,11 @@ class StepSettings(Portable):
         n = self.n_actuators
         for name in ("q_min", "q_max", "dq_max", "q_pref"):
             value = vars(self)[name]
-            if isinstance(value, Tensor) and n is not None and name not in self.of_model:
+            if (
+                isinstance(value, Tensor)
+                and n is not None
+                and name not in self.of_model
+            ):
                 q = torch.where(torch.isfinite(value), value, 0.0).expand(1, n)
                 factor = _FAST if name == "dq_max" else 1.0
                 found += self.task.models[0].robot.unit_messages(q, name, factor)
@@ -231,7 +271,11 @@ class StepSettings(Portable):
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if targets lie too far from the robot to be in metres."""
         points = self._positions(x)
-        return self.task.models[0].robot.far_messages(points, name) if points.shape[-1] == 3 else []
+        return (
+            self.task.models[0].robot.far_messages(points, name)
+            if points.shape[-1] == 3
+            else []
+        )
 
     def misses(self, target: Tensor) -> Tensor:
         """Return proven lower bounds (N,) of the errors at targets [m]; not positive: no proof."""
@@ -245,7 +289,9 @@ class StepSettings(Portable):
 
     def _sizes(self) -> dict[str, int]:
         """Return the numbers of actuators given by the settings and the model, by name."""
-        vectors = {k: a for k, a in vars(self).items() if isinstance(a, Tensor) and a.ndim == 1}
+        vectors = {
+            k: a for k, a in vars(self).items() if isinstance(a, Tensor) and a.ndim == 1
+        }
         sizes = {name: len(a) for name, a in vectors.items()}
         n = self.task.n_actuators
         return sizes if n is None else {**sizes, "model": n}
@@ -274,7 +320,9 @@ class StepSettings(Portable):
     def whole_turns(self, dq: Tensor) -> Tensor:
         """Return the whole turns nearest to dq (..., n)."""
         periods = self.periods.to(dq)
-        return torch.where(torch.isfinite(periods), periods * (dq / periods).round(), 0.0)
+        return torch.where(
+            torch.isfinite(periods), periods * (dq / periods).round(), 0.0
+        )
 
     @property
     def has_posture(self) -> bool:
@@ -299,7 +347,9 @@ class StepSettings(Portable):
         if self.tip_limits is not None:
             raise TypeError("limits of the tip have no kernel")
         if n is None:
-            raise TypeError("the number of actuators is unknown; give one limit for each")
+            raise TypeError(
+                "the number of actuators is unknown; give one limit for each"
+            )
         arrays = {
             "q_min": self.q_min,
             "q_max": self.q_max,
@@ -311,11 +361,23 @@ class StepSettings(Portable):
             "pulls": self.pulls,
         }
         arrays = {name: np.broadcast_to(as_array(a), n) for name, a in arrays.items()}
-        arrays["normals"] = np.zeros((n, 0)) if self.plane is None else as_array(self.plane[1])
-        names = ("beta", "gain", "damping", "limits", "dt", "has_posture", "accelerates")
+        arrays["normals"] = (
+            np.zeros((n, 0)) if self.plane is None else as_array(self.plane[1])
+        )
+        names = (
+            "beta",
+            "gain",
+            "damping",
+            "limits",
+            "dt",
+            "has_posture",
+            "accelerates",
+        )
         settings = {name: getattr(self, name) for name in names}
         settings["radian"] = self.task.units[1] if len(self.task.parts) > 1 else 0.0
-        return Stored.of(self.layout.kind, arrays, {"model": model.stored()}, **settings)
+        return Stored.of(
+            self.layout.kind, arrays, {"model": model.stored()}, **settings
+        )
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
@@ -341,14 +403,18 @@ class StepSettings(Portable):
         if len(q) > 0:
             x, J = self.task.evaluate(q)
             return x, self.in_plane(J)
-        return q.new_zeros(0, *self.task.shape), q.new_zeros(0, sum(self.task.parts), q.shape[1])
+        return q.new_zeros(0, *self.task.shape), q.new_zeros(
+            0, sum(self.task.parts), q.shape[1]
+        )
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
         wanted = self.posture(q) if callable(self.posture) else self.posture
         if not isinstance(wanted, Tensor):
             got = type(wanted).__name__
-            raise TypeError(f"`q_pref` must map torch tensors to torch tensors, got {got}.")
+            raise TypeError(
+                f"`q_pref` must map torch tensors to torch tensors, got {got}."
+            )
         return self.on_plane(wanted.to(q))
 
     def start(self, like: Tensor) -> Tensor:
@@ -356,9 +422,13 @@ class StepSettings(Portable):
         start = self.posture if isinstance(self.posture, Tensor) else self.middle
         need = "give `q0` or `q_pref` of shape (n,)"
         if start is None:
-            raise ValueError(f"a start is needed: {need}, or finite `q_min` and `q_max`.")
+            raise ValueError(
+                f"a start is needed: {need}, or finite `q_min` and `q_max`."
+            )
         if self.n_actuators is None:
-            raise ValueError(f"the number of actuators is not known from this model; {need}.")
+            raise ValueError(
+                f"the number of actuators is not known from this model; {need}."
+            )
         start = start.to(like).expand(self.n_actuators)
         return self.preferred(start) if callable(self.q_pref) else start
 
@@ -367,7 +437,10 @@ class StepSettings(Portable):
         dt = self.dt if period is None else period
         gain = 1.0 if self.gain is None else self.gain * dt
         beta = min(dt, 1.0) if self.beta is None else self.beta * dt
-        for name, share, good in (("gain", gain, gain > 0.0), ("beta", beta, beta >= 0.0)):
+        for name, share, good in (
+            ("gain", gain, gain > 0.0),
+            ("beta", beta, beta >= 0.0),
+        ):
             need = "must lie in [0, 1], and a gain above 0"
             got = f"got {share / dt:.6g} 1/s x {dt:.6g} s = {share:.4g}"
             way = f"use a {name} up to {1.0 / dt:.4g} 1/s or a shorter period"
@@ -444,12 +517,18 @@ class StepSettings(Portable):
 
     # Conversion of a caller's arrays to tensors.
 
-    def configurations(self, value: Array, name: str, like: Tensor | None = None) -> Tensor:
+    def configurations(
+        self, value: Array, name: str, like: Tensor | None = None
+    ) -> Tensor:
         """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
         q = as_tensor(value, name, self.task.device if like is None else like.device)
         n = self.n_actuators
         check_shape(q, name, ("...", n or "n"), "one value per actuator")
-        return q if like is None else q.to(like.device, torch.promote_types(q.dtype, like.dtype))
+        return (
+            q
+            if like is None
+            else q.to(like.device, torch.promote_types(q.dtype, like.dtype))
+        )
 
     def points(
         self,
@@ -476,12 +555,17 @@ class StepSettings(Portable):
         n = len(target)
         dt = self.dt
         if t is None:
-            return dt * torch.arange(n, dtype=target.dtype, device=target.device), [dt] * n
+            return dt * torch.arange(n, dtype=target.dtype, device=target.device), [
+                dt
+            ] * n
         times = as_tensor(t, "t", target.device)
         check_shape(times, "t", [n], "one time per point of `path`")
         periods = times.diff().tolist()
         increasing = bool(countable(times).all()) and min(periods, default=dt) > 0.0
-        require(increasing, "`t` must be finite and increasing [s]; sort it, drop repeated times.")
+        require(
+            increasing,
+            "`t` must be finite and increasing [s]; sort it, drop repeated times.",
+        )
         self.rates(max(periods, default=dt))
         return times, [*periods, dt]
 
@@ -489,11 +573,16 @@ class StepSettings(Portable):
         """Return the number of configurations per target."""
         if n_solutions is None:
             return 1
-        require(not differentiable, "`n_solutions` must be None for differentiable=True.")
+        require(
+            not differentiable, "`n_solutions` must be None for differentiable=True."
+        )
         n_solutions = whole(n_solutions, "n_solutions", 1, 10_000)
         good = torch.isfinite(self.spans).all()
         way = "give finite `q_min` and `q_max`"
-        require(good, f"`n_solutions` needs finite ranges of q to compare configurations; {way}.")
+        require(
+            good,
+            f"`n_solutions` needs finite ranges of q to compare configurations; {way}.",
+        )
         return n_solutions
 
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
@@ -504,5 +593,8 @@ class StepSettings(Portable):
             return float(given[0])
         n = len(self.task.parts)
         parts = "one for every part of the task"
-        require(given.shape == (n,), f"`tol` must be one number [m] or {n}, {parts}, got {tol!r}.")
+        require(
+            given.shape == (n,),
+            f"`tol` must be one number [m] or {n}, {parts}, got {tol!r}.",
+        )
         return tuple(given.tolist())

@@ -40,12 +40,17 @@ def nearest_starts(
     """
     task = settings.task
     n = q.shape[-1]
-    k = max(count, _SHARED if torch.isfinite(settings.q_max - settings.q_min).all() else _OWN)
+    k = max(
+        count,
+        _SHARED if torch.isfinite(settings.q_max - settings.q_min).all() else _OWN,
+    )
     sample = even_starts(settings, q, size, k)
     sample = settings.start_at(sample)
     x, _ = settings.evaluate(sample.flatten(0, 1))
     away = task.distances(x.unflatten(0, (-1, k)), target)
-    away = away * torch.where(task.in_domain(sample.flatten(0, 1)), 1.0, _OUTSIDE).view(-1, k)
+    away = away * torch.where(task.in_domain(sample.flatten(0, 1)), 1.0, _OUTSIDE).view(
+        -1, k
+    )
     near = away.nan_to_num(torch.inf).topk(count, largest=False).indices
     return sample.expand(len(q), k, n).gather(1, near[..., None].expand(-1, -1, n))
 
@@ -55,7 +60,9 @@ def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> 
 
     If an actuator has no limits they fill a range around q (N, n): (N, count, n).
     """
-    low, high = (a.to(q).expand(1, q.shape[-1]) for a in (settings.q_min, settings.q_max))
+    low, high = (
+        a.to(q).expand(1, q.shape[-1]) for a in (settings.q_min, settings.q_max)
+    )
     if not torch.isfinite(high - low).all():
         size = torch.minimum(size[:, None], 0.5 * settings.periods.to(q))
         lower = torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size)

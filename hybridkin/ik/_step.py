@@ -105,7 +105,11 @@ def control_step(
         if posture is not None:
             most = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -most, most)
-    v = gain * e if feed_forward is None else torch.where(fine, feed_forward + gain * e, 0.0)
+    v = (
+        gain * e
+        if feed_forward is None
+        else torch.where(fine, feed_forward + gain * e, 0.0)
+    )
     bounds = settings.step_bounds(q, seconds, before)
     if limits is None:
         step = limited_step(settings, J, v, posture, *bounds)
@@ -114,14 +118,18 @@ def control_step(
         margin = limits.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
             normals = limits.normals.to(J)
-            brakes = [_braking(settings, J, a.expand(len(J), -1), change) for a in normals]
+            brakes = [
+                _braking(settings, J, a.expand(len(J), -1), change) for a in normals
+            ]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
         step = _step_inside(settings, margin, J, v, posture, *bounds)
         v = v + limits.way_in(margin - limits.along(v))
     if settings.pulls.any():
         step = _arriving(settings, at, J, v, step, *bounds)
     fine = fine & _finite(step.dq)
-    still = torch.where(torch.isfinite(q), torch.clamp(torch.zeros_like(q), *bounds), 0.0)
+    still = torch.where(
+        torch.isfinite(q), torch.clamp(torch.zeros_like(q), *bounds), 0.0
+    )
     held = (still <= bounds[0]) | (still >= bounds[1])
     return step._replace(
         dq=torch.where(fine, step.dq, still),
@@ -139,11 +147,18 @@ def _finite(rows: Tensor) -> Tensor:
 def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
-    return (change / limited_step(settings, J, way, None, -free, free).dq.abs()).amin(-1)
+    return (change / limited_step(settings, J, way, None, -free, free).dq.abs()).amin(
+        -1
+    )
 
 
 def _step_inside(
-    settings: StepSettings, margin: Tensor, J: Tensor, v: Tensor, z: Tensor | None, *bounds: Tensor
+    settings: StepSettings,
+    margin: Tensor,
+    J: Tensor,
+    v: Tensor,
+    z: Tensor | None,
+    *bounds: Tensor,
 ) -> StepRows:
     """Return a step within the bounds after which, to first order, the tip is within its limits.
 
@@ -242,7 +257,9 @@ def _with_plane(
         return J, v
     stiff = IK_BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
     rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
-    aside = torch.zeros_like(rows[..., 0]) if posture is None else apply_rows(rows, posture)
+    aside = (
+        torch.zeros_like(rows[..., 0]) if posture is None else apply_rows(rows, posture)
+    )
     return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
 
 
@@ -252,7 +269,9 @@ def _only_taut(settings: StepSettings, J: Tensor) -> Tensor:
     A learned error makes them small instead of zero, and a step would drive these tendons far.
     """
     size = J.norm(dim=-2, keepdim=True)
-    slack = (size <= IK_SLACK * size.amax(-1, keepdim=True)) & (settings.pulls.to(J) != 0.0)
+    slack = (size <= IK_SLACK * size.amax(-1, keepdim=True)) & (
+        settings.pulls.to(J) != 0.0
+    )
     return torch.where(slack, 0.0, J)
 
 
@@ -270,7 +289,12 @@ class _End(NamedTuple):
     def where(self, better: Tensor, other: _End) -> _End:
         """Return the ends of `other` in the rows (N, 1) where it is better."""
         pairs = zip(other, self, strict=True)
-        return _End(*(a.where(better if a.ndim == 2 else better[..., None], b) for a, b in pairs))
+        return _End(
+            *(
+                a.where(better if a.ndim == 2 else better[..., None], b)
+                for a, b in pairs
+            )
+        )
 
 
 def _norm(rows: Tensor) -> Tensor:

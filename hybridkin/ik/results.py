@@ -50,7 +50,12 @@ class IKStatus(IntEnum):
 
 
 def statuses(
-    task: Task, q: Tensor, error: Tensor, reached: Tensor, held: Tensor, singular: Tensor
+    task: Task,
+    q: Tensor,
+    error: Tensor,
+    reached: Tensor,
+    held: Tensor,
+    singular: Tensor,
 ) -> Tensor:
     """Return the `IKStatus` of rows, int (N,); later conditions override earlier ones.
 
@@ -113,7 +118,9 @@ class Step(Generic[ArrayT]):
     def __repr__(self) -> str:
         """Return a one-line summary."""
         held = f"{int(as_array(self.saturated).sum())} saturated"
-        return f"Step(dq of shape {tuple(self.dq.shape)}, {held}, {_errors(self.error)})"
+        return (
+            f"Step(dq of shape {tuple(self.dq.shape)}, {held}, {_errors(self.error)})"
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -248,7 +255,8 @@ def score(track: Track) -> tuple[int, int]:
     """Return the number of points reached in the domain, and the number reached at all."""
     status = as_array(track.status)
     inside, outside = (
-        int((status == wanted).sum()) for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
+        int((status == wanted).sum())
+        for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
     )
     return inside, inside + outside
 

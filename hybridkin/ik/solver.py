@@ -172,15 +172,21 @@ class InverseKinematics:
             bounds["q_max"],
             bounds["dq_max"],
             bound(np.inf if ddq_max is None else ddq_max, "ddq_max", positive=True),
-            q_pref if q_pref is None or callable(q_pref) else bound(q_pref, "q_pref", finite=True),
+            q_pref
+            if q_pref is None or callable(q_pref)
+            else bound(q_pref, "q_pref", finite=True),
             None if beta is None else number(beta, "beta"),
             None if gain is None else number(gain, "gain"),
             damping if isinstance(damping, str) else number(damping, "damping"),
             one_of(limits, "limits", ("saturate", "off")),
             number(dt, "dt"),
-            None if weights is None else bound(weights, "weights", finite=True, positive=True),
+            None
+            if weights is None
+            else bound(weights, "weights", finite=True, positive=True),
             of_model,
-            None if tip_limits is None or limits == "off" else half_spaces(tip_limits, task),
+            None
+            if tip_limits is None or limits == "off"
+            else half_spaces(tip_limits, task),
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
@@ -198,7 +204,10 @@ class InverseKinematics:
         return f"InverseKinematics({', '.join([type(self.model).__name__, *shown])})"
 
     def _repr_html_(self) -> str:
-        models = {f"model: {type(m).__name__}": m.html_rows() for m in self.settings.task.models}
+        models = {
+            f"model: {type(m).__name__}": m.html_rows()
+            for m in self.settings.task.models
+        }
         settings = self.settings.shown(signature(type(self)), defaults=True)
         task = {"task": type(self.settings.task).__name__}
         return html_table(type(self).__name__, {**task, **settings, **models})
@@ -244,7 +253,11 @@ class InverseKinematics:
             `ddq_max` it brakes first); outside the limits its known actuators return to them.
         """
         core = core_of(self.settings)
-        found = None if core is None or dq is not None else core.step(q, x_target, dx, x_measured)
+        found = (
+            None
+            if core is None or dq is not None
+            else core.step(q, x_target, dx, x_measured)
+        )
         if found is None:
             return self._steps(core, q, x_target, dx, x_measured, dq)
         step = object.__new__(Step)  # its constructor takes longer than the step
@@ -252,7 +265,9 @@ class InverseKinematics:
         return step
 
     @torch.no_grad()
-    def _steps(self, core: Core | None, q: Array, x_target: Array, *more: Array | None) -> Step:
+    def _steps(
+        self, core: Core | None, q: Array, x_target: Array, *more: Array | None
+    ) -> Step:
         settings = self.settings
         task = self.settings.task
         dx, tip, last = more
@@ -279,7 +294,14 @@ class InverseKinematics:
         seen = x if measured is None else measured
         e = task.difference(seen, target)
         step = control_step(settings, rows, J, e, feed_forward, last=before, tip=seen)
-        parts = (step.dq, x, e.norm(dim=-1), step.sigma_min, step.damping, step.saturated)
+        parts = (
+            step.dq,
+            x,
+            e.norm(dim=-1),
+            step.sigma_min,
+            step.damping,
+            step.saturated,
+        )
         return Step(*give_back(parts, lead, as_numpy))
 
     @torch.no_grad()
@@ -351,13 +373,23 @@ class InverseKinematics:
         target = settings.points(x_target, "x_target")
         for message in settings.far_messages(target, "x_target"):
             warnings.warn(message, stacklevel=3)
-        q = settings.start(target) if q0 is None else settings.configurations(q0, "q0", target)
+        q = (
+            settings.start(target)
+            if q0 is None
+            else settings.configurations(q0, "q0", target)
+        )
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q = rows_of(q, lead)
         target = rows_of(target, lead, axes)
-        q = torch.where(torch.isfinite(q), q, torch.nan)  # limits must not make it finite
-        core = core_of(settings, search=True) if as_numpy and q.dtype == torch.float64 else None
+        q = torch.where(
+            torch.isfinite(q), q, torch.nan
+        )  # limits must not make it finite
+        core = (
+            core_of(settings, search=True)
+            if as_numpy and q.dtype == torch.float64
+            else None
+        )
         search = Search(settings, tolerance, max_iter)
         if core is not None:
             search = core.search(tolerance, max_iter)
@@ -373,15 +405,21 @@ class InverseKinematics:
         moved = (found.target != target).flatten(1).any(-1)
         if differentiable:
             with torch.enable_grad():
-                goal = rows_of(torch.as_tensor(x_target, device=q.device).to(q), lead, axes)
-                q = with_derivatives(settings, q, goal, found.reached & ~moved, tolerance)
+                goal = rows_of(
+                    torch.as_tensor(x_target, device=q.device).to(q), lead, axes
+                )
+                q = with_derivatives(
+                    settings, q, goal, found.reached & ~moved, tolerance
+                )
         # Error and status refer to the returned q.
         x, J = settings.evaluate(q.detach())
         e = task.difference(x, target)
         error = e.norm(dim=-1)
         gram = row_gram(J)
         reached = task.reached(e, tolerance)
-        status = statuses(task, q.detach(), error, reached, found.held, gram.is_singular)
+        status = statuses(
+            task, q.detach(), error, reached, found.held, gram.is_singular
+        )
         missed = ~reached & torch.isfinite(error)
         status[missed & found.stationary] = IKStatus.MAX_ITER
         beyond = moved | (settings.misses(target) > np.max(tolerance))
@@ -389,7 +427,16 @@ class InverseKinematics:
         further = torch.arange(len(q), device=q.device) % places > 0
         status[further & q.isnan().all(-1)] = IKStatus.NO_FURTHER
         margin = settings.margin(q.detach())
-        results = (q, x, error, status, found.n_iter, found.n_starts, gram.sigma_min, margin)
+        results = (
+            q,
+            x,
+            error,
+            status,
+            found.n_iter,
+            found.n_starts,
+            gram.sigma_min,
+            margin,
+        )
         with torch.set_grad_enabled(differentiable):
             return IKSolution(*give_back(results, lead, as_numpy))
 
@@ -447,11 +494,17 @@ class InverseKinematics:
         """
         settings = self.settings
         good = feedback in ("model", "measured", None)
-        require(good, f'`feedback` must be "model", "measured" or None, got {feedback!r}.')
+        require(
+            good, f'`feedback` must be "model", "measured" or None, got {feedback!r}.'
+        )
         good = feedback != "measured" or plant is not None
-        require(good, '`feedback="measured"` needs `plant`, a callable q -> measured tip.')
+        require(
+            good, '`feedback="measured"` needs `plant`, a callable q -> measured tip.'
+        )
         good = memory is None or feedback == "measured"
-        require(good, '`memory` requires feedback="measured"; set it, or remove `memory`.')
+        require(
+            good, '`memory` requires feedback="measured"; set it, or remove `memory`.'
+        )
         points = path.x if isinstance(path, Trajectory) else path
         if isinstance(path, Trajectory) and t is None:
             t = path.t
@@ -460,11 +513,16 @@ class InverseKinematics:
         as_numpy = is_numpy(points)
         tolerance = settings.tolerance(tol)
         target = settings.points(points, "path", lead="T")
-        require(len(target) > 0, f"`path` must hold at least one point, got {tuple(target.shape)}.")
+        require(
+            len(target) > 0,
+            f"`path` must hold at least one point, got {tuple(target.shape)}.",
+        )
         starts = None if q0 is None else settings.configurations(q0, "q0", target)
         if starts is not None:
             good = starts.ndim < 3 and starts.numel() > 0
-            require(good, f"`q0` must have shape (n,) or (K, n), got {tuple(starts.shape)}.")
+            require(
+                good, f"`q0` must have shape (n,) or (K, n), got {tuple(starts.shape)}."
+            )
         t, periods = settings.times(t, target)
         way = (target, t, periods, tolerance)
         loop = (plant, feedback, memory)
@@ -476,11 +534,15 @@ class InverseKinematics:
         dry = plant is not None or feedback != "model"  # the robot moves once
         shown = None if dry else progress
         for start in self._starts(target[:1], starts):
-            tracks.append(self._followed(start, *way, None, "model", None, as_numpy, shown))
+            tracks.append(
+                self._followed(start, *way, None, "model", None, as_numpy, shown)
+            )
             if score(tracks[-1]) == (len(target), len(target)):
                 break
         best = max(tracks, key=score)  # of equal tracks the first
-        return self._followed(best.q[0], *way, *loop, as_numpy, progress) if dry else best
+        return (
+            self._followed(best.q[0], *way, *loop, as_numpy, progress) if dry else best
+        )
 
     def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
@@ -529,14 +591,28 @@ class InverseKinematics:
         reached = task.reached(judged, tol)
         status = statuses(task, q, judged.norm(dim=-1), reached, held, damped)
         status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
-        results = (t, q, x, measured, target, error, status, sigma_min, settings.margin(q))
+        results = (
+            t,
+            q,
+            x,
+            measured,
+            target,
+            error,
+            status,
+            sigma_min,
+            settings.margin(q),
+        )
         results = give_back(results, (len(target),), as_numpy)
         if plant is None:
             results[3] = None
         return Track(*results)
 
     def tracker(
-        self, q0: Array, *, tol: float | Sequence[float] = 1e-4, memory: float | None = None
+        self,
+        q0: Array,
+        *,
+        tol: float | Sequence[float] = 1e-4,
+        memory: float | None = None,
     ) -> Tracker:
         """Return a tracker that follows targets step by step, for one robot at its control rate.
 

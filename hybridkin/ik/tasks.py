@@ -94,7 +94,9 @@ class Task:
         n = len(x_target)
         k = x.shape[1]
         x = x.expand(n, k, *self.shape).flatten(0, 1)
-        return self.difference(x, x_target.repeat_interleave(k, 0)).norm(dim=-1).view(n, k)
+        return (
+            self.difference(x, x_target.repeat_interleave(k, 0)).norm(dim=-1).view(n, k)
+        )
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if targets ``(..., *shape)`` are not valid, e.g. their rotations."""
@@ -110,12 +112,16 @@ class Task:
     @property
     def n_actuators(self) -> int | None:
         """Length of q, or None if no model defines it."""
-        return next((model.n_actuators for model in self.models if model.n_actuators), None)
+        return next(
+            (model.n_actuators for model in self.models if model.n_actuators), None
+        )
 
     @property
     def device(self) -> torch.device:
         """Device of the first model with tensors; the CPU if there is none."""
-        tensors = (a for model in self.models for a in (*model.parameters(), *model.buffers()))
+        tensors = (
+            a for model in self.models for a in (*model.parameters(), *model.buffers())
+        )
         return next((a.device for a in tensors), torch.device("cpu"))
 
     def domain_distance(self, q: Tensor) -> Tensor:
@@ -124,7 +130,11 @@ class Task:
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies inside the domains of all models, shape (N,)."""
-        return self.domain_distance(q) <= 1.0 if len(q) > 0 else q.new_ones(0, dtype=torch.bool)
+        return (
+            self.domain_distance(q) <= 1.0
+            if len(q) > 0
+            else q.new_ones(0, dtype=torch.bool)
+        )
 
 
 class PositionTask(Task):
@@ -259,7 +269,9 @@ class PoseTask(Task):
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the displacement [m] and the rotation vector [rad] times `radian`, (N, 6)."""
         turn = rotation_vector(x_target[..., :3, :3] @ x[..., :3, :3].mT)
-        return torch.cat([x_target[..., :3, 3] - x[..., :3, 3], self.units[1] * turn], dim=-1)
+        return torch.cat(
+            [x_target[..., :3, 3] - x[..., :3, 3], self.units[1] * turn], dim=-1
+        )
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return distances of x to targets, with chords instead of angles of rotations."""
@@ -326,16 +338,28 @@ class PointsTask(Task):
             )
         self.models = tuple(chain.with_tip(number(a, "at")) for a in at)
         n = len(at)
-        self.units = (1.0,) * n if weights is None else tuple(number(w, "weights") for w in weights)
-        if n == 0 or len(self.units) != n or not all(0.0 < w < math.inf for w in self.units):
+        self.units = (
+            (1.0,) * n
+            if weights is None
+            else tuple(number(w, "weights") for w in weights)
+        )
+        if (
+            n == 0
+            or len(self.units) != n
+            or not all(0.0 < w < math.inf for w in self.units)
+        ):
             need = "positive, one for every point of `at`"
-            raise ValueError(f"`weights` must be {need}, got {self.units} for {n} points.")
+            raise ValueError(
+                f"`weights` must be {need}, got {self.units} for {n} points."
+            )
         self.shape = (n, 3)
         self.parts = (3,) * n
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points (N, P, 3) and the weighted J (N, 3 P, n)."""
-        x, J = zip(*(model.forward_and_jacobian(q) for model in self.models), strict=True)
+        x, J = zip(
+            *(model.forward_and_jacobian(q) for model in self.models), strict=True
+        )
         weighted = [w * rows for w, rows in zip(self.units, J, strict=True)]
         return torch.stack(x, dim=1).to(q), torch.cat(weighted, dim=-2).to(q)
 

@@ -161,9 +161,13 @@ class Tracker(Portable):
         """
         given = as_tensor(q, "q", self._settings.task.device)
         n = self._settings.n_actuators
-        good = given.ndim == 1 and n in (None, len(given)) and torch.isfinite(given).all()
+        good = (
+            given.ndim == 1 and n in (None, len(given)) and torch.isfinite(given).all()
+        )
         need = f"finite and of shape ({n or 'n'},)"
-        require(good, f"`q` must be {need}, got {given.tolist()}; read it from the robot.")
+        require(
+            good, f"`q` must be {need}, got {given.tolist()}; read it from the robot."
+        )
         with self._lock:
             self._like = given.clone()
             self._start(self._like, torch.zeros_like(given))
@@ -176,7 +180,9 @@ class Tracker(Portable):
         if core is not None and self._as_numpy and q.dtype == torch.float64:
             robot = Follower(core, self._memory)
         else:
-            reason = "`q0` is no float64 array of NumPy" if core else why_torch(settings)
+            reason = (
+                "`q0` is no float64 array of NumPy" if core else why_torch(settings)
+            )
             robot = _InTorch(settings, self._memory, self._as_numpy, reason)
         robot.start(q[None], dq[None])
         self._estimator = task.estimator
@@ -184,7 +190,11 @@ class Tracker(Portable):
         self._robot = robot
 
     def step(
-        self, x_target: Array, dx: Array | None = None, *, x_measured: Array | None = None
+        self,
+        x_target: Array,
+        dx: Array | None = None,
+        *,
+        x_measured: Array | None = None,
     ) -> NDArray | Tensor:
         """Return the actuator vector to command next, one period ahead, eq. (1).
 
@@ -207,14 +217,21 @@ class Tracker(Portable):
             finite, the robot stops (with `ddq_max` it brakes first).
         """
         with self._lock:
-            if self._estimator is not None and self._estimator.module_ is not self._module:
-                self._start(as_tensor(self._robot.command, "q"), self._robot.last().step.dq[0])
+            if (
+                self._estimator is not None
+                and self._estimator.module_ is not self._module
+            ):
+                self._start(
+                    as_tensor(self._robot.command, "q"), self._robot.last().step.dq[0]
+                )
             robot = self._robot
             if not robot.tick(x_target, dx, x_measured):
                 self._step(x_target, dx, x_measured)
             return robot.command
 
-    def _step(self, x_target: Array, dx: Array | None, x_measured: Array | None) -> None:
+    def _step(
+        self, x_target: Array, dx: Array | None, x_measured: Array | None
+    ) -> None:
         """Do a step with arguments that need full checks."""
         settings = self._settings
         like = self._like
@@ -223,7 +240,9 @@ class Tracker(Portable):
         tip = None
         if dx is not None:
             rows = (sum(settings.task.parts),)
-            feed_forward = settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)[None]
+            feed_forward = (
+                settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)[None]
+            )
         if x_measured is not None:
             tip = settings.points(x_measured, "x_measured", like, lead="")[None]
         self._robot.advance(None, target, feed_forward, tip)
@@ -257,10 +276,14 @@ class Tracker(Portable):
             ahead_now = ahead[i : i + 1]
             target = target if known[i] else None
             tick = self._robot.advance(periods[i], target, ahead_now, used)
-            rows.append((tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped))
+            rows.append(
+                (tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped)
+            )
             held = tick.step.saturated.any(-1) | tick.step.stopped
             damped = tick.step.damping > 0.0
-        q, x, seen, J, held, damped = (torch.cat(parts) for parts in zip(*rows, strict=True))
+        q, x, seen, J, held, damped = (
+            torch.cat(parts) for parts in zip(*rows, strict=True)
+        )
         return [q, x, seen, row_gram(J).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
@@ -270,9 +293,13 @@ class Tracker(Portable):
         earlier rows are not lost.
         """
         try:
-            return self._settings.points(plant(self.q), "tip", self._like, lead="")[None]
+            return self._settings.points(plant(self.q), "tip", self._like, lead="")[
+                None
+            ]
         except Exception as error:
-            warnings.warn(f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7)
+            warnings.warn(
+                f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7
+            )
             return self._like.new_full((1, *self._settings.task.shape), math.nan)
 
 

@@ -47,12 +47,16 @@ class Trajectory:
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(x).all(axis=1)))
         if bad.size:
             rows = f"{bad.size} rows (first: row {bad[0]})"
-            raise ValueError(f"`t` and `x` must be finite; drop the {rows} that are not.")
+            raise ValueError(
+                f"`t` and `x` must be finite; drop the {rows} that are not."
+            )
         late = np.flatnonzero(np.diff(t) <= 0)
         if late.size:
             row = late[0] + 1
             pair = f"{t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s"
-            raise ValueError(f"`t` must increase, got {pair} in row {row}; sort, drop repeats.")
+            raise ValueError(
+                f"`t` must increase, got {pair} in row {row}; sort, drop repeats."
+            )
         largest = float(np.abs(x).max())
         if largest > _FAR:
             warnings.warn(
@@ -144,7 +148,9 @@ def figure_eight(
     Trajectory(801 points, 8 s, 0.4 x 0.2 x 0 m)
     """
     center = _checked(center, "center", _POINT, (3,))
-    width, height = _checked(size, "size", "two numbers, positive [m]", (2,), _ABOVE_ZERO)
+    width, height = _checked(
+        size, "size", "two numbers, positive [m]", (2,), _ABOVE_ZERO
+    )
     t, s = _timing(duration, dt, timing)
     across, up, _ = _plane(normal)
     phase = 2.0 * math.pi * s[:, None]
@@ -252,7 +258,9 @@ def line(
     return Trajectory(t, (1.0 - s)[:, None] * start + s[:, None] * end)
 
 
-def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = "m") -> Trajectory:
+def from_csv(
+    path: str | PathLike[str], *, dt: float | None = None, unit: str = "m"
+) -> Trajectory:
     """Return a recorded path from a CSV file.
 
     Parameters
@@ -273,21 +281,35 @@ def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = 
     one_of(unit, "unit", METRES)
     path = as_path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {path}.")
+        raise FileNotFoundError(
+            f"`path` must be a CSV file of points, there is none at {path}."
+        )
     try:
         with open(path, encoding="utf-8-sig") as file:
-            rows = [text.split(",") for text in map(str.strip, file) if text and text[0] != "#"]
+            rows = [
+                text.split(",")
+                for text in map(str.strip, file)
+                if text and text[0] != "#"
+            ]
     except UnicodeDecodeError as error:
-        raise ValueError(f"`path` must be a CSV file of points, {path} is not text.") from error
-    columns, need = (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
-    named = bool(rows) and not re.match(r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE)
+        raise ValueError(
+            f"`path` must be a CSV file of points, {path} is not text."
+        ) from error
+    columns, need = (
+        (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
+    )
+    named = bool(rows) and not re.match(
+        r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE
+    )
     try:
         table = np.array(rows[named:], dtype=float)
     except ValueError as error:
         need = f"numbers in {columns} columns ({need}) after one line of names"
         raise ValueError(f"{path} must hold {need}: {error!s:.200}.") from error
     if table.ndim != 2 or table.shape[1] != columns:
-        raise ValueError(f"{path} must have rows of {columns} columns ({need}), got {table.shape}.")
+        raise ValueError(
+            f"{path} must have rows of {columns} columns ({need}), got {table.shape}."
+        )
     t = table[:, 0] if dt is None else _period(dt, "dt") * np.arange(len(table))
     return Trajectory(t, METRES[unit] * table[:, -3:])
 
@@ -296,7 +318,9 @@ def periods(duration: float, dt: float) -> float:
     """Return the number of periods `dt` in a duration [s]; raise if there are too many."""
     n = duration / _period(dt, "dt")
     if n > _MOST:
-        raise ValueError(f"`duration` must be at most {_MOST:g} times `dt`, got {n:g} times.")
+        raise ValueError(
+            f"`duration` must be at most {_MOST:g} times `dt`, got {n:g} times."
+        )
     return n
 
 
@@ -322,7 +346,11 @@ def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _checked(
-    value: ArrayLike, name: str, need: str, shape: tuple[int, ...], least: float = -math.inf
+    value: ArrayLike,
+    name: str,
+    need: str,
+    shape: tuple[int, ...],
+    least: float = -math.inf,
 ) -> np.ndarray:
     """Return finite numbers of this shape, each at least `least`."""
     numbers = np.array(real_array(value, name), dtype=float)

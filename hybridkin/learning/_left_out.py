@@ -9,7 +9,9 @@ from sklearn.utils import gen_batches
 from hybridkin.learning._ridge import moments
 
 _BLOCK_ELEMENTS = 2_000_000  # 16 MB of float64 per temporary
-_PAIRED = 4  # rows whose products with all rows before are computed at once, in the cache
+_PAIRED = (
+    4  # rows whose products with all rows before are computed at once, in the cache
+)
 
 
 class LeftOut:
@@ -56,7 +58,9 @@ class LeftOut:
             phi = self._features(np.arange(len(X)))
             gram = phi @ phi.T
             if fit_intercept:  # the direction of the mean, without residual, comes last
-                gram += (1 + np.trace(gram)) * np.outer(self._root, self._root) / self._n
+                gram += (
+                    (1 + np.trace(gram)) * np.outer(self._root, self._root) / self._n
+                )
             eigenvalues, self._basis = linalg.eigh(gram)
             if fit_intercept:
                 eigenvalues = eigenvalues[:-1]
@@ -108,7 +112,10 @@ class LeftOut:
             for out, asked in part:
                 stop = start + len(out)
                 errors = self._solved(Z[start:stop], D, residuals[:, start:stop], out)
-                yield asked, errors[:, np.searchsorted(out, asked)] / self._root[asked, None]
+                yield (
+                    asked,
+                    errors[:, np.searchsorted(out, asked)] / self._root[asked, None],
+                )
                 start = stop
 
     def _in_parts(self, splits, n_rows):
@@ -148,7 +155,9 @@ class LeftOut:
         return errors
 
     def _rows_at_a_time(self, n_alphas):
-        return max(1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1]))
+        return max(
+            1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1])
+        )
 
     def _d(self, alphas):
         numerator = alphas[:, None] if self._wide else -1.0
@@ -160,7 +169,9 @@ class LeftOut:
     def _features(self, rows):
         q = torch.from_numpy(self._X[rows].astype(np.float64))
         with torch.no_grad():
-            phi = self._elm.features(q.to(self._elm.input_center.device)).numpy(force=True)
+            phi = self._elm.features(q.to(self._elm.input_center.device)).numpy(
+                force=True
+            )
         return (phi - self._center) * self._root[rows, None]
 
     def _residuals(self, Z, D, rows):

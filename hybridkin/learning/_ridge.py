@@ -12,7 +12,9 @@ from sklearn.utils import gen_batches
 from hybridkin._core.arrays import copied
 from hybridkin.learning.network import READOUT
 
-BLOCK_ELEMENTS = 500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
+BLOCK_ELEMENTS = (
+    500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
+)
 
 
 class Statistics(NamedTuple):
@@ -38,7 +40,9 @@ def gather(stats, elm, X, y, sample_weight, block_size):
     block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
     n = stats.n
     mean = torch.tensor(stats.mean, device=device)
-    scatter = torch.tensor(stats.scatter, device=device).T  # BLAS order; only one half is updated
+    scatter = torch.tensor(
+        stats.scatter, device=device
+    ).T  # BLAS order; only one half is updated
     buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
     for rows in gen_batches(len(X), block_size):
         q = copied(X[rows], device, np.float64)
@@ -57,7 +61,14 @@ def gather(stats, elm, X, y, sample_weight, block_size):
         n += n_block
         mean += step * (n_block / n)
         if z.device.type == "cpu":  # half the work of a general product
-            c = dsyrk(1.0, z.T.numpy(), beta=1.0, c=scatter.numpy(), overwrite_c=True, lower=True)
+            c = dsyrk(
+                1.0,
+                z.T.numpy(),
+                beta=1.0,
+                c=scatter.numpy(),
+                overwrite_c=True,
+                lower=True,
+            )
             scatter = torch.from_numpy(c)
         else:
             scatter.addmm_(z.T, z)
@@ -141,7 +152,9 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
     # This form of the residual is stationary in W: rounding in W enters squared.
     rss = yy - np.sum(W * (2 * C - G @ W), axis=0)
     dof_left = n - dof - fit_intercept
-    resolved = (dof_left > np.sqrt(np.finfo(np.float64).eps) * n) & np.isfinite(dof_left)
+    resolved = (dof_left > np.sqrt(np.finfo(np.float64).eps) * n) & np.isfinite(
+        dof_left
+    )
     noise = np.maximum(rss, 0.0) / np.where(resolved, dof_left, np.nan)
     mu = mean[:n_features]
     offset = np.float64(1 / n if fit_intercept else 0)

@@ -14,8 +14,19 @@ from sklearn.utils.validation import check_is_fitted
 from hybridkin._core.arrays import copied, real_array
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
-from hybridkin.learning._ridge import BLOCK_ELEMENTS, Statistics, fit_readout, gather, merge
-from hybridkin.learning.hidden_layer import check_inputs, check_rows, device_named, draw_layer
+from hybridkin.learning._ridge import (
+    BLOCK_ELEMENTS,
+    Statistics,
+    fit_readout,
+    gather,
+    merge,
+)
+from hybridkin.learning.hidden_layer import (
+    check_inputs,
+    check_rows,
+    device_named,
+    draw_layer,
+)
 from hybridkin.learning.network import ACTIVATIONS, ELM, LAYER, READOUT
 from hybridkin.native.library import program_of
 
@@ -116,7 +127,9 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
             q = copied(X, elm.input_center.device, np.float64)
-            parts = in_blocks(partial(function, elm), q, int(self.block_size or max(1, size)))
+            parts = in_blocks(
+                partial(function, elm), q, int(self.block_size or max(1, size))
+            )
         return self._shaped(X, [part.cpu().numpy() for part in parts])
 
     def _shaped(self, X, arrays):
@@ -288,7 +301,9 @@ class ELMRegressor(FittedNetwork):
                 f"`decay` must lie in (0, 1], got {decay!r}; 1 keeps the weight of earlier rows, "
                 f"0.99 reduces it by 1 %."
             )
-        return self._learn(X, y, sample_weight, first="module_" not in vars(self), decay=decay)
+        return self._learn(
+            X, y, sample_weight, first="module_" not in vars(self), decay=decay
+        )
 
     def merge(self, other):
         """Add the training rows of `other` and return self; equals one `fit` to all rows.
@@ -304,11 +319,19 @@ class ELMRegressor(FittedNetwork):
             The fitted estimator.
         """
         if not isinstance(other, ELMRegressor):
-            raise TypeError(f"`other` must be a fitted ELMRegressor, got {type(other).__name__}.")
+            raise TypeError(
+                f"`other` must be a fitted ELMRegressor, got {type(other).__name__}."
+            )
         check_is_fitted(self, "module_")
         check_is_fitted(other, "module_")
-        ours, theirs = ({**vars(m), "activation": m.module_.activation} for m in (self, other))
-        for name in (*(f"{name}_" for name in LAYER), "activation", "feature_names_in_"):
+        ours, theirs = (
+            {**vars(m), "activation": m.module_.activation} for m in (self, other)
+        )
+        for name in (
+            *(f"{name}_" for name in LAYER),
+            "activation",
+            "feature_names_in_",
+        ):
             if not np.array_equal(ours.get(name, ()), theirs.get(name, ())):
                 raise ValueError(
                     f"`other` must have this model's hidden layer, input scaling and columns, but "
@@ -326,7 +349,9 @@ class ELMRegressor(FittedNetwork):
     def _learn(self, X, y, sample_weight, first, decay=1.0):
         X, y, sample_weight = check_rows(self, X, y, sample_weight, reset=first)
         if sample_weight is not None and not sample_weight.all():
-            X, y, sample_weight = (part[sample_weight > 0] for part in (X, y, sample_weight))
+            X, y, sample_weight = (
+                part[sample_weight > 0] for part in (X, y, sample_weight)
+            )
         y_ndim = y.ndim
         y = y.reshape(len(y), -1)
         if first:
@@ -354,7 +379,10 @@ class ELMRegressor(FittedNetwork):
         n_outputs = len(stats.mean) - n_features
         if np.ndim(self.alpha):
             alpha = real_array(self.alpha, "alpha").astype(np.float64)
-            if alpha.shape != (n_outputs,) or not (np.isfinite(alpha) & (alpha >= 0)).all():
+            if (
+                alpha.shape != (n_outputs,)
+                or not (np.isfinite(alpha) & (alpha >= 0)).all()
+            ):
                 raise ValueError(
                     f"`alpha` must be a number >= 0, or {n_outputs} of them, one for each column "
                     f"of `y`, got {self.alpha!r}."
@@ -411,4 +439,6 @@ class ELMRegressor(FittedNetwork):
         elm.solver_ = stored.value("solver", str)
         elm._y_ndim = stored.value("y_ndim", int)
         restore_columns(elm, stored, network.n_actuators)
-        return elm._hold(network, Statistics(stored.value("n_samples_seen", float), mean, scatter))
+        return elm._hold(
+            network, Statistics(stored.value("n_samples_seen", float), mean, scatter)
+        )

@@ -7,7 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from sklearn.base import _fit_context
-from sklearn.model_selection import GroupKFold, LeaveOneGroupOut, PredefinedSplit, check_cv
+from sklearn.model_selection import (
+    GroupKFold,
+    LeaveOneGroupOut,
+    PredefinedSplit,
+    check_cv,
+)
 from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted
@@ -21,12 +26,26 @@ from hybridkin.learning._ridge import gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
 from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
 
-_AUTO_ALPHAS = np.logspace(-11, 2, 40)  # times the largest eigenvalue of the features' Gram matrix
-_ZOOM = (0.5, 1.0, 2.0, 4.0)  # factors on the best weight scale, tried with new input scales
+_AUTO_ALPHAS = np.logspace(
+    -11, 2, 40
+)  # times the largest eigenvalue of the features' Gram matrix
+_ZOOM = (
+    0.5,
+    1.0,
+    2.0,
+    4.0,
+)  # factors on the best weight scale, tried with new input scales
 _WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
 _LEAST_RELEVANCE = 0.01
 _ROWS_OF_JACOBIANS = 10_000
-_SHARED = ["activation", "input_scaling", "fit_intercept", "direct_link", "block_size", "device"]
+_SHARED = [
+    "activation",
+    "input_scaling",
+    "fit_intercept",
+    "direct_link",
+    "block_size",
+    "device",
+]
 
 
 class ELMRegressorCV(FittedNetwork):
@@ -113,7 +132,10 @@ class ELMRegressorCV(FittedNetwork):
         "cv": ["cv_object"],
         "relevance_rounds": [Interval(Integral, 0, None, closed="left")],
         "max_hidden": [Interval(Integral, 0, None, closed="left")],
-        **{name: ELMRegressor._parameter_constraints[name] for name in (*_SHARED, "random_state")},
+        **{
+            name: ELMRegressor._parameter_constraints[name]
+            for name in (*_SHARED, "random_state")
+        },
     }
 
     def __init__(
@@ -172,7 +194,11 @@ class ELMRegressorCV(FittedNetwork):
         if groups is not None:
             groups = labels(groups, len(X))
         # Listed splits are used as given, even if equal rows fall into different splits.
-        apart = np.arange(len(X)) if isinstance(self.cv, (Iterable, PredefinedSplit)) else groups
+        apart = (
+            np.arange(len(X))
+            if isinstance(self.cv, (Iterable, PredefinedSplit))
+            else groups
+        )
         first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
         X = X[first]
         y = y[first]
@@ -184,7 +210,9 @@ class ELMRegressorCV(FittedNetwork):
             )
         weights = np.ones(len(X)) if sample_weight is None else sample_weight
         splits = _splits(self.cv, groups, len(X), place)
-        task = _Task(X, y.reshape(len(y), -1), sample_weight, weights, splits, self.alphas)
+        task = _Task(
+            X, y.reshape(len(y), -1), sample_weight, weights, splits, self.alphas
+        )
         seed = self.random_state
         if not isinstance(seed, Integral):
             seed = int(check_random_state(seed).randint(2**31))
@@ -202,9 +230,15 @@ class ELMRegressorCV(FittedNetwork):
             before = best
             for zoom in _ZOOM:
                 scale = zoom * before.params["weight_scale"]
-                params = {**before.params, "weight_scale": scale, "input_scaling": bounds}
+                params = {
+                    **before.params,
+                    "weight_scale": scale,
+                    "input_scaling": bounds,
+                }
                 tried.append(_candidate(params, relevance, task))
-            best = min(best, *tried[-len(_ZOOM) :], key=lambda candidate: candidate.score)
+            best = min(
+                best, *tried[-len(_ZOOM) :], key=lambda candidate: candidate.score
+            )
             if best is before:
                 break
         while 2 * best.params["n_hidden"] <= self.max_hidden:
@@ -221,17 +255,29 @@ class ELMRegressorCV(FittedNetwork):
         self.module_ = chosen.module_
         self.noise_variance_ = chosen.noise_variance_
         self._y_ndim = y.ndim
-        self.left_out_errors_ = at_place(_left_out_errors(best, task).reshape(y.shape), place)
-        names = ("n_hidden", "weight_scale", "relevance", "alphas", "mean_squared_error")
+        self.left_out_errors_ = at_place(
+            _left_out_errors(best, task).reshape(y.shape), place
+        )
+        names = (
+            "n_hidden",
+            "weight_scale",
+            "relevance",
+            "alphas",
+            "mean_squared_error",
+        )
         rows = [{**candidate.params, **candidate._asdict()} for candidate in tried]
-        self.cv_results_ = {name: np.array([row[name] for row in rows]) for name in names}
+        self.cv_results_ = {
+            name: np.array([row[name] for row in rows]) for name in names
+        }
         return self
 
     def stored(self):
         """Return the description of the chosen ELMRegressor."""
         check_is_fitted(self, "module_")
         chosen = self.best_estimator_.stored()
-        chosen.settings["feature_names_in"] = plain(vars(self).get("feature_names_in_", []))
+        chosen.settings["feature_names_in"] = plain(
+            vars(self).get("feature_names_in_", [])
+        )
         return chosen
 
 
@@ -265,7 +311,11 @@ def _candidate(params, relevance, task):
     stats = gather(None, elm, X, targets, sample_weight, asked.block_size)
     left_out = LeftOut(elm, stats, X, targets, weights, asked.fit_intercept)
     largest = left_out.eigenvalues[-1] or 1.0
-    alphas = _AUTO_ALPHAS * largest if isinstance(alphas, str) else _positive(alphas, "alphas")
+    alphas = (
+        _AUTO_ALPHAS * largest
+        if isinstance(alphas, str)
+        else _positive(alphas, "alphas")
+    )
     total = np.zeros((len(alphas), targets.shape[1]))
     weight = 0.0
     for rows, errors in _errors(left_out, splits, alphas):
@@ -278,7 +328,9 @@ def _candidate(params, relevance, task):
 
 def _errors(left_out, splits, alphas):
     """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
-    return left_out.alone(alphas) if splits is None else left_out.together(splits, alphas)
+    return (
+        left_out.alone(alphas) if splits is None else left_out.together(splits, alphas)
+    )
 
 
 def _left_out_errors(best, task):
@@ -298,7 +350,8 @@ def _relevance(best, task):
     """
     model = ELMRegressor(**best.params).fit(task.X, task.targets, task.sample_weight)
     center, scale = (
-        model.module_.get_buffer(name).numpy(force=True) for name in ("input_center", "input_scale")
+        model.module_.get_buffer(name).numpy(force=True)
+        for name in ("input_center", "input_scale")
     )
     scale = scale * best.relevance
     total = 0.0
@@ -310,7 +363,9 @@ def _relevance(best, task):
         total = total + np.tensordot(w, J, 1)
         squares = squares + np.tensordot(w, J * J, 1)
         weight = weight + w.sum()
-    spread = np.sqrt(np.maximum(squares / weight - (total / weight) ** 2, 0.0).sum(axis=0))
+    spread = np.sqrt(
+        np.maximum(squares / weight - (total / weight) ** 2, 0.0).sum(axis=0)
+    )
     relevance = np.maximum(spread / (spread.max() or 1.0), _LEAST_RELEVANCE)
     half = scale / relevance
     return relevance, np.array([center - half, center + half])
@@ -343,7 +398,10 @@ def _splits(cv, groups, n_rows, place):
             )
         out = np.ones(n_rows + 1, dtype=bool)
         asked = np.zeros(n_rows + 1, dtype=bool)
-        out[place[train]], asked[place[test]] = False, True  # the last: rows of weight 0
+        out[place[train]], asked[place[test]] = (
+            False,
+            True,
+        )  # the last: rows of weight 0
         splits.append((np.flatnonzero((out | asked)[:-1]), np.flatnonzero(asked[:-1])))
     return [split for split in splits if len(split[1])]
 
@@ -353,6 +411,10 @@ def _positive(values, name, integer=False):
     kind = np.integer if integer else np.number
     fits = array.ndim == 1 and array.size and np.issubdtype(array.dtype, kind)
     if not fits or not (np.isfinite(array) & (array > 1.0 / LARGEST)).all():
-        what = "positive integers" if integer else f"positive numbers, over {1.0 / LARGEST:g}"
+        what = (
+            "positive integers"
+            if integer
+            else f"positive numbers, over {1.0 / LARGEST:g}"
+        )
         raise ValueError(f"`{name}` must be one or more {what}, got {values!r}.")
     return array

@@ -49,9 +49,13 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
     good = _is_finite(y, 1) or _is_finite(y, 2)
     checks = {"multi_output": True, "y_numeric": True}
     X, y = _validated(estimator, X, y, good=good, reset=reset, **checks)
-    weights = None if sample_weight is None else np.asarray(sample_weight, dtype=np.float64)
+    weights = (
+        None if sample_weight is None else np.asarray(sample_weight, dtype=np.float64)
+    )
     if weights is not None:
-        good = _is_finite(weights, 1) and len(weights) == len(X) and weights.min() >= 0.0
+        good = (
+            _is_finite(weights, 1) and len(weights) == len(X) and weights.min() >= 0.0
+        )
         if not good or not weights.any():
             weights = _check_sample_weight(
                 sample_weight, X, dtype=np.float64, ensure_non_negative=True
@@ -72,7 +76,12 @@ def check_inputs(estimator, X):
 
 def _is_finite(a, ndim):
     """Return whether an object is a plain array of real, finite numbers."""
-    if type(a) is not np.ndarray or a.ndim != ndim or a.dtype not in DTYPES or not a.size:
+    if (
+        type(a) is not np.ndarray
+        or a.ndim != ndim
+        or a.dtype not in DTYPES
+        or not a.size
+    ):
         return False
     with np.errstate(all="ignore"):
         return bool(np.isfinite(a.sum()))
@@ -109,7 +118,13 @@ def device_named(name):
     try:
         device = torch.device("cpu" if name is None else name)
         torch.zeros(1, dtype=torch.float64, device=device).item()
-    except (RuntimeError, AssertionError, TypeError, ValueError, NotImplementedError) as error:
+    except (
+        RuntimeError,
+        AssertionError,
+        TypeError,
+        ValueError,
+        NotImplementedError,
+    ) as error:
         raise RuntimeError(
             f"`device` must name a device on which torch can compute in float64, got "
             f"{str(name)!r}; use device=None for the CPU."

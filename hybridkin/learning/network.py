@@ -11,7 +11,9 @@ from hybridkin._core.kernel_numbers import HK_GROUP
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Layout
 
-_BLOCK = 2**17  # numbers in the hidden layer of a block of rows: 1 MB, which fits the cache
+_BLOCK = (
+    2**17
+)  # numbers in the hidden layer of a block of rows: 1 MB, which fits the cache
 
 # name -> sigma(a), and sigma'(a) from a and s = sigma(a)
 ACTIVATIONS = {
@@ -93,7 +95,9 @@ def write_network(plan, stored, leverage=False):
     readout = stored.array("intercept"), direct.T, weights[:n_hidden].T
     lever = ()
     if leverage:
-        lever = [stored.array(f"leverage_{name}") for name in ("offset", "center", "factor")]
+        lever = [
+            stored.array(f"leverage_{name}") for name in ("offset", "center", "factor")
+        ]
     activation = stored.value("activation", str)
     return write_units(plan, "elm", activation, scaling, readout, (W, b), lever)
 
@@ -134,7 +138,12 @@ class ELM(LeverageModule):
 
     layout = Layout(
         "elm",
-        {"input_weights": "hn", "input_bias": "h", "input_center": "n", "input_scale": "n"}
+        {
+            "input_weights": "hn",
+            "input_bias": "h",
+            "input_center": "n",
+            "input_scale": "n",
+        }
         | {"output_weights": "fm", "intercept": "m", "leverage_offset": ""}
         | {"leverage_center": "f", "leverage_factor": "ff"},
         {"activation": str},
@@ -151,7 +160,9 @@ class ELM(LeverageModule):
         n_hidden, self.n_actuators = self.input_weights.shape
         n_features, self.n_outputs = self.output_weights.shape
         if n_features not in (n_hidden, n_hidden + self.n_actuators):
-            raise ValueError(f"{n_hidden} hidden neurons cannot have {n_features} features")
+            raise ValueError(
+                f"{n_hidden} hidden neurons cannot have {n_features} features"
+            )
         # J = T @ sigma' with T = w_out (x) w_in
         w_in = self.input_weights / self.input_scale
         w_out = self.output_weights[:n_hidden]
@@ -169,7 +180,11 @@ class ELM(LeverageModule):
         u = (q - self.input_center.to(q)) / self.input_scale.to(q)
         W = self.input_weights.to(q)
         b = self.input_bias.to(q)
-        a = nn.functional.linear(u, W, b) if out is None else torch.addmm(b, u, W.T, out=out)
+        a = (
+            nn.functional.linear(u, W, b)
+            if out is None
+            else torch.addmm(b, u, W.T, out=out)
+        )
         return u, a, ACTIVATIONS[self.activation][0](a, out=out)
 
     def _write_features(self, q, out):
@@ -206,7 +221,9 @@ class ELM(LeverageModule):
 
     def forward_and_jacobian(self, q):
         """Return ``forward(q)`` and ``jacobian(q)`` from one evaluation of the hidden layer."""
-        x, J = self._in_blocks(q, lambda u, a, s: (self._readout(u, s), self._slope(a, s)))
+        x, J = self._in_blocks(
+            q, lambda u, a, s: (self._readout(u, s), self._slope(a, s))
+        )
         return x, J
 
     def forward_jacobian_and_leverage(self, q):

@@ -43,7 +43,11 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     """
     if isinstance(getattr(regressor, "module_", None), nn.Module):
         return as_forward_model(regressor)
-    steps = [*regressor.named_steps.values()] if isinstance(regressor, Pipeline) else [regressor]
+    steps = (
+        [*regressor.named_steps.values()]
+        if isinstance(regressor, Pipeline)
+        else [regressor]
+    )
     center = np.zeros(q.shape[1])
     scale = np.ones(q.shape[1])
     while len(steps) > 1 and (found := _affine(steps[0])) is not None:
@@ -54,11 +58,17 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     if isinstance(readout, _LINEAR):
         coef = np.atleast_2d(np.asarray(readout.coef_))
         if len(steps) == 1:
-            return AffineModule(coef / scale, readout.intercept_ - coef / scale @ center)
+            return AffineModule(
+                coef / scale, readout.intercept_ - coef / scale @ center
+            )
         if len(steps) == 2 and isinstance(steps[0], PolynomialFeatures):
-            powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))  # the intercept is a monomial
+            powers = np.pad(
+                steps[0].powers_, ((1, 0), (0, 0))
+            )  # the intercept is a monomial
             constant = np.broadcast_to(readout.intercept_, len(coef))
-            return PolynomialModule(powers, np.vstack([constant, coef.T]), center, scale)
+            return PolynomialModule(
+                powers, np.vstack([constant, coef.T]), center, scale
+            )
     if len(steps) == 1 and (expansion := _expansion(readout)) is not None:
         rows, weights, widths, bias = expansion
         return KernelModule(rows / widths, weights, bias, center, scale * widths)
@@ -77,7 +87,9 @@ def _write_affine(plan: Plan, stored: Stored) -> int:
     m, n = coef.shape
     readout = bias, coef, np.zeros((m, 0))
     hidden = np.zeros((0, n)), np.zeros(0)
-    return write_units(plan, "affine", "sin", (np.zeros(n), np.ones(n)), readout, hidden)
+    return write_units(
+        plan, "affine", "sin", (np.zeros(n), np.ones(n)), readout, hidden
+    )
 
 
 class AffineModule(ForwardModel):
@@ -121,7 +133,9 @@ def _write_polynomial(plan: Plan, stored: Stored) -> int:
         factors += [len(inputs), *(inputs * degrees + exponents[inputs])]
     scaling = stored.array("center"), 1.0 / stored.array("scale")
     numbers = [*scaling, np.column_stack([readout, stored.derived["slope"]])]
-    return plan.node("polynomial", n, readout.shape[1], numbers, n_monomials, degrees, *factors)
+    return plan.node(
+        "polynomial", n, readout.shape[1], numbers, n_monomials, degrees, *factors
+    )
 
 
 class PolynomialModule(ForwardModel):
@@ -167,7 +181,14 @@ class PolynomialModule(ForwardModel):
         np.add.at(values, own, coef)
         np.add.at(slope, (below, j), exponents[k, j][:, None] * coef[k])
         slope = (slope.swapaxes(1, 2) / np.asarray(scale)).reshape(len(distinct), -1)
-        _register(self, powers=distinct, readout=values, center=center, scale=scale, slope=slope)
+        _register(
+            self,
+            powers=distinct,
+            readout=values,
+            center=center,
+            scale=scale,
+            slope=slope,
+        )
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the polynomial, shape (..., m)."""
@@ -250,7 +271,9 @@ class KernelModule(ForwardModel):
         """Return the sum, shape (..., m)."""
         weights = self.weights.to(q)
         bias = self.bias.to(q)
-        return in_blocks(lambda q: (self._kernel(q)[1] @ weights + bias,), q, self._block)[0]
+        return in_blocks(
+            lambda q: (self._kernel(q)[1] @ weights + bias,), q, self._block
+        )[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the sum (..., m) and its Jacobian (..., m, n) from one kernel matrix."""
@@ -284,7 +307,9 @@ class RegressorModule(ForwardModel):
         super().__init__()
         self.regressor = regressor
         width = (q.amax(0) - q.amin(0)).numpy()
-        self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(width > 0, width, 1.0)
+        self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(
+            width > 0, width, 1.0
+        )
         self.n_actuators = q.shape[1]
         self.n_outputs = self.evaluate(q[:1]).shape[1]
 
@@ -300,7 +325,9 @@ class RegressorModule(ForwardModel):
         """Return dx/dq without a graph, shape (..., m, n)."""
         at = q.detach().cpu().double()
         steps = torch.from_numpy(np.diag(self._step))
-        changes = [self.evaluate(at + step) - self.evaluate(at - step) for step in steps]
+        changes = [
+            self.evaluate(at + step) - self.evaluate(at - step) for step in steps
+        ]
         return (torch.stack(changes, dim=-1) / (2 * steps.diag())).to(q)
 
     def evaluate(self, q: Tensor) -> Tensor:
@@ -309,7 +336,9 @@ class RegressorModule(ForwardModel):
         Trees compute in float32, so numbers that it cannot hold are replaced by its largest.
         """
         rows = q.detach().cpu().double().clamp(-_LARGEST, _LARGEST).numpy()
-        x = copied(self.regressor.predict(rows.reshape(-1, q.shape[-1])), q.device, np.float64)
+        x = copied(
+            self.regressor.predict(rows.reshape(-1, q.shape[-1])), q.device, np.float64
+        )
         return x.to(q).reshape(*q.shape[:-1], -1)
 
 
@@ -330,7 +359,10 @@ class _Differenced(torch.autograd.Function):
 def _affine(step: object) -> tuple[Any, Any] | None:
     """Return center and scale of a fitted scaler, u = (q - center) / scale."""
     if isinstance(step, StandardScaler):
-        return step.mean_ if step.with_mean else 0.0, step.scale_ if step.with_std else 1.0
+        return (
+            step.mean_ if step.with_mean else 0.0,
+            step.scale_ if step.with_std else 1.0,
+        )
     if isinstance(step, MinMaxScaler) and not step.clip:
         return -step.min_ / step.scale_, 1.0 / step.scale_
     return None
@@ -349,7 +381,9 @@ def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
         if found is not None:
             height, widths = found
             rows = fitted.X_train_
-            weights = height * fitted.alpha_.reshape(len(rows), -1) * fitted._y_train_std
+            weights = (
+                height * fitted.alpha_.reshape(len(rows), -1) * fitted._y_train_std
+            )
             return rows, weights, widths, fitted._y_train_mean
     return None
 
@@ -361,8 +395,16 @@ def _gaussian(kernel: gp.Kernel) -> tuple[float, Any] | None:
     if isinstance(kernel, gp.KernelOperator):
         for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):
             found = _gaussian(one)
-            if found and isinstance(kernel, gp.Sum) and isinstance(other, gp.WhiteKernel):
+            if (
+                found
+                and isinstance(kernel, gp.Sum)
+                and isinstance(other, gp.WhiteKernel)
+            ):
                 return found
-            if found and isinstance(kernel, gp.Product) and isinstance(other, gp.ConstantKernel):
+            if (
+                found
+                and isinstance(kernel, gp.Product)
+                and isinstance(other, gp.ConstantKernel)
+            ):
                 return other.constant_value * found[0], found[1]
     return None

@@ -26,9 +26,16 @@ from hybridkin._core.version import __version__
 
 _FOLDER = Path(__file__).parent
 _REAL = {"float64": "double", "float32": "float"}
-_TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # of the test, relative to the largest numbers
+_TOLERANCE = {
+    "float64": 1e-8,
+    "float32": 2e-3,
+}  # of the test, relative to the largest numbers
 # Buffers with the middle and the half width of the training rows of a learned part.
-_RANGES = (("input_center", "input_scale"), ("center", "scale"), ("center", "half_width"))
+_RANGES = (
+    ("input_center", "input_scale"),
+    ("center", "scale"),
+    ("center", "half_width"),
+)
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
 _NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
 _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
@@ -38,9 +45,13 @@ _MEMORY = 5.0
 # Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
 _OPERATIONS = {
     "arcs": lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
-    "elastic": lambda a, n, m, S: (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S,
+    "elastic": lambda a, n, m, S: (
+        (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S
+    ),
     "rigid": lambda a, n, m, S: 10 * (a - 9) + 15 * n,  # the tip does not turn
-    "hybrid": lambda a, n, m, S: a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2)),
+    "hybrid": lambda a, n, m, S: (
+        a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2))
+    ),
 }
 
 
@@ -102,10 +113,14 @@ def export_c(
     if dtype not in _REAL:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-        raise ValueError(f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}.")
+        raise ValueError(
+            f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}."
+        )
     controller = model if isinstance(model, _Controller) else None
     # The model of a task: of several markers it is the one that is steered.
-    module = controller.settings.task.models[0] if controller else as_forward_model(model)
+    module = (
+        controller.settings.task.models[0] if controller else as_forward_model(model)
+    )
     try:
         plan = Plan((controller or module).stored())
         if controller and plan.n_outputs > 3:
@@ -114,27 +129,45 @@ def export_c(
     except (NoKernel, TypeError) as error:
         way = "use it from Python, or a model and a task that have kernels"
         raise NoKernel(f"`model` cannot be written in C: {error}; {way}.") from None
-    sources = {f"{name}.h": "model.h", f"{name}.c": "model.c", f"{name}_test.c": "check.c"}
+    sources = {
+        f"{name}.h": "model.h",
+        f"{name}.c": "model.c",
+        f"{name}_test.c": "check.c",
+    }
     sources["CMakeLists.txt"] = "CMakeLists.txt"
     paths = [Path(folder) / file for file in (*sources, "README.md")]
     for path in paths:
         if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
-            raise FileExistsError(f"`folder` has a {path.name} of another origin; use another.")
+            raise FileExistsError(
+                f"`folder` has a {path.name} of another origin; use another."
+            )
     entries = {
-        **dict(NAME=name, GUARD=name.upper(), TITLE=type(model).__name__, VERSION=__version__),
+        **dict(
+            NAME=name,
+            GUARD=name.upper(),
+            TITLE=type(model).__name__,
+            VERSION=__version__,
+        ),
         "ABOUT_Q": about_q.replace("*/", "* /"),
-        **dict(REAL=_REAL[dtype], N=plan.n_inputs, M=plan.n_outputs, TOL=_TOLERANCE[dtype]),
+        **dict(
+            REAL=_REAL[dtype], N=plan.n_inputs, M=plan.n_outputs, TOL=_TOLERANCE[dtype]
+        ),
         **_code(plan, controller is not None, dtype),
         **_vectors(module, plan, controller, dtype),
     }
-    parts = dict(STEP_H="step.h", STEP_C="step.c", TICKS="ticks.c", STEP_README="step.md")
+    parts = dict(
+        STEP_H="step.h", STEP_C="step.c", TICKS="ticks.c", STEP_README="step.md"
+    )
     for key, template in parts.items():
         entries[key] = "" if controller is None else _filled(template, entries)
 
     texts = {file: _filled(template, entries) for file, template in sources.items()}
     entries["MEASURED"] = _measured(f"{name}.c", texts)
     texts["README.md"] = _filled("README.md", entries)
-    write_files(folder, {file: partial(Path.write_text, data=text) for file, text in texts.items()})
+    write_files(
+        folder,
+        {file: partial(Path.write_text, data=text) for file, text in texts.items()},
+    )
     return paths
 
 
@@ -160,7 +193,10 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
     # gcc warns about arrays of length 1 if it cannot see that loops over them run at all.
     sizes = {f"MAX_{s}": max(plan.largest[what], 2) for s, what in _SIZES.items()}
     kinds = sum(1 << kind for kind in {*plan.code[plan.places].tolist()})
-    lines = [f"#define HK_{a} {number}" for a, number in {**sizes, "KINDS": f"{kinds}u"}.items()]
+    lines = [
+        f"#define HK_{a} {number}"
+        for a, number in {**sizes, "KINDS": f"{kinds}u"}.items()
+    ]
     found = {
         "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
         "CODE": _literals(plan.code),
@@ -183,9 +219,16 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
 def _check_stack(plan: Plan, dtype: str) -> None:
     """Raise if the code would need more than 64 KiB of stack; bounds the HK_MODEL_WORK of src."""
     n, segments, m, features, powers = plan.code[:5].tolist()
-    numbers = 2 * (features + powers) + max(n, 3 * segments, m) * (n + 37) + 140 * segments + 30
+    numbers = (
+        2 * (features + powers)
+        + max(n, 3 * segments, m) * (n + 37)
+        + 140 * segments
+        + 30
+    )
     if numbers * np.dtype(dtype).itemsize > _MOST_STACK:
-        raise NoKernel("its sizes need more than 64 KiB of stack, too much for a controller")
+        raise NoKernel(
+            "its sizes need more than 64 KiB of stack, too much for a controller"
+        )
 
 
 def _operations(plan: Plan) -> int:
@@ -238,7 +281,9 @@ def _vectors(
         center = 0.5 * (low + high)
         half = 0.5 * (high - low)
     # Eight usual rows, then rows at growing distance from the center; the last one is NaN.
-    far = np.concatenate([np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]])
+    far = np.concatenate(
+        [np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]]
+    )
     rows = center + half * far[:, None] * rng.uniform(-1.0, 1.0, (17, len(half)))
     rows = rows.astype(dtype)
     with torch.no_grad():
@@ -251,7 +296,11 @@ def _vectors(
         arrays |= _runs(controller, plan, rows[:8], x[:8], dtype)
         found |= {"STEPS": _STEPS, "MEMORY": _MEMORY * _limits(plan)[1]}
         found["COMPARED"] = 8 if dtype == "float64" else 4
-    return {"ROWS": len(rows), **found, **{key: _literals(a) for key, a in arrays.items()}}
+    return {
+        "ROWS": len(rows),
+        **found,
+        **{key: _literals(a) for key, a in arrays.items()},
+    }
 
 
 def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
@@ -265,7 +314,9 @@ def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
     gains = buffers.get("gains", np.ones(n))
     extensible = "gains" in buffers and "lengths" not in buffers
     middle = (3.0 * radii.mean() if extensible else 0.0) / gains
-    return middle + buffers.get("actuator_zeros", 0.0), 0.5 * radii.min() / np.abs(gains)
+    return middle + buffers.get("actuator_zeros", 0.0), 0.5 * radii.min() / np.abs(
+        gains
+    )
 
 
 def _runs(
@@ -287,29 +338,50 @@ def _runs(
     measured[:, 2] = math.nan  # no measurement
     found = []
     for q, *run in zip(starts, target, dx, measured, strict=True):
-        tracker = controller.tracker(torch.from_numpy(q.astype(float)), memory=_MEMORY * dt)
+        tracker = controller.tracker(
+            torch.from_numpy(q.astype(float)), memory=_MEMORY * dt
+        )
         for i, rows in enumerate(zip(*run, strict=True)):
             goal, speed, tip = (torch.from_numpy(a.astype(float)) for a in rows)
             seen = tip if i < _STEPS - 1 else None  # as in the template
             q = tracker.step(goal, speed, x_measured=seen).numpy()
             found.append([*q, tracker.sigma_min**2])
     command, squares = np.split(np.array(found), [plan.n_inputs], axis=1)
-    found = {"STARTS": starts, "LOW": low, "HIGH": high, "COMMAND": command, "SIGMA_SQ": squares}
+    found = {
+        "STARTS": starts,
+        "LOW": low,
+        "HIGH": high,
+        "COMMAND": command,
+        "SIGMA_SQ": squares,
+    }
     return found | {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
 
 
 def _measured(source: str, texts: dict[str, str]) -> str:
     """Return the size of the code and of its stack, measured by the compiler of this machine."""
     if shutil.which("cc") and shutil.which("size"):
-        with suppress(OSError), tempfile.TemporaryDirectory() as home:  # the disk may be full
+        with (
+            suppress(OSError),
+            tempfile.TemporaryDirectory() as home,
+        ):  # the disk may be full
             for name, text in texts.items():
                 Path(home, name).write_text(text)
             built = Path(home) / "a.o"
             usage = Path(home) / "a.su"
-            options = ["-std=c99", "-Os", "-fstack-usage", "-c", Path(home, source), "-o", built]
+            options = [
+                "-std=c99",
+                "-Os",
+                "-fstack-usage",
+                "-c",
+                Path(home, source),
+                "-o",
+                built,
+            ]
             done = subprocess.run(["cc", *options], capture_output=True)
             if done.returncode == 0 and usage.exists():
-                stack = sum(int(line.split("\t")[1]) for line in usage.read_text().splitlines())
+                stack = sum(
+                    int(line.split("\t")[1]) for line in usage.read_text().splitlines()
+                )
                 text = subprocess.check_output(["size", built], text=True).split()[6]
                 return f"{text} and {stack} bytes on the machine of the export, with `cc -Os`"
     return "not measured: the machine of the export had no C compiler"

@@ -27,7 +27,9 @@ _LEVELS = {"hk_v2": 2, "hk_v3": 3, "hk_v4": 4}  # smallest hk_level() of each
 _CHUNK = 20_000  # rows per task of a thread
 _BYTE = ctypes.c_char
 
-Results = tuple[NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.float64] | None]
+Results = tuple[
+    NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.float64] | None
+]
 
 
 def library() -> ctypes.CDLL | None:
@@ -93,7 +95,12 @@ def _fault(opened: ctypes.CDLL) -> str:
     opened.hk_work.restype = ctypes.c_int64
     opened.hk_ik_tick.argtypes = [pointer]
     opened.hk_evaluate.restype = opened.hk_play.restype = None
-    opened.hk_play.argtypes = [ctypes.c_int64, ctypes.c_int32, ctypes.c_int32, *[pointer] * 5]
+    opened.hk_play.argtypes = [
+        ctypes.c_int64,
+        ctypes.c_int32,
+        ctypes.c_int32,
+        *[pointer] * 5,
+    ]
     return "" if _is_right(opened) else "computes wrong numbers"
 
 
@@ -183,7 +190,9 @@ class Program:
     def __reduce__(self) -> tuple[type[Program], tuple[Plan]]:
         return Program, (self.plan,)
 
-    def evaluate(self, q: NDArray, jacobian: bool = False, distance: bool = False) -> Results:
+    def evaluate(
+        self, q: NDArray, jacobian: bool = False, distance: bool = False
+    ) -> Results:
         """Return x (..., m), dx/dq (..., m, n) or None, and the domain distance (...) or None.
 
         More than 20,000 rows are shared among the threads that torch may use. The number of
@@ -205,7 +214,10 @@ class Program:
             size = m + m * n
             at = _address(a) or 0
             row = np.asarray(q, np.float64).tobytes()
-            places = at + 8 * m if jacobian else None, at + 8 * size if distance else None
+            places = (
+                at + 8 * m if jacobian else None,
+                at + 8 * size if distance else None,
+            )
             self._evaluate(self._call.place, row, 1, at, *places)
             J = a[m:size].reshape(m, n) if jacobian else None
             return a[:m], J, a[size, ...] if distance else None
@@ -230,12 +242,17 @@ class Program:
         if q.size:
             self._in_chunks(q.size // n, q.ctypes.data, results)
 
-    def _in_chunks(self, rows: int, q: int, results: list[tuple[NDArray | None, int]]) -> None:
+    def _in_chunks(
+        self, rows: int, q: int, results: list[tuple[NDArray | None, int]]
+    ) -> None:
         n = self._sizes[0]
         places = [(_address(a), 8 * width) for a, width in results]
 
         def run(start: int, count: int) -> None:
-            to = [None if place is None else place + start * step for place, step in places]
+            to = [
+                None if place is None else place + start * step
+                for place, step in places
+            ]
             self._evaluate(self._call.place, q + 8 * n * start, count, *to)
 
         in_chunks(rows, run)
@@ -254,7 +271,9 @@ def in_chunks(rows: int, run: Callable[[int, int], None]) -> None:
             list(pool.map(run, starts, counts))
 
 
-def play(rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool) -> list[NDArray]:
+def play(
+    rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool
+) -> list[NDArray]:
     """Return rows (T, n) after the play of the tendons, and the state after the last row.
 
     Parameters
@@ -302,14 +321,18 @@ class _Compiled:
         self.dicts = [d for d in dicts if d]
         self.parts = [dict(d) for d in self.dicts]
         portable = [m for m in modules if isinstance(m, PortableModule)]
-        self.settings = [(vars(m), name) for m in portable for name in m.layout.settings]
+        self.settings = [
+            (vars(m), name) for m in portable for name in m.layout.settings
+        ]
         self.content = []
         self.state = self._state()
         try:
             _check_classes(modules)
             tensors = [*model.buffers(), *model.parameters()]
             if any(a.device.type != "cpu" or a.is_inference() for a in tensors):
-                raise NoKernel("the compiled core needs tensors on the CPU, no inference tensors")
+                raise NoKernel(
+                    "the compiled core needs tensors on the CPU, no inference tensors"
+                )
             self.tensors = tensors
             self.views = [*map(_memory, tensors)]
             self.content = [*map(bytearray, self.views)]
@@ -319,7 +342,10 @@ class _Compiled:
             self.reason = str(error).split(";")[0]
 
     def _state(self) -> list[Any]:
-        places = [*map(Tensor.data_ptr, self.tensors), *map(Tensor.stride, self.tensors)]
+        places = [
+            *map(Tensor.data_ptr, self.tensors),
+            *map(Tensor.stride, self.tensors),
+        ]
         return places + [attributes.get(name) for attributes, name in self.settings]
 
     def holds(self) -> bool:
@@ -333,7 +359,12 @@ class _Compiled:
 
 def _memory(a: Tensor) -> memoryview:
     """Return the memory that a tensor reads."""
-    return torch.empty(0, dtype=a.dtype, device=a.device).set_(a.untyped_storage()).numpy().data
+    return (
+        torch.empty(0, dtype=a.dtype, device=a.device)
+        .set_(a.untyped_storage())
+        .numpy()
+        .data
+    )
 
 
 def _check_classes(modules: list[torch.nn.Module]) -> None:
@@ -371,7 +402,9 @@ def evaluate(
     if program is not None and not (value or jacobian):
         return (program.domain(q)[0],)
     if program is not None:
-        return tuple(a for a in program.evaluate(q, jacobian, distance) if a is not None)
+        return tuple(
+            a for a in program.evaluate(q, jacobian, distance) if a is not None
+        )
     rows = torch.from_numpy(q)
     found = ()
     with torch.no_grad():

@@ -22,7 +22,16 @@ from hybridkin._core.arrays import one_of
 
 LENGTHS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 # Okabe & Ito: colour-blind readers can distinguish them.
-COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
+COLORS = (
+    "#D55E00",
+    "#0072B2",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#000000",
+    "#F0E442",
+)
 STYLES = ("-", "--", "-.", ":")
 # Words in the name of a model, its colour and line style; the first that fit count.
 _MODELS = (
@@ -115,7 +124,9 @@ def model_color(name: str, default: str = "#000000") -> str:
     >>> plots.model_color("hybrid, ELM") == plots.model_color("hybrid on nominal")
     True
     """
-    return next((color for words, color, _ in _MODELS if re.search(words, str(name))), default)
+    return next(
+        (color for words, color, _ in _MODELS if re.search(words, str(name))), default
+    )
 
 
 def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
@@ -165,8 +176,15 @@ def label_space(ax: Any, unit: str) -> None:
     low, high = np.array([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     half = half.clip(min=0.25 * half.max())
-    ax.set(**{f"{k}lim": (m - h, m + h) for k, m, h in zip("xyz", middle, half, strict=True)})
-    for axis, share in zip((ax.xaxis, ax.yaxis, ax.zaxis), half / half.max(), strict=True):
+    ax.set(
+        **{
+            f"{k}lim": (m - h, m + h)
+            for k, m, h in zip("xyz", middle, half, strict=True)
+        }
+    )
+    for axis, share in zip(
+        (ax.xaxis, ax.yaxis, ax.zaxis), half / half.max(), strict=True
+    ):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_major_locator(MaxNLocator(max(2, round(5 * share))))
     ax.patch.set_visible(False)  # it would hide the labels of the axes beside it

@@ -74,7 +74,9 @@ def body_of(
             body["points"] = _spread(arcs.backbone, drawn)
             body["actuators"] = [_spread(path, drawn) for path in arcs.actuators()]
             body["disks"] = _spread(arcs.disks(), drawn)
-            body["segments"] = np.repeat(range(chain.n_segments), chain.actuators_per_segment)
+            body["segments"] = np.repeat(
+                range(chain.n_segments), chain.actuators_per_segment
+            )
         else:
             body["points"] = _spread(chain.backbone(rows), drawn)
             body["rigid"] = True

@@ -23,7 +23,10 @@ Trace = dict[str, Any]
 
 
 def page(
-    scene: Scene, fps: float, view: tuple[float, float], progress: Callable[[int, int], None] | None
+    scene: Scene,
+    fps: float,
+    view: tuple[float, float],
+    progress: Callable[[int, int], None] | None,
 ) -> str:
     """Return the page as HTML that needs no other file."""
     try:
@@ -38,7 +41,9 @@ def page(
     looks = [_look(line) for line in scene.moving]
     if scene.error is not None:
         still.append(_error_curve(scene))
-        looks.append({"type": "scatter", "mode": "markers", "marker": {"color": "black"}})
+        looks.append(
+            {"type": "scatter", "mode": "markers", "marker": {"color": "black"}}
+        )
         looks[-1]["showlegend"] = False
     moving = [*range(len(still), len(still) + len(looks))]
     frames = []
@@ -46,7 +51,9 @@ def page(
         frames.append({"name": str(k), "data": _moved(scene, k), "traces": moving})
         if progress is not None:
             progress(k + 1, len(scene.rows))
-    first = [look | points for look, points in zip(looks, frames[0]["data"], strict=True)]
+    first = [
+        look | points for look, points in zip(looks, frames[0]["data"], strict=True)
+    ]
     figure = go.Figure(still + first, _layout(scene, fps, view)).to_dict()
     figure["frames"] = frames  # as plain dicts: plotly's checks take a second per frame
     return plotly.io.to_html(
@@ -60,12 +67,18 @@ def page(
 
 def _paths(scene: Scene) -> list[Trace]:
     """Return the target, if there is one, and the path reached."""
-    reached = {"name": "path reached", "line": {"color": COLORS[0], "dash": "dash", "width": 3}}
+    reached = {
+        "name": "path reached",
+        "line": {"color": COLORS[0], "dash": "dash", "width": 3},
+    }
     paths = [reached | _xyz(scene, scene.x)]
     if scene.target is not None:
         target = {"name": "target", "line": {"color": "black", "width": 3}}
         paths.insert(0, target | _xyz(scene, scene.target))
-    return [{"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", **path} for path in paths]
+    return [
+        {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", **path}
+        for path in paths
+    ]
 
 
 def _error_curve(scene: Scene) -> Trace:
@@ -84,7 +97,10 @@ def _error_at(scene: Scene, rows: slice) -> Trace:
     """Return times and errors of rows, rounded by the size of the error, not of the robot."""
     assert scene.error is not None
     digits = decimals(scene.error) + 2
-    return {"x": _numbers(scene.steps[rows], 4), "y": _numbers(scene.error[rows], digits)}
+    return {
+        "x": _numbers(scene.steps[rows], 4),
+        "y": _numbers(scene.error[rows], digits),
+    }
 
 
 def _moved(scene: Scene, k: int) -> list[Trace]:
@@ -123,7 +139,10 @@ def _layout(scene: Scene, fps: float, view: tuple[float, float]) -> dict[str, An
         "uirevision": "kept",  # frames do not reset the view
     }
     if scene.error is not None:
-        layout["xaxis"] = {"domain": [_WIDTH + 0.06, 1.0], "title": {"text": scene.when}}
+        layout["xaxis"] = {
+            "domain": [_WIDTH + 0.06, 1.0],
+            "title": {"text": scene.when},
+        }
         layout["yaxis"] = {
             "title": {"text": scene.error_name},
             "rangemode": "tozero",
@@ -137,14 +156,21 @@ def _space(scene: Scene, view: tuple[float, float]) -> dict[str, Any]:
     sides = (scene.high - scene.low) / (scene.high - scene.low).max()
     elevation, azimuth = np.radians(view)
     level = np.cos(elevation)
-    eye = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    eye = np.array(
+        [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+    )
     space = {
         "aspectmode": "manual",
         "aspectratio": _point(sides),
         "domain": {"x": [0.0, 1.0 if scene.error is None else _WIDTH]},
-        "camera": {"eye": _point(_FAR * eye), "center": {"x": 0.0, "y": 0.0, "z": -0.05}},
+        "camera": {
+            "eye": _point(_FAR * eye),
+            "center": {"x": 0.0, "y": 0.0, "z": -0.05},
+        },
     }
-    for letter, side, low, high in zip("xyz", sides, scene.low, scene.high, strict=True):
+    for letter, side, low, high in zip(
+        "xyz", sides, scene.low, scene.high, strict=True
+    ):
         # Fewer ticks on short sides, or their numbers cover each other.
         ticks = MaxNLocator(max(2, round(5 * side))).tick_values(low, high)
         space[f"{letter}axis"] = {
@@ -174,7 +200,9 @@ def _buttons(fps: float) -> dict[str, Any]:
 
 def _slider(scene: Scene) -> dict[str, Any]:
     """Return the slider of the time."""
-    steps = [_animate(caption, [str(k)], _jump()) for k, caption in enumerate(scene.captions)]
+    steps = [
+        _animate(caption, [str(k)], _jump()) for k, caption in enumerate(scene.captions)
+    ]
     return {
         "steps": steps,
         "x": 0.14,

@@ -54,12 +54,19 @@ class Stage:
         label_space(ax, scene.unit)
         if scene.target is not None:
             ax.plot(*scene.target.T, color="black", linewidth=1.0, label="target")
-        self.trail = ax.plot([], [], [], color=COLORS[0], linewidth=1.2, linestyle="--")[0]
+        self.trail = ax.plot(
+            [], [], [], color=COLORS[0], linewidth=1.2, linestyle="--"
+        )[0]
         self.moving = [
             (ax.plot([], [], [], label=line.label or None, **line.look())[0], line)
             for line in scene.moving
         ]
-        ax.legend(frameon=False, fontsize="small", loc="upper left", bbox_to_anchor=(-0.25, 1.0))
+        ax.legend(
+            frameon=False,
+            fontsize="small",
+            loc="upper left",
+            bbox_to_anchor=(-0.25, 1.0),
+        )
         self.cursor = None
         if error_ax is not None and scene.error is not None:
             error_ax.plot(scene.steps, scene.error, color=COLORS[0], linewidth=1.5)

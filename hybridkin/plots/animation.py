@@ -17,7 +17,14 @@ from typing_extensions import Self
 from hybridkin._core.arrays import whole
 from hybridkin._core.files import write_file
 from hybridkin.plots._arrays import distance, plain, shaped, times
-from hybridkin.plots._canvas import COLORS, Display, decimals, scale_of, space_or_new, steps_of
+from hybridkin.plots._canvas import (
+    COLORS,
+    Display,
+    decimals,
+    scale_of,
+    space_or_new,
+    steps_of,
+)
 from hybridkin.plots._models import Model, predicted
 from hybridkin.plots._page import page
 from hybridkin.plots._scene import Line, Scene, Stage
@@ -95,16 +102,23 @@ class TrackAnimation(Display):
         self.error = None if self.target is None else distance(self.x, self.target)
         self.error_name = "error"
         if expected is not None:
-            self.error, self.error_name = shaped(expected, "expected", "T", T), "expected error"
+            self.error, self.error_name = (
+                shaped(expected, "expected", "T", T),
+                "expected error",
+            )
         self.t = times(t, T)
         shown = np.arange(T) if rows is None else shaped(rows, "rows", "K")
         K = len(shown)
         inside = K > 0 and shown[0] >= 0 and shown[-1] < T
         if not (inside and (np.diff(shown) > 0).all()):
-            raise ValueError(f"`rows` must increase within the {T} rows of `x`, got {shown}.")
+            raise ValueError(
+                f"`rows` must increase within the {T} rows of `x`, got {shown}."
+            )
         self.rows = shown.astype(int)
         if body is not None and len(body.points) != K:
-            raise ValueError(f"`body` must hold {K} configurations, got {len(body.points)}.")
+            raise ValueError(
+                f"`body` must hold {K} configurations, got {len(body.points)}."
+            )
         self.body, self.name = body, str(name)
 
     @classmethod
@@ -157,7 +171,10 @@ class TrackAnimation(Display):
         rows = _evenly(times(t, len(q)), len(q), n_frames)
         ends = None if tips is None else shaped(tips, "tips", "T3", len(q))[rows]
         body = BackboneDisplay.from_estimator(model, q[rows], tips=ends, names=names)
-        name, x = "tip (model)" if x is None else "tip (measured)", tips if x is None else x
+        name, x = (
+            "tip (model)" if x is None else "tip (measured)",
+            tips if x is None else x,
+        )
         if x is None:
             known = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
@@ -170,9 +187,13 @@ class TrackAnimation(Display):
         """Frames per second at which the film takes as long as the motion [1/s]."""
         if self.t is None or len(self.rows) < 2:
             return _PACE
-        return (len(self.rows) - 1) / float(self.t[self.rows[-1]] - self.t[self.rows[0]])
+        return (len(self.rows) - 1) / float(
+            self.t[self.rows[-1]] - self.t[self.rows[0]]
+        )
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm", frame: int = -1) -> Self:
+    def plot(
+        self, ax: Axes | None = None, *, unit: str = "cm", frame: int = -1
+    ) -> Self:
         """Draw one frame into a 3-D axes and return self.
 
         Parameters
@@ -239,7 +260,9 @@ class TrackAnimation(Display):
         path = Path(path)
         kind = path.suffix.lower()
         if kind not in _FORMATS:
-            raise ValueError(f"`path` must end in one of {_FORMATS}, got {path.name!r}.")
+            raise ValueError(
+                f"`path` must end in one of {_FORMATS}, got {path.name!r}."
+            )
         if not 0.0 < speed < np.inf:
             raise ValueError(f"`speed` must be positive, got {speed!r}.")
         scene, fps = self._scene(unit), speed * self.fps
@@ -249,15 +272,21 @@ class TrackAnimation(Display):
             return path
         writer, figure = _writer(kind, fps), Figure(figsize=_SIZE, layout="constrained")
         grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
-        ax = figure.add_subplot(grid[:] if self.error is None else grid[0], projection="3d")
+        ax = figure.add_subplot(
+            grid[:] if self.error is None else grid[0], projection="3d"
+        )
         ax.view_init(*view)
-        stage = Stage(scene, ax, None if self.error is None else figure.add_subplot(grid[1]))
+        stage = Stage(
+            scene, ax, None if self.error is None else figure.add_subplot(grid[1])
+        )
         stage.show(0)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # keeps the axes in place
 
         def draw(staging: Path) -> None:
-            with writer.saving(figure, str(staging), _DPI[kind] if dpi is None else dpi):
+            with writer.saving(
+                figure, str(staging), _DPI[kind] if dpi is None else dpi
+            ):
                 for k in range(len(self.rows)):
                     stage.show(k)
                     writer.grab_frame()
@@ -278,13 +307,17 @@ class TrackAnimation(Display):
             way = np.stack([self.target[self.rows], x], axis=1)
             found.append(Line("tip error", way, "black", 2.0))
             found.append(Line("", way[:, :1], "black", 1.0, marker="x", style="none"))
-        found.append(Line(self.name, x[:, None], COLORS[0], 1.0, marker="o", style="none"))
+        found.append(
+            Line(self.name, x[:, None], COLORS[0], 1.0, marker="o", style="none")
+        )
         return found
 
     def limits(self) -> tuple[NDArray, NDArray]:
         """Return the corners (3,) of a box around all points, with a margin [m]."""
         parts = [self.x, *(line.points.reshape(-1, 3) for line in self.lines())]
-        everything = np.concatenate(parts if self.target is None else [*parts, self.target])
+        everything = np.concatenate(
+            parts if self.target is None else [*parts, self.target]
+        )
         known = everything[np.isfinite(everything).all(axis=1)]
         if len(known) == 0:
             raise ValueError("`x` must hold at least one known tip; all rows are NaN.")
@@ -298,7 +331,10 @@ class TrackAnimation(Display):
         when = f"step {row}" if self.t is None else f"t = {self.t[row]:.2f} s"
         if self.error is None:
             return when
-        error, places = scale_of(unit) * self.error[row], decimals(scale_of(unit) * self.error)
+        error, places = (
+            scale_of(unit) * self.error[row],
+            decimals(scale_of(unit) * self.error),
+        )
         shown = f"{error:.{places}f} {unit}" if np.isfinite(error) else "not known"
         return f"{when}, {self.error_name} {shown}"
 

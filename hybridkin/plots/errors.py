@@ -11,7 +11,13 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
 from hybridkin.plots._arrays import distance, named, plain, positions
-from hybridkin.plots._canvas import Display, axes_or_new, legend_below, looks_of, scale_of
+from hybridkin.plots._canvas import (
+    Display,
+    axes_or_new,
+    legend_below,
+    looks_of,
+    scale_of,
+)
 
 
 class _ErrorDisplay(Display):
@@ -29,7 +35,9 @@ class _ErrorDisplay(Display):
             self.errors[name] = values
 
     @classmethod
-    def from_predictions(cls, x: ArrayLike, predictions: Mapping[str, ArrayLike]) -> Self:
+    def from_predictions(
+        cls, x: ArrayLike, predictions: Mapping[str, ArrayLike]
+    ) -> Self:
         """Return the display of the distances from predicted to measured tips.
 
         Parameters
@@ -138,7 +146,9 @@ class ErrorBoxDisplay(_ErrorDisplay):
         Where it was drawn last.
     """
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm", log: bool = False) -> Self:
+    def plot(
+        self, ax: Axes | None = None, *, unit: str = "cm", log: bool = False
+    ) -> Self:
         """Draw horizontal boxes with the mean (dot) and the maximum (cross) and return self.
 
         A linear axis shows most models up to their 95 %. Larger means and maxima are numbers at
@@ -193,7 +203,13 @@ class ErrorBoxDisplay(_ErrorDisplay):
                 words = f"max {largest[row]:.0f}"
                 if means[row] > end:
                     words = f"mean {means[row]:.0f}, {words}"
-                beside = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
-                ax.annotate(f"▸ {words}", (end, places[row]), **beside, fontsize="small")
+                beside = {
+                    "xytext": (4, 0),
+                    "textcoords": "offset points",
+                    "va": "center",
+                }
+                ax.annotate(
+                    f"▸ {words}", (end, places[row]), **beside, fontsize="small"
+                )
         legend_below(ax, 2)
         return self._drawn(ax)

@@ -15,7 +15,14 @@ from sklearn.utils.validation import has_fit_parameter
 from typing_extensions import Self
 
 from hybridkin.plots._arrays import distance, named, plain, positions
-from hybridkin.plots._canvas import MARKERS, Display, axes_or_new, legend_below, looks_of, scale_of
+from hybridkin.plots._canvas import (
+    MARKERS,
+    Display,
+    axes_or_new,
+    legend_below,
+    looks_of,
+    scale_of,
+)
 from hybridkin.plots._models import Predictor, predicted
 
 _MOST_TICKS = 8
@@ -53,7 +60,9 @@ class LearningCurveDisplay(Display):
     def __init__(self, sizes: ArrayLike, errors: Mapping[str, ArrayLike]) -> None:
         self.sizes = plain(sizes, "sizes")
         if self.sizes.ndim != 1 or not (np.diff(self.sizes, prepend=0.0) > 0.0).all():
-            raise ValueError(f"`sizes` must be positive and increase, got {self.sizes.tolist()}.")
+            raise ValueError(
+                f"`sizes` must be positive and increase, got {self.sizes.tolist()}."
+            )
         self.errors: dict[str, NDArray] = {}
         for name, values in named(errors, "errors").items():
             array = plain(values, "errors")
@@ -125,15 +134,23 @@ class LearningCurveDisplay(Display):
         rng = check_random_state(random_state)
         groups = None if groups is None else np.asarray(groups)
         splits = _splits(cv, q, groups, rng)
-        splits = [(_ordered(np.asarray(train), groups, rng), test) for train, test in splits]
+        splits = [
+            (_ordered(np.asarray(train), groups, rng), test) for train, test in splits
+        ]
         most = min(len(train) for train, _ in splits)
         chosen = np.unique(_sizes(sizes, most))
-        options: dict[str, Any] = {"train_sizes": chosen, "cv": splits, "error_score": "raise"}
+        options: dict[str, Any] = {
+            "train_sizes": chosen,
+            "cv": splits,
+            "error_score": "raise",
+        }
         errors = {}
         for name, model in named(models, "models").items():
             takes = groups is not None and has_fit_parameter(model, "groups")
             params = {"groups": groups} if takes else None
-            scores = learning_curve(model, q, x, scoring=_mean_distance, params=params, **options)
+            scores = learning_curve(
+                model, q, x, scoring=_mean_distance, params=params, **options
+            )
             errors[name] = scores[2]
         return cls(chosen, errors)
 
@@ -166,10 +183,19 @@ class LearningCurveDisplay(Display):
             color, form = (styles or {}).get(name, own)
             known = np.isfinite(errors).any(axis=1)
             sizes, values = self.sizes[known], scale * errors[known]
-            ax.plot(sizes, np.nanmean(values, axis=1), form, color=color, markersize=4, label=name)
+            ax.plot(
+                sizes,
+                np.nanmean(values, axis=1),
+                form,
+                color=color,
+                markersize=4,
+                label=name,
+            )
             if values.shape[1] > 1:
                 low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
-                ax.fill_between(sizes, low, high, color=color, alpha=0.15, linewidth=0.0)
+                ax.fill_between(
+                    sizes, low, high, color=color, alpha=0.15, linewidth=0.0
+                )
         ax.set(xscale="log", yscale="log")
         ax.set(xlabel="training rows", ylabel=f"mean tip error [{unit}]")
         if len(self.sizes) <= _MOST_TICKS:
@@ -202,19 +228,28 @@ def _splits(
     return [*splitter.split(q, groups=groups)]
 
 
-def _ordered(train: NDArray, groups: NDArray | None, rng: np.random.RandomState) -> NDArray:
+def _ordered(
+    train: NDArray, groups: NDArray | None, rng: np.random.RandomState
+) -> NDArray:
     """Return the training rows in random order, motion by motion."""
     if groups is None:
         return rng.permutation(train)
     own = groups[train]
-    return np.concatenate([train[own == group] for group in rng.permutation(np.unique(own))])
+    return np.concatenate(
+        [train[own == group] for group in rng.permutation(np.unique(own))]
+    )
 
 
 def _sizes(sizes: Iterable[int] | None, most: int) -> NDArray:
     if sizes is None:
         return np.geomspace(min(25, most), most, 6).round().astype(int)
     chosen = np.array([*sizes])
-    if chosen.size == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 1 or chosen.max() > most:
+    if (
+        chosen.size == 0
+        or chosen.dtype.kind not in "iu"
+        or chosen.min() < 1
+        or chosen.max() > most
+    ):
         raise ValueError(
             f"`sizes` must be whole numbers from 1 to {most}, the rows of the smallest training "
             f"part, got {chosen.tolist()}."

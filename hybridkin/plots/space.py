@@ -94,7 +94,12 @@ class WorkspaceDisplay(Display):
         space.computed_zorder = False  # the robot in front of the cloud
         dots = self._draw_tips(space, scale)
         space.figure.colorbar(
-            dots, ax=space, label=f"tip error [{unit}]", shrink=0.75, pad=0.1, extend="max"
+            dots,
+            ax=space,
+            label=f"tip error [{unit}]",
+            shrink=0.75,
+            pad=0.1,
+            extend="max",
         )
         if self.backbone is not None:
             line = scale * self.backbone.T
@@ -102,8 +107,12 @@ class WorkspaceDisplay(Display):
         if self.row is not None:
             measured = scale * self.x[self.row]
             predicted = scale * self.predicted[self.row]
-            space.plot(*np.stack([measured, predicted], axis=1), color="black", linewidth=1.5)
-            space.scatter(*measured, color="black", s=30, label="measured tip", zorder=3)
+            space.plot(
+                *np.stack([measured, predicted], axis=1), color="black", linewidth=1.5
+            )
+            space.scatter(
+                *measured, color="black", s=30, label="measured tip", zorder=3
+            )
             ring = {"facecolor": "white", "edgecolor": "black", "depthshade": False}
             space.scatter(*predicted, s=30, label="predicted tip", zorder=3, **ring)
         if self.backbone is not None or self.row is not None:
@@ -192,22 +201,36 @@ class BackboneDisplay(Display):
         rigid: bool = False,
     ) -> None:
         points = plain(points, "points")
-        self.points = shaped(points[None] if points.ndim == 2 else points, "points", "KP3")
+        self.points = shaped(
+            points[None] if points.ndim == 2 else points, "points", "KP3"
+        )
         K = len(self.points)
         if not isinstance(actuators, Iterable):
-            raise ValueError(f"`actuators` must hold arrays (K, P, 3), got {actuators!r:.80}.")
-        self.actuators = tuple(shaped(path, "actuators", "KP3", K) for path in actuators)
-        self.segments = (0,) * len(self.actuators) if segments is None else tuple(segments)
+            raise ValueError(
+                f"`actuators` must hold arrays (K, P, 3), got {actuators!r:.80}."
+            )
+        self.actuators = tuple(
+            shaped(path, "actuators", "KP3", K) for path in actuators
+        )
+        self.segments = (
+            (0,) * len(self.actuators) if segments is None else tuple(segments)
+        )
         n = len(self.actuators)
         if len(self.segments) != n:
             raise ValueError(f"`segments` must hold {n} numbers, one per actuator.")
         self.names = tuple(names)
         if len(self.names) not in (0, n):
-            raise ValueError(f"`names` must hold {n} names, one per actuator, got {names!r:.80}.")
+            raise ValueError(
+                f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
+            )
         self.disks = None if disks is None else shaped(disks, "disks", "KDC3", K)
         self.frames = None if frames is None else shaped(frames, "frames", "KF44", K)
-        self.tips = self.points[:, -1] if tips is None else shaped(tips, "tips", "K3", K)
-        self.predicted = None if predicted is None else shaped(predicted, "predicted", "K3", K)
+        self.tips = (
+            self.points[:, -1] if tips is None else shaped(tips, "tips", "K3", K)
+        )
+        self.predicted = (
+            None if predicted is None else shaped(predicted, "predicted", "K3", K)
+        )
         self.rigid = rigid
 
     @classmethod
@@ -299,10 +322,14 @@ class BackboneDisplay(Display):
         if body and self.disks is not None and self.disks.size:
             lines.append(Line("", _joined(self.disks.swapaxes(0, 1)), "#808080", 1.0))
         if tip:
-            lines.append(Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none"))
+            lines.append(
+                Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none")
+            )
         if self.predicted is not None:
             way = np.stack([self.tips, self.predicted], axis=1)
-            lines.append(Line("learned correction", way, COLORS[0], 1.5, style=":", marker="."))
+            lines.append(
+                Line("learned correction", way, COLORS[0], 1.5, style=":", marker=".")
+            )
         return lines
 
     def _actuator_lines(self) -> list[Line]:
@@ -312,12 +339,16 @@ class BackboneDisplay(Display):
             lines.append(Line(name, self.actuators[i], COLORS[i % len(COLORS)], 1.6))
         if lines:
             return lines
-        paths: dict[int, list[NDArray]] = {segment: [] for segment in sorted({*self.segments})}
+        paths: dict[int, list[NDArray]] = {
+            segment: [] for segment in sorted({*self.segments})
+        }
         for segment, path in zip(self.segments, self.actuators, strict=True):
             paths[segment].append(path)
         for segment, own in paths.items():
             color = _SEGMENTS[segment % len(_SEGMENTS)]
-            lines.append(Line(f"actuators of segment {segment + 1}", _joined(own), color, 1.6))
+            lines.append(
+                Line(f"actuators of segment {segment + 1}", _joined(own), color, 1.6)
+            )
         return lines
 
     def _draw_outline(self, space: Any, k: int, scale: float) -> None:
@@ -329,10 +360,14 @@ class BackboneDisplay(Display):
     def _draw_body(self, space: Any, scale: float) -> None:
         """Draw all parts of the only configuration."""
         for line in self.lines():
-            space.plot(*(scale * line.points[0].T), label=line.label or None, **line.look())
+            space.plot(
+                *(scale * line.points[0].T), label=line.label or None, **line.look()
+            )
         if self.disks is not None and self.disks.size:
             disks = scale * self.disks[0]
-            space.add_collection3d(Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0))
+            space.add_collection3d(
+                Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0)
+            )
         if self.frames is not None:
             self._draw_frames(space, self.frames[0], scale)
 

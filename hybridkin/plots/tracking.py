@@ -65,7 +65,10 @@ class TrackingDisplay(Display):
     """
 
     def __init__(
-        self, target: ArrayLike, tracks: Mapping[str, ArrayLike], t: ArrayLike | None = None
+        self,
+        target: ArrayLike,
+        tracks: Mapping[str, ArrayLike],
+        t: ArrayLike | None = None,
     ) -> None:
         self.target = shaped(target, "target", "T3")
         T = len(self.target)
@@ -93,14 +96,18 @@ class TrackingDisplay(Display):
         target = shaped(first.target, "target", "T3")
         for other in others:
             if not np.array_equal(plain(other.target), target, equal_nan=True):
-                raise ValueError("`tracks` must follow one path, got different targets.")
+                raise ValueError(
+                    "`tracks` must follow one path, got different targets."
+                )
         reached = {
             name: track.x if track.x_measured is None else track.x_measured
             for name, track in tracks.items()
         }
         return cls(target, reached, first.t)
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm", plane: str = "xy") -> Self:
+    def plot(
+        self, ax: Axes | None = None, *, unit: str = "cm", plane: str = "xy"
+    ) -> Self:
         """Draw the paths in one plane of the task space and return self.
 
         Parameters
@@ -121,11 +128,15 @@ class TrackingDisplay(Display):
         scale = scale_of(unit)
         ax = axes_or_new(ax)
         i, j = map("xyz".index, plane)
-        for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
+        for look, (name, x) in zip(
+            looks_of(self.tracks), self.tracks.items(), strict=True
+        ):
             label = self._summary(name, scale, unit)
             ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look)
         target = scale * self.target
-        ax.plot(target[:, i], target[:, j], color="black", linewidth=1.0, label="target")
+        ax.plot(
+            target[:, i], target[:, j], color="black", linewidth=1.0, label="target"
+        )
         ax.set(xlabel=f"{plane[0]} [{unit}]", ylabel=f"{plane[1]} [{unit}]")
         ax.set_aspect("equal", adjustable="datalim")
         legend_below(ax)
@@ -136,14 +147,21 @@ class TrackingDisplay(Display):
         scale = scale_of(unit)
         ax = axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
-        for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
+        for look, (name, x) in zip(
+            looks_of(self.tracks), self.tracks.items(), strict=True
+        ):
             lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
             lines[0].set_label(name)
         ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
         for letter, values in zip("xyz", scale * self.target.T, strict=True):
             if np.isfinite(values).any():
                 top = int(np.nanargmax(values))
-                ax.annotate(letter, (steps[top], values[top]), (0, 3), textcoords="offset points")
+                ax.annotate(
+                    letter,
+                    (steps[top], values[top]),
+                    (0, 3),
+                    textcoords="offset points",
+                )
         ax.margins(y=0.08)
         ax.set(xlabel=when, ylabel=f"tip [{unit}]")
         return self._drawn(ax)
@@ -175,13 +193,17 @@ class TrackingDisplay(Display):
         scale = scale_of(unit)
         ax = axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
-        for look, (name, x) in zip(looks_of(self.tracks), self.tracks.items(), strict=True):
+        for look, (name, x) in zip(
+            looks_of(self.tracks), self.tracks.items(), strict=True
+        ):
             error = scale * distance(x, self.target)
             ax.plot(steps, error, label=self._summary(name, scale, unit), **look)
         ax.set(xlabel=when, ylabel=f"tip error [{unit}]")
         ax.set_xlim((steps[0], steps[-1]) if len(steps) > 1 else None)
         least = []
-        for (label, level), style in zip((expected or {}).items(), STYLES * 2, strict=False):
+        for (label, level), style in zip(
+            (expected or {}).items(), STYLES * 2, strict=False
+        ):
             level = np.broadcast_to(scale * plain(level, "expected"), len(steps))
             if np.isfinite(level).any():
                 least.append(float(np.nanmin(level)))
@@ -236,9 +258,13 @@ class ActuatorDisplay:
         limits: ArrayLike | None = None,
     ) -> None:
         given = np.ravel(np.asarray(actuators_per_segment, dtype=object))
-        self.actuators_per_segment = tuple(whole(k, "actuators_per_segment") for k in given)
+        self.actuators_per_segment = tuple(
+            whole(k, "actuators_per_segment") for k in given
+        )
         n = sum(self.actuators_per_segment)
-        self.paths = {name: plain(q, "paths") for name, q in named(paths, "paths").items()}
+        self.paths = {
+            name: plain(q, "paths") for name, q in named(paths, "paths").items()
+        }
         rows = next(iter(self.paths.values())).shape[:1]
         for name, q in self.paths.items():
             if q.shape != (*rows, n):
@@ -249,7 +275,9 @@ class ActuatorDisplay:
         self.t = times(t, *rows)
         self.names: list[str] = []
         if names is not None:
-            self.names = [str(name) for name in np.ravel(np.asarray(names, dtype=object))]
+            self.names = [
+                str(name) for name in np.ravel(np.asarray(names, dtype=object))
+            ]
             if len(self.names) != n:
                 raise ValueError(
                     f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
@@ -257,7 +285,9 @@ class ActuatorDisplay:
         self.limits = None if limits is None else shaped(limits, "limits", ("2", n))
 
     @classmethod
-    def from_tracks(cls, tracks: Mapping[str, Any], actuators_per_segment: Sequence[int]) -> Self:
+    def from_tracks(
+        cls, tracks: Mapping[str, Any], actuators_per_segment: Sequence[int]
+    ) -> Self:
         """Return the display of results of `InverseKinematics.track`.
 
         Parameters
@@ -273,7 +303,9 @@ class ActuatorDisplay:
             Not drawn yet.
         """
         t = next(iter(named(tracks, "tracks").values())).t
-        return cls({name: track.q for name, track in tracks.items()}, actuators_per_segment, t)
+        return cls(
+            {name: track.q for name, track in tracks.items()}, actuators_per_segment, t
+        )
 
     def plot(
         self,
@@ -306,11 +338,15 @@ class ActuatorDisplay:
         else:
             size = plain(per_unit, "per_unit")
             if size.shape not in ((), (sum(counts),)) or not size.all():
-                raise ValueError(f"`per_unit` must be one or (n,) numbers, not 0, got {per_unit}.")
+                raise ValueError(
+                    f"`per_unit` must be one or (n,) numbers, not 0, got {per_unit}."
+                )
             scale = 1.0 / size
         if axes is None:
             size = (6.0, 1.0 + 1.6 * n)
-            axes = plt.subplots(n, 1, figsize=size, sharex=True, layout="constrained")[1]
+            axes = plt.subplots(n, 1, figsize=size, sharex=True, layout="constrained")[
+                1
+            ]
         axes = np.ravel(np.asarray(axes, dtype=object))
         if len(axes) != n:
             raise ValueError(f"`axes` must hold {n} axes, got {len(axes)}.")
@@ -324,7 +360,11 @@ class ActuatorDisplay:
                 beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
                 ax.legend(frameon=False, fontsize="small", **beside)
         else:
-            above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(self.paths)}
+            above = {
+                "loc": "lower center",
+                "bbox_to_anchor": (0.5, 1.0),
+                "ncols": len(self.paths),
+            }
             axes[0].legend(frameon=False, fontsize="small", **above)
         axes[-1].set(xlabel=when)
         self.axes_ = axes
@@ -340,7 +380,9 @@ class ActuatorDisplay:
         if self.names:
             colors = [COLORS[j % 8] for j in range(len(columns))]
         for i, (name, q) in enumerate(self.paths.items()):
-            lines = ax.plot(steps, (scale * q)[:, columns], **{**looks[i], "linewidth": 1.2})
+            lines = ax.plot(
+                steps, (scale * q)[:, columns], **{**looks[i], "linewidth": 1.2}
+            )
             lines[0].set_label(name)
             if self.names:
                 for line, color in zip(lines, colors, strict=True):

@@ -31,7 +31,14 @@ from hybridkin._core.stored import Stored
 FORMAT = "hybridkin-model"
 VERSION = 3
 _HEADER, _CHECKSUM = "hybridkin", "sha256"
-_UNREADABLE = (SafetensorError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+_UNREADABLE = (
+    SafetensorError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
 
 Header = dict[str, Any]
 Arrays = dict[str, NDArray]
@@ -46,10 +53,19 @@ def packed(stored: Stored) -> tuple[Header, Arrays]:
         own = {}
         for name, array in stored.arrays.items():
             content = hashlib.sha256(array.tobytes()).digest()
-            own[name] = names.setdefault((array.dtype.name, array.shape, content), prefix + name)
+            own[name] = names.setdefault(
+                (array.dtype.name, array.shape, content), prefix + name
+            )
             arrays[own[name]] = array
-        parts = {key: entries(part, f"{prefix}{key}.") for key, part in stored.parts.items()}
-        return {"kind": stored.kind, "settings": stored.settings, "arrays": own, "parts": parts}
+        parts = {
+            key: entries(part, f"{prefix}{key}.") for key, part in stored.parts.items()
+        }
+        return {
+            "kind": stored.kind,
+            "settings": stored.settings,
+            "arrays": own,
+            "parts": parts,
+        }
 
     return entries(stored, ""), arrays
 
@@ -60,8 +76,13 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
     Equal parts become one object, as in the model.
     """
     for name, array in arrays.items():
-        if array.dtype == np.float64 and not (countable(array) | ~np.isfinite(array)).all():
-            raise ValueError(f"the numbers of {name!r:.60} must be less than {LARGEST:g}")
+        if (
+            array.dtype == np.float64
+            and not (countable(array) | ~np.isfinite(array)).all()
+        ):
+            raise ValueError(
+                f"the numbers of {name!r:.60} must be less than {LARGEST:g}"
+            )
     found: dict[str, Stored] = {}
     kinds = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
 
@@ -85,11 +106,15 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
 def write(path: Path, header: Header, arrays: Arrays) -> None:
     """Write header and arrays to a file with `write_file`; equal content gives equal bytes."""
     text = json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False)
-    whole = {name: np.array(array, order="C", ndmin=0) for name, array in arrays.items()}
+    whole = {
+        name: np.array(array, order="C", ndmin=0) for name, array in arrays.items()
+    }
     content = save(whole, metadata={_HEADER: text, _CHECKSUM: _checksum(text, whole)})
     # safetensors writes its metadata in random order.
     end = 8 + int.from_bytes(content[:8], "little")
-    head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    head = json.dumps(
+        json.loads(content[8:end]), sort_keys=True, separators=(",", ":")
+    ).encode()
     head += b" " * (-len(head) % 8)
 
     def write_parts(staging: Path) -> None:
@@ -104,16 +129,22 @@ def read(path: Path) -> tuple[Header, Arrays]:
     if path.is_dir():
         found = sorted(file.name for file in path.glob("[!.]*.safetensors"))
         hint = f"; it contains {found[0]}." if found else " without a saved model."
-        raise FileNotFoundError(f"`path` must name a saved model, got the folder {path}{hint}")
+        raise FileNotFoundError(
+            f"`path` must name a saved model, got the folder {path}{hint}"
+        )
     if not path.is_file():
-        raise FileNotFoundError(f"`path` must name a saved model, got {path}: no such file.")
+        raise FileNotFoundError(
+            f"`path` must name a saved model, got {path}: no such file."
+        )
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             header = json.loads(metadata[_HEADER], parse_constant=_refused)
             arrays = {name: file.get_tensor(name) for name in file.keys()}
     except _UNREADABLE as error:
-        raise ValueError(f"{path} is not a model saved by hybridkin ({error!r}).") from error
+        raise ValueError(
+            f"{path} is not a model saved by hybridkin ({error!r})."
+        ) from error
     _check_version(path, header)
     if metadata.get(_CHECKSUM) != _checksum(metadata[_HEADER], arrays):
         raise ValueError(
@@ -126,7 +157,9 @@ def read(path: Path) -> tuple[Header, Arrays]:
 def _check_version(path: Path, header: Any) -> None:
     known = isinstance(header, dict) and header.get("format") == FORMAT
     if not known or type(header.get("version")) is not int or header["version"] < 1:
-        raise ValueError(f"{path} is not a model saved by hybridkin: its header does not match.")
+        raise ValueError(
+            f"{path} is not a model saved by hybridkin: its header does not match."
+        )
     if header["version"] != VERSION:
         versions = header.get("versions")
         writer = versions.get("hybridkin") if isinstance(versions, dict) else None
@@ -143,7 +176,10 @@ def _refused(constant: str) -> None:
 
 def _checksum(text: str, arrays: Arrays) -> str:
     names = sorted(arrays)
-    manifest = [text, [[name, arrays[name].dtype.name, arrays[name].shape] for name in names]]
+    manifest = [
+        text,
+        [[name, arrays[name].dtype.name, arrays[name].shape] for name in names],
+    ]
     digest = hashlib.sha256(json.dumps(manifest).encode())
     for name in names:
         array = arrays[name]

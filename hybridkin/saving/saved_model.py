@@ -30,7 +30,14 @@ from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.hidden_layer import device_named
 from hybridkin.saving._file import packed, read, unpacked, write
 
-_DAMAGE = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError)
+_DAMAGE = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    TypeError,
+    ValueError,
+)
 Model = ForwardModel | ELMRegressor | ELMRegressorCV | HybridForwardModel
 
 
@@ -186,7 +193,9 @@ def model_header(path: str | Path) -> dict[str, Any]:
 
 def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
     if not isinstance(training, (Mapping, NoneType)):
-        raise TypeError(f"`training` must be a mapping of names to numbers, got {training!r:.80}.")
+        raise TypeError(
+            f"`training` must be a mapping of names to numbers, got {training!r:.80}."
+        )
     given = plain(dict(training or {}))
     try:
         json.dumps(given)

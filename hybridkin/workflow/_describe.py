@@ -123,15 +123,32 @@ def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
     if geometry is None:
         report.text("No mechanical model.")
         return
-    parts = [f", {key} {geometry[key]}" for key in ("stage", "routing") if key in geometry]
+    parts = [
+        f", {key} {geometry[key]}" for key in ("stage", "routing") if key in geometry
+    ]
     report.text(f"Mechanical model: {geometry['kind']}{''.join(parts)}.")
     rows = []
     for k, entry in enumerate(geometry.get("segments", [])):
-        length = "extensible" if entry["length"] is None else f"{1e3 * entry['length']:.2f}"
-        cells = [f"{k + 1}", f"{1e3 * entry['radius']:.3f}", length, f"{1e3 * entry['offset']:.2f}"]
-        rows.append([*cells, ", ".join(f"{angle:.1f}" for angle in entry["angles_deg"])])
+        length = (
+            "extensible" if entry["length"] is None else f"{1e3 * entry['length']:.2f}"
+        )
+        cells = [
+            f"{k + 1}",
+            f"{1e3 * entry['radius']:.3f}",
+            length,
+            f"{1e3 * entry['offset']:.2f}",
+        ]
+        rows.append(
+            [*cells, ", ".join(f"{angle:.1f}" for angle in entry["angles_deg"])]
+        )
     if rows:
-        header = ["segment", "radius [mm]", "length [mm]", "offset [mm]", "actuators at [deg]"]
+        header = [
+            "segment",
+            "radius [mm]",
+            "length [mm]",
+            "offset [mm]",
+            "actuators at [deg]",
+        ]
         report.table(header, rows)
     turn = ", ".join(f"{v:.1f}" for v in geometry["base"]["rotation_vector_deg"])
     position = in_millimetres(geometry["base"]["position"])
@@ -167,7 +184,9 @@ def _write_model(report: Report, loaded: LoadedModel) -> None:
         report.text(f"Logs: {columns}.")
 
 
-def _write_limits(report: Report, what: str, limits: Limits, log_format: LogFormat) -> None:
+def _write_limits(
+    report: Report, what: str, limits: Limits, log_format: LogFormat
+) -> None:
     """Add limits in the unit and sign of the logs."""
     unit = "" if log_format.q_unit == "1" else f" {log_format.q_unit}"
     per_time = {"dq_max": "/s", "ddq_max": "/s^2"}
@@ -180,7 +199,11 @@ def _write_limits(report: Report, what: str, limits: Limits, log_format: LogForm
 def _write_training(report: Report, training: dict[str, Any]) -> None:
     """Add the training notes in the file; a model that was saved by hand may have few."""
     if "log" in training:
-        thinned = "" if training["n_whole"] == training["rows"] else f" of {training['n_whole']}"
+        thinned = (
+            ""
+            if training["n_whole"] == training["rows"]
+            else f" of {training['n_whole']}"
+        )
         report.text(
             f"Fitted to {training['log']}: {training['rows']}{thinned} rows, "
             f"{training['n_motions']} motions. Model: {training['saved']}, {training['chosen']}. "
@@ -192,5 +215,7 @@ def _write_training(report: Report, training: dict[str, Any]) -> None:
     if report.record["auto"] is not None:
         report.text(" ".join(report.record["auto"]["words"]))
     if report.record["versions"] is not None:
-        versions = ", ".join(f"{name} {value}" for name, value in report.record["versions"].items())
+        versions = ", ".join(
+            f"{name} {value}" for name, value in report.record["versions"].items()
+        )
         report.text(f"Saved on {report.record['created']} by {versions}.")

@@ -22,7 +22,9 @@ _STEPS = 60
 _STEP = 0.12  # length of a step, as a share of the range
 _PLANAR = 1e-9  # relative cut-off of singular values, for tendons in one plane
 _NAMES = ("q_min", "q_max", "dq_max", "ddq_max")
-_EASE = 0.5  # domain distance from which the posture returns; 1 is the edge of the domain
+_EASE = (
+    0.5  # domain distance from which the posture returns; 1 is the edge of the domain
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,9 @@ def path_limits(
         if value is not None:
             given[name] = real_array(value, name).astype(float)
             if given[name].shape not in ((), (1,), (n,)):
-                raise ValueError(f"`{name}` must be one number or {n}, got {given[name].size}.")
+                raise ValueError(
+                    f"`{name}` must be one number or {n}, got {given[name].size}."
+                )
     described = robots.Limits()
     if loaded.description is not None:
         described = loaded.description.limits
@@ -109,7 +113,9 @@ def path_limits(
         )
     speed = None if limits.dq_max is None else _of_actuators(limits.dq_max, n)
     acceleration = None if limits.ddq_max is None else _of_actuators(limits.ddq_max, n)
-    return PathLimits(low, high, speed, acceleration, _source(given, described, trained))
+    return PathLimits(
+        low, high, speed, acceleration, _source(given, described, trained)
+    )
 
 
 def _of_actuators(value: ArrayLike, n: int) -> NDArray:
@@ -117,7 +123,9 @@ def _of_actuators(value: ArrayLike, n: int) -> NDArray:
     return np.broadcast_to(np.asarray(value, dtype=float), n).copy()
 
 
-def _source(given: Iterable[str], described: robots.Limits, trained: robots.Limits) -> str:
+def _source(
+    given: Iterable[str], described: robots.Limits, trained: robots.Limits
+) -> str:
     """Return in words where the range of the actuators comes from."""
     known = []
     if described.q_min is not None:
@@ -157,7 +165,9 @@ class Domain:
         tested = None if hybrid is None else hybrid.module_.fitted.tested
         if hybrid is not None and tested is not None:
             rows = as_array(tested.rows - hybrid.module_.shift)
-            candidates.append(rows[np.linalg.norm(rows - candidates[0], axis=1).argmin()])
+            candidates.append(
+                rows[np.linalg.norm(rows - candidates[0], axis=1).argmin()]
+            )
         q = np.clip(candidates, limits.q_min, limits.q_max)
         distance = self.loaded.domain_distance(q)
         return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
@@ -166,13 +176,19 @@ class Domain:
     def tendons(self) -> ArcChain | None:
         """The chain if all its actuators are tendons, else None."""
         chain = self.loaded.chain
-        return chain if isinstance(chain, ArcChain) and not any(chain.extensible) else None
+        return (
+            chain if isinstance(chain, ArcChain) and not any(chain.extensible) else None
+        )
 
     @property
     def rest(self) -> NDArray:
         """The command (n,) at which no tendon is pulled; for other robots zero."""
         chain = self.tendons
-        return np.zeros(self.loaded.n_actuators) if chain is None else as_array(chain.rest.detach())
+        return (
+            np.zeros(self.loaded.n_actuators)
+            if chain is None
+            else as_array(chain.rest.detach())
+        )
 
     @cached_property
     def sample(self) -> tuple[NDArray, NDArray]:
@@ -191,7 +207,10 @@ class Domain:
         if self.loaded.hybrid is not None:
             q[:] = self.preferred
             for _ in range(_STEPS):
-                ahead = q + _STEP * (high - low) * rng.standard_normal(q.shape) @ self.bending
+                ahead = (
+                    q
+                    + _STEP * (high - low) * rng.standard_normal(q.shape) @ self.bending
+                )
                 inside = self.loaded.domain_distance(ahead) <= 1.0
                 inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
                 q[inside] = ahead[inside]
@@ -223,7 +242,9 @@ class Domain:
         for own in np.split(np.arange(len(low)), ends[:-1]):
             axes = np.stack([np.cos(angles[own]), np.sin(angles[own])], axis=1)
             q[:, own] = q[:, own] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
-            q[:, own] -= (q[:, own] - high[own]).max(axis=1, keepdims=True).clip(min=0.0)
+            q[:, own] -= (
+                (q[:, own] - high[own]).max(axis=1, keepdims=True).clip(min=0.0)
+            )
         return rest + q[((q >= low) & (q <= high)).all(axis=1)] / gains
 
     @cached_property

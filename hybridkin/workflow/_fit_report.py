@@ -17,7 +17,13 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.plots import ErrorBoxDisplay, ErrorHistogramDisplay, new_figure
 from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.model import play_widths
-from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries, millimetres, statistics
+from hybridkin.workflow.report import (
+    IDENTIFIED,
+    Report,
+    geometry_entries,
+    millimetres,
+    statistics,
+)
 
 _SHOWN = (
     "mechanical, calibrated",
@@ -38,7 +44,9 @@ _AUTO = (
 _WITH_BACKLASH = (
     ' "With backlash": the calibrated model at the motion of the actuators, as hybrids.'
 )
-_NO_MECHANICAL = 'The robot has no segments: "hybrid" models correct the linear model of the data.'
+_NO_MECHANICAL = (
+    'The robot has no segments: "hybrid" models correct the linear model of the data.'
+)
 
 
 def write_check(report: Report, log: MeasuredLog) -> None:
@@ -78,18 +86,26 @@ def write_comparison(
     ratios = [f"by that of {name}: **{first[1] / mean:.2f}**" for name, mean in others]
     best = min(record, key=lambda name: record[name]["mean"])
     start = "the calibrated model" if present[0] == _SHOWN[0] else "the linear model"
-    report.text(f"Mean error of {start} divided {', '.join(ratios)}. Least mean error: {best}.")
+    report.text(
+        f"Mean error of {start} divided {', '.join(ratios)}. Least mean error: {best}."
+    )
     _add_figures(report, errors, (present[0], present[-1]))
     motions, counts = np.unique(log.motions, return_counts=True)
-    means = np.array([[errors[n][log.motions == m].mean() for n in present] for m in motions])
-    report.text(f"Mean errors in mm of the five motions with the largest errors of {present[-1]}:")
+    means = np.array(
+        [[errors[n][log.motions == m].mean() for n in present] for m in motions]
+    )
+    report.text(
+        f"Mean errors in mm of the five motions with the largest errors of {present[-1]}:"
+    )
     rows = [
         [str(motions[i]), str(counts[i]), *(f"{1e3 * mean:.1f}" for mean in means[i])]
         for i in np.argsort(means[:, -1])[::-1][:5]
     ]
     report.table(["motion", "rows", *present], rows)
     saved, chosen = report.record["saved"], report.record["chosen"]
-    by_fold = "; ".join(choices.get(saved, "-") for choices in report.record["choices_by_fold"])
+    by_fold = "; ".join(
+        choices.get(saved, "-") for choices in report.record["choices_by_fold"]
+    )
     reason = "It has the least mean error of the models that can be saved."
     if saved == "hybrid, auto":
         reason = "It chooses among the other hybrids itself."
@@ -116,12 +132,16 @@ def write_markers(report: Report, errors: NDArray, what: str) -> None:
     measured = [column[~np.isnan(column)] for column in errors.T]
     entries = [{"rows": len(column), **statistics(column)} for column in measured]
     report.record["markers"] = entries
-    report.text(f"Errors of the markers, base to tip ({what}). Other tables give their mean.")
+    report.text(
+        f"Errors of the markers, base to tip ({what}). Other tables give their mean."
+    )
     columns = ("rows", "mean", "p95", "max")
     report.errors({f"marker {k}": entry for k, entry in enumerate(entries)}, columns)
 
 
-def _add_figures(report: Report, errors: dict[str, NDArray], shown: tuple[str, str]) -> None:
+def _add_figures(
+    report: Report, errors: dict[str, NDArray], shown: tuple[str, str]
+) -> None:
     figure, ax = new_figure(8.0, 1.5 + 0.32 * len(errors))
     ErrorBoxDisplay(errors).plot(ax, unit="mm")
     caption = "Tip error on held-out motions: quartiles, 5 and 95 %; larger errors as numbers."
@@ -174,7 +194,9 @@ def radius_entry(model: HybridForwardModel) -> dict[str, Any] | None:
     if model.radius_ is None:
         return None
     radius = model.radius_
-    known = f"not known; at least {radius.least_groups} motions in the domain are needed."
+    known = (
+        f"not known; at least {radius.least_groups} motions in the domain are needed."
+    )
     if np.isfinite(radius.inside):
         known = f"{1e3 * radius.inside:.3g} mm, in the domain and for motions as in the log."
     words = f"Estimated error radius covering {100 * radius.coverage:g} % of the tips: {known}"
@@ -189,7 +211,9 @@ def auto_in_short(entry: dict[str, Any]) -> str:
         words = "blend of " + ", ".join(f"{w:.1f} {name}" for name, w in weights)
     if len(entry["mechanical_models"]) > 1:
         words += f" on {entry['taken']}"
-    return words + ("" if entry["play"] is None else f", backlash {millimetres(entry['play'])}")
+    return words + (
+        "" if entry["play"] is None else f", backlash {millimetres(entry['play'])}"
+    )
 
 
 def _in_words(entry: dict[str, Any]) -> list[str]:
@@ -202,9 +226,14 @@ def _in_words(entry: dict[str, Any]) -> list[str]:
         )
     candidates = entry["candidates"]
     # A single candidate is named even if another one has less error: a gain must be clear.
-    names = {*candidates} - {"blend"} if len(entry["weights"]) > 1 else {*entry["weights"]}
+    names = (
+        {*candidates} - {"blend"} if len(entry["weights"]) > 1 else {*entry["weights"]}
+    )
     least, alone = min((candidates[name], name) for name in names)
-    best, without = f"{1e3 * least:.2f} mm", f"{1e3 * candidates['mechanical']:.2f} mm without one."
+    best, without = (
+        f"{1e3 * least:.2f} mm",
+        f"{1e3 * candidates['mechanical']:.2f} mm without one.",
+    )
     text = f"Auto chose the error model {alone}: {best} on held-out motions, {without}"
     if alone == "mechanical":
         text = f"Auto chose no error model: {best} on held-out motions; none is clearly better."
@@ -214,13 +243,18 @@ def _in_words(entry: dict[str, Any]) -> list[str]:
             f"{1e3 * candidates['blend']:.2f} mm on held-out motions, {best} with the best of them "
             f"alone ({alone}), {without}"
         )
-    sentences += [text, f"Expected on new motions like these: {1e3 * entry['expected']:.2f} mm."]
+    sentences += [
+        text,
+        f"Expected on new motions like these: {1e3 * entry['expected']:.2f} mm.",
+    ]
     if entry["play"] is not None:
         width = millimetres(entry["play"])
         order = "Predictions depend on the order of the rows in a motion."
         sentences.append(f"Backlash (play) of the actuators: {width}. {order}")
     elif entry["play_asked"]:
-        sentences.append("Auto looked for backlash (play), but it did not lower the errors.")
+        sentences.append(
+            "Auto looked for backlash (play), but it did not lower the errors."
+        )
     return sentences
 
 
@@ -243,7 +277,10 @@ def write_choice(report: Report, geometry: GeometryChoice) -> None:
         "is the held-out error times the square of the error outside. Of the sets with nearly the "
         "least score, the one with the fewest parameters is calibrated.",
     )
-    rows = [[n, *(f"{1e3 * e:.2f}" for e in errors)] for n, errors in geometry.errors.items()]
+    rows = [
+        [n, *(f"{1e3 * e:.2f}" for e in errors)]
+        for n, errors in geometry.errors.items()
+    ]
     report.table(["parameters", "held-out motions", "outside"], rows)
 
 
@@ -287,16 +324,27 @@ def write_calibration(
 def _agrees(entry: dict[str, Any], others: Sequence[dict[str, Any]]) -> bool:
     """Return whether other calibrations change a value by less than a tenth of its prior."""
     prior = entry["narrowing"] * entry["std_error"]
-    jumps = [abs(one["value"] - entry["value"]) for one in others if one["name"] == entry["name"]]
+    jumps = [
+        abs(one["value"] - entry["value"])
+        for one in others
+        if one["name"] == entry["name"]
+    ]
     if entry["unit"] == "deg":
         jumps = [min(jump, abs(360.0 - jump)) for jump in jumps]  # angles repeat
     return bool(IDENTIFIED * max(jumps, default=0.0) <= prior)
 
 
-def write_elastic_calibration(report: Report, chain: Chain, model: HybridForwardModel) -> None:
+def write_elastic_calibration(
+    report: Report, chain: Chain, model: HybridForwardModel
+) -> None:
     """Add the calibration of the elastic tendons if auto chose them instead of the chain."""
-    if isinstance(model.mechanical_model_, ElasticTendonChain) and model.calibration_ is not None:
+    if (
+        isinstance(model.mechanical_model_, ElasticTendonChain)
+        and model.calibration_ is not None
+    ):
         if isinstance(chain, ConstantCurvatureChain):
             chain = ElasticTendonChain.from_chain(chain)
         title = "Calibration of the elastic tendons that auto chose"
-        write_calibration(report, chain, model.calibration_, [], title, "calibration_of_saved")
+        write_calibration(
+            report, chain, model.calibration_, [], title, "calibration_of_saved"
+        )

@@ -11,7 +11,9 @@ from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow._domain import Domain
 from hybridkin.workflow.report import in_millimetres
 
-_POINTS = 13  # of the path, evenly in time; the farthest points in each direction are added
+_POINTS = (
+    13  # of the path, evenly in time; the farthest points in each direction are added
+)
 _PLACES = 48  # places that are tried for a path
 
 
@@ -28,11 +30,15 @@ def placed(domain: Domain, path: Trajectory, tol: float) -> tuple[Trajectory, fl
     shifts = np.concatenate([np.zeros((1, 3)), places - center])
     x = path.x[some_rows(path)] + shifts[:, None]
     nearest = np.linalg.norm(tips - x[..., None, :], axis=-1).argmin(axis=-1)
-    solution = solver(domain).solve(x, q0=commands[nearest], tol=tol, max_iter=100, restarts=0)
+    solution = solver(domain).solve(
+        x, q0=commands[nearest], tol=tol, max_iter=100, restarts=0
+    )
     inside = (solution.status == IKStatus.CONVERGED).mean(axis=1)
     good = np.flatnonzero(inside == inside.max())
     best = int(good[0])
-    if promised := domain.loaded.promised_errors(solution.q[good].reshape(-1, commands.shape[1])):
+    if promised := domain.loaded.promised_errors(
+        solution.q[good].reshape(-1, commands.shape[1])
+    ):
         best = int(good[promised["mean"].reshape(len(good), -1).mean(axis=1).argmin()])
     return Trajectory(path.t, path.x + shifts[best]), float(inside[best])
 

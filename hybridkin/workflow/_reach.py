@@ -12,7 +12,9 @@ from hybridkin.workflow.path import scaled_path
 from hybridkin.workflow.report import Progress, in_millimetres
 
 _HALVINGS = 7
-_OTHER_UNIT = 100.0  # a path this many times larger than the workspace is in another unit
+_OTHER_UNIT = (
+    100.0  # a path this many times larger than the workspace is in another unit
+)
 
 
 def check_reach(

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from hybridkin.calibration.measured import distance, distances
 from hybridkin.datasets import Log
-from hybridkin.plots import BackboneDisplay, ErrorHistogramDisplay, WorkspaceDisplay, new_figure
+from hybridkin.plots import (
+    BackboneDisplay,
+    ErrorHistogramDisplay,
+    WorkspaceDisplay,
+    new_figure,
+)
 from hybridkin.workflow._fit_report import radius_entry, write_check, write_markers
 from hybridkin.workflow.log import MeasuredLog, checked
 from hybridkin.workflow.model import LoadedModel, check_columns
@@ -58,13 +63,17 @@ def evaluate_log(
         If the log does not pass its check.
     """
     if out is not None:
-        check_out(out, "evaluate", ["error_histogram.png", "workspace.png"], force=force)
+        check_out(
+            out, "evaluate", ["error_histogram.png", "workspace.png"], force=force
+        )
     check_columns(log.q, loaded)
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
     if loaded.play is not None:
         measured.check_order("A model with backlash (play)")
-    motion = measured.motions if measured.named else np.zeros(len(log.q))  # else one motion
+    motion = (
+        measured.motions if measured.named else np.zeros(len(log.q))
+    )  # else one motion
     predicted = loaded.predict(log.q, motion)
     markers = distances(predicted, log.x)
     columns = {"error": np.nanmean(markers, axis=1)}
@@ -123,7 +132,9 @@ def _write_errors(report: Report) -> None:
     motions = sorted(record["motions"].items(), key=lambda item: -item[1]["mean"])
     report.text("## Errors by motion, largest first")
     if record["fitted_rows"] is None:
-        report.text("The model does not say which rows it was fitted to; they have smaller errors.")
+        report.text(
+            "The model does not say which rows it was fitted to; they have smaller errors."
+        )
     if record["fitted_rows"]:
         report.text(
             f"**{record['fitted_rows']} of {everything['rows']} rows were fitted: their errors are "
@@ -138,11 +149,17 @@ def _write_errors(report: Report) -> None:
     columns += [share for share in _SHARES if share in everything]
     report.errors({**entries, **dict(motions)}, columns)
     if "radius" in report.record:
-        report.text(f"{report.record['radius']['words']} Rows without a radius do not count.")
+        report.text(
+            f"{report.record['radius']['words']} Rows without a radius do not count."
+        )
 
 
 def _add_figures(
-    report: Report, loaded: LoadedModel, log: MeasuredLog, predicted: NDArray, motion: NDArray
+    report: Report,
+    loaded: LoadedModel,
+    log: MeasuredLog,
+    predicted: NDArray,
+    motion: NDArray,
 ) -> None:
     errors = distance(predicted, log.x)
     figure, ax = new_figure(6.0, 3.6)
@@ -156,4 +173,6 @@ def _add_figures(
         q = loaded.effective(log.q, motion)[row]
         body = BackboneDisplay.from_estimator(loaded.chain, q).points[0]
     WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row).plot(ax, unit="mm")
-    report.figure("workspace", figure, "Measured tips, coloured by the tip error of the model.")
+    report.figure(
+        "workspace", figure, "Measured tips, coloured by the tip error of the model."
+    )

@@ -53,7 +53,9 @@ def export_model(
     report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
     if dt is not None:
         limits = path_limits(loaded) if limits is None else limits
-        settings: dict[str, Any] = {k: v for k, v in vars(limits).items() if k != "source"}
+        settings: dict[str, Any] = {
+            k: v for k, v in vars(limits).items() if k != "source"
+        }
         settings |= {"q_pref": Domain(loaded, limits).preferred}
         model = InverseKinematics(loaded.module, dt=dt, **settings)
         report.record["limits"] = vars(limits)
@@ -68,7 +70,9 @@ def _about_q(loaded: LoadedModel) -> str:
     log = loaded.log_format()
     factors = np.broadcast_to(log.q_factor, len(log.q))
     rows = zip(factors, log.q, strict=True)
-    terms = ", ".join(f"q[{i}] = {factor:g} * {name}" for i, (factor, name) in enumerate(rows))
+    terms = ", ".join(
+        f"q[{i}] = {factor:g} * {name}" for i, (factor, name) in enumerate(rows)
+    )
     unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
     about_q = f"q from the columns of the log{unit}: {terms}."
     if loaded.play is None:

@@ -64,7 +64,10 @@ _DATA_QUADRATIC = "data-driven, quadratic"
 _DATA_ELM = "data-driven, ELM"
 _HYBRID_ELM = "hybrid, ELM"
 _FILES = ("model.safetensors", "robot.toml", "held_out.png", "error_histogram.png")
-_ROWS_PER_PROCESS = {True: 150, False: 1500}  # with and without auto; fewer are not worth a start
+_ROWS_PER_PROCESS = {
+    True: 150,
+    False: 1500,
+}  # with and without auto; fewer are not worth a start
 
 
 @dataclass(frozen=True)
@@ -162,7 +165,9 @@ class _Rows(NamedTuple):
             messages = [*geometry.messages]
         if chain is None or not names:
             return chain, None, messages
-        result, more = fit_geometry(chain, self.q, self.x, names, self.settings.loss, start=start)
+        result, more = fit_geometry(
+            chain, self.q, self.x, names, self.settings.loss, start=start
+        )
         return chain, result, messages + more
 
     def rival_entries(self) -> list[dict[str, Any]]:
@@ -178,7 +183,9 @@ class _Rows(NamedTuple):
         """Return the described chain, with a fitted base if the base is calibrated."""
         if not self.robot.base_is_free:
             return chain
-        return fit_geometry(chain, self.q, self.x, ("base",), self.settings.loss)[0].chain
+        return fit_geometry(chain, self.q, self.x, ("base",), self.settings.loss)[
+            0
+        ].chain
 
     def mechanical(self) -> ForwardModel:
         """Return the calibrated chain; for a robot without segments a linear model of the rows."""
@@ -188,7 +195,9 @@ class _Rows(NamedTuple):
             return error_module(linear, torch.from_numpy(self.q))
         return chain if result is None else result.chain
 
-    def with_play_detected(self, log: MeasuredLog, calibrated: ForwardModel | None) -> _Rows:
+    def with_play_detected(
+        self, log: MeasuredLog, calibrated: ForwardModel | None
+    ) -> _Rows:
         """Return the rows with a setting `play` that is not "detect"."""
         settings = self.settings
         if settings.play != "detect":
@@ -254,7 +263,9 @@ def compare_by_group(
     parts = folds(log.q, log.motions, settings.n_folds)
     rows = _Rows(log.q, log.x, log.motions, robot, settings)
     if settings.play == "detect":
-        chain = None if robot.chain is None else rows.with_geometry_chosen().mechanical()
+        chain = (
+            None if robot.chain is None else rows.with_geometry_chosen().mechanical()
+        )
         rows = rows.with_play_detected(log, chain)
     jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in parts)
     fold, distance = np.empty(len(log.q), dtype=int), np.empty(len(log.q))
@@ -262,11 +273,15 @@ def compare_by_group(
     most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
     most = min(effective_n_jobs(n_jobs or 1), len(parts), most)
     # Otherwise torch and BLAS start threads in every process, which wait for each other.
-    workers = Parallel(n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator")
+    workers = Parallel(
+        n_jobs=most, backend="loky", inner_max_num_threads=1, return_as="generator"
+    )
     results: Any = workers(jobs)
     progress("cross-validation by motion", 0, len(parts))
     fitted_folds = []
-    for i, ((train, test), (errors, chosen)) in enumerate(zip(parts, results, strict=True)):
+    for i, ((train, test), (errors, chosen)) in enumerate(
+        zip(parts, results, strict=True)
+    ):
         fitted_folds.append(errors)
         found.fold[test] = i
         held_out = held_out_distances(log.q[train], log.motions[train], log.q[test])
@@ -274,12 +289,16 @@ def compare_by_group(
         found.choices.append(chosen)
         progress("cross-validation by motion", i + 1, len(parts))
     for name in sorted(fitted_folds[0], key=_kind_of_model):
-        if any(name not in errors for errors in fitted_folds):  # kernel ridge: up to 2000 rows
+        if any(
+            name not in errors for errors in fitted_folds
+        ):  # kernel ridge: up to 2000 rows
             continue
         found.markers[name] = np.empty((len(log.q), log.x.shape[1] // 3))
         for (_, test), errors in zip(parts, fitted_folds, strict=True):
             found.markers[name][test] = errors[name]
-    found.errors.update((name, np.nanmean(values, 1)) for name, values in found.markers.items())
+    found.errors.update(
+        (name, np.nanmean(values, 1)) for name, values in found.markers.items()
+    )
     return found
 
 
@@ -332,7 +351,9 @@ def fit_log(
     """
     check_out(out, "fit", _FILES, force=force)
     if robot.chain is None and settings.play not in (None, "detect"):
-        raise ValueError("`play` requires a robot with segments: its width is a length.")
+        raise ValueError(
+            "`play` requires a robot with segments: its width is a length."
+        )
     complete = checked(log, robot.chain, robot.base_is_free)
     _check(complete, settings, force)
     data = complete.thinned(settings.max_rows)
@@ -345,7 +366,9 @@ def fit_log(
         warnings.warn(message, stacklevel=2)
     chain = start if result is None else result.chain
     rows = rows.with_play_detected(complete, chain)
-    compared = compare_by_group(data, robot, rows.settings, n_jobs=n_jobs, progress=progress)
+    compared = compare_by_group(
+        data, robot, rows.settings, n_jobs=n_jobs, progress=progress
+    )
     saved = AUTO if settings.auto else _best_to_save(compared)
     report_fit = partial(progress, f"fitting {saved} to all motions")
     report_fit(0, 1)
@@ -408,14 +431,30 @@ def _check(log: MeasuredLog, settings: FitSettings, force: bool) -> None:
 
 
 def _add_model(
-    report: Report, model: HybridForwardModel, robot: robots.RobotDescription, log: MeasuredLog
+    report: Report,
+    model: HybridForwardModel,
+    robot: robots.RobotDescription,
+    log: MeasuredLog,
 ) -> None:
     """Add the model and the description of its robot to the files of the report."""
-    kept = ("log", "robot", "n_whole", "n_motions", "excluded", "loss", "saved", "chosen")
+    kept = (
+        "log",
+        "robot",
+        "n_whole",
+        "n_motions",
+        "excluded",
+        "loss",
+        "saved",
+        "chosen",
+    )
     training = {key: report.record[key] for key in (*kept, "held_out", "promise")}
     training |= {"rows": report.record["n"], "split": log.split}
-    model._fitted_rows = np.unique(row_digests(log.q, log.x))  # with those dropped by thinning
-    report.file("model.safetensors", lambda path: save_model(model, path, training=training))
+    model._fitted_rows = np.unique(
+        row_digests(log.q, log.x)
+    )  # with those dropped by thinning
+    report.file(
+        "model.safetensors", lambda path: save_model(model, path, training=training)
+    )
     report.text("The model: `hybridkin.load_model('model.safetensors')`.")
     if robot.path is not None:  # the description it was made from
         report.file("robot.toml", partial(shutil.copyfile, robot.path))
@@ -428,7 +467,11 @@ def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, 
     errors = {}
     choices = {}
     for name, model in _models(train, train.mechanical()).items():
-        options = {"groups": train.groups, "geometry": train.geometry, "held_out": False}
+        options = {
+            "groups": train.groups,
+            "geometry": train.geometry,
+            "held_out": False,
+        }
         model.fit_with_messages(train.q, train.x, **options)
         for candidate, module in (model.candidates_ or {}).items():
             if candidate != "mechanical":
@@ -484,7 +527,9 @@ def _chosen(model: HybridForwardModel) -> str:
         return auto_in_short(auto_entry(model))
     network = model.error_model_
     if isinstance(network, ELMRegressorCV):
-        return f"{network.best_params_['n_hidden']} neurons, alpha = {network.alpha_:.3g}"
+        return (
+            f"{network.best_params_['n_hidden']} neurons, alpha = {network.alpha_:.3g}"
+        )
     if not isinstance(model.error_model, str):
         return "a network for each marker"
     return "no correction" if model.error_model == "drop" else model.error_model
@@ -492,5 +537,9 @@ def _chosen(model: HybridForwardModel) -> str:
 
 def _held_out(model: HybridForwardModel, module: ForwardModel, test: _Rows) -> NDArray:
     """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
-    q = test.q if model.play_ is None else model.play_.apply_by_group(test.q, test.groups)
+    q = (
+        test.q
+        if model.play_ is None
+        else model.play_.apply_by_group(test.q, test.groups)
+    )
     return distances(evaluate(module, np.array(q, dtype=float))[0], test.x)

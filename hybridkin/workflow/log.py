@@ -28,8 +28,12 @@ class LogError(ValueError):
 
     def __init__(self, report: LogReport) -> None:
         first = report.errors[0]
-        more = f" ({len(report.errors) - 1} more above)" if len(report.errors) > 1 else ""
-        super().__init__(f"the log did not pass its check: {first.message} {first.advice}{more}")
+        more = (
+            f" ({len(report.errors) - 1} more above)" if len(report.errors) > 1 else ""
+        )
+        super().__init__(
+            f"the log did not pass its check: {first.message} {first.advice}{more}"
+        )
         self.report = report
 
 
@@ -138,22 +142,30 @@ def read_log(
     ValueError
         If columns or motions do not exist.
     """
-    if not isinstance(exclude, Sequence) or not all(isinstance(p, str) for p in exclude):
-        raise TypeError(f"`exclude` must be a list of patterns of names, got {exclude!r:.80}.")
+    if not isinstance(exclude, Sequence) or not all(
+        isinstance(p, str) for p in exclude
+    ):
+        raise TypeError(
+            f"`exclude` must be a list of patterns of names, got {exclude!r:.80}."
+        )
     suffix = log_format.group_suffix
     log = load_log(path, **log_format.reading, delimiter=delimiter, drop_invalid=True)
     if log.groups is None and exclude:
         raise ValueError("`exclude` needs `groups`, the column that names the motions.")
     if log.groups is not None:
         motions = [str(name).removesuffix(suffix) for name in log.groups]
-        kept = np.array([not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions])
+        kept = np.array(
+            [not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions]
+        )
         if not kept.any():
             raise ValueError(
                 f"`exclude` must leave at least 2 motions, but leaves none of {len({*motions})}; "
                 "use fewer patterns."
             )
         log = replace(log, groups=np.array(motions)).rows(kept)
-    report = check_log(log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid)
+    report = check_log(
+        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
+    )
     measured = _with_motions(log, report, tuple(exclude))
     if drop_frozen:
         frozen = [f.rows for f in report.findings if f.kind == "frozen tip"]
@@ -169,7 +181,9 @@ def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
     return _with_motions(log, check_log(log, chain=chain, base_is_free=base_is_free))
 
 
-def _with_motions(log: Log, report: LogReport, excluded: tuple[str, ...] = ()) -> MeasuredLog:
+def _with_motions(
+    log: Log, report: LogReport, excluded: tuple[str, ...] = ()
+) -> MeasuredLog:
     named, n, columns = log.groups is not None, len(log.q), dict(vars(log))
     if not named:
         columns["groups"] = np.arange(n) * _BLOCKS // n

@@ -62,7 +62,9 @@ class LoadedModel:
     @property
     def chain(self) -> Chain | None:
         """The mechanical model if it is a chain, else None."""
-        mechanical = self.model if self.hybrid is None else self.hybrid.mechanical_model_
+        mechanical = (
+            self.model if self.hybrid is None else self.hybrid.mechanical_model_
+        )
         return mechanical if isinstance(mechanical, Chain) else None
 
     @property
@@ -73,7 +75,11 @@ class LoadedModel:
     @property
     def n_actuators(self) -> int:
         """Size of q."""
-        return self.module.n_actuators if self.hybrid is None else self.hybrid.n_features_in_
+        return (
+            self.module.n_actuators
+            if self.hybrid is None
+            else self.hybrid.n_features_in_
+        )
 
     @property
     def trained_range(self) -> robots.Limits | None:
@@ -99,7 +105,9 @@ class LoadedModel:
         """Return the motion of the actuators (N, n) for commands q of one motion, or of groups."""
         if self.play is None:
             return q
-        return self.play.apply_by_group(q, np.zeros(len(q)) if groups is None else groups)
+        return self.play.apply_by_group(
+            q, np.zeros(len(q)) if groups is None else groups
+        )
 
     def predict(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
         """Return tips (N, 3) [m], or all markers; `groups`, the motions, matter with backlash."""
@@ -113,18 +121,26 @@ class LoadedModel:
 
     def domain_distance(self, q: NDArray) -> NDArray:
         """Return the distance of rows q (N, n) from the training rows, at most 1 in the domain."""
-        return evaluate(self.module, np.array(q, dtype=float), value=False, distance=True)[0]
+        return evaluate(
+            self.module, np.array(q, dtype=float), value=False, distance=True
+        )[0]
 
-    def was_fitted(self, q: NDArray, x: NDArray, motions: NDArray) -> NDArray[np.bool_] | None:
+    def was_fitted(
+        self, q: NDArray, x: NDArray, motions: NDArray
+    ) -> NDArray[np.bool_] | None:
         """Return whether each row (N,), to a micrometre, or half of its motion was fitted.
 
         None if the model does not hold its rows.
         """
         if self.hybrid is None:
-            return None if self.header else np.zeros(len(q), dtype=bool)  # nominal: no fit
+            return (
+                None if self.header else np.zeros(len(q), dtype=bool)
+            )  # nominal: no fit
         fitted = np.isin(row_digests(q, x), self.hybrid._fitted_rows)
         _, motion = np.unique(motions, return_inverse=True)
-        return fitted | (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
+        return (
+            fitted | (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
+        )
 
     @property
     def _training(self) -> dict[str, Any]:
@@ -139,7 +155,9 @@ class LoadedModel:
     def kind(self) -> str:
         """What the model is, as the fit calls it: "hybrid, ELM", "mechanical, nominal", ..."""
         nominal = "data-driven" if self.chain is None else "mechanical, nominal"
-        return self._training.get("saved") or (nominal if self.hybrid is None else "hybrid")
+        return self._training.get("saved") or (
+            nominal if self.hybrid is None else "hybrid"
+        )
 
     def promised_errors(self, q: NDArray) -> dict[str, NDArray]:
         """Return the "mean" errors and their "p95" (N,) [m] to expect where the actuators do q.
@@ -155,7 +173,10 @@ class LoadedModel:
             "per_distance": 0.0,
             "p95": known["p95"] / known["mean"],
         }
-        promise, far = Promise(**self._training.get("promise", constant)), np.zeros(len(q))
+        promise, far = (
+            Promise(**self._training.get("promise", constant)),
+            np.zeros(len(q)),
+        )
         tested = None if self.hybrid is None else self.hybrid.module_.fitted.tested
         if self.hybrid is not None and tested is not None:
             far = distances(tested, q + as_array(self.hybrid.module_.shift))
@@ -245,10 +266,14 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
             )
         return LoadedModel(description.name, path, description.chain, description)
     if path.suffix.lower() in LOG_SUFFIXES:
-        raise ValueError(f"`model` must be a model or a robot description, got the log {path}.")
+        raise ValueError(
+            f"`model` must be a model or a robot description, got the log {path}."
+        )
     if path.is_dir():
         if not (path / _MODEL).is_file():
-            raise FileNotFoundError(f"`model` {path} is a folder without {_MODEL}; name the file.")
+            raise FileNotFoundError(
+                f"`model` {path} is a folder without {_MODEL}; name the file."
+            )
         path = path / _MODEL
     file, beside = path, path.with_name(_ROBOT)
     model = load_model(file)
@@ -257,7 +282,10 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
     description = None if robot is None else robots.read_description(robot)
     name = path.stem if description is None else description.name
     loaded = LoadedModel(name, path, model, description, model_header(file))
-    if description is not None and description.n_actuators not in (0, loaded.n_actuators):
+    if description is not None and description.n_actuators not in (
+        0,
+        loaded.n_actuators,
+    ):
         raise ValueError(
             f"`robot` {description.name!r} has {description.n_actuators} actuators, but the model "
             f"{path} has {loaded.n_actuators}; give the description that it was fitted with."

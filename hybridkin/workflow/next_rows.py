@@ -87,12 +87,22 @@ def next_rows(
         where = f"along the path, which the model reaches to within {1e3 * far:.3g} mm"
     known = None if measured is None else loaded.effective(measured.q, measured.motions)
     progress("choosing configurations", 0, 1)
-    rows, errors = choose_rows(loaded.model, candidates, n, measured=known, target=target)
-    sent = candidates[rows] if loaded.play is None else loaded.play.command(candidates[rows])[0]
+    rows, errors = choose_rows(
+        loaded.model, candidates, n, measured=known, target=target
+    )
+    sent = (
+        candidates[rows]
+        if loaded.play is None
+        else loaded.play.command(candidates[rows])[0]
+    )
     report = Report(f"{loaded.name}: {n} configurations to measure next")
     n_measured = 0 if known is None else len(known)
-    report.record.update(model=str(loaded.path), n=n, n_measured=n_measured, where=where)
-    report.record.update(limits=dict(vars(limits)), expected_errors=errors, command="next")
+    report.record.update(
+        model=str(loaded.path), n=n, n_measured=n_measured, where=where
+    )
+    report.record.update(
+        limits=dict(vars(limits)), expected_errors=errors, command="next"
+    )
     shown = sorted({k for k in _SHOWN if k < n} | {n})
     table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
     report.table(["rows", "expected error [mm]"], table)

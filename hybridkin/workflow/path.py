@@ -21,7 +21,9 @@ _TOL = 1e-4  # of a point that lies in the domain [m]
 _SHAPES = ("figure-eight", "spiral", "line")
 
 
-def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> Trajectory:
+def read_path(
+    path: str | Path, *, unit: str = "m", dt: float | None = None
+) -> Trajectory:
     """Return a path from a CSV file of t, x, y, z or x, y, z.
 
     Parameters
@@ -47,21 +49,31 @@ def read_path(path: str | Path, *, unit: str = "m", dt: float | None = None) -> 
     """
     file, dt = as_path(path), None if dt is None else number(dt, "dt")
     if not file.is_file():
-        raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {file}.")
+        raise FileNotFoundError(
+            f"`path` must be a CSV file of points, there is none at {file}."
+        )
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise ValueError(f"`path` must be a CSV file of points, {file} is not text.") from error
+        raise ValueError(
+            f"`path` must be a CSV file of points, {file} is not text."
+        ) from error
     rows = [line.split(",") for line in lines if line.strip() and line[0] != "#"]
     if max(map(len, rows), default=0) == 3:
         if dt is None:
-            raise ValueError(f"{file} has no times; give the time between its points (--dt 0.02).")
+            raise ValueError(
+                f"{file} has no times; give the time between its points (--dt 0.02)."
+            )
         return trajectories.from_csv(file, dt=dt, unit=unit)
     timed = trajectories.from_csv(file, unit=unit)
     if dt is None:
         return timed
-    t = timed.t[0] + dt * np.arange(int(trajectories.periods(timed.duration, dt) + 1e-9) + 1)
-    return Trajectory(t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1))
+    t = timed.t[0] + dt * np.arange(
+        int(trajectories.periods(timed.duration, dt) + 1e-9) + 1
+    )
+    return Trajectory(
+        t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1)
+    )
 
 
 def scaled_path(path: Trajectory, scale: float) -> Trajectory:
@@ -151,7 +163,9 @@ def shape_path(
     if shape == "figure-eight":
         path = trajectories.figure_eight(middle, extent, normal=across, **timing)
     elif shape == "spiral":
-        path = trajectories.spiral(middle, extent, normal=across, turns=turns, rise=rise, **timing)
+        path = trajectories.spiral(
+            middle, extent, normal=across, turns=turns, rise=rise, **timing
+        )
     else:
         path = trajectories.line(middle - half, middle + half, **timing)
     return placed(domain, path, _TOL)[0] if center is None else path

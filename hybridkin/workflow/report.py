@@ -64,7 +64,9 @@ Progress = Callable[[str, int, int], None]
 
 def quadratic() -> Any:
     """Return a plain quadratic polynomial by least squares."""
-    return make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression())
+    return make_pipeline(
+        MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression()
+    )
 
 
 def statistics(errors: NDArray, motions: NDArray | None = None) -> dict[str, Any]:
@@ -79,8 +81,12 @@ def statistics(errors: NDArray, motions: NDArray | None = None) -> dict[str, Any
     """
     spread = {"mean": errors.mean(), "std": errors.std(), "median": np.median(errors)}
     if motions is not None:
-        sums = np.bincount(np.unique(motions, return_inverse=True)[1], errors - errors.mean())
-        spread["std_error"] = np.sqrt(len(sums) * (sums @ sums) / (len(sums) - 1)) / len(errors)
+        sums = np.bincount(
+            np.unique(motions, return_inverse=True)[1], errors - errors.mean()
+        )
+        spread["std_error"] = np.sqrt(
+            len(sums) * (sums @ sums) / (len(sums) - 1)
+        ) / len(errors)
     return {**spread, "p95": np.percentile(errors, 95), "max": errors.max()}
 
 
@@ -130,13 +136,19 @@ def geometry_entries(start: Chain, result: CalibrationResult) -> list[dict[str, 
     return entries
 
 
-def _values(start: Chain, name: str, value: NDArray) -> tuple[NDArray, NDArray, list[_Unit]]:
+def _values(
+    start: Chain, name: str, value: NDArray
+) -> tuple[NDArray, NDArray, list[_Unit]]:
     """Return a parameter before and after its calibration, and the unit of every number."""
     before = _start_value(start, name)
     if name == "base":
         turn = Rotation.from_matrix(value[:3, :3] @ before[:3, :3].T).as_rotvec()
         after = np.append(turn, value[:3, 3])
-        return np.append(np.zeros(3), before[:3, 3]), after, 3 * [_DEGREES] + 3 * [_MILLIMETRES]
+        return (
+            np.append(np.zeros(3), before[:3, 3]),
+            after,
+            3 * [_DEGREES] + 3 * [_MILLIMETRES],
+        )
     unit: _Unit = _UNITS.get(name, _MILLIMETRES)
     if name == "actuator_zeros" and isinstance(start, ArcChain) and not start.in_metres:
         unit = (1.0, "units of q")
@@ -145,8 +157,12 @@ def _values(start: Chain, name: str, value: NDArray) -> tuple[NDArray, NDArray, 
 
 def _start_value(start: Chain, name: str) -> NDArray:
     """Return the start value of a parameter of `calibrate`."""
-    geometry = {key: value.detach().cpu().numpy() for key, value in start.geometry().items()}
-    if name == "turns" and isinstance(start, ArcChain):  # the angle of each ring's first actuator
+    geometry = {
+        key: value.detach().cpu().numpy() for key, value in start.geometry().items()
+    }
+    if name == "turns" and isinstance(
+        start, ArcChain
+    ):  # the angle of each ring's first actuator
         counts = np.array(start.actuators_per_segment)
         return geometry["angles"][np.cumsum(counts) - counts]
     if name == "tool" and name not in geometry:
@@ -168,7 +184,9 @@ class Report:
     def __init__(self, title: str) -> None:
         self.record: dict[str, Any] = {"title": title, "versions": versions()}
         # As Markdown, and text or header and rows of a table.
-        self._blocks: list[tuple[str, str | tuple[Sequence[str], Sequence[Sequence[str]]]]] = []
+        self._blocks: list[
+            tuple[str, str | tuple[Sequence[str], Sequence[Sequence[str]]]]
+        ] = []
         self._files: dict[str, Callable[[Path], Any]] = {}
         self.text(f"# {title}")
 
@@ -196,7 +214,13 @@ class Report:
 
     def geometry(self, entries: Sequence[dict[str, Any]]) -> None:
         """Add a table of calibrated parameters, see `geometry_entries`."""
-        header = ["parameter", "start", "calibrated", "standard error", "prior narrowed by"]
+        header = [
+            "parameter",
+            "start",
+            "calibrated",
+            "standard error",
+            "prior narrowed by",
+        ]
         rows = []
         for entry in entries:
             identified = "yes" if entry["identified"] else "no"
@@ -264,22 +288,32 @@ def _wrapped(text: str) -> str:
     return "\n".join(lines)
 
 
-def check_out(out: str | Path, command: str, files: Sequence[str] = (), *, force: bool) -> None:
+def check_out(
+    out: str | Path, command: str, files: Sequence[str] = (), *, force: bool
+) -> None:
     """Raise, before any work, if `out` cannot be used as a folder for results.
 
     `files` and a report are replaced only if the report is one of the same command, or by `force`.
     """
     path = as_path(out, "out")
     if path.exists() and not path.is_dir():
-        raise FileExistsError(f"`out` must be a folder, got the file {path}; name another one.")
-    home = next(parent for parent in [path, *path.absolute().parents] if parent.exists())
+        raise FileExistsError(
+            f"`out` must be a folder, got the file {path}; name another one."
+        )
+    home = next(
+        parent for parent in [path, *path.absolute().parents] if parent.exists()
+    )
     if not os.access(home, os.W_OK):
-        raise PermissionError(f"`out` must be writable, but {home} is not; name another folder.")
+        raise PermissionError(
+            f"`out` must be writable, but {home} is not; name another folder."
+        )
     report = path / "report.json"
     entry = f'"command": "{command}"'
     if force or (report.is_file() and entry in report.read_text(errors="replace")):
         return
-    there = [name for name in (*files, report.name, "report.md") if (path / name).exists()]
+    there = [
+        name for name in (*files, report.name, "report.md") if (path / name).exists()
+    ]
     if there:
         raise FileExistsError(
             f"`out` {path} has {', '.join(there)}, not written by `hybridkin {command}`; name "

@@ -117,13 +117,23 @@ def track_path(
         n=len(path),
         duration_s=path.duration,
         reached=score(track)[1],
-        errors={"mean": track.mean_error, "p95": track.p95_error, "max": track.max_error},
+        errors={
+            "mean": track.mean_error,
+            "p95": track.p95_error,
+            "max": track.max_error,
+        },
         tol=tol,
         in_domain=None if loaded.hybrid is None else float(inside.mean()),
-        expected={name: errors.mean() for name, errors in promised.items() if len(errors)},
+        expected={
+            name: errors.mean() for name, errors in promised.items() if len(errors)
+        },
         play=loaded.play_width,
         statuses=dict(Counter(names)),
-        lead_in={"rows": n_lead, "duration_s": whole.t[n_lead] - whole.t[0], "start": stands},
+        lead_in={
+            "rows": n_lead,
+            "duration_s": whole.t[n_lead] - whole.t[0],
+            "start": stands,
+        },
         limits=dict(vars(limits)),
         largest_speed=speeds.max(initial=0.0),
         columns=dict(vars(log_format)),
@@ -133,7 +143,11 @@ def track_path(
         outside = better_place(domain, path, tol)
     _write_summary(report, loaded.plane_in_words(), outside)
     _add_path(report, loaded, track)
-    shown = {"command": sent} if loaded.play is None else {"command": sent, "actuator": whole.q}
+    shown = (
+        {"command": sent}
+        if loaded.play is None
+        else {"command": sent, "actuator": whole.q}
+    )
     _add_commands(report, domain, whole.t, shown, n_lead)
     statuses = [*[LEAD_IN] * n_lead, *names]
     report.file("track.csv", partial(_write_track, whole, shown, statuses, log_format))
@@ -146,13 +160,18 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
     high = domain.limits.q_max
     if isinstance(start, str):
         if start not in ("rest", "path"):
-            raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
+            raise ValueError(
+                f'`start` must be "rest", "path" or numbers, got {start!r}.'
+            )
         if start == "path":
             return None
         zero = domain.tendons or ((low <= 0) & (high >= 0)).all()
         return domain.rest if zero else domain.preferred
     q = np.array(start, dtype=float)
-    if q.shape != low.shape or (np.abs(q - 0.5 * (low + high)) > 1.5 * (high - low)).any():
+    if (
+        q.shape != low.shape
+        or (np.abs(q - 0.5 * (low + high)) > 1.5 * (high - low)).any()
+    ):
         raise ValueError(
             f"`start` must be {len(low)} values in or near the limits, {low.round(4)} to "
             f"{high.round(4)} m, got {q} m; check its unit and sign."
@@ -160,7 +179,9 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
     return q
 
 
-def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[Track, int]:
+def _with_lead_in(
+    track: Track, start: NDArray | None, domain: Domain
+) -> tuple[Track, int]:
     """Return a track that begins at `start`, and the number of rows from there to the path.
 
     These rows begin and end at rest; their targets are the tips of the model.
@@ -176,15 +197,22 @@ def _with_lead_in(track: Track, start: NDArray | None, domain: Domain) -> tuple[
         seconds = np.sqrt(_PUSH * np.abs(way) / limits.ddq_max).max()
         moves = max(moves, math.ceil(seconds / dt))
         n = moves + 1  # the path begins at rest
-    q = track.q[0] - (1.0 - trajectories.min_jerk(np.arange(n) / max(moves, 1)))[:, None] * way
+    q = (
+        track.q[0]
+        - (1.0 - trajectories.min_jerk(np.arange(n) / max(moves, 1)))[:, None] * way
+    )
     x = domain.loaded.tips(q)
     before = {"q": q, "x": x, "target": x, "error": np.zeros(n)}
-    rows = {name: np.concatenate([rows, vars(track)[name]]) for name, rows in before.items()}
+    rows = {
+        name: np.concatenate([rows, vars(track)[name]]) for name, rows in before.items()
+    }
     t = np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt])
     return replace(track, t=t, **rows), n
 
 
-def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress) -> Track:
+def best_track(
+    domain: Domain, path: Trajectory, tol: float, progress: Progress
+) -> Track:
     """Return the track of several attempts that reaches most points in the domain."""
     commands, tips = domain.sample
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
@@ -198,7 +226,9 @@ def best_track(domain: Domain, path: Trajectory, tol: float, progress: Progress)
         options = {"q_pref": domain.posture(pull), "dt": dt}
         ik = InverseKinematics(domain.loaded.module, **bounds, **options)
 
-        def report(done: int, total: int, what: str = f"tracking, attempt {attempt + 1}") -> None:
+        def report(
+            done: int, total: int, what: str = f"tracking, attempt {attempt + 1}"
+        ) -> None:
             progress(what, done + 1, total)
 
         track: Any = ik.track(fine, q0=commands, tol=tol, progress=report)
@@ -275,7 +305,9 @@ def animate_track(
         n_frames=n_frames,
     )
     try:
-        film.save(out, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
+        film.save(
+            out, unit=unit, speed=speed, progress=partial(progress, "drawing frames")
+        )
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
     return {
@@ -296,28 +328,43 @@ def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
     if file.is_dir():
         file = file / "track.csv"
     if not file.is_file():
-        raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
+        raise FileNotFoundError(
+            f"`track` must be a file of commands, there is none at {file}."
+        )
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
     columns: dict[str, Any] = {**log_format.reading, "groups": None}
-    columns["time"] = next((name for name in (TIME, log_format.time) if name in header), None)
+    columns["time"] = next(
+        (name for name in (TIME, log_format.time) if name in header), None
+    )
     if {*TARGET} <= {*header}:
         columns |= {"x": TARGET, "groups": "status"}
     return load_log(file, **columns)
 
 
 def _write_track(
-    track: Track, shown: dict[str, NDArray], statuses: list[str], log: robots.LogFormat, file: Path
+    track: Track,
+    shown: dict[str, NDArray],
+    statuses: list[str],
+    log: robots.LogFormat,
+    file: Path,
 ) -> None:
     """Write commands, and with backlash the motion of the actuators, point by point."""
     lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
-    columns = [_text(track.t), *_text(log.to_log(shown["command"])), *_text(lengths), statuses]
+    columns = [
+        _text(track.t),
+        *_text(log.to_log(shown["command"])),
+        *_text(lengths),
+        statuses,
+    ]
     if "actuator" in shown:
         head += [f"effective_{name}" for name in log.q]
         columns += [*_text(log.to_log(shown["actuator"]))]
     with open(file, "w", encoding="utf-8", newline="") as lines:
-        csv.writer(lines, lineterminator="\n").writerows([head, *zip(*columns, strict=True)])
+        csv.writer(lines, lineterminator="\n").writerows(
+            [head, *zip(*columns, strict=True)]
+        )
 
 
 def _text(values: NDArray) -> NDArray:
@@ -327,7 +374,9 @@ def _text(values: NDArray) -> NDArray:
 def _add_path(report: Report, loaded: LoadedModel, track: Track) -> None:
     figure, axes = new_figure(11.0, 4.6, 1, 3)
     display = TrackingDisplay.from_tracks({f"solver on {loaded.kind}": track})
-    i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])  # the plane of the largest moves
+    i, j = sorted(
+        np.argsort(np.ptp(track.target, axis=0))[1:]
+    )  # the plane of the largest moves
     display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
     display.plot_time(axes[1], unit="mm")
     errors = loaded.expected_errors(track.q)
@@ -354,7 +403,9 @@ def _add_commands(
     ends = np.stack([domain.limits.q_min - half_play, domain.limits.q_max + half_play])
     display = ActuatorDisplay(shown, counts, t, names=log_format.q, limits=ends)
     display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
-    caption = "Commands and their limits, with the names, unit and sign of the robot's logs."
+    caption = (
+        "Commands and their limits, with the names, unit and sign of the robot's logs."
+    )
     if n_lead:
         for ax in axes[:, 0]:
             ax.axvline(t[n_lead], color="0.6", linewidth=1.0)
@@ -371,7 +422,9 @@ def _write_summary(report: Report, plane: str, better: str | None) -> None:
         f"{1e3 * record['tol']:g} mm. Error of the solver in mm: mean {errors['mean']}, 95 % "
         f"quantile {errors['p95']}, max {errors['max']}. Limits: {record['limits']['source']}."
     )
-    report.table(["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()])
+    report.table(
+        ["status", "points"], [[k, str(v)] for k, v in record["statuses"].items()]
+    )
     if record["lead_in"]["rows"]:
         report.text(
             "Rows with the status LEAD_IN move from the start of the robot to the path: {rows} in "
@@ -395,7 +448,9 @@ def _promise_in_words(record: dict[str, Any], better: str | None) -> str:
     inside = record["in_domain"]
     words = "The error of the robot is not known: the model has no held-out errors"
     if record["expected"]:
-        expected = {name: f"{1e3 * error:.2g} mm" for name, error in record["expected"].items()}
+        expected = {
+            name: f"{1e3 * error:.2g} mm" for name, error in record["expected"].items()
+        }
         words = f"Expect {expected['mean']} (95 % below {expected['p95']}) of the robot inside "
         words += "the log"
     if inside is not None and inside < 1.0:

@@ -92,19 +92,27 @@ def verify_track(
     rows = rows[used]
     x = x[used]
     if len(rows) < 3:
-        raise ValueError(f"`log` must have at least 3 measured tips of the path, got {len(rows)}.")
+        raise ValueError(
+            f"`log` must have at least 3 measured tips of the path, got {len(rows)}."
+        )
     q = motion[rows]
     errors = np.linalg.norm(x - loaded.tips(q), axis=1)
     causes = _explained(loaded, motion, rows, x)
     promised = loaded.promised_errors(q)
-    parts = {name: _entry(errors, promised, part) for name, part in _parts(loaded, q).items()}
+    parts = {
+        name: _entry(errors, promised, part) for name, part in _parts(loaded, q).items()
+    }
     kept = None
     if promised:
         kept = bool(parts["path"]["mean"] <= _KEPT * parts["path"]["promised"])
     likely = max(causes, key=causes.__getitem__)
     cause = likely if not kept and causes[likely] > _LIKELY else None
-    report = Report(f"{loaded.name}: {Path(track).name} against {Path(log.source).name}")
-    report.record.update(command="verify", model=str(loaded.path), track=str(track), log=log.source)
+    report = Report(
+        f"{loaded.name}: {Path(track).name} against {Path(log.source).name}"
+    )
+    report.record.update(
+        command="verify", model=str(loaded.path), track=str(track), log=log.source
+    )
     report.record.update(parts=parts, kept=kept, causes=causes, cause=cause)
     _write(report)
     return report, [] if out is None else report.write(out)
@@ -144,7 +152,9 @@ def _parts(loaded: LoadedModel, q: NDArray) -> dict[str, NDArray]:
     return {name: rows for name, rows in parts.items() if rows.any()}
 
 
-def _entry(errors: NDArray, promised: dict[str, NDArray], rows: NDArray) -> dict[str, Any]:
+def _entry(
+    errors: NDArray, promised: dict[str, NDArray], rows: NDArray
+) -> dict[str, Any]:
     entry = {"rows": rows.sum()}
     if promised:
         entry["promised"] = promised["mean"][rows].mean()
@@ -152,7 +162,9 @@ def _entry(errors: NDArray, promised: dict[str, NDArray], rows: NDArray) -> dict
     return {**entry, **statistics(errors[rows])}
 
 
-def _explained(loaded: LoadedModel, motion: NDArray, rows: NDArray, x: NDArray) -> dict[str, float]:
+def _explained(
+    loaded: LoadedModel, motion: NDArray, rows: NDArray, x: NDArray
+) -> dict[str, float]:
     """Return the share of the mean squared error that each cause explains."""
     q = motion[rows]
     tips, J = evaluate(loaded.module, q, jacobian=True)
@@ -166,7 +178,9 @@ def _explained(loaded: LoadedModel, motion: NDArray, rows: NDArray, x: NDArray) 
         "off the plane of the log": np.square(residual - linear).sum(),
     }
     whole = max(np.square(residual).sum(), np.finfo(float).tiny)
-    return {cause: max(0.0, 1.0 - float(squares / whole)) for cause, squares in left.items()}
+    return {
+        cause: max(0.0, 1.0 - float(squares / whole)) for cause, squares in left.items()
+    }
 
 
 def _off_plane(loaded: LoadedModel, q: NDArray) -> NDArray:
@@ -178,7 +192,9 @@ def _off_plane(loaded: LoadedModel, q: NDArray) -> NDArray:
     return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
 
 
-def _without_backlash(motion: NDArray, rows: NDArray, J: NDArray, residual: NDArray) -> float:
+def _without_backlash(
+    motion: NDArray, rows: NDArray, J: NDArray, residual: NDArray
+) -> float:
     """Return the sum of squares that the most likely backlash of every actuator leaves.
 
     The tip errors are linear in the widths if the shape of the lag, from -1/2 to 1/2, is known. It
@@ -221,10 +237,16 @@ def _write(report: Report) -> None:
     promise = "The model promised no error"
     if kept is not None:
         promise = "Promised: mean {promised}, 95 % below {promised_p95}".format(**path)
-    report.text(f"{promise}. Robot: mean {{mean}}, 95 % below {{p95}}, max {{max}}.".format(**path))
+    report.text(
+        f"{promise}. Robot: mean {{mean}}, 95 % below {{p95}}, max {{max}}.".format(
+            **path
+        )
+    )
     report.errors(parts, _COLUMNS)
     shares = report.record["causes"].items()
-    report.table(["cause", "explains [%]"], [[name, f"{100 * v:.0f}"] for name, v in shares])
+    report.table(
+        ["cause", "explains [%]"], [[name, f"{100 * v:.0f}"] for name, v in shares]
+    )
     if kept:
         report.text("The promise is kept.")
     elif cause is None:
