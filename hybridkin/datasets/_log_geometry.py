@@ -215,7 +215,10 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
             f"the robot is described with a length of {robot.length:g} m and radii up to "
             f"{radii.max():g} m, which look like millimetres; q and x do not fit to them."
         )
-        advice = "give radii, lengths and offsets of the description in metres: divide them by 1000."
+        advice = (
+            "give radii, lengths and offsets of the description in metres: "
+            "divide them by 1000."
+        )
         yield LogFinding("units", "error", message, advice)
         return
     if q_factor is not None:
