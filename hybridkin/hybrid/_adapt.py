@@ -20,7 +20,7 @@ from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import MISFITS, SWITCH, too_far
 from hybridkin.hybrid._module import Hybrid
-from hybridkin.hybrid._pose import PoseHybridModule
+from hybridkin.hybrid._pose import PoseHybrid
 from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import evaluate
 
@@ -41,7 +41,7 @@ def adapted(
     noise: float,
     scale: NDArray,
     parameters: Sequence[str],
-) -> tuple[Hybrid | AdaptedModel, str | None]:
+) -> tuple[Hybrid, str | None]:
     """Return the model after the most probable change, given new rows, and a warning or None.
 
     The change theta = (rotation, translation, shift) is in natural units: a rotation about the base
@@ -144,12 +144,10 @@ class _Problem:
         R, motion = rotation(change[:3])[0], identity(4, change)
         motion[:3, :3] = R
         motion[:3, 3] = self.pivot - R @ self.pivot + self.reach * change[3:6]
-        kind = (
-            AdaptedPoseModel
-            if isinstance(self.fitted, PoseHybridModule)
-            else AdaptedModel
-        )
-        return kind(self.fitted, self.scale * change[6:], motion)
+        shift = self.scale * change[6:]
+        if isinstance(self.fitted, PoseHybrid):
+            return AdaptedPoseModel(self.fitted, shift, motion)
+        return AdaptedModel(self.fitted, shift, motion)
 
     def registered(self, noise: float) -> NDArray:
         """Return the best change of the base alone, as a start.
@@ -181,16 +179,13 @@ class _Problem:
         residual, J = self.y - x, J * self.scale
         A = torch.cat([J.new_zeros(*x.shape, 6), J], dim=-1)
         spin = rotation(torch.from_numpy(theta[:3]))[1]
-        pose, K = isinstance(self.fitted, PoseHybridModule), x.shape[1] // 3
+        K = x.shape[1] // 3
         if x.shape[1] % 3 == 0:
-            arm = (
-                x.unflatten(1, (K, 3))
-                - self.pivot
-                - self.reach * torch.from_numpy(theta[3:6])
-            )
+            centre = self.pivot + self.reach * torch.from_numpy(theta[3:6])
+            arm = x.unflatten(1, (K, 3)) - centre
             A[..., :3] = (-cross_matrix(arm) @ spin).flatten(1, 2)
             A[..., 3:6] = self.reach * identity(3, x).repeat(K, 1)
-        if pose:
+        if isinstance(self.fitted, PoseHybrid):
             turn = rotation(self.y[:, 3:])[0] @ rotation(x[:, 3:])[0].mT
             residual[:, 3:] = self.reach * rotation_vector(turn)
             A[:, 3:, :3], A[:, 3:, 3:6] = spin, 0.0

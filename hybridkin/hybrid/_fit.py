@@ -24,7 +24,7 @@ from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._error_models import ErrorModel, FittedError, PerMarker, Residuals
 from hybridkin.hybrid._guards import GroupDistance, Plane
 from hybridkin.hybrid._module import Hybrid, HybridModule
-from hybridkin.hybrid._pose import PoseHybridModule, pose_errors
+from hybridkin.hybrid._pose import WithPose, pose_errors
 from hybridkin.hybrid._rows import Rows, rare_marker
 from hybridkin.hybrid._stacked import Stacked
 
@@ -102,9 +102,14 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
         plane = Plane.of_log(spec.mechanical, rows.q, spec.commanded or directions)
         groups = rows.groups if guarded else None
         tested = GroupDistance.of_log(rows.q, groups, directions, plane)
-    kind = PoseHybridModule if spec.output == "pose" else HybridModule
     weights = rows.q.new_tensor([weight for weight, _ in fitted.corrections])
-    module = kind(spec.mechanical, corrections, weights, None, tested, plane)
+    if spec.output == "pose":
+        mechanical = cast(PoseModel, spec.mechanical)
+        module = WithPose.of(mechanical, corrections, weights, tested, plane)
+    else:
+        module = HybridModule(
+            spec.mechanical, corrections, weights, None, tested, plane
+        )
     return FittedHybrid(
         spec.mechanical, spec.calibration, fitted, module, spec.messages
     )

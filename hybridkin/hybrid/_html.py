@@ -21,7 +21,7 @@ _HELD_OUT = (
 def fitted_rows(model: Any) -> dict[str, object]:
     """Return names and values of what the fit of a hybrid found, for `html_table`."""
     mechanical, found, play = model.mechanical_model_, model.calibration_, model.play_
-    fitted = model.module_.fitted
+    fitted = model.module_.as_fitted
     changed = fitted is not model.module_ or fitted.drift is not None
     domain = {None: "everywhere (no guard)", "box": "the training range of q"}
     domain = domain.get(model.guard, "close to the training rows (guard by leverage)")

@@ -40,9 +40,9 @@ class Inside:
 
 # The weight g(q) of a correction (N, 1), if it is less than one anywhere, and dg/dq (N, 1, n).
 Fading = tuple[Tensor, Tensor]
-Guarded = tuple[
-    Tensor, Tensor, Fading | None
-]  # a correction, its derivative, its fading
+
+# A correction, its derivative and its fading.
+Guarded = tuple[Tensor, Tensor, Fading | None]
 
 
 class TipCorrection(PortableModule):
@@ -78,10 +78,8 @@ class TipCorrection(PortableModule):
             x, J, leverage = guard.model.forward_jacobian_and_leverage(q)
             distance = leverage / guard.limit.to(q)
         else:
-            (x, J), distance = (
-                self.module.forward_and_jacobian(q),
-                guard.domain_distance(q),
-            )
+            x, J = self.module.forward_and_jacobian(q)
+            distance = guard.domain_distance(q)
         fading = _fading(guard, q, distance)
         if fading is not None:
             x, J = _weighed(x, J, *fading)
@@ -129,13 +127,15 @@ class InnerCorrection(PortableModule):
         assert inside is not None
         delta, turn = self.readout.forward_and_jacobian(q)
         x, columns = self.mechanical.from_coordinates_and_jacobian(inside.z + delta)
-        J, guard = columns @ (inside.slope + turn), self.guard
+        J = columns @ (inside.slope + turn)
+        guard = self.guard
         if guard is None:
             return x, J, None
         fading = _fading(guard, q, guard.domain_distance(q))
         if fading is None and not guard.is_long(x - inside.x).any():
             return x, J, None
-        x, J = x - inside.x, J - inside.jacobian
+        x = x - inside.x
+        J = J - inside.jacobian
         if fading is not None:
             x, J = _weighed(x, J, *fading)
         x, J = guard.shortened_with_jacobian(x, J)
@@ -151,7 +151,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     def place_of(name: str) -> int:
         return plan.node_of(stored.part(name)) if name in stored.parts else -1
 
-    base, drift, tested = place_of("mechanical"), place_of("drift"), place_of("tested")
+    base = place_of("mechanical")
+    drift = place_of("drift")
+    tested = place_of("tested")
     if base >= 0 and plan.kind(base) not in CHAINS:
         raise NoKernel(
             f"the mechanical part {stored.part('mechanical').kind!r} is not a chain"
@@ -180,11 +182,8 @@ def _entries_of(
     guard = correction.part("guard")
     place = plan.node_of(guard)
     if [_content(part) for part in guard.parts.values()] == [_content(regressor)]:
-        return (
-            False,
-            plan.entry(place, 0),
-            place,
-        )  # value and leverage share the features
+        # Value and leverage share the features.
+        return False, plan.entry(place, 0), place
     return acts_inside, plan.node_of(regressor), place
 
 
@@ -217,17 +216,22 @@ class Hybrid(ForwardModel):
         return self if self.mechanical is None else self.mechanical
 
     @property
+    def tip_model(self) -> Hybrid:
+        """The hybrid of the tip alone: the last one of several markers, else this one."""
+        return self
+
+    @property
     def corrects_inside(self) -> bool:
         """Whether a correction acts inside the robot, see `InnerCorrection`."""
         raise NotImplementedError
 
     @property
-    def fitted(self) -> Hybrid:
+    def as_fitted(self) -> Hybrid:
         """The model of the fit: this one, since the robot has not changed; see `AdaptedModel`."""
         return self
 
     @property
-    def shift(self) -> Tensor:
+    def shift_of_zeros(self) -> Tensor:
         """Shift of the actuator zeros since the fit [unit of q]."""
         return torch.zeros((), dtype=torch.float64, device="cpu")
 
@@ -242,7 +246,7 @@ class Hybrid(ForwardModel):
             return super().misses(x, largest)
         return self.mechanical.misses(x, largest) - self.longest_correction
 
-    def of(self, fitted: Hybrid) -> Hybrid:
+    def after_change(self, fitted: Hybrid) -> Hybrid:
         """Return another hybrid after the same change of the robot: none."""
         return fitted
 
@@ -254,19 +258,27 @@ class Hybrid(ForwardModel):
         """Return the same model with another drift; this model does not change."""
         raise NotImplementedError
 
+    def without_learned(self) -> Hybrid:
+        """Return the mechanical model alone, as a hybrid."""
+        raise NotImplementedError
+
     def rows(self) -> Hybrid:
         """Return the module whose outputs are the columns of measured y; for tips this module."""
         return self
 
     def mechanical_part(self, q: Tensor) -> Tensor:
         """Return f(q), zero without a mechanical model, shape (..., m) [m]."""
-        return (
-            0.0 * self.error_part(q) if self.mechanical is None else self.mechanical(q)
-        )
+        if self.mechanical is None:
+            return 0.0 * self.error_part(q)
+        return self.mechanical(q)
 
     def error_part(self, q: Tensor) -> Tensor:
         """Return what is added to f(q), shape (..., m) [m]."""
         raise NotImplementedError
+
+    def learned_error(self, q: Tensor) -> Tensor:
+        """Return the learned part in the form of `residuals`, poses as six numbers [m]."""
+        return self.error_part(q)
 
     def error_weight(self, q: Tensor) -> Tensor:
         """Return the weight of the learned part, shape (...)."""
@@ -322,22 +334,24 @@ class HybridModule(Hybrid):
         self.drift = drift
         self.tested = tested
         self.log_plane = log_plane
-        learned = [c.module for c in corrections if isinstance(c, TipCorrection)]
-        for model in learned[:1] if mechanical is None else [mechanical]:
-            self.n_actuators, self.n_outputs = model.n_actuators, model.n_outputs
+        shape = mechanical
+        if shape is None and isinstance(corrections[0], TipCorrection):
+            shape = corrections[0].module
+        if shape is not None:
+            self.n_actuators = shape.n_actuators
+            self.n_outputs = shape.n_outputs
 
     @property
     def corrects_inside(self) -> bool:
         """Whether a correction acts inside the robot, see `InnerCorrection`."""
-        return any(
-            isinstance(correction, InnerCorrection) for correction in self.corrections
-        )
+        return any(isinstance(c, InnerCorrection) for c in self.corrections)
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
         """The plane of the log, see `Plane`."""
-        plane = self.log_plane
-        return None if plane is None else (plane.point, plane.normals)
+        if self.log_plane is None:
+            return None
+        return self.log_plane.point, self.log_plane.normals
 
     @property
     def longest_correction(self) -> Tensor | float:
@@ -345,22 +359,20 @@ class HybridModule(Hybrid):
         longest = 0.0 if self.drift is None else torch.inf
         for weight, correction in self._parts():
             guard = correction.guard
-            longest = longest + (
-                torch.inf if guard is None else weight * guard.MOST * guard.largest
-            )
+            if guard is None:
+                return torch.inf
+            longest = longest + weight * guard.MOST * guard.largest
         return longest
 
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this model does not change."""
-        corrections = [c for _, c in self._parts()]
-        return type(self)(
-            self.mechanical,
-            corrections,
-            self.weights,
-            drift,
-            self.tested,
-            self.log_plane,
-        )
+        corrections = [correction for _, correction in self._parts()]
+        others = self.weights, drift, self.tested, self.log_plane
+        return type(self)(self.mechanical, corrections, *others)
+
+    def without_learned(self) -> HybridModule:
+        """Return the mechanical model alone, as a hybrid."""
+        return HybridModule(self.mechanical, [], self.weights[:0])
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m) [m]."""
@@ -391,102 +403,108 @@ class HybridModule(Hybrid):
 
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""
-        mechanical = self.mechanical if self.corrects_inside else None
-        return None if mechanical is None else Inside(mechanical, q)
+        if self.mechanical is None or not self.corrects_inside:
+            return None
+        return Inside(self.mechanical, q)
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         inside = self._inside(q)
         learned = self._learned(q, inside)
-        if self.mechanical is None:
-            return (learned,)
-        return ((self.mechanical(q) if inside is None else inside.x) + learned,)
+        if inside is not None:
+            return (inside.x + learned,)
+        if self.mechanical is not None:
+            return (self.mechanical(q) + learned,)
+        return (learned,)
 
     def _learned(self, q: Tensor, inside: Inside | None) -> Tensor:
         """Return the sum of corrections and drift at rows q, shape (N, m) [m]."""
-        trust, terms = q.new_ones(len(q), 1), []
+        trust = q.new_ones(len(q), 1)
+        terms = []
         for weight, correction in self._parts():
-            value, guard = correction.value(q, inside), correction.guard
+            value = correction.value(q, inside)
+            guard = correction.guard
             if guard is not None:
-                own = guard(q)
-                value, trust = (
-                    guard.shortened(own * value),
-                    trust - weight * (1.0 - own),
-                )
+                inside_domain = guard(q)
+                value = guard.shortened(inside_domain * value)
+                trust = trust - weight * (1.0 - inside_domain)
             terms.append(weight * value)
         if self.drift is not None:
             terms.append(trust * self.drift(q))
-        return sum(terms[1:], terms[0]) if terms else self._nothing(q)
-
-    def _nothing(self, q: Tensor) -> Tensor:
-        """Return zeros in the shape of the corrections, (N, m)."""
-        return 0.0 * self.mechanical_part(q)
+        if not terms:
+            return 0.0 * self.mechanical_part(q)
+        return sum(terms[1:], terms[0])
 
     def _trust(self, q: Tensor) -> Tensor:
         """Return the error weight t(q) at rows q, shape (N, 1)."""
-        guards = [
-            (weight, c.guard) for weight, c in self._parts() if c.guard is not None
-        ]
-        return q.new_ones(len(q), 1) - sum(
-            weight * (1.0 - guard(q)) for weight, guard in guards
-        )
+        trust = q.new_ones(len(q), 1)
+        for weight, correction in self._parts():
+            if correction.guard is not None:
+                trust = trust - weight * (1.0 - correction.guard(q))
+        return trust
 
     def _distance(self, q: Tensor) -> Tensor:
         """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
-        guards = [c.guard for _, c in self._parts() if c.guard is not None]
-        guards += [] if self.tested is None else [self.tested]
-        distances = [guard.domain_distance(q) for guard in guards] or [
-            q.new_zeros(len(q))
-        ]
-        return torch.stack(distances, 1).amax(1, keepdim=True)
+        guards = [correction.guard for _, correction in self._parts()]
+        farthest = q.new_zeros(len(q))
+        for measure in (*guards, self.tested):
+            if measure is not None:
+                farthest = torch.maximum(farthest, measure.domain_distance(q))
+        return farthest[:, None]
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        inside, total = self._inside(q), None
-        if inside is not None:
-            # Inner corrections include f. df/dq is needed only if their weights sum to less than 1.
-            inner = (
-                weight for weight, c in self._parts() if isinstance(c, InnerCorrection)
-            )
-            share = 1.0 - sum(inner)
-            if share > _ROUNDING:
-                total = share * inside.x, share * inside.jacobian
-        elif self.mechanical is not None:
-            total = self.mechanical.forward_and_jacobian(q)
-        return self._added(total, q, inside)
-
-    def _added(
-        self, total: tuple[Tensor, Tensor] | None, q: Tensor, inside: Inside | None
-    ) -> tuple[Tensor, Tensor]:
-        """Return `total`, a value and its derivative, plus all corrections and the drift."""
+        inside = self._inside(q)
+        total = self._mechanical_and_jacobian(q, inside)
         fadings: list[tuple[float, Fading]] = []
         for weight, correction in self._parts():
             x, J, fading = correction.guarded_and_jacobian(q, inside)
             total = _plus(total, weight, x, J)
-            fadings += [] if fading is None else [(weight, fading)]
+            if fading is not None:
+                fadings.append((weight, fading))
         if self.drift is not None:
             x, J = self.drift.forward_and_jacobian(q)
             if fadings:
-                trust, slope = q.new_ones(len(q), 1), q.new_zeros(len(q), 1, q.shape[1])
-                for weight, (own, own_slope) in fadings:
-                    trust, slope = (
-                        trust + weight * (own - 1.0),
-                        slope + weight * own_slope,
-                    )
-                x, J = _weighed(x, J, trust, slope)
+                x, J = _weighed(x, J, *_trust_of(fadings))
             total = _plus(total, 1.0, x, J)
         assert total is not None, "a hybrid needs a mechanical model or a correction"
         return total
 
+    def _mechanical_and_jacobian(
+        self, q: Tensor, inside: Inside | None
+    ) -> tuple[Tensor, Tensor] | None:
+        """Return the part of f and df/dq beside inner corrections, which include f."""
+        if inside is None:
+            f = self.mechanical
+            return None if f is None else f.forward_and_jacobian(q)
+        rest = 1.0
+        for weight, correction in self._parts():
+            if isinstance(correction, InnerCorrection):
+                rest -= weight
+        # df/dq is needed only if the weights of inner corrections sum to less than 1.
+        if rest <= _ROUNDING:
+            return None
+        return rest * inside.x, rest * inside.jacobian
+
 
 def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
     """Return the weights of a correction and their slopes at rows q (N, n), None if all are 1."""
-    rows = (~(distance <= guard.FULL)).nonzero()[
-        :, 0
-    ]  # written so that NaN is included
+    fades = ~(distance <= guard.FULL)  # written so that NaN is included
+    rows = fades.nonzero()[:, 0]
     if not len(rows):
         return None
     weight, slope = guard.weight_and_jacobian(q[rows])
-    whole, flat = q.new_ones(len(q), 1), q.new_zeros(len(q), 1, q.shape[1])
-    return whole.index_copy(0, rows, weight), flat.index_copy(0, rows, slope)
+    weights = q.new_ones(len(q), 1).index_copy(0, rows, weight)
+    return weights, q.new_zeros(len(q), 1, q.shape[1]).index_copy(0, rows, slope)
+
+
+def _trust_of(fadings: Sequence[tuple[float, Fading]]) -> Fading:
+    """Return the error weight of corrections with these weights and fadings, and its slope."""
+    weight, (fading, slope) = fadings[0]
+    trust = 1.0 + weight * (fading - 1.0)
+    total_slope = weight * slope
+    for weight, (fading, slope) in fadings[1:]:
+        trust = trust + weight * (fading - 1.0)
+        total_slope = total_slope + weight * slope
+    return trust, total_slope
 
 
 def _plus(
@@ -494,7 +512,7 @@ def _plus(
 ) -> tuple[Tensor, Tensor]:
     """Return a sum plus the weighted x and J."""
     if total is None:
-        return (x, J) if weight == 1.0 else (weight * x, weight * J)
+        return weight * x, weight * J
     return torch.add(total[0], x, alpha=weight), torch.add(total[1], J, alpha=weight)
 
 

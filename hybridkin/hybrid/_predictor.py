@@ -20,7 +20,6 @@ from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
-from hybridkin.hybrid._adapted import AdaptedModel
 from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._module import Hybrid
@@ -35,7 +34,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The prediction methods of a `HybridForwardModel`; they use only the results of `fit`."""
 
     output: str
-    module_: Hybrid | AdaptedModel
+    module_: Hybrid
     mechanical_model_: ForwardModel | None
     play_: PlayOperator | None
     radius_: Radius | None
@@ -151,7 +150,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def training_range_(self) -> TrainingRange:
         """The range of q in the fit, where it lies after `adapt` [unit of q]."""
-        return self._fitted_range.moved(-as_array(self.module_.shift))
+        return self._fitted_range.moved(-as_array(self.module_.shift_of_zeros))
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
@@ -193,7 +192,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _evaluated(
         self,
-        function: Callable[[Hybrid | AdaptedModel, NDArray], Sequence[NDArray]],
+        function: Callable[[Hybrid, NDArray], Sequence[NDArray]],
         X: Any,
         groups: ArrayLike | None,
         warn: bool = True,
@@ -220,14 +219,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
 
 
-def _method(name: str) -> Callable[[Hybrid | AdaptedModel, NDArray], Sequence[NDArray]]:
+def _method(name: str) -> Callable[[Hybrid, NDArray], Sequence[NDArray]]:
     """Return a function that evaluates a method of a module at rows q."""
     return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
 
 
-def _with_domain(
-    module: Hybrid | AdaptedModel, q: NDArray, value: bool = True
-) -> list[NDArray]:
+def _with_domain(module: Hybrid, q: NDArray, value: bool = True) -> list[NDArray]:
     """Return x of rows q if `value`, and whether they lie in the domain."""
     *x, distance = evaluate(module, q, value, distance=True)
     return [*x, distance <= 1.0]

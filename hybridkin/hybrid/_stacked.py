@@ -74,13 +74,13 @@ class Stacked(Hybrid):
         """Return the same model with another drift; this model does not change."""
         tips = []
         for k, tip in enumerate(self._tips()):
+            if drift is None:
+                tips.append(tip.with_drift(None))
+                continue
             rows = slice(3 * k, 3 * k + 3)
-            of_tip = (
-                None
-                if drift is None
-                else AffineModule(drift.coef[rows], drift.bias[rows])
+            tips.append(
+                tip.with_drift(AffineModule(drift.coef[rows], drift.bias[rows]))
             )
-            tips.append(tip.with_drift(of_tip))
         return type(self)(self.mechanical, tips)
 
     def forward(self, q: Tensor) -> Tensor:
@@ -99,15 +99,13 @@ class Stacked(Hybrid):
 
     def error_weight(self, q: Tensor) -> Tensor:
         """Return the least error weight of a marker, shape (...)."""
-        return torch.stack([tip.error_weight(q) for tip in self._tips()], dim=-1).amin(
-            -1
-        )
+        weights = [tip.error_weight(q) for tip in self._tips()]
+        return torch.stack(weights, dim=-1).amin(dim=-1)
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the largest distance from the training rows of a marker, shape (...)."""
-        return torch.stack(
-            [tip.domain_distance(q) for tip in self._tips()], dim=-1
-        ).amax(-1)
+        distances = [tip.domain_distance(q) for tip in self._tips()]
+        return torch.stack(distances, dim=-1).amax(dim=-1)
 
     def _tips(self) -> list[HybridModule]:
         return cast("list[HybridModule]", [*self.tips])

@@ -26,10 +26,9 @@ from hybridkin._core.stored import (
 # Their chains are among the kinds that a description may hold.
 from hybridkin.chains import constant_curvature, elastic_tendons, rigid  # noqa: F401
 from hybridkin.chains.play import PlayOperator
-from hybridkin.hybrid._adapted import AdaptedPoseModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._error_models import Blend
-from hybridkin.hybrid._pose import PoseHybridModule
+from hybridkin.hybrid._pose import PoseHybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._readout_fit import ReadoutFit
@@ -110,9 +109,7 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.error_model = _estimator(asked) if isinstance(asked, dict) else asked
     check_settings(model)
     model.module_ = restore(stored.part("module"))
-    if isinstance(model.module_, (PoseHybridModule, AdaptedPoseModel)) != (
-        model.output == "pose"
-    ):
+    if isinstance(model.module_, PoseHybrid) != (model.output == "pose"):
         raise ValueError(
             f"`output` {model.output!r} does not fit {stored.part('module').kind!r}"
         )

@@ -350,18 +350,17 @@ class HybridForwardModel(HybridPredictor):
         self._warn_of_units(rows)
         q, tips = self.module_.before(rows.q, torch.from_numpy(rows.tips))
         rows = replace(rows, X=q.numpy(), y=tips.numpy().reshape(rows.y.shape))
-        fitted = self.module_.fitted.with_drift(None)
+        fitted = self.module_.as_fitted.with_drift(None)
         with torch.no_grad():
             error = residuals(fitted.mechanical, rows.q, rows.y, self.output)
-            residual = (
-                error.reshape(rows.tips.shape) - fitted.error_part(rows.q).numpy()
-            )
+            learned = fitted.learned_error(rows.q).numpy()
+        residual = error.reshape(rows.tips.shape) - learned
         self._drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
             alpha = self._drift.likeliest_alpha(self._noise)
         # A module that a caller already holds does not change.
         drifted = fitted.with_drift(self._drift.correction(alpha))
-        self.module_ = self.module_.of(drifted)
+        self.module_ = self.module_.after_change(drifted)
         return self
 
     def adapt(
@@ -421,7 +420,7 @@ class HybridForwardModel(HybridPredictor):
         tensor(True)
         """
         check_is_fitted(self, "module_")
-        fitted = self.module_.fitted.with_drift(None)
+        fitted = self.module_.as_fitted.with_drift(None)
         rows = self._checked_rows(X, y, None, groups, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         rows = replace(rows, X=self._effective(rows.X, rows.groups))

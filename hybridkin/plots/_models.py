@@ -59,7 +59,7 @@ def body_of(
         drawn = drawn & np.isfinite(ends).all(axis=1)
     elif isinstance(model, Predictor):
         predicted_tips = _spread(_predicted_tips(model, chain, q[drawn]), drawn)
-        if cast(Any, model).module_.fitted.corrects_inside:  # of a HybridForwardModel
+        if cast(Any, model).module_.corrects_inside:  # of a HybridForwardModel
             ends, predicted_tips = predicted_tips, None
     rows = torch.from_numpy(q[drawn])
     if ends is not None:

@@ -177,9 +177,9 @@ class LoadedModel:
             Promise(**self._training.get("promise", constant)),
             np.zeros(len(q)),
         )
-        tested = None if self.hybrid is None else self.hybrid.module_.fitted.tested
+        tested = None if self.hybrid is None else self.hybrid.module_.tested
         if self.hybrid is not None and tested is not None:
-            far = distances(tested, q + as_array(self.hybrid.module_.shift))
+            far = distances(tested, q + as_array(self.hybrid.module_.shift_of_zeros))
         mean = promise.mean(far)
         return {"mean": mean, "p95": promise.p95 * mean}
 

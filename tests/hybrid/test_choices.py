@@ -28,7 +28,7 @@ from hybridkin.hybrid._features import Features
 from hybridkin.hybrid._fit import Spec, fit_hybrid
 from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
 from hybridkin.hybrid._linearised import choose
-from hybridkin.hybrid._pose import PoseHybridModule
+from hybridkin.hybrid._pose import WithPose
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
 from hybridkin.hybrid._readout_fit import fit_readout
 from hybridkin.hybrid._rows import Rows
@@ -341,7 +341,7 @@ def test_a_regressor_that_knows_its_rows_by_heart_has_some_noise():
 def test_the_derivative_of_a_pose_by_a_change_of_the_robot():
     """Against differences, where the residual is zero and so linear in the change."""
     q = torch.from_numpy(log(4)[0])
-    fitted = PoseHybridModule(CHAIN, [], q.new_zeros(0))
+    fitted = WithPose.of(CHAIN, [], q.new_zeros(0))
     rows = Rows(q.numpy(), np.zeros((4, 6)))
     rng = np.random.default_rng(0)
     theta = rng.uniform(-0.2, 0.2, 9)

@@ -217,7 +217,7 @@ def test_poses_keep_to_the_tested_distance():
     model.fit(q, np.hstack([x, 0.1 * q]), groups=groups)
     new = 0.16 + 0.1 * np.random.default_rng(1).random((500, 3))
     share = model.in_domain(new).mean()
-    model.module_.tested = None
+    model.module_.learned.tested = None
     assert 0.0 < share < 0.7 * model.in_domain(new).mean()
 
 

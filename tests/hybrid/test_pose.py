@@ -285,9 +285,8 @@ def test_pose_jacobian_is_the_derivative(log, kind):
     if kind == 5:
         model.partial_fit(log[0][:20], log[1][:20] + 0.02)
     if kind == 2:
-        model.module_.corrections[
-            0
-        ].guard.largest *= 0.6  # so that some are shortened where they are trusted
+        # So that some are shortened where they are trusted.
+        model.module_.learned.corrections[0].guard.largest *= 0.6
     module, q = model.module_, cases(log)
     T, J = module.pose(q), module.pose_jacobian(q)
     if kind in (1, 2, 3, 5):
@@ -296,7 +295,7 @@ def test_pose_jacobian_is_the_derivative(log, kind):
         assert module.in_domain(q)[1:11].all()
         assert ((weight > 0.1) & (weight < 0.9)).any()
     if kind == 2:
-        (correction,) = module.corrections
+        (correction,) = module.learned.corrections
         long = correction.guard.is_long(correction.guard(q) * correction.module(q))
         assert (long & module.in_domain(q)).any()
     # Central differences.
@@ -359,7 +358,7 @@ def test_the_guard_bounds_position_and_orientation(fitted, log, monkeypatch):
     away = q[fitted.error_weight(q) < 1e-6]
     assert len(away)
     assert_allclose(fitted.predict(away), fitted.predict_mechanical(away), rtol=0, atol=1e-5)
-    guard = fitted.module_.corrections[0].guard
+    guard = fitted.module_.learned.corrections[0].guard
     largest, units = float(guard.largest), np.repeat([1.0, float(bha().reach)], 3)
 
     def longest(model):

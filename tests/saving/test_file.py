@@ -24,7 +24,8 @@ NOT_LEARNING |= {"pose_output", "rigid"}  # that have no `partial_fit` of tips
 LEARNING = [path for path in STORED if path.stem not in NOT_LEARNING]
 # Arrays with an entry for every row of the training, and one that nothing uses.
 LENGTHS = {"error_model.residual": ("short", "empty"), "fitted_rows": ("short", "empty")}
-LENGTHS |= {"module.tested.rows": ("short",), "error_model.singular_": ("axis", "short", "empty")}
+LENGTHS |= {"module.tested.rows": ("short",), "module.learned.tested.rows": ("short",)}
+LENGTHS |= {"error_model.singular_": ("axis", "short", "empty")}
 ONE_OF_EACH = ("chain", "elastic_chain", "rigid", "elm", "drift_and_radius", "parallel_kernel")
 ONE_OF_EACH += ("parallel_regression", "serial_pose", "serial_elm", "pose_output")
 
