@@ -16,6 +16,8 @@ from hybridkin.plots._arrays import plain, positions, shaped
 _RIM = 1.15  # radius of a drawn disk over that of the actuator circle
 _CORNERS = 17  # points of a disk's rim
 _STEPS = 12  # to the tips that a model predicts
+_SINGULAR = 1e-3  # of a Jacobian: no steps along smaller singular values, relative to the largest
+_REACHED = 1e-6  # largest distance of a drawn tip from its place [m]
 
 
 @runtime_checkable
@@ -54,13 +56,15 @@ def body_of(
     drawn = np.asarray(np.isfinite(q).all(axis=1))
     ends = None
     predicted_tips = None
+    leads = False
     if tips is not None:
         ends = shaped(tips, "tips", "K3", len(q))
         drawn = drawn & np.isfinite(ends).all(axis=1)
     elif isinstance(model, Predictor):
         predicted_tips = _spread(_predicted_tips(model, chain, q[drawn]), drawn)
-        if cast(Any, model).module_.corrects_inside:  # of a HybridForwardModel
-            ends, predicted_tips = predicted_tips, None
+        leads = cast(Any, model).module_.corrects_inside  # of a HybridForwardModel
+        if leads:
+            ends = predicted_tips
     rows = torch.from_numpy(q[drawn])
     if ends is not None:
         rows = _led_to(chain, rows, torch.from_numpy(ends[drawn]))
@@ -81,7 +85,9 @@ def body_of(
             body["points"] = _spread(chain.backbone(rows), drawn)
             body["rigid"] = True
     if predicted_tips is not None:
-        body["predicted"] = predicted_tips
+        way = np.abs(body["tips"] - predicted_tips)
+        if not leads or np.nanmax(way, initial=0.0) > _REACHED:
+            body["predicted"] = predicted_tips
     return body
 
 
@@ -103,14 +109,12 @@ def _predicted_tips(model: Predictor, chain: Chain, q: NDArray) -> NDArray:
 def _led_to(chain: Chain, q: torch.Tensor, tips: torch.Tensor) -> torch.Tensor:
     """Return configurations near q (K, n) at which the chain's tips are the given ones (K, 3).
 
-    Damped Gauss-Newton steps, the shortest in q; of tips out of reach as near as they come.
+    Gauss-Newton steps, the shortest in q; of tips out of reach as near as they come.
     """
     for _ in range(_STEPS):
         x, J = chain.tip_model.forward_and_jacobian(q)
-        gram = J @ J.mT
-        damping = 1e-6 * gram.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
-        gram = gram + torch.diag_embed(damping.expand(-1, 3))
-        q = q + (J.mT @ torch.linalg.solve(gram, (tips - x)[..., None]))[..., 0]
+        step = torch.linalg.pinv(J, rtol=_SINGULAR) @ (tips - x)[..., None]
+        q = q + step[..., 0]
     return q.detach()
 
 

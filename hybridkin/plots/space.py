@@ -251,7 +251,7 @@ class BackboneDisplay(Display):
             A chain of arcs shows chambers or tendons, at their angles and radii, and disks at the
             ends of its segments; a `RigidChain` its links. A fitted hybrid model shows its
             mechanical part, calibrated when asked, and where it predicts the tip. With a serial
-            correction the body ends at this tip.
+            correction the body ends at this tip, if the mechanical part can reach it.
         q : array-like of shape (K, n) or (n,)
             Actuator vectors; of a row with NaN nothing is drawn.
         n_points : int, default=12

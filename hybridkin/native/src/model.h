@@ -35,8 +35,9 @@ static inline void HK(turn)(int n, const real *R, V *a) {
    changed since the fit it is x = R f(q + shift) + p. */
 static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance,
                              V *work) {
-    const int n = p->code[at + HK_N], adapted = HK_IS(p, at, HK_ADAPTED);
-    const real *R = adapted && p->code[at + HK_M] == 3 ? hk_numbers(p, at) + n : NULL;
+    const int n = p->code[at + HK_N], m = p->code[at + HK_M];
+    const int adapted = HK_IS(p, at, HK_ADAPTED);
+    const real *R = adapted && m % 3 == 0 ? hk_numbers(p, at) + n : NULL;
     V *then = HK(take)(&work, n);
     if (adapted) {
         at = HK(before)(p, at, q, then);
@@ -50,9 +51,11 @@ static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V
     else
         HK(regress)(p, at, q, x, J, NULL, work);
     if (!R) return;
-    HK(turn)(1, R, x);
-    for (int i = 0; i < 3; i++) x[i] = x[i] + R[9 + i];
-    if (J) HK(turn)(n, R, J);
+    for (int k = 0; k < m; k += 3) {
+        HK(turn)(1, R, x + k);
+        for (int i = 0; i < 3; i++) x[k + i] = x[k + i] + R[9 + i];
+        if (J) HK(turn)(n, R, J + n * k);
+    }
 }
 
 /* The largest distance of any guard, and its slope (n) by q where not NULL. */

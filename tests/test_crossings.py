@@ -1,0 +1,426 @@
+"""Every feature of a hybrid with every other: laws that hold for any combination.
+
+A robot, its markers, backlash, the error model, the coupling, what is calibrated, the guard, the
+groups and a change of the robot are crossed pairwise: every two values of two factors meet in at
+least one case, where the documentation allows them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+from sklearn.linear_model import LinearRegression
+
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    ELMRegressor,
+    ELMRegressorCV,
+    HybridForwardModel,
+    InverseKinematics,
+    RigidChain,
+    load_model,
+    save_model,
+)
+from hybridkin.plots import BackboneDisplay
+from hybridkin.workflow import open_model, path_limits
+
+MARKERS = [(0, 0.6), (0, 1.0)]
+N_MOTIONS, N_ROWS = 5, 8
+DRAWN = 4
+
+
+def tendons(**options):
+    return ConstantCurvatureChain([0.005], lengths=[0.06], offsets=[0.01], **options)
+
+
+def arm():
+    origins = np.stack([np.eye(4)] * 3)
+    origins[1:, 0, 3] = 0.3, 0.2
+    kinds = ["revolute", "prismatic", "revolute"]
+    axes = [[0, 0, 1], [1, 0, 2], [0, 1, 0]]
+    limits = {"q_min": [-2.0, 0.0, -2.0], "q_max": [2.0, 0.4, 2.0]}
+    return RigidChain(origins, axes, kinds=kinds, tool=[0.1, 0.0, 0.02], **limits)
+
+
+class OwnModel(torch.nn.Module):
+    """A mechanical model of a user: no chain, no closed-form Jacobian."""
+
+    def forward(self, q):
+        return torch.stack([q.sum(-1), q[..., 0].sin(), q[..., 1] * q[..., 2]], dim=-1)
+
+
+class Robot(NamedTuple):
+    """The model of a robot, and the middle and half the range of its actuators."""
+
+    chain: torch.nn.Module | None
+    middle: float
+    half: float
+
+    @property
+    def n(self):
+        return getattr(self.chain, "n_actuators", 0) or 3
+
+
+ROBOTS = {
+    "chambers": Robot(ConstantCurvatureChain([0.05], offsets=[0.03]), 0.2, 0.03),
+    "tendons": Robot(tendons(), 0.0, 0.003),
+    "gain": Robot(tendons(gains=2e-5), 0.0, 150.0),
+    "gains": Robot(tendons(gains=[2e-5, -2e-5, 3e-5]), 0.0, 150.0),
+    "unit range": Robot(tendons(gains=1e-3, actuator_zeros=5.0), 5.0, 1.0),
+    "elastic": Robot(ElasticTendonChain([0.005], [0.06], bending_stiffness=3e-7), 0.0, 0.002),
+    "elastic, gain": Robot(ElasticTendonChain([0.005], [0.06], gains=2e-5), 0.0, 100.0),
+    "rotated stage": Robot(
+        ConstantCurvatureChain(
+            [0.05] * 2, n_actuators=[1, 3], lengths=[None, 0.1], routing="base", stage="rotation"
+        ),
+        0.0,
+        0.01,
+    ),
+    "rigid": Robot(arm(), 0.2, 0.2),
+    "own": Robot(OwnModel(), 0.0, 0.5),
+    "none": Robot(None, 0.2, 0.03),
+}
+ERROR_MODELS = {
+    "drop": "drop",
+    "linear": "linear",
+    "quadratic": "quadratic",
+    "pose": "pose",
+    "kernel": "kernel",
+    "ELM": ELMRegressor(20, random_state=0),
+    "ELM-CV": ELMRegressorCV(20, random_state=0),
+    "regression": LinearRegression(),
+    "auto": "auto",
+}
+FACTORS = {
+    "robot": tuple(ROBOTS),
+    "markers": ("tip", "two", "two, some missing"),
+    "play": ("none", "width", "auto"),
+    "error_model": tuple(ERROR_MODELS),
+    "coupling": ("parallel", "serial"),
+    "output": ("position", "pose"),
+    "calibrate": ("as it is", "base", "gain"),
+    "guard": ("leverage", "box", None),
+    "groups": (True, False),
+    "change": ("none", "adapted", "drifted", "adapted and drifted"),
+}
+
+
+def allowed(case):
+    """Return whether the documentation allows a case, or a part of one."""
+
+    def known(*names):
+        return all(name in case for name in names)
+
+    chain = ROBOTS[case["robot"]].chain if known("robot") else None
+    arcs = hasattr(chain, "with_markers")
+    gains = arcs and "gains" in chain.geometry()
+    model = case.get("error_model")
+    marked = case.get("markers", "tip") != "tip"
+    if known("robot"):
+        if not arcs and (model == "pose" or (chain is not None and marked)):
+            return False
+        if chain is None:
+            if model not in (None, "kernel", "ELM", "ELM-CV", "regression", "auto"):
+                return False
+            if case.get("coupling") == "serial" or case.get("output") == "pose":
+                return False
+        if not arcs and case.get("calibrate") not in (None, "as it is"):
+            if case["robot"] != "rigid" or case["calibrate"] == "gain":
+                return False
+        if case.get("calibrate") == "gain" and not gains:
+            return False
+        if case["robot"] == "own" and case.get("output") == "pose":
+            return False
+    if case.get("output") == "pose" and (marked or case.get("coupling") == "serial"):
+        return False
+    if case.get("output") == "pose" and model in ("linear", "quadratic", "pose", "auto"):
+        return False
+    if case.get("coupling") == "serial" and model in ("kernel", "regression", "auto"):
+        return False
+    # Choices take long, and have tests of their own: not one within the other.
+    if case.get("play") == "auto" and model in ("auto", "kernel", "ELM-CV"):
+        return False
+    # Motions need rows in order of time; changed robots need three coordinates or poses.
+    return not (case.get("play") == "auto" and case.get("groups") is False)
+
+
+def pairwise(seed=0):
+    """Return cases in which every allowed pair of values meets, greedily from random ones."""
+    rng = np.random.default_rng(seed)
+    missing = set()
+    for a, b in itertools.combinations(FACTORS, 2):
+        for pair in itertools.product(FACTORS[a], FACTORS[b]):
+            entry = ((a, pair[0]), (b, pair[1]))
+            if allowed(dict(entry)):
+                missing.add(entry)
+    cases = []
+    for entry in sorted(missing, key=str):
+        if entry not in missing:
+            continue
+        tried = [completed(dict(entry), rng) for _ in range(100)]
+        tried = [case for case in tried if case is not None]
+        if not tried:
+            missing.discard(entry)  # a third value rules the pair out
+            continue
+        best = max(tried, key=lambda case: len(missing & met(case)))
+        missing -= met(best)
+        cases.append(best)
+    return cases
+
+
+def completed(case, rng):
+    """Return the case with random allowed values of the other factors, None if there are none."""
+    for name in rng.permutation([name for name in FACTORS if name not in case]):
+        values = [value for value in FACTORS[name] if allowed({**case, name: value})]
+        if not values:
+            return None
+        case = {**case, name: values[rng.integers(len(values))]}
+    return case
+
+
+def met(case):
+    ordered = [(name, case[name]) for name in FACTORS]
+    return set(itertools.combinations(ordered, 2))
+
+
+CASES = pairwise()
+SLOW = {"auto"}  # values whose fits take more than 0.3 s
+
+
+class Log(NamedTuple):
+    q: np.ndarray
+    x: np.ndarray
+    groups: np.ndarray | None
+
+
+def log_of(case, robot, chain):
+    """Return measured rows of a robot that bends a little more than its model says."""
+    rng = np.random.default_rng(0)
+    way = rng.uniform(-1.0, 1.0, (N_MOTIONS, 2, robot.n))
+    share = np.linspace(0.0, 1.0, N_ROWS)[:, None]
+    commands = np.concatenate([start + share * (end - start) for start, end in way])
+    q = robot.middle + robot.half * commands
+    q[0] = robot.middle - robot.half
+    q[1] = robot.middle + robot.half
+    actual = torch.from_numpy(robot.middle + 1.02 * robot.half * (commands + 0.05 * commands**2))
+    size = 1e-3 * rng.standard_normal((len(q), 3))
+    if robot.chain is None:
+        tips = [np.column_stack([q[:, 0] + k, np.sin(q[:, 1]), q[:, 2] ** 2]) for k in range(2)]
+        x = np.concatenate(tips if case["markers"] != "tip" else tips[:1], axis=1)
+    elif case["output"] == "pose":
+        model = HybridForwardModel(chain, "drop", output="pose", guard=None)
+        model.fit(q, np.zeros((len(q), 6)))
+        x = model.predict(actual.numpy())
+    else:
+        x = chain(actual).numpy()
+    x = x.copy()
+    x[:, :3] += 0.05 * size
+    if case["markers"] == "two, some missing":
+        x[3:7, :3] = np.nan
+    groups = np.repeat(np.arange(N_MOTIONS), N_ROWS) if case["groups"] else None
+    return Log(q, x, groups)
+
+
+class Fitted(NamedTuple):
+    model: HybridForwardModel  # after the change of the robot
+    unchanged: HybridForwardModel
+    log: Log
+    robot: Robot
+
+
+def fitted(case):
+    robot = ROBOTS[case["robot"]]
+    chain = robot.chain
+    if case["markers"] != "tip" and chain is not None:
+        segments = chain.n_segments - 1
+        chain = chain.with_markers([(segments, at) for _, at in MARKERS])
+    log = log_of(case, robot, chain)
+    calibrate = {"as it is": (), "base": ["base"], "gain": ["gain"]}
+    model = HybridForwardModel(
+        chain,
+        ERROR_MODELS[case["error_model"]],
+        coupling=case["coupling"],
+        calibrate=calibrate[case["calibrate"]],
+        guard=case["guard"],
+        play={"none": None, "width": 0.1 * robot.half, "auto": "auto"}[case["play"]],
+        output=case["output"],
+        random_state=0,
+    )
+    model.fit(log.q, log.x, groups=log.groups)
+    unchanged = pickle.loads(pickle.dumps(model))
+    if "adapted" in case["change"]:
+        moved = log.x[:10] + np.resize([0.004, -0.002, 0.003, 0.0, 0.0, 0.0], log.x.shape[1])
+        if case["output"] == "position":
+            moved = log.x[:10] + np.resize([0.004, -0.002, 0.003], log.x.shape[1])
+        model.adapt(log.q[:10], moved)
+    if "drifted" in case["change"]:
+        model.partial_fit(log.q[:20], log.x[:20] + 0.002)
+    return Fitted(model, unchanged, log, robot)
+
+
+def name_of(case):
+    return " - ".join(str(value) for value in case.values())
+
+
+PARAMS = [
+    pytest.param(case, id=name_of(case), marks=[pytest.mark.slow] * bool(SLOW & {*case.values()}))
+    for case in CASES
+]
+
+
+@pytest.fixture(scope="module", params=PARAMS)
+def crossing(request):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # few rows, and what a robot cannot tell
+        return request.param, fitted(request.param)
+
+
+@pytest.fixture(autouse=True)
+def _without_warnings_of_few_rows():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def test_parts_add_up(crossing):
+    case, (model, _, log, _) = crossing
+    whole = model.predict(log.q, groups=log.groups)
+    mechanical = model.predict_mechanical(log.q, groups=log.groups)
+    error = model.predict_error(log.q, groups=log.groups)
+    columns = slice(None, 3 if case["output"] == "pose" else None)
+    np.testing.assert_allclose((mechanical + error)[:, columns], whole[:, columns], atol=1e-9)
+    if case["error_model"] == "drop" and case["change"] in ("none", "adapted"):
+        np.testing.assert_allclose(error, 0.0, atol=1e-12)
+
+
+def test_the_core_agrees_with_torch(crossing):
+    _, (model, _, log, _) = crossing
+    module = model.module_.rows()
+    q = torch.from_numpy(model._effective(log.q, log.groups))
+    with torch.no_grad():
+        x, J = module.forward_and_jacobian(q)
+        inside = model.module_.in_domain(q)
+    np.testing.assert_allclose(model.predict(log.q, groups=log.groups), x, atol=1e-9)
+    np.testing.assert_allclose(model.jacobian(log.q, groups=log.groups), J, rtol=1e-7, atol=1e-7)
+    assert (model.in_domain(log.q, groups=log.groups) == inside.numpy()).all()
+
+
+def test_the_jacobian_is_the_derivative(crossing):
+    _, (model, _, log, robot) = crossing
+    module = model.module_
+    q = torch.from_numpy(log.q[12:20] + 0.01 * robot.half)
+    step = 1e-5 * robot.half
+    with torch.no_grad():
+        J = module.jacobian(q)
+        for k in range(robot.n):
+            way = torch.zeros_like(q)
+            way[:, k] = step
+            slope = (module(q + way) - module(q - way)) / (2.0 * step)
+            np.testing.assert_allclose(
+                robot.half * J[..., k], robot.half * slope, rtol=0, atol=2e-7
+            )
+
+
+def test_a_file_holds_the_model(crossing, tmp_path):
+    case, (model, _, log, _) = crossing
+    if case["robot"] == "own":
+        with pytest.raises(TypeError, match="code"):
+            save_model(model, tmp_path / "model.safetensors")
+        return
+    save_model(model, tmp_path / "model.safetensors")
+    again = load_model(tmp_path / "model.safetensors")
+    for method in ("predict", "predict_mechanical", "predict_error", "jacobian", "in_domain"):
+        before = getattr(model, method)(log.q, groups=log.groups)
+        after = getattr(again, method)(log.q, groups=log.groups)
+        np.testing.assert_allclose(after, before, rtol=1e-12, atol=1e-12, err_msg=method)
+    np.testing.assert_array_equal(again.training_range_, model.training_range_)
+    if model.play_ is not None:
+        np.testing.assert_array_equal(again.play_.width, model.play_.width)
+    pickled = pickle.loads(pickle.dumps(model))
+    np.testing.assert_array_equal(
+        pickled.predict(log.q, groups=log.groups), model.predict(log.q, groups=log.groups)
+    )
+
+
+def test_limits_of_a_track_leave_room(crossing, tmp_path):
+    case, (model, _, _, robot) = crossing
+    if case["robot"] == "own":
+        return  # is code, which no file holds
+    save_model(model, tmp_path / "model.safetensors")
+    limits = path_limits(open_model(tmp_path / "model.safetensors"))
+    assert (np.broadcast_to(limits.q_max - limits.q_min, robot.n) > 0.5 * robot.half).all()
+
+
+def test_a_clone_fits_the_same(crossing):
+    _, (_, model, log, _) = crossing
+    again = clone(model).fit(log.q, log.x, groups=log.groups)
+    np.testing.assert_allclose(
+        again.predict(log.q, groups=log.groups),
+        model.predict(log.q, groups=log.groups),
+        rtol=0,
+        atol=1e-9,
+    )
+
+
+def test_the_training_range_is_that_of_the_log(crossing):
+    case, (model, unchanged, log, robot) = crossing
+    low, high = unchanged.training_range_
+    if model.play_ is None:
+        np.testing.assert_allclose(low, log.q.min(axis=0), rtol=0, atol=1e-12 * robot.half)
+        np.testing.assert_allclose(high, log.q.max(axis=0), rtol=0, atol=1e-12 * robot.half)
+    else:
+        width = np.max(model.play_.width)
+        assert (low >= log.q.min(axis=0) - 1e-12).all()
+        assert (high <= log.q.max(axis=0) + 1e-12).all()
+        assert (high - low >= np.ptp(log.q, axis=0) - 1.01 * width).all()
+    shift = model.training_range_.low - low
+    if "adapted" not in case["change"]:
+        np.testing.assert_array_equal(shift, 0.0)
+    assert (np.abs(shift) < robot.half).all()
+
+
+def test_the_drawn_body_ends_at_the_tip(crossing):
+    case, (model, _, log, _) = crossing
+    if case["robot"] in ("own", "none"):
+        return
+    q = log.q[:DRAWN]
+    body = BackboneDisplay.from_estimator(model, q)
+    tips = model.predict(q)
+    tips = tips[:, :3] if case["output"] == "pose" else tips[:, -3:]
+    ends = body.tips if body.predicted is None else body.predicted
+    np.testing.assert_allclose(ends, tips, rtol=0, atol=1e-5)
+
+
+def test_what_a_solve_says_of_its_error_is_true(crossing):
+    _, (model, _, log, robot) = crossing
+    if model.module_.tip_model.n_outputs != 3:
+        return  # outputs without a chain: which of them is the tip is not known
+    q_min, q_max = robot.middle - robot.half, robot.middle + robot.half
+    ik = InverseKinematics(model, q_min=q_min, q_max=q_max)
+    q = log.q[[5, 25]]
+    with torch.no_grad():
+        targets = model.module_.tip_model(torch.from_numpy(q)).numpy()
+    solution = ik.solve(targets, q0=q + 0.02 * robot.half)
+    with torch.no_grad():
+        reached = model.module_.tip_model(torch.from_numpy(np.asarray(solution.q))).numpy()
+    error = np.linalg.norm(reached - targets, axis=1)
+    np.testing.assert_allclose(solution.error, error, rtol=0, atol=1e-7)
+    assert (np.asarray(solution.q) >= q_min - 1e-9 * robot.half).all()
+    assert (np.asarray(solution.q) <= q_max + 1e-9 * robot.half).all()
+
+
+def test_every_factor_meets_every_other():
+    together = set().union(*map(met, CASES))
+    for name, values in FACTORS.items():
+        for value in values:
+            partners = {entry for entry in together if (name, value) in entry}
+            assert len(partners) >= 10, (name, value)
+    assert len(CASES) < 140
