@@ -19,7 +19,7 @@ ELSEWHERE = {
     # what saving, calibration and serial coupling call of a chain or a hybrid
     *("coordinates", "from_coordinates", "from_coordinates_and_jacobian", "from_stored", "stored"),
     *("far_messages", "unit_messages", "frames_and_moves", "up_to_tip", "tips", "extra_repr"),
-    *("fit_with_messages", "with_geometry"),
+    "with_geometry",
     # files: hostile ones are an examination of their own
     *("from_urdf", "from_mjcf", "to_urdf", "load_armlab", "load_asl_trunk", "load_ftdcr"),
     # arguments go to matplotlib, or are dictionaries and sentences

@@ -39,6 +39,7 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel
 from hybridkin.datasets import Log, check_log
+from hybridkin.hybrid.estimator import fit_quietly
 from hybridkin.workflow.report import Report
 
 N_MOTIONS, N_ROWS = 12, 16  # of the fitted log
@@ -490,7 +491,7 @@ def examined(case: Case, fit: bool | None = None) -> Outcome:
     # What data decide at once; lengths and stiffnesses stay nominal, as many users leave them.
     names = ("radii", "base") if case.base_is_free else ("radii",)
     model = HybridForwardModel(case.chain, LinearRegression(), calibrate=names)
-    messages = model.fit_with_messages(case.log.q, case.log.x, groups=case.log.groups)
+    messages = fit_quietly(model, case.log.q, case.log.x, groups=case.log.groups)
     kinds += ("calibration",) * bool(messages)
     with torch.no_grad():
         tips = model.module_(torch.from_numpy(case.test.q)).numpy()

@@ -242,11 +242,11 @@ class HybridForwardModel(HybridPredictor):
             millimetres; if there are too few groups for `coverage`; and the warnings of
             `calibrate`.
         """
-        for message in self.fit_with_messages(X, y, sample_weight, groups):
+        for message in self._fit(X, y, sample_weight, groups):
             warnings.warn(message, stacklevel=2)
         return self
 
-    def fit_with_messages(
+    def _fit(
         self,
         X: Any,
         y: Any,
@@ -256,12 +256,7 @@ class HybridForwardModel(HybridPredictor):
         progress: Callable[[int, int], None] | None = None,
         held_out: bool = True,
     ) -> list[str]:
-        """Fit as `fit` does and return the messages of its warnings without issuing them.
-
-        `geometry` replaces the choice of what to calibrate. `progress` gets (done, total). Without
-        `held_out`, errors on held-out rows that predictions do not need are not computed: those of
-        the calibration and of readouts, and ``expected_distance`` has the penalties of all rows.
-        """
+        """Fit, see `fit_quietly`, and return the messages of all warnings."""
         check_settings(self)
         given = self._checked_rows(X, y, sample_weight, groups)
         asked = replace(self._spec(given), left_out=held_out)
@@ -474,3 +469,38 @@ class HybridForwardModel(HybridPredictor):
         return Spec(
             mechanical, error_model, names, self.guard, self.output, self.random_state
         )
+
+
+def fit_quietly(
+    model: HybridForwardModel,
+    X: NDArray,
+    y: NDArray,
+    groups: ArrayLike | None = None,
+    *,
+    geometry: GeometryChoice | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    held_out: bool = True,
+    log: tuple[NDArray, NDArray] | None = None,
+) -> list[str]:
+    """Fit as `HybridForwardModel.fit` does and return the messages of its warnings.
+
+    Parameters
+    ----------
+    model : HybridForwardModel
+        The estimator; it is fitted in place.
+    X, y, groups
+        As for its `fit`.
+    geometry : GeometryChoice, optional
+        What to calibrate. Default: chosen on the rows.
+    progress : callable, optional
+        Gets (done, total).
+    held_out : bool, default=True
+        Whether to compute errors on held-out rows that predictions do not need: those of the
+        calibration and of readouts. Without, ``expected_distance`` has the penalties of all rows.
+    log : tuple of ndarray, optional
+        All rows (q, x) of the log, if X and y are some of them: all count as fitted.
+    """
+    messages = model._fit(X, y, None, groups, geometry, progress, held_out)
+    if log is not None:
+        model._fitted_rows = np.unique(row_digests(*log))
+    return messages

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import whole
-from hybridkin._core.digests import row_digests
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.turns import one_thread
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
@@ -25,7 +24,7 @@ from hybridkin.calibration.measured import distances, folds
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.hybrid.estimator import HybridForwardModel, fit_quietly
 from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.regressor_modules import error_module
@@ -205,7 +204,7 @@ class _Rows(NamedTuple):
         play = None
         if calibrated is not None and settings.auto and log.named and not log.n_late:
             model = HybridForwardModel(calibrated, "drop", play="auto")
-            model.fit_with_messages(self.q, self.x, groups=self.groups)
+            fit_quietly(model, self.q, self.x, self.groups)
             play = None if model.play_ is None else "auto"
         return self._replace(settings=replace(settings, play=play))
 
@@ -375,8 +374,15 @@ def fit_log(
     mechanical = rows.mechanical() if result is None else result.chain
     model = _models(rows, mechanical)[saved]
     model.set_params(coverage=settings.coverage)
-    given = {"groups": rows.groups, "geometry": rows.geometry, "progress": report_fit}
-    model.fit_with_messages(rows.q, rows.x, **given)
+    fit_quietly(
+        model,
+        rows.q,
+        rows.x,
+        rows.groups,
+        geometry=rows.geometry,
+        progress=report_fit,
+        log=(complete.q, complete.x),
+    )
     progress("writing the report", 0, 1)
     report = Report(f"{robot.name}: hybrid model of {Path(log.source).name}")
     report.record.update(
@@ -449,9 +455,6 @@ def _add_model(
     )
     training = {key: report.record[key] for key in (*kept, "held_out", "promise")}
     training |= {"rows": report.record["n"], "split": log.split}
-    model._fitted_rows = np.unique(
-        row_digests(log.q, log.x)
-    )  # with those dropped by thinning
     report.file(
         "model.safetensors", lambda path: save_model(model, path, training=training)
     )
@@ -467,12 +470,10 @@ def _one_fold(train: _Rows, test: _Rows) -> tuple[dict[str, NDArray], dict[str, 
     errors = {}
     choices = {}
     for name, model in _models(train, train.mechanical()).items():
-        options = {
-            "groups": train.groups,
-            "geometry": train.geometry,
-            "held_out": False,
-        }
-        model.fit_with_messages(train.q, train.x, **options)
+        geometry = train.geometry
+        fit_quietly(
+            model, train.q, train.x, train.groups, geometry=geometry, held_out=False
+        )
         for candidate, module in (model.candidates_ or {}).items():
             if candidate != "mechanical":
                 errors[f"hybrid, {candidate}"] = _held_out(model, module, test)

@@ -23,6 +23,7 @@ from hybridkin import (
     workflow,
 )
 from hybridkin.cli.main import main
+from hybridkin.hybrid.estimator import fit_quietly
 from hybridkin.saving.saved_model import model_header
 from hybridkin.workflow._domain import Domain
 from hybridkin.workflow._fit_report import auto_entry
@@ -119,7 +120,7 @@ def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
     form = robots.read_description(robot).log
     data = workflow.read_log(path, replace(form, groups="motion"))
     model = HybridForwardModel(robots.from_toml(robot), "linear", coverage=0.8, guard="box")
-    model.fit_with_messages(data.q, data.x, groups=data.groups)
+    fit_quietly(model, data.q, data.x, groups=data.groups)
     save_model(model, tmp_path / "model.safetensors")
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
     rows[rows[:, 9] == 1, 0] += 160.0  # all of this motion, outside the training range
