@@ -86,10 +86,10 @@ def copied(a: NDArray, device: torch.device | str, dtype: type | None = None) ->
 
 def number(value: Any, name: str) -> float:
     """Return a caller's real number."""
-    found = real_array(value, name)
-    if found.ndim:
+    numbers = real_array(value, name)
+    if numbers.ndim:
         raise ValueError(f"`{name}` must be one number, got {value!r:.200}.")
-    return float(found)
+    return float(numbers)
 
 
 def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
@@ -181,14 +181,14 @@ def labels(groups: Any, n_rows: int) -> NDArray:
     """Return the label of the motion of every row, shape (N,)."""
     if isinstance(groups, Tensor):
         as_tensor(groups, "groups")
-    found = (
+    names = (
         groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
     )
-    check_shape(found, "groups", [n_rows], "one entry for each row of the log")
-    if found.dtype.kind == "f" and not np.isfinite(found).all():
+    check_shape(names, "groups", [n_rows], "one entry for each row of the log")
+    if names.dtype.kind == "f" and not np.isfinite(names).all():
         need = "must name the motion of every row, got NaN or infinity"
         raise ValueError(f"`groups` {need}; drop these rows.")
-    return found.astype(str) if found.dtype == object else found
+    return names.astype(str) if names.dtype == object else names
 
 
 def as_array(a: Numbers) -> np.ndarray:

@@ -24,11 +24,11 @@ def in_blocks(
     if q.ndim == 0:
         return function(q)  # which raises
     blocks = q.reshape(math.prod(q.shape[:-1]), q.shape[-1]).split(size)
-    found = [function(rows) for rows in blocks]
+    results = [function(rows) for rows in blocks]
     whole = [
-        torch.cat([a.flatten(1) for a in part]) for part in zip(*found, strict=True)
+        torch.cat([a.flatten(1) for a in part]) for part in zip(*results, strict=True)
     ]
-    pairs = zip(whole, found[0], strict=True)
+    pairs = zip(whole, results[0], strict=True)
     return tuple(
         result.reshape(*q.shape[:-1], *part.shape[1:]) for result, part in pairs
     )
@@ -42,8 +42,8 @@ def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:
             f"`{name}` must be a torch tensor of shape (..., {size}), got "
             f"{type(value).__name__}; wrap it in torch.as_tensor(...)."
         )
-    known = value.dtype in (torch.float64, torch.float32)
-    if not known or value.layout != torch.strided or value.is_meta:
+    real = value.dtype in (torch.float64, torch.float32)
+    if not real or value.layout != torch.strided or value.is_meta:
         raise TypeError(
             f"`{name}` must be a dense floating tensor, float64 or float32, got {value.dtype} "
             f"with layout {value.layout} on {value.device}; convert it with `.double()` or "

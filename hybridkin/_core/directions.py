@@ -83,10 +83,12 @@ def few_terms(directions: NDArray) -> NDArray:
 
     def shortest(held: NDArray) -> NDArray:
         equal = np.concatenate([held, np.zeros(P)])[None]
-        found = linprog(
+        solution = linprog(
             cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)
         ).x
-        a = held if found is None else found[:K]  # if it fails, the nearest vector
+        a = (
+            held if solution is None else solution[:K]
+        )  # if it fails, the nearest vector
         return a / np.linalg.norm(a)
 
     columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]

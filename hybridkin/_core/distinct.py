@@ -50,17 +50,19 @@ def distinct_rows(
     rows += 0.0  # -0.0 equals 0.0
     times = np.ones(len(rows)) if weights is None else as_array(weights)
     if runs:
-        kept = np.arange(len(rows))
+        counted = np.arange(len(rows))
         keys = np.cumsum(np.append(True, (rows[1:] != rows[:-1]).any(axis=1)))
     else:
-        kept = np.flatnonzero(times)
-        keys = rows[kept].view(np.dtype((np.void, rows.itemsize * rows.shape[1])))[:, 0]
+        counted = np.flatnonzero(times)
+        keys = rows[counted].view(np.dtype((np.void, rows.itemsize * rows.shape[1])))[
+            :, 0
+        ]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)
     place = np.full(len(rows), -1)
-    place[kept] = np.argsort(order)[inverse]
-    counts = np.bincount(place[kept], weights=times[kept])
-    return kept[first[order]], None if (counts == 1.0).all() else counts, place
+    place[counted] = np.argsort(order)[inverse]
+    counts = np.bincount(place[counted], weights=times[counted])
+    return counted[first[order]], None if (counts == 1.0).all() else counts, place
 
 
 def at_place(values: NDArray, place: NDArray) -> NDArray:

@@ -48,9 +48,9 @@ class Portable:
             KINDS_OF_MODELS[layout.kind] = cls
 
     def __getstate__(self) -> dict[str, Any]:
-        own = vars(self).copy()  # one copy: another thread may add its program
+        state = vars(self).copy()  # one copy: another thread may add its program
         return _closed(
-            {k: value for k, value in own.items() if "_program" != k != "_lock"}
+            {k: value for k, value in state.items() if "_program" != k != "_lock"}
         )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -311,11 +311,11 @@ class FunctionModel(ForwardModel):
         super().__init__()
         self.function = function
         names = ("jacobian", "forward_and_jacobian", "in_domain", "n_actuators")
-        own, pair, self.own_domain, n = (
+        own_jacobian, pair, self.own_domain, n = (
             getattr(function, name, None) for name in names
         )
         self.own_jacobian, self.own_pair = (
-            (own, pair) if jacobian is None else (jacobian, None)
+            (own_jacobian, pair) if jacobian is None else (jacobian, None)
         )
         self.n_actuators = int(n or 0)
 

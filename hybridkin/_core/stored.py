@@ -177,14 +177,14 @@ class Stored:
             ``tensors(coef="mn", bias="m")``.
         """
         lengths = {}
-        found = {}
+        tensors = {}
         for name, letters in shapes.items():
             array = self.array(
                 name, [lengths.get(letter, letter) for letter in letters]
             )
             lengths |= dict(zip(letters, array.shape, strict=True))
-            found[name] = torch.tensor(array, device="cpu")
-        return found
+            tensors[name] = torch.tensor(array, device="cpu")
+        return tensors
 
     def part(self, name: str) -> Stored:
         """Return the description of a part."""
@@ -229,14 +229,14 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
     """Return an estimator with the given parameters; unknown ones are ignored."""
     defaults = cls().get_params(deep=False)
-    known = {
+    settings = {
         name: tuple(value)
         if isinstance(defaults[name], tuple) and type(value) is list
         else value
         for name, value in params.items()
         if name in defaults
     }
-    return cls(**known)
+    return cls(**settings)
 
 
 def restore_columns(estimator: Any, stored: Stored, n: int) -> None:

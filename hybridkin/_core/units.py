@@ -45,8 +45,10 @@ def motion_message(
 
 def millimetres_message(name: str, value: Tensor, limit: float) -> str | None:
     """Return a warning if values are too large to be metres."""
-    what = ", which looks like millimetres; hybridkin works in metres: divide by 1000."
-    return _too_large(name, value, limit, what)
+    advice = (
+        ", which looks like millimetres; hybridkin works in metres: divide by 1000."
+    )
+    return _too_large(name, value, limit, advice)
 
 
 def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
@@ -58,8 +60,10 @@ def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
 
 def degrees_message(name: str, turns: Tensor, factor: float = 1.0) -> str | None:
     """Return a warning if joint angles are too large to be radians."""
-    what = " on a revolute joint, which looks like degrees; hybridkin works in radians."
-    return _too_large(name, turns, factor * _TURNS, what)
+    advice = (
+        " on a revolute joint, which looks like degrees; hybridkin works in radians."
+    )
+    return _too_large(name, turns, factor * _TURNS, advice)
 
 
 def _too_large(name: str, value: Tensor, limit: float, what: str) -> str | None:

@@ -42,21 +42,21 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
     A free base is aligned with the tips. Free rings are turned and mirrored, one after the other.
     If only the base is free, the mirror image of the whole robot is a guess.
     """
-    found = [Guess(chain)]
+    guesses = [Guess(chain)]
     free_base = "base" in names
     if free_base:
-        found.append(Guess(aligned(chain, rows)))
+        guesses.append(Guess(aligned(chain, rows)))
     if isinstance(chain, ArcChain) and {"angles", "turns"} & {*names}:
         step = max(1, len(rows.q) // _ROWS)
         few = Rows(*(part[::step] for part in rows))
-        found += _searched(chain, few, free_base, "radii" in names)
+        guesses += _searched(chain, few, free_base, "radii" in names)
     elif free_base and isinstance(chain, ArcChain):
         counts = chain.actuators_per_segment
         mirrored = (True,) * len(counts)
         image = aligned(_ringed(chain, mirrored, np.zeros(len(counts))), rows)
-        if rows.rmse(image) < rows.rmse(found[-1].chain):
-            found.append(Guess(image, mirrored=mirrored))
-    return found
+        if rows.rmse(image) < rows.rmse(guesses[-1].chain):
+            guesses.append(Guess(image, mirrored=mirrored))
+    return guesses
 
 
 def aligned(chain: _Chain, rows: Rows) -> _Chain:
@@ -77,7 +77,7 @@ def _searched(
     chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool
 ) -> Iterator[Guess]:
     """Yield the best guesses of a search ring by ring, for several scales of the radii."""
-    found: dict[tuple, tuple[float, Guess]] = {}
+    best: dict[tuple, tuple[float, Guess]] = {}
     n_segments = len(chain.actuators_per_segment)
     for scale in _SCALES if free_radii else (1.0,):
         for hand in (False, True):
@@ -95,9 +95,9 @@ def _searched(
                             choice = tried
             guess, _ = _chosen(chain, choice, scale, rows, free_base)
             key = tuple(choice)
-            if key not in found or score < found[key][0]:
-                found[key] = (score, guess)
-    ranked = sorted(found.values(), key=lambda pair: pair[0])
+            if key not in best or score < best[key][0]:
+                best[key] = (score, guess)
+    ranked = sorted(best.values(), key=lambda pair: pair[0])
     hopeful = [guess for score, guess in ranked if score < _HOPELESS * ranked[0][0]]
     for mirrored in (False, True):
         yield from [guess for guess in hopeful if any(guess.mirrored) == mirrored][

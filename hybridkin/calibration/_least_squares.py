@@ -112,9 +112,9 @@ def row_loss(z: NDArray, weight: NDArray, loss: str) -> NDArray:
     rows, prior = np.split(z, [3 * len(weight)])
     s = rows.reshape(-1, 3).sum(axis=1) / (3.0 * weight)
     rho, slope, bend = LOSSES[loss](s)
-    own = np.repeat([weight * rho, slope, bend * s / 3.0], 3, axis=1)
-    own[2] /= np.maximum(rows, np.finfo(np.float64).tiny)
-    return np.hstack([own, [prior, np.ones_like(prior), np.zeros_like(prior)]])
+    scales = np.repeat([weight * rho, slope, bend * s / 3.0], 3, axis=1)
+    scales[2] /= np.maximum(rows, np.finfo(np.float64).tiny)
+    return np.hstack([scales, [prior, np.ones_like(prior), np.zeros_like(prior)]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +180,8 @@ def solve(
         sigma = max(rows.noise(residual(theta), robust), floor)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    found = rows.rmse(known(theta.tobytes())[0])
+    rmse = rows.rmse(known(theta.tobytes())[0])
     count = float(weight.sum())
     free = max(3.0 * count - theta.size, 1.0)
-    noise = max(sigma if robust else found * (count / free) ** 0.5, floor)
-    return Fit(problem, theta, jacobian(theta), noise, found, bool(converged))
+    noise = max(sigma if robust else rmse * (count / free) ** 0.5, floor)
+    return Fit(problem, theta, jacobian(theta), noise, rmse, bool(converged))

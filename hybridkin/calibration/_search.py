@@ -65,9 +65,9 @@ def widened(
     if elastic and isinstance(chain, ConstantCurvatureChain):
         chain = ElasticTendonChain.from_chain(chain)
     problem = Problem.of(chain, names, {}, prior)
-    known = zip(start.problem.parameters, start.problem.parts(start.theta), strict=True)
-    found = {part.name: theta for part, theta in known}
-    theta = [found.get(part.name, np.zeros(part.size)) for part in problem.parameters]
+    pairs = zip(start.problem.parameters, start.problem.parts(start.theta), strict=True)
+    values = {part.name: theta for part, theta in pairs}
+    theta = [values.get(part.name, np.zeros(part.size)) for part in problem.parameters]
     return Start(problem, np.concatenate(theta), start.message)
 
 

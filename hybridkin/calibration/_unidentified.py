@@ -48,7 +48,7 @@ def sentences(
     steps = [_STEPS[kind] for part in problem.parameters for kind in part.kind]
     to_steps = problem.prior_std * units / np.array([size for size, _ in steps])
     columns = 1e3 * fit.jacobian * problem.prior_std / np.sqrt(n_rows)  # [mm] of tip
-    found = []
+    texts = []
     for move in few_terms(directions):
         # The first parameter with a fair part is named first and changes by one step.
         lead = int(np.argmax(np.abs(move) > _FAIR * np.abs(move).max()))
@@ -66,16 +66,16 @@ def sentences(
             f"{label} {size:+.3g} {steps[place][1]}" for label, size, place in shown
         ]
         advice = _advice(fit, covariance, move * to_steps, shown)
-        found.append(f"{_joined(words, n_hidden)} {effect}: {advice}")
-    return tuple(found)
+        texts.append(f"{_joined(words, n_hidden)} {effect}: {advice}")
+    return tuple(texts)
 
 
 def _joined(words: list[str], n_hidden: int) -> str:
     """Return the first part of a direction "with" the others."""
-    others = [", ".join(words[1:])] if len(words) > 1 else []
+    middle = [", ".join(words[1:])] if len(words) > 1 else []
     if n_hidden:
-        others.append(f"{n_hidden} smaller")
-    return " with ".join([words[0], " and ".join(others)]) if others else words[0]
+        middle.append(f"{n_hidden} smaller")
+    return " with ".join([words[0], " and ".join(middle)]) if middle else words[0]
 
 
 def _advice(fit: Fit, covariance: NDArray, move: NDArray, shown: list[_Term]) -> str:
@@ -115,8 +115,8 @@ def _determined(fit: Fit, covariance: NDArray, move: NDArray, i: int, j: int) ->
         for v in part.value(geometry[part.entry]).flatten()[: part.size]
     ]
     value = float(values[i] / values[j] ** way)
-    what = f"{labels[i]} {'/' if way > 0 else '*'} {labels[j]}"
-    shown = f" The data identify {what} = {value:.4g} (std. error {abs(value) * error:.2g})."
+    combination = f"{labels[i]} {'/' if way > 0 else '*'} {labels[j]}"
+    shown = f" The data identify {combination} = {value:.4g} (std. error {abs(value) * error:.2g})."
     return shown if error < _DETERMINED else ""
 
 

@@ -447,12 +447,15 @@ def check_data(
         raise ValueError("`q` must hold at least one row, got none.")
     messages = chain.check_actuators(q)
     x = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x"))
-    found = chain(q)
-    known = torch.where(x.isnan(), found, x)
+    predicted = chain(q)
+    measured = torch.where(x.isnan(), predicted, x)
     return (
         q,
         x,
-        [*messages, motion_message("x", known, found, float(chain.reach.detach()))],
+        [
+            *messages,
+            motion_message("x", measured, predicted, float(chain.reach.detach())),
+        ],
     )
 
 

@@ -174,17 +174,21 @@ def choose_geometry(
         The parameters to calibrate, and the errors of all sets.
     """
     one_of(loss, "loss", LOSSES)
-    given = chain
+    nominal = chain
     chain = copy.deepcopy(chain).cpu()
     q, x, _ = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))
-    kept = np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
-    kept = np.sort(kept[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)])
+    chosen_rows = (
+        np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
+    )
+    chosen_rows = np.sort(
+        chosen_rows[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)]
+    )
     counts = (
         q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
     )
-    rows = Rows(q[kept], x[kept], counts[kept])
+    rows = Rows(q[chosen_rows], x[chosen_rows], counts[chosen_rows])
     with torch.no_grad():
         rungs = _rungs(chain, q, parameters)
         tied = () if parameters is not None else unmoved(chain, q)
@@ -193,25 +197,27 @@ def choose_geometry(
     errors = {}
     near = []
     if len(rungs) > 1:
-        motions = None if groups is None else groups[kept]
+        motions = None if groups is None else groups[chosen_rows]
         splits = [(1, *split) for split in _splits(rows, motions)]
-        if outside and len(kept) >= _FEW:
+        if outside and len(chosen_rows) >= _FEW:
             splits.append((0, *inner_and_outer(rows.q.numpy())))
-        found = [
+        rung_errors = [
             _errors(rung, at, rows, splits, loss)
             for rung, at in zip(rungs, starts, strict=True)
         ]
         free = np.array([0 if at is None else at.theta.size for at in starts])
-        sure = (free <= len(kept) / _ROWS) | [rung.name in _USUAL for rung in rungs]
+        sure = (free <= len(chosen_rows) / _ROWS) | [
+            rung.name in _USUAL for rung in rungs
+        ]
         enough = free <= len(splits[-1][1]) / _ROWS
-        table = np.maximum(found, _EXACT * float(chain.reach))
+        table = np.maximum(rung_errors, _EXACT * float(chain.reach))
         best = _best(table, sure, enough)
-        errors = {rung.name: one for rung, one in zip(rungs, found, strict=True)}
+        errors = {rung.name: one for rung, one in zip(rungs, rung_errors, strict=True)}
         near = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
 
     def choice(k: int) -> GeometryChoice:
         name, chosen, names = rungs[k]
-        chosen = given if chosen is chain else chosen
+        chosen = nominal if chosen is chain else chosen
         return GeometryChoice(chosen, names, starts[k], name, errors, tied)
 
     rivals = tuple(choice(k) for k in near if k != best and rungs[k].parameters)
@@ -250,19 +256,23 @@ def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_R
         names = tuple(parameters)
         rungs = [_Rung(_name(names), chain, names)]
         if elastic is not None:
-            own = elastic.default_parameters
+            elastic_names = elastic.default_parameters
             # Lengths and radii of a plain chain compensate for slack; elastic tendons keep them.
-            kept = [
+            not_elastic = [
                 name
                 for name in names
                 if name not in ("radii", "lengths", "actuator_zeros")
             ]
             if names != chain.default_parameters:
-                own = (
-                    *kept,
-                    *(name for name in own if name not in ("radii", "lengths", *kept)),
+                elastic_names = (
+                    *not_elastic,
+                    *(
+                        name
+                        for name in elastic_names
+                        if name not in ("radii", "lengths", *not_elastic)
+                    ),
                 )
-            rungs.append(_Rung(_RIVAL + _name(own), elastic, own))
+            rungs.append(_Rung(_RIVAL + _name(elastic_names), elastic, elastic_names))
         return rungs
     if not isinstance(chain, ArcChain):
         sets = ((), chain.default_parameters)
@@ -366,12 +376,14 @@ def _errors(
     """Return the errors of a set; splits are (1, ...) of held-out rows, (0, ...) of outer rows."""
     totals = np.zeros((2, 2))  # of io and cv: weighted distances, and weights
     for kind, train, test in splits:
-        chain, known, new = (
+        chain, training, new = (
             rung.chain,
             *(Rows(*(part[i] for part in rows)) for i in (train, test)),
         )
         if start is not None:
-            chain = solve(start.problem, known, start.theta, loss, roughly=True).chain()
+            chain = solve(
+                start.problem, training, start.theta, loss, roughly=True
+            ).chain()
         residual = new.residual(chain)
         weight = new.weights
         totals[kind] += weight @ np.linalg.norm(residual, axis=1), weight.sum()
@@ -415,8 +427,8 @@ def split_by_effect(
     it hardly moves.
     """
     with torch.enable_grad():
-        some = model.forward_and_jacobian(q[:: max(1, len(q) // 50)])[1]
-    J = some.detach().flatten(0, 1).numpy()
+        jacobians = model.forward_and_jacobian(q[:: max(1, len(q) // 50)])[1]
+    J = jacobians.detach().flatten(0, 1).numpy()
     effects, turned = np.linalg.eigh((J @ directions).T @ (J @ directions))
     moving = effects > (_MOVES * np.linalg.norm(J, 2)) ** 2
     return turned[:, moving], turned[:, ~moving]

@@ -125,8 +125,10 @@ def fit_play(
     size = (
         float(chain.gains.detach().abs().mean()) if isinstance(chain, ArcChain) else 1.0
     )
-    given = _WIDTHS / size if widths is None else real_array(widths, "widths").ravel()
-    tried = np.unique(np.concatenate([[0.0], given])).tolist()
+    tried_widths = (
+        _WIDTHS / size if widths is None else real_array(widths, "widths").ravel()
+    )
+    tried = np.unique(np.concatenate([[0.0], tried_widths])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q = real_array(q, "q")
     x = real_array(x, "x")

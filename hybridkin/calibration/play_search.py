@@ -78,8 +78,10 @@ def search_width(
         place = widths.index(best)
         bounds = widths[place - 1], widths[min(place + 1, len(widths) - 1)]
         options = {"xatol": _CLOSE * best}
-        found = minimize_scalar(error, bounds=bounds, method="bounded", options=options)
-        best = min(best, float(found.x), key=error)
+        minimum = minimize_scalar(
+            error, bounds=bounds, method="bounded", options=options
+        )
+        best = min(best, float(minimum.x), key=error)
     gains = errors_of(0.0) - errors_of(best)
     std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
     return WidthSearch(

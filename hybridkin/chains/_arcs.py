@@ -157,7 +157,7 @@ def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     arc = stumpff(bending.square().sum(-1))
     x, y = bending.unbind(-1)
     zero = torch.zeros_like(x)
-    one = torch.ones_like(x)
+    ones = torch.ones_like(x)
     fx = arc.f * x
     fy = arc.f * y
     gxy = -arc.g * x * y
@@ -166,7 +166,7 @@ def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
         *(1.0 - arc.g * x * x, gxy, fx, across * x),
         *(gxy, 1.0 - arc.g * y * y, fy, across * y),
         *(-fx, -fy, arc.c, length * arc.f + offsets * arc.c),
-        *(zero, zero, zero, one),
+        *(zero, zero, zero, ones),
     ]
     return torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
 
@@ -216,10 +216,10 @@ def free_arcs(
     the one in the plane of its actuators.
     """
     S = len(bends)
-    shares = [*map(float, extensible), *(0.5 * n for n in (*bends, *bends))]
+    counts = [*map(float, extensible), *(0.5 * n for n in (*bends, *bends))]
     # Not new_tensor: before torch 2.5 it does not work in functional transforms.
     free = torch.diag(
-        torch.tensor(shares, dtype=angles[0].dtype, device=angles[0].device)
+        torch.tensor(counts, dtype=angles[0].dtype, device=angles[0].device)
     )
     for k in (k for k in range(S) if bends[k] == 1):
         # In a plane at the angle psi: [[1 + cos 2 psi, sin 2 psi], [sin 2 psi, 1 - cos 2 psi]] / 2.

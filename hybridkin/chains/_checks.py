@@ -134,49 +134,51 @@ def bend_counts(
 
     It is 0 for an extensible segment with a single actuator.
     """
-    found = []
+    bends = []
     for own, stretches in zip(angles, extensible, strict=True):
-        seen = torch.linalg.svdvals(bend_readings(own, stretches))
-        most, least = torch.nn.functional.pad(seen, (0, 1))[:2].tolist()
+        singular = torch.linalg.svdvals(bend_readings(own, stretches))
+        most, least = torch.nn.functional.pad(singular, (0, 1))[:2].tolist()
         planar = least <= 64.0 * torch.finfo(own.dtype).eps * most
         if stretches and len(own) == 1:
-            found.append(0)
+            bends.append(0)
         elif most > _DETERMINED and (planar or least > _DETERMINED * most):
-            found.append(1 if planar else 2)
+            bends.append(1 if planar else 2)
         else:
             raise ValueError(
                 "`angles` must determine the bending of every segment, got "
                 f"{[row.tolist() for row in angles]}; give the actuators of a segment clearly "
                 "different angles [rad], or exactly planar ones: psi and psi + math.pi."
             )
-    return tuple(found)
+    return tuple(bends)
 
 
 def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
     """Return the constructor arguments of a stored chain, from its entries of these names."""
     counts = stored.list_of(int, "actuators_per_segment")
     may_lack = ("lengths", "gains")
-    given: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         name: stored.array(name)
         for name in names
         if name not in may_lack or name in stored.arrays
     }
-    if sum(counts) != len(given["angles"]):
+    if sum(counts) != len(arguments["angles"]):
         raise ValueError(
             f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}"
         )
-    given["angles"] = np.split(given["angles"], np.cumsum(counts)[:-1])
+    arguments["angles"] = np.split(arguments["angles"], np.cumsum(counts)[:-1])
     if "stage" in stored.settings:  # older files have neither stages nor planes
-        lengths = iter(given.pop("lengths", ()))
+        lengths = iter(arguments.pop("lengths", ()))
         flags = stored.list_of(bool, "extensible")
-        given["lengths"] = [None if own else next(lengths, math.nan) for own in flags]
-        given["stage"] = stored.value("stage", (str, None))
+        arguments["lengths"] = [
+            None if own else next(lengths, math.nan) for own in flags
+        ]
+        arguments["stage"] = stored.value("stage", (str, None))
         # Planar actuators stay planar, although calibration has moved their angles slightly.
-        pairs = zip(given["angles"], stored.list_of(int, "bends"), strict=True)
-        given["angles"] = [
+        pairs = zip(arguments["angles"], stored.list_of(int, "bends"), strict=True)
+        arguments["angles"] = [
             math.pi * (np.arange(len(a)) % 2) if n == 1 else a for a, n in pairs
         ]
-    return {**given, "routing": stored.value("routing", str), "n_actuators": counts}
+    return {**arguments, "routing": stored.value("routing", str), "n_actuators": counts}
 
 
 def numeric(
@@ -221,13 +223,13 @@ def actuator_counts(
     n_actuators: int | Sequence[int], n_segments: int
 ) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
-    given = np.asarray(n_actuators)
-    if given.dtype.kind not in "iu" or given.shape not in ((), (n_segments,)):
+    numbers = np.asarray(n_actuators)
+    if numbers.dtype.kind not in "iu" or numbers.shape not in ((), (n_segments,)):
         raise ValueError(
             f"`n_actuators` must be one whole number or {n_segments} of them, one per segment as "
             f"in `radii`, got {n_actuators!r}."
         )
-    counts = tuple(np.broadcast_to(given, n_segments).tolist())
+    counts = tuple(np.broadcast_to(numbers, n_segments).tolist())
     if min(counts) < 1:
         raise ValueError(
             f"`n_actuators` must be at least 1 on every segment, got {counts}."
@@ -249,8 +251,8 @@ def flat_angles(
     elif _is_nested(angles):
         rows = angles
     else:
-        given = numeric(angles, "angles", dtype)
-        rows = given if given.ndim == 2 else [given] * len(counts)
+        values = numeric(angles, "angles", dtype)
+        rows = values if values.ndim == 2 else [values] * len(counts)
     rows = [numeric(row, "angles", dtype) for row in rows]
     if tuple(row.numel() for row in rows) != counts:
         raise ValueError(

@@ -339,8 +339,8 @@ class JointChain(Chain):
 
     def _frames(self, q: Tensor) -> Tensor:
         """Return the base and every joint's moving frame, shape (..., n_joints + 1, 4, 4)."""
-        found = frames(*self._shares(self._joints(q)), self.motions.to(q))
-        return self.base.to(q) @ found.reshape(*q.shape[:-1], *found.shape[1:])
+        poses = frames(*self._shares(self._joints(q)), self.motions.to(q))
+        return self.base.to(q) @ poses.reshape(*q.shape[:-1], *poses.shape[1:])
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         x, J = self.from_coordinates_and_jacobian(self._joints(q))

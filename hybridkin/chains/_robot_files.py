@@ -188,28 +188,37 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
             f"[[segment]] must describe at most {_MOST} segments in all, got "
             f"{len(segments)}; check `repeat`."
         )
-    given: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         key: [segment[key] for segment in segments] for key in segments[0]
     }
     for key in ("gains", *(("length", *_STIFFNESS) if elastic else ())):
-        missing = [i + 1 for i, value in enumerate(given[key]) if value is None]
+        missing = [i + 1 for i, value in enumerate(arguments[key]) if value is None]
         needed = key == "length"
         if missing and (needed or len(missing) < len(segments)):
             raise ValueError(
                 f"`{key}` must be in every [[segment]]{'' if needed else ' or in none'}, but is "
                 f"missing for segment {missing[0]}."
             )
-        given[key] = None if missing else given[key]
-    given |= {"lengths": given.pop("length"), "base": _base(tables.get("base", {}))}
-    given["gains"] = given["gains"] or 1.0
-    given |= {"routing": tables["routing"]} if "routing" in tables else {}
-    stages = given.pop("stage")
+        arguments[key] = None if missing else arguments[key]
+    arguments |= {
+        "lengths": arguments.pop("length"),
+        "base": _base(tables.get("base", {})),
+    }
+    arguments["gains"] = arguments["gains"] or 1.0
+    arguments |= {"routing": tables["routing"]} if "routing" in tables else {}
+    stages = arguments.pop("stage")
     if "rotation" in stages[1:]:
         raise ValueError('`stage` "rotation" is only allowed in the first [[segment]].')
-    given |= {"stage": "rotation"} if stages[0] == "rotation" else {}
-    any_radius = next(filter(None, given["radii"]), 1.0)  # for stages it has no effect
-    given["radii"] = [radius or any_radius for radius in given["radii"]]
-    return ElasticTendonChain(**given) if elastic else ConstantCurvatureChain(**given)
+    arguments |= {"stage": "rotation"} if stages[0] == "rotation" else {}
+    any_radius = next(
+        filter(None, arguments["radii"]), 1.0
+    )  # for stages it has no effect
+    arguments["radii"] = [radius or any_radius for radius in arguments["radii"]]
+    return (
+        ElasticTendonChain(**arguments)
+        if elastic
+        else ConstantCurvatureChain(**arguments)
+    )
 
 
 def _segment(

@@ -57,8 +57,8 @@ def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
     forces = units[:, None] * torch.cat([force, unit_forces], dim=-1)
     solved = units[:, None] * torch.linalg.solve_ex(scaled, forces).result
     shape, compliance = solved.split([force.shape[-1], len(stiffness)], dim=-1)
-    given = torch.cat([torch.diag(gains), -zeros[:, None]], dim=-1)
-    return Responses(shape, readings @ shape - given, compliance)
+    loads = torch.cat([torch.diag(gains), -zeros[:, None]], dim=-1)
+    return Responses(shape, readings @ shape - loads, compliance)
 
 
 def extended(rows: Tensor) -> Tensor:
@@ -104,15 +104,15 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
     for step in range(HK_WHOLE_STEPS + 2 ** min(n, HK_MOST_TURNS)):
         maps = maps_of(here)
         stretch = applied(maps, x)
-        found = ((stretch >= 0) * bits).sum(-1)
+        taut = ((stretch >= 0) * bits).sum(-1)
         if step >= HK_WHOLE_STEPS:  # one at a time, ignoring rounding errors
             rounding = 4.0 * torch.finfo(x.dtype).eps * applied(maps.abs(), x.abs())
-            wrong = (found ^ here) & ((stretch.abs() > rounding) * bits).sum(-1)
-            found = here ^ (wrong & -wrong)
-        moved = (found != here).nonzero()[:, 0]
+            wrong = (taut ^ here) & ((stretch.abs() > rounding) * bits).sum(-1)
+            taut = here ^ (wrong & -wrong)
+        moved = (taut != here).nonzero()[:, 0]
         if not len(moved):
             break
-        at, x, here = (part.index_select(0, moved) for part in (at, x, found))
+        at, x, here = (part.index_select(0, moved) for part in (at, x, taut))
         codes[at] = here
     return codes
 
@@ -150,5 +150,5 @@ class FindTaut(torch.autograd.Function):
         n = info.batch_size
         pairs = zip(tensors, dims, strict=True)
         each = [[a] * n if dim is None else a.unbind(dim) for a, dim in pairs]
-        found = [FindTaut.apply(find, *parts) for parts in zip(*each, strict=True)]
-        return torch.stack(found), 0
+        results = [FindTaut.apply(find, *parts) for parts in zip(*each, strict=True)]
+        return torch.stack(results), 0

@@ -100,29 +100,29 @@ def _bytes(text: str) -> bytes:
 def _numbers(element: _Element, tag: str, key: str, default: str) -> list[float]:
     """Return the numbers of an attribute, as many as the default has."""
     text = element[tag].get(key, default)
-    found = []
+    numbers = []
     try:
-        found = [float(part) for part in text.split()]
+        numbers = [float(part) for part in text.split()]
     except ValueError:
         pass
-    if len(found) != (n := len(default.split())):
+    if len(numbers) != (n := len(default.split())):
         where = f"`{key}` of <{tag}> of joint {element['joint'].get('name', '')!r}"
         raise ValueError(
             f"{where} must be {n} numbers, got {text!r}; correct the URDF."
         )
-    return found
+    return numbers
 
 
 def _elements(
     text: str, end_link: str, root_link: str | None
 ) -> list[tuple[_Element, list[Joint]]]:
     """Return the <joint> elements from one link to another, each with its joints."""
-    known, joints = _read(text)
-    _check_tree(known, joints)
+    links, joints = _read(text)
+    _check_tree(links, joints)
     by_child = {joint["child"].get("link", ""): joint for joint in joints}
     by_name = {joint["joint"].get("name", ""): joint for joint in joints}
-    link = in_robot(end_link, known, "`end_link`")
-    root = None if root_link is None else in_robot(root_link, known, "`root_link`")
+    link = in_robot(end_link, links, "`end_link`")
+    root = None if root_link is None else in_robot(root_link, links, "`root_link`")
     path: list[tuple[_Element, list[Joint]]] = []
     while link != root and link in by_child:
         element = by_child[link]
@@ -137,8 +137,8 @@ def _elements(
 
 def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[Joint]:
     """Return the joints of a URDF from one link to another."""
-    found = _elements(urdf_text(text_or_path), end_link, root_link)
-    path = [joint for _, joints in found for joint in joints]
+    elements = _elements(urdf_text(text_or_path), end_link, root_link)
+    path = [joint for _, joints in elements for joint in joints]
     moving = {joint.name: joint for joint in path if joint.kind != "fixed"}
     for limits, what in ((None, _MISSING), ((0.0, 0.0), _LOCKED)):
         names = [name for name, joint in moving.items() if joint.limits == limits]
@@ -159,10 +159,10 @@ def _check_tree(links: list[str], joints: list[_Element]) -> None:
             raise ValueError(
                 f"every {what} of a URDF must occur once, got {doubled} repeatedly."
             )
-    known = dict.fromkeys(links)
+    reached = dict.fromkeys(links)
     for name, parent, child in zip(named, parents, children, strict=True):
-        in_robot(parent, known, f"<parent> of joint {name!r}")
-        in_robot(child, known, f"<child> of joint {name!r}")
+        in_robot(parent, reached, f"<parent> of joint {name!r}")
+        in_robot(child, reached, f"<child> of joint {name!r}")
     try:
         tree = zip(children, parents, strict=True)
         TopologicalSorter({child: [parent] for child, parent in tree}).prepare()
@@ -222,9 +222,9 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
         )  # not in the file
     driven_by = driver["joint"].get("type", "")
     if not {kind, driven_by} <= {*_ONE_AXIS, "fixed"}:
-        known = (*_ONE_AXIS, "fixed", *_FREE)
+        kinds = (*_ONE_AXIS, "fixed", *_FREE)
         raise ValueError(
-            f"`type` of joint {followed[0]!r} must be one of {known}, or one of the first four "
+            f"`type` of joint {followed[0]!r} must be one of {kinds}, or one of the first four "
             f"if it mimics another joint, got {kind!r}"
             + f" that mimics {driven_by!r}."
             * bool(element["mimic"])

@@ -127,9 +127,9 @@ class ArcChain(MarkedChain):
     @property
     def absolute(self) -> Tensor:
         """Which actuators (n,) have absolute lengths: those of extensible segments, bool."""
-        own = np.repeat(self.extensible, self.actuators_per_segment)
-        own[: self.stage is not None] = False
-        return torch.from_numpy(own).to(self.radii.device)
+        absolute = np.repeat(self.extensible, self.actuators_per_segment)
+        absolute[: self.stage is not None] = False
+        return torch.from_numpy(absolute).to(self.radii.device)
 
     @property
     def in_metres(self) -> bool:
@@ -523,9 +523,9 @@ class ArcChain(MarkedChain):
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
         """Return the chain built from a description."""
-        given = stored_arguments(stored, cls._entries)
-        chain = cls(**given, dtype=torch.from_numpy(given["base"]).dtype)
-        angles = stored.array("angles").astype(given["base"].dtype, copy=False)
+        arguments = stored_arguments(stored, cls._entries)
+        chain = cls(**arguments, dtype=torch.from_numpy(arguments["base"]).dtype)
+        angles = stored.array("angles").astype(arguments["base"].dtype, copy=False)
         chain = chain.with_geometry(angles=torch.from_numpy(angles))
         tip_at = stored.value("tip_at", float)
         places = stored.list_of(list, "markers")

@@ -130,12 +130,12 @@ class Chain(PoseModel):
 
     def _check_tangents(self, tangents: Mapping[str, Tensor]) -> None:
         shapes = {name: value.shape for name, value in self.geometry().items()}
-        given = tangents if isinstance(tangents, Mapping) else {}
-        if not given or not {*given} <= {*shapes}:
+        entries = tangents if isinstance(tangents, Mapping) else {}
+        if not entries or not {*entries} <= {*shapes}:
             need = f"must map entries of the geometry, {sorted(shapes)}, to changes"
             raise ValueError(f"`tangents` {need}, got {tangents!r:.80}.")
-        first = next(iter(given.values()))
-        for name, value in given.items():
+        first = next(iter(entries.values()))
+        for name, value in entries.items():
             check_tensor(value, f"tangents[{name!r}]")
             check_shape(value, f"tangents[{name!r}]", (len(first), *shapes[name]))
 

@@ -272,8 +272,10 @@ class ConstantCurvatureChain(ArcChain):
         if all(self.extensible):
             return None
         with torch.no_grad():
-            given = ~torch.tensor(self.extensible, device=q.device)
-            (wrong,) = in_blocks(lambda some: (self.contradictory(some) & given,), rows)
+            fixed_length = ~torch.tensor(self.extensible, device=q.device)
+            (wrong,) = in_blocks(
+                lambda some: (self.contradictory(some) & fixed_length,), rows
+            )
             if not wrong.any():
                 return None
             residual = self.consistency(rows) * wrong

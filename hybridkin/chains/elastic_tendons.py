@@ -239,12 +239,12 @@ class ElasticTendonChain(ArcChain):
         counts = chain.actuators_per_segment
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
-        given = {
+        arguments = {
             "n_actuators": counts,
             "routing": chain.routing,
             "dtype": chain.radii.dtype,
         }
-        return cls(**{**geometry, "angles": angles, **given, **options})._marked(
+        return cls(**{**geometry, "angles": angles, **arguments, **options})._marked(
             chain.markers
         )
 
@@ -302,14 +302,14 @@ class ElasticTendonChain(ArcChain):
     def _elasticity(self) -> _slack.Elasticity:
         counts = self.actuators_per_segment
         at = levers(self.radii, self.angles, counts)
-        one = torch.ones_like(self.radii)
+        ones = torch.ones_like(self.radii)
         return _slack.Elasticity(
             reading_matrix(at, counts, self.starts),
-            torch.cat([one, 1.0 / self.radii, 1.0 / self.radii]),
+            torch.cat([ones, 1.0 / self.radii, 1.0 / self.radii]),
             torch.cat(
                 [self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]
             ),
-            torch.cat([0.0 * one, *self.rest_bends.unbind(-1)]),
+            torch.cat([0.0 * ones, *self.rest_bends.unbind(-1)]),
             self.tendon_zeros,
             self.gains,
         )
@@ -328,9 +328,9 @@ class ElasticTendonChain(ArcChain):
             else (rows.dtype, rows.device, *(v._version for v in shaping))
         )
         if key is not None and self._table is not None:
-            kept, kept_key, responses = self._table
+            kept_elasticity, kept_key, responses = self._table
             if key == kept_key and all(
-                a is b for a, b in zip(kept, shaping, strict=True)
+                a is b for a, b in zip(kept_elasticity, shaping, strict=True)
             ):
                 return responses
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
@@ -361,8 +361,8 @@ class ElasticTendonChain(ArcChain):
             )
             return codes, codes, table
         elasticity = _slack.Elasticity(*(part.to(rows) for part in self._elasticity()))
-        given = (part.detach() for part in (rows, *elasticity))
-        codes = _slack.FindTaut.apply(_slack.find_by_solving, *given)
+        parts = (part.detach() for part in (rows, *elasticity))
+        codes = _slack.FindTaut.apply(_slack.find_by_solving, *parts)
         responses = _slack.responses_of(
             _slack.as_mask(codes, self.n_actuators), elasticity
         )

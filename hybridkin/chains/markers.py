@@ -94,7 +94,7 @@ class MarkedChain(Chain):
         >>> marked(torch.zeros(6, dtype=torch.float64))
         tensor([0.0200, 0.0000, 0.0500, 0.0000, 0.0000, 0.2000], dtype=torch.float64)
         """
-        found = []
+        markers_checked = []
         for marker in markers if isinstance(markers, (list, tuple)) else [markers]:
             if not isinstance(marker, (list, tuple)) or len(marker) not in (2, 3):
                 need = "tuples (segment, fraction) or (segment, fraction, offset)"
@@ -111,14 +111,16 @@ class MarkedChain(Chain):
                     "`markers` must be tuples (segment, fraction, offset) with a segment from 0 to "
                     f"{self.n_segments - 1} and a fraction in (0, 1], got {segment}, {fraction}."
                 )
-            found.append((segment + fraction, *beside.tolist()))
-        if not found:
+            markers_checked.append((segment + fraction, *beside.tolist()))
+        if not markers_checked:
             raise ValueError("`markers` must hold at least one marker, got none.")
-        if getattr(self, "stage", None) and any(x or y for _, x, y, _ in found):
+        if getattr(self, "stage", None) and any(
+            x or y for _, x, y, _ in markers_checked
+        ):
             raise ValueError(
                 "`markers` must lie on the backbone of a robot on a rotation stage."
             )
-        return self._marked(found)
+        return self._marked(markers_checked)
 
     @property
     def tip_model(self) -> Self:
@@ -127,8 +129,8 @@ class MarkedChain(Chain):
 
     def tips(self) -> list[Self]:
         """Return one chain per marker, each mapping q (..., n) to x (..., 3)."""
-        one = len(self.markers) == 1
-        return [self] if one else [self._marked([marker]) for marker in self.markers]
+        single = len(self.markers) == 1
+        return [self] if single else [self._marked([marker]) for marker in self.markers]
 
     def up_to_tip(self, arcs: Tensor) -> Tensor:
         """Return the rows (3 m, ...) up to the tip, of arcs (3 S, ...) or of their slope.

@@ -137,12 +137,12 @@ class Limits:
 
     def intersect(self, other: Limits) -> Limits:
         """Return the intersection of two limits; an entry that is None sets no limit."""
-        found = {}
+        tighter_limits = {}
         for name, mine in vars(self).items():
-            given = [limit for limit in (mine, vars(other)[name]) if limit is not None]
+            limits = [limit for limit in (mine, vars(other)[name]) if limit is not None]
             tighter = np.maximum if name == "q_min" else np.minimum
-            found[name] = functools.reduce(tighter, given) if given else None
-        return Limits(**found)
+            tighter_limits[name] = functools.reduce(tighter, limits) if limits else None
+        return Limits(**tighter_limits)
 
     def scaled(self, factor: float | np.ndarray) -> Limits:
         """Return the limits in other units; a negative `factor` swaps low and high."""
@@ -363,12 +363,12 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
     if markers and chain is not None:
         chain = chain.with_markers([(k, at, beside) for k, at, *beside in markers])
     names = () if chain is None else tables.get("calibrate", "auto")
-    known = () if chain is None else (*chain.geometry(), *ALIASES)
+    geometry_names = () if chain is None else (*chain.geometry(), *ALIASES)
     if names == "default" and chain is not None:
         names = chain.default_parameters
-    if names != "auto" and (not {*names} <= {*known} or len({*names}) < len(names)):
+    if names != "auto" and (not {*names} <= {*geometry_names} or len({*names}) < len(names)):
         raise ValueError(
-            f'`calibrate` must name different entries of {known}, or be "auto" or "default", got '
+            f'`calibrate` must name different entries of {geometry_names}, or be "auto" or "default", got '
             f"{names}."
         )
     names = names if isinstance(names, str) else tuple(names)
@@ -401,10 +401,10 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     given.pop("markers", None)
     gained = chain is not None and not chain.in_metres
     unit = given.setdefault("q_unit", "1" if gained else "m")
-    known = [*UNITS] if chain is None else [*METRES]
-    if not gained and unit not in known:
+    units = [*UNITS] if chain is None else [*METRES]
+    if not gained and unit not in units:
         raise ValueError(
-            f'`q_unit` in [log] must be one of {known}; for motors "deg" or "rad", with a '
+            f'`q_unit` in [log] must be one of {units}; for motors "deg" or "rad", with a '
             "`spool_radius` [m] in every [[segment]]; for pressures or other units any name, with "
             f"a `gain` [m per unit] instead; got {unit!r}."
         )
@@ -413,17 +413,17 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
 
 
 def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
-    given = {key: value for key, value in table.items() if key != "unit"}
+    values = {key: value for key, value in table.items() if key != "unit"}
     unit = table.get("unit", "m")
     log = robot.log
     plain = robot.chain is not None and robot.chain.in_metres
     need = "m" if log is None else unit if plain else "log"
-    if given and unit != need:
+    if values and unit != need:
         why = "without [[segment]]" if robot.chain is None else "with gains"
         why = "without [log]" if log is None else why
         raise ValueError(f'`unit` in [limits] must be "{need}" {why}, got "{unit}".')
     limits = Limits(
-        **{key: each(given, key, "[limits]", robot.n_actuators) for key in given}
+        **{key: each(values, key, "[limits]", robot.n_actuators) for key in values}
     )
     low = limits.q_min
     high = limits.q_max

@@ -125,10 +125,10 @@ def _is_needless(name: str, answers: _Answers, given: _Answers) -> bool:
 def _asked(question: _Question) -> Any:
     """Return what the user answers to a question on standard error; empty: the default."""
     name, text, parse, default = question
-    known = (
+    proposal = (
         ",".join(map(str, default)) if isinstance(default, tuple | list) else default
     )
-    hint = "" if default is _NEEDED else f" [{known or 'none'}]"
+    hint = "" if default is _NEEDED else f" [{proposal or 'none'}]"
     while True:
         print(f"{name}: {text}{hint}: ", end="", file=sys.stderr, flush=True)
         answer = input().strip()

@@ -538,8 +538,8 @@ def _add_model(
     text: str = "model file, its folder, or a robot description",
 ) -> None:
     command.add_argument(name, type=Path, metavar=metavar, help=text)
-    known = "robot description with [log] and [limits] (the one beside the model)"
-    command.add_argument("--robot", type=Path, metavar="ROBOT.toml", help=known)
+    default = "robot description with [log] and [limits] (the one beside the model)"
+    command.add_argument("--robot", type=Path, metavar="ROBOT.toml", help=default)
 
 
 _REPLACE_OTHERS = "in --out, replace files that another command or program wrote"
@@ -568,8 +568,8 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     )
     add("--time", metavar="COLUMN", help="column of the time [s]; or none")
     add("--delimiter", metavar="CHAR", help=_DELIMITER)
-    some = "leave out motions by name, such as '*tendon*'; may be repeated"
-    add("--exclude", action="append", default=[], metavar="PATTERN", help=some)
+    text = "leave out motions by name, such as '*tendon*'; may be repeated"
+    add("--exclude", action="append", default=[], metavar="PATTERN", help=text)
     add(
         "--drop-invalid",
         action="store_true",

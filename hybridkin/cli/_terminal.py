@@ -118,8 +118,8 @@ def shown(report: Report) -> str:
 def _ruled(
     console: Console, header: Sequence[str], rows: Sequence[Sequence[str]]
 ) -> str:
-    first, *others = map(Text, header)
-    columns = [Column(first), *(Column(title, justify="right") for title in others)]
+    first, *remaining = map(Text, header)
+    columns = [Column(first), *(Column(title, justify="right") for title in remaining)]
     table = Table(*columns, box=box.SIMPLE_HEAD)
     for row in rows:
         table.add_row(*map(Text, row))

@@ -150,8 +150,8 @@ def _next(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     loaded = workflow.open_model(arguments.model, arguments.robot)
     measured = path = None
     if arguments.log is not None:
-        known = None if loaded.description is None else loaded.description.log
-        log_format = _log_format(arguments, known, arguments.model)
+        robot_format = None if loaded.description is None else loaded.description.log
+        log_format = _log_format(arguments, robot_format, arguments.model)
         measured = _read(arguments, log_format, loaded.chain, False, stages)
         measured.check(arguments.force)
     if arguments.path is not None:
@@ -223,9 +223,9 @@ def _model_before(arguments: argparse.Namespace) -> str:
 
 def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
-    known = None if loaded.description is None else loaded.description.log
+    robot_format = None if loaded.description is None else loaded.description.log
     nominal = loaded.chain if loaded.header is None else None
-    log_format = _log_format(arguments, known, arguments.model)
+    log_format = _log_format(arguments, robot_format, arguments.model)
     log = _read(arguments, log_format, nominal, False, stages)
     _note(log.report, stages)
     report, paths = hybridkin.workflow.evaluate_log(
@@ -274,10 +274,10 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         progress=stages,
     )
     record = report.record
-    known = (
+    inside = (
         arguments.force or record["in_domain"] is None or record["in_domain"] > _INSIDE
     )
-    code = 0 if known and record["reached"] == record["n"] else 1
+    code = 0 if inside and record["reached"] == record["n"] else 1
     return _Outcome(record, shown(report), paths, code)
 
 
@@ -332,8 +332,8 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         )
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
-    found = _read(arguments, log_format, robot.chain, robot.base_is_free, stages).report
-    return _Outcome(found.to_dict(), str(found), code=0 if found.ok else 1)
+    check = _read(arguments, log_format, robot.chain, robot.base_is_free, stages).report
+    return _Outcome(check.to_dict(), str(check), code=0 if check.ok else 1)
 
 
 def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
@@ -418,10 +418,10 @@ def _limits(
     arguments: argparse.Namespace, loaded: LoadedModel, **options: bool
 ) -> PathLimits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
-    asked = {
+    limits = {
         name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max", "ddq_max")
     }
-    scaled = hybridkin.robots.Limits(**asked).scaled(loaded.log_format().q_factor)
+    scaled = hybridkin.robots.Limits(**limits).scaled(loaded.log_format().q_factor)
     return hybridkin.workflow.path_limits(loaded, **vars(scaled), **options)
 
 
@@ -451,14 +451,16 @@ def _log_format(
 ) -> LogFormat:
     """Return how the log is written: what is known, with what the options say instead."""
     names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time")
-    given = {name: vars(arguments)[name] for name in names}
-    given = {name: value for name, value in given.items() if value is not None}
-    given |= {name: None for name in ("groups", "time") if given.get(name) == "none"}
+    entries = {name: vars(arguments)[name] for name in names}
+    entries = {name: value for name, value in entries.items() if value is not None}
+    entries |= {
+        name: None for name in ("groups", "time") if entries.get(name) == "none"
+    }
     if known is not None:
-        return replace(known, **given)
-    if "q" not in given or "x" not in given:
+        return replace(known, **entries)
+    if "q" not in entries or "x" not in entries:
         raise ValueError(
             f"{source} does not say how logs are written: it has no [log] table, as in "
             "help(hybridkin.robots.read_description); or name the columns by --q and --x."
         )
-    return hybridkin.robots.LogFormat(**given)
+    return hybridkin.robots.LogFormat(**entries)

@@ -106,12 +106,12 @@ def check_log(
             _motions,
         ):
             findings += check(rows)
-        found = [] if chain is None else [*zero_findings(rows.log, chain)]
+        geometry = [] if chain is None else [*zero_findings(rows.log, chain)]
         read, chain = in_metres(rows.log, chain)
-        if chain is not None and not found:
-            found = geometry_findings(read, chain, base_is_free)
-        findings += found
-        if not any(f.kind in MISREAD for f in found):
+        if chain is not None and not geometry:
+            geometry = geometry_findings(read, chain, base_is_free)
+        findings += geometry
+        if not any(f.kind in MISREAD for f in geometry):
             findings += residual_findings(read, chain, rows.same_motion())
         columns = columns[valid]
     ranges = np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)
@@ -176,18 +176,22 @@ def _invalid(log: Log, valid: NDArray, drop_invalid: bool) -> Iterator[LogFindin
     if len(lines) == 0:
         return
     n = len(valid) + len(log.invalid_lines)
-    what = (
+    problem = (
         f"{len(lines)} of {n} rows have a missing, NaN or infinite value, or no motion"
     )
-    what = f"{what} ({named_rows(lines, kind)})"
+    problem = f"{problem} ({named_rows(lines, kind)})"
     if drop_invalid and valid.all():
         advice = "find out why: a marker that is hidden in some poses leaves a gap in the data."
-        yield LogFinding("invalid", "warning", f"{what}; they were left out.", advice)
+        yield LogFinding(
+            "invalid", "warning", f"{problem}; they were left out.", advice
+        )
     else:
         advice = (
             "correct them, or leave them out with --drop-invalid (drop_invalid=True)."
         )
-        yield LogFinding("invalid", "error", f"{what}.", advice, np.flatnonzero(~valid))
+        yield LogFinding(
+            "invalid", "error", f"{problem}.", advice, np.flatnonzero(~valid)
+        )
 
 
 def _runs(still: NDArray) -> list[tuple[int, int]]:
@@ -205,17 +209,17 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
     for (name, _), still in zip(rows.columns("x"), steps.T, strict=True):
         parts.append((f"column {name!r}", "warning", 0.2, still))
     for what, severity, most, still in parts:
-        found = np.setdiff1d(_frozen_rows(q, still), tips)
-        if len(found) and still.mean() < most:
+        frozen = np.setdiff1d(_frozen_rows(q, still), tips)
+        if len(frozen) and still.mean() < most:
             message = (
-                f"{what} does not change at all in {len(found)} rows while the actuators move "
-                f"({rows.named(found)}): the sensor was frozen or lost the marker."
+                f"{what} does not change at all in {len(frozen)} rows while the actuators move "
+                f"({rows.named(frozen)}): the sensor was frozen or lost the marker."
             )
             advice = (
                 "leave these rows out with --drop-frozen, or delete them from the log."
             )
-            yield rows.finding("frozen tip", message, advice, found, severity)
-        tips = np.union1d(tips, found) if what == "the tip" else tips
+            yield rows.finding("frozen tip", message, advice, frozen, severity)
+        tips = np.union1d(tips, frozen) if what == "the tip" else tips
     moved = np.linalg.norm(np.ptp(x, axis=0))
     for name, column in rows.columns("q"):
         still = np.diff(column) == 0
@@ -223,36 +227,36 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
         if len(runs) != 1:  # commands are often constant, measured values never
             continue
         first, last = runs[0]
-        others = still.sum() - (last - first)
-        share = (last - first) / len(still)
+        elsewhere = still.sum() - (last - first)
+        frozen_share = (last - first) / len(still)
         alone = (column == column[first]).sum() <= last - first + 2
         way = np.linalg.norm(np.ptp(x[first : last + 1], axis=0))
         if (
-            others < 0.05 * len(still)
-            and share < 0.5
+            elsewhere < 0.05 * len(still)
+            and frozen_share < 0.5
             and alone
             and way > _FROZEN_WAY * moved
         ):
-            found = np.arange(first, last + 1)
+            frozen = np.arange(first, last + 1)
             message = (
                 f"actuator {name!r}, which changes from row to row elsewhere, does not change at "
-                f"all in {len(found)} rows ({rows.named(found)}) while the tip moves."
+                f"all in {len(frozen)} rows ({rows.named(frozen)}) while the tip moves."
             )
             advice = "if its sensor was frozen, leave these rows out; if it was at rest, keep them."
-            yield rows.finding("frozen actuator", message, advice, found)
+            yield rows.finding("frozen actuator", message, advice, frozen)
 
 
 def _frozen_rows(q: NDArray, still: NDArray) -> NDArray:
     """Return the still rows during which an actuator moves considerably."""
     spans = np.ptp(q, axis=0)
     spans[spans == 0] = np.inf
-    found = np.zeros(len(q), dtype=bool)
+    frozen = np.zeros(len(q), dtype=bool)
     for first, last in _runs(still):
         way = (np.ptp(q[first : last + 1], axis=0) / spans).max()
-        found[first : last + 1] = (
+        frozen[first : last + 1] = (
             last - first + 1 >= _FROZEN_ROWS and way >= _FROZEN_WAY
         )
-    return np.flatnonzero(found)
+    return np.flatnonzero(frozen)
 
 
 _CONSTANT = {

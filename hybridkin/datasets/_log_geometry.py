@@ -138,8 +138,8 @@ def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
 def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFinding]:
     """Return contradictions to the chain; units first, because the other checks need them."""
     robot = _Robot(chain)
-    found = [*_kind_findings(log, robot)] or [*_unit_findings(log, robot)]
-    return found or [*_orientation_findings(log, robot, base_is_free)]
+    findings = [*_kind_findings(log, robot)] or [*_unit_findings(log, robot)]
+    return findings or [*_orientation_findings(log, robot, base_is_free)]
 
 
 def zero_findings(log: Log, chain: Any) -> Iterator[LogFinding]:
@@ -165,7 +165,7 @@ def _kind_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
     high = log.q.max(axis=0)
     kind = "geometry"
     if not (low > 0)[robot.absolute].all():
-        what = "chambers, whose q are positive lengths"
+        needed = "chambers, whose q are positive lengths"
         columns = robot.absolute
         advice = _ADVICE["changes"]
         negative = columns & (high < 0)
@@ -173,13 +173,13 @@ def _kind_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
             kind = "sign"
             advice = _sign_advice(log, _signs(np.where(negative, -1, 1)))
     elif robot.pulled.any() and (low > 0.1 * high)[robot.pulled].all():
-        what = "tendons, whose q are changes of length"
+        needed = "tendons, whose q are changes of length"
         columns = robot.pulled
         advice = _ADVICE["whole"]
     else:
         return
     span = f"{1e3 * low[columns].min():.4g} and {1e3 * high[columns].max():.4g} mm"
-    message = f"the robot is described with {what}, but q lies between {span}."
+    message = f"the robot is described with {needed}, but q lies between {span}."
     yield LogFinding(kind, "error", message, advice)
 
 
@@ -206,10 +206,14 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
     x_factor = _factor(reach, _USUAL_REACH) if reach > _REACH else None
     if x_factor is None:
         tips = robot.tips(q[:: max(1, len(q) // _ROWS)] / (q_factor or 1.0))
-        share = spread / max(
+        relative_spread = spread / max(
             float(np.linalg.norm(np.ptp(tips, axis=0))), np.finfo(float).tiny
         )
-        x_factor = _factor(share, 1.0) if 0.0 < share < _SMALL_SHARE else None
+        x_factor = (
+            _factor(relative_spread, 1.0)
+            if 0.0 < relative_spread < _SMALL_SHARE
+            else None
+        )
     if max(robot.length, 10.0 * radii.max()) > _LONGEST and (q_factor or x_factor):
         message = (
             f"the robot is described with a length of {robot.length:g} m and radii up to "
@@ -222,12 +226,12 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         yield LogFinding("units", "error", message, advice)
         return
     if q_factor is not None:
-        what = "the chambers are" if robot.extensible else "the longest stroke is"
-        what = f"{what} {1e3 * size:.4g} mm, {stroke:.3g} times the radii ({1e3 * radius:.4g} mm)"
-        yield _unit_finding("q", what, log.file_units["q"], q_factor)
+        problem = "the chambers are" if robot.extensible else "the longest stroke is"
+        problem = f"{problem} {1e3 * size:.4g} mm, {stroke:.3g} times the radii ({1e3 * radius:.4g} mm)"
+        yield _unit_finding("q", problem, log.file_units["q"], q_factor)
     if x_factor is not None:
-        what = f"the tip moves within {1e3 * spread:.4g} mm, {reach:.3g} of the robot's reach"
-        yield _unit_finding("x", what, log.file_units["x"], x_factor)
+        problem = f"the tip moves within {1e3 * spread:.4g} mm, {reach:.3g} of the robot's reach"
+        yield _unit_finding("x", problem, log.file_units["x"], x_factor)
 
 
 def _longest_stroke(q: NDArray, robot: _Robot) -> tuple[float, float]:
@@ -302,21 +306,19 @@ def _orientation_findings(
         yield LogFinding("axes", "warning", message, _ADVICE["axes"])
         return
     few = slice(None, None, -(-len(q) // _FEW))
-    other, i, j = _exchanged(chain, q[few], x[few])
-    if other < min(good, _FAR_BETTER * least):
+    exchanged, i, j = _exchanged(chain, q[few], x[few])
+    if exchanged < min(good, _FAR_BETTER * least):
         name = column_names(log, "q")[i]
         axis = column_names(log, "x")[j]
-        message = (
-            f"{compared}{_share(other)} with columns {name!r} and {axis!r} exchanged."
-        )
+        message = f"{compared}{_share(exchanged)} with columns {name!r} and {axis!r} exchanged."
         yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
         return
     changed = robot.changed(q[few])
     scores = misses(chain, np.stack([*changed.values()]), x[few], True)
     kind, i, by = [*changed][int(np.argmax(scores < _SIMPLE * scores.min()))]
-    share = float(scores.min() / misses(chain, q[few][None], x[few], True)[0])
+    gain = float(scores.min() / misses(chain, q[few][None], x[few], True)[0])
     twist, tilt = base_turn(chain, q, x)
-    if least < good and least < share * missed:
+    if least < good and least < gain * missed:
         yield _way_finding(log, robot, way, f"{compared}{_share(least)} with ")
     elif base_is_free and not robot.extensible and abs(twist) > _TWIST and tilt < _TILT:
         message = (
@@ -325,15 +327,15 @@ def _orientation_findings(
         )
         mounted = "Or, if the robot is mounted so, give the rotation in [base] (`base` of a chain)."
         yield LogFinding("sign", "warning", message, f"{flip} {mounted}")
-    elif share < (_FAR_BETTER if kind == "size" else _SHIFTED):
-        what = f"its bends are {i:g} times as large"
+    elif gain < (_FAR_BETTER if kind == "size" else _SHIFTED):
+        problem = f"its bends are {i:g} times as large"
         if kind != "size":
             name = column_names(log, "q")[int(i)]
             far = 1e3 * abs(by) * q[:, int(i)].std()
             does = "is off" if kind == "offset" else "drifts"
-            what = f"actuator {name!r} {does} by about {far:.1g} mm"
+            problem = f"actuator {name!r} {does} by about {far:.1g} mm"
         message = (
-            f"the error of the nominal model falls to {100 * share:.0f} % if {what}."
+            f"the error of the nominal model falls to {100 * gain:.0f} % if {problem}."
         )
         yield LogFinding(kind, "warning", message, _ADVICE[kind])
     elif 1 - missed**2 < _ENOUGH:
@@ -361,17 +363,17 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
     names = [declared[i] for i in way.order]
     clockwise = next(changes(robot.chain.actuators_per_segment, False)).order
     kind = "sign"
-    what = []
+    causes = []
     advice = []
     if names != declared and way.order == clockwise:
-        kind, what = "numbering", ["the actuators numbered in the other direction"]
+        kind, causes = "numbering", ["the actuators numbered in the other direction"]
         first, second = robot.chain.angles[:2].tolist()
         counted = f"set clockwise = {str(np.sin(second - first) > 0).lower()} in every [[segment]]"
         advice = [
             f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."
         ]
     elif names != declared:
-        kind, what = "order", [f"the columns of q in the order {', '.join(names)}"]
+        kind, causes = "order", [f"the columns of q in the order {', '.join(names)}"]
         listed = f"set q = {json.dumps(names)} in [log] of the robot description."
         advice = [listed if log.q_names else f"use q[:, {[*way.order]}]."]
     if min(way.sign) < 0:
@@ -380,10 +382,10 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
             flipped = ", ".join(
                 repr(names[i]) for i in np.flatnonzero(np.less(way.sign, 0))
             )
-        what.append(f"the sign of {flipped} flipped")
+        causes.append(f"the sign of {flipped} flipped")
         advice.append(_sign_advice(log, way))
     return LogFinding(
-        kind, "warning", f"{compared}{' and '.join(what)}.", " ".join(advice)
+        kind, "warning", f"{compared}{' and '.join(causes)}.", " ".join(advice)
     )
 
 

@@ -153,11 +153,13 @@ def better_way(
     tried = [*changes(chain.actuators_per_segment, not any(chain.extensible))]
     best = as_declared(q.shape[1])
     least = float(misses(chain, q[None], x, base_is_free)[0])
-    kept = [best]
+    candidates = [best]
     for _ in range(_ROUNDS):
-        ways = [*dict.fromkeys(way.then(change) for way in kept for change in tried)]
+        ways = [
+            *dict.fromkeys(way.then(change) for way in candidates for change in tried)
+        ]
         missed = misses(chain, np.stack([way.of(q) for way in ways]), x, base_is_free)
-        kept = [ways[i] for i in np.argsort(missed)[:_KEPT]]
+        candidates = [ways[i] for i in np.argsort(missed)[:_KEPT]]
         if missed.min() > _GAIN * least:
             break
         first = int(np.flatnonzero(missed <= _SIMPLE * missed.min())[0])

@@ -97,14 +97,14 @@ class LogReport:
 
     def accepting(self, kind: str) -> LogReport:
         """Return the report with findings of a kind as notes, because their rows are left out."""
-        others = [f for f in self.findings if f.kind != kind]
+        findings = [f for f in self.findings if f.kind != kind]
         for f in self.findings:
             if f.kind == kind:
                 message = f"{f.message} They were left out."
-                others.append(
+                findings.append(
                     LogFinding(kind, "note", message, "find out why.", f.rows)
                 )
-        return replace(self, findings=tuple(others))
+        return replace(self, findings=tuple(findings))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as numbers, text and lists, for JSON."""
@@ -121,8 +121,10 @@ class LogReport:
     def summary(self) -> str:
         """Return the numbers of errors and warnings as text."""
         counts = {"error": len(self.errors), "warning": len(self.warnings)}
-        found = [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
-        return " and ".join(found) or "no errors and no warnings"
+        counted = [
+            f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n
+        ]
+        return " and ".join(counted) or "no errors and no warnings"
 
     def __str__(self) -> str:
         """Return the report as text, one paragraph for each finding."""
@@ -157,11 +159,11 @@ def _filled(head: str, text: str) -> str:
 
 def named_rows(places: NDArray, kind: str) -> str:
     """Return places as text, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
-    found = np.sort(places)
-    runs = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
+    ordered = np.sort(places)
+    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
     words = [
         f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:4]
     ]
     left = sum(map(len, runs[4:]))
-    more = f" and {left} more" if left else ""
-    return f"{kind}{'s' if len(found) > 1 else ''} {', '.join(words)}{more}"
+    rest = f" and {left} more" if left else ""
+    return f"{kind}{'s' if len(ordered) > 1 else ''} {', '.join(words)}{rest}"

@@ -54,9 +54,9 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
             slice(max(-k, 0), min(-k, 0) or None),
             slice(max(k, 0), min(k, 0) or None),
         )
-        kept = run[early] == run[late]
-        if k and kept.sum() > 0.3 * len(x):
-            lagged[k] = _left(features[early][kept], x[late][kept])
+        same_run = run[early] == run[late]
+        if k and same_run.sum() > 0.3 * len(x):
+            lagged[k] = _left(features[early][same_run], x[late][same_run])
     best = min(lagged, key=lambda k: lagged[k])
     if lagged[best] < _LAG * left:
         message = (

@@ -233,10 +233,10 @@ def load_log(
     )
     places = np.arange(len(values)) if table.lines is None else table.lines
     tips = slice(len(q), len(q) + len(x))
-    known = countable(values)
-    seen = known[:, tips].reshape(len(known), -1, 3).all(axis=2)
-    values[:, tips][~seen.repeat(3, axis=1)] = np.nan
-    valid = np.delete(known, tips, axis=1).all(axis=1) & seen.any(axis=1)
+    readable = countable(values)
+    complete = readable[:, tips].reshape(len(readable), -1, 3).all(axis=2)
+    values[:, tips][~complete.repeat(3, axis=1)] = np.nan
+    valid = np.delete(readable, tips, axis=1).all(axis=1) & complete.any(axis=1)
     if motions is not None:
         valid &= ~np.isin(motions, _UNNAMED)
     if not valid.any() or not (drop_invalid or valid.all()):
@@ -388,12 +388,15 @@ class _Table(NamedTuple):
         self, names: list[str], time: str | None, groups: str | None
     ) -> tuple[NDArray, NDArray | None]:
         """Return columns as numbers (N, k), that of the time in seconds, and the groups."""
-        found, labels = {name: self.numbers(name, name == time) for name in names}, None
-        if len(found) < len(names):
+        columns, labels = (
+            {name: self.numbers(name, name == time) for name in names},
+            None,
+        )
+        if len(columns) < len(names):
             raise ValueError(
                 f"`q`, `x` and `time` must name a column once, got {names}."
             )
-        sizes = {name: len(column) for name, column in found.items()}
+        sizes = {name: len(column) for name, column in columns.items()}
         if groups is not None:
             named = [str(value).strip() for value in self.column(groups)]
             if (longest := max(map(len, named), default=0)) > _LONGEST:
@@ -410,13 +413,13 @@ class _Table(NamedTuple):
         if not all(sizes.values()):
             header = "no" if self.lines is None else "a header but no"
             raise ValueError(f"{str(self.path)!r} has {header} rows.")
-        return np.column_stack([*found.values()]), labels
+        return np.column_stack([*columns.values()]), labels
 
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
     """Return the factor on the n columns of q, after a check of units and sign."""
-    other = "; for other units give '1', and `gains` [m per unit] of the chain"
-    one_of(q_unit, "q_unit", UNITS, other)
+    advice = "; for other units give '1', and `gains` [m per unit] of the chain"
+    one_of(q_unit, "q_unit", UNITS, advice)
     one_of(x_unit, "x_unit", METRES)
     sign = real_array(q_sign, "q_sign")
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
@@ -461,10 +464,10 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
             )
         # A cell may have line breaks, but with all delimiters of a row it hides one.
         text = delimiter.join(row)
-        more = len(text.splitlines()) - 1
-        if more > 0 and text.count(delimiter) >= len(row) + n - 2:
+        n_lines = len(text.splitlines()) - 1
+        if n_lines > 0 and text.count(delimiter) >= len(row) + n - 2:
             raise ValueError(
-                f'A quote (") in line {line - more} of {str(path)!r} hides rows up to line {line}; '
+                f'A quote (") in line {line - n_lines} of {str(path)!r} hides rows up to line {line}; '
                 "close or remove it."
             )
     lines, cells = zip(*rows, strict=True)
@@ -515,8 +518,8 @@ def _check_rows(path: Path) -> None:
         from pyarrow.parquet import read_metadata
     except ImportError:  # fastparquet reads it
         return
-    found = read_metadata(path)
-    check_expansion(path, 8 * found.num_rows * found.num_columns)
+    metadata = read_metadata(path)
+    check_expansion(path, 8 * metadata.num_rows * metadata.num_columns)
 
 
 def _number(cell: str, name: str, line: int, path: Path) -> float:

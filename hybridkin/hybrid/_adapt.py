@@ -206,10 +206,10 @@ def _whitened(values: NDArray, groups: NDArray | None) -> NDArray:
     np.add.at(sums, of, values)
     shape = (-1,) + (1,) * (values.ndim - 1)
     means = (sums / counts.reshape(shape))[of]
-    own = 1.0 - _COMMON
-    return (values - means) / own**0.5 + means / ((own + _COMMON * counts) ** 0.5)[
-        of
-    ].reshape(shape)
+    individual = 1.0 - _COMMON
+    return (values - means) / individual**0.5 + means / (
+        (individual + _COMMON * counts) ** 0.5
+    )[of].reshape(shape)
 
 
 def _likeliest_scales(

@@ -71,12 +71,14 @@ class Drift(NamedTuple):
             raise too_far()
         phi = np.column_stack([np.ones(len(q)), (q - self.center) / self.scale])
         later = weights[::-1].cumsum()[::-1] - weights
-        own = weights if decay == 1.0 else (1.0 - decay**weights) / (1.0 - decay)
-        weighed = (own * decay**later)[:, None] * phi
-        kept = decay ** weights.sum()
-        gram = kept * self.gram + np.einsum("nk,ni,nj->kij", measured, weighed, phi)
-        moment = kept * self.moment + weighed.T @ residual
-        squares = kept * self.squares + weighed[:, 0] @ (residual**2).sum(1)
+        decayed = weights if decay == 1.0 else (1.0 - decay**weights) / (1.0 - decay)
+        weighed = (decayed * decay**later)[:, None] * phi
+        remaining = decay ** weights.sum()
+        gram = remaining * self.gram + np.einsum(
+            "nk,ni,nj->kij", measured, weighed, phi
+        )
+        moment = remaining * self.moment + weighed.T @ residual
+        squares = remaining * self.squares + weighed[:, 0] @ (residual**2).sum(1)
         return self._replace(gram=gram, moment=moment, squares=squares)
 
     def emptied(self) -> Drift:

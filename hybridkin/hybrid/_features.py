@@ -73,8 +73,8 @@ class Features(PortableModule):
         value = u @ linear[:, 1:].mT + linear[:, 0]
         slope = linear[:, 1:].expand(*u.shape[:-1], *linear[:, 1:].shape)
         if bent.shape[1]:
-            more, slope_more = self._bent_readout(u, bent)
-            value, slope = value + more, slope + slope_more
+            nonlinear, slope_more = self._bent_readout(u, bent)
+            value, slope = value + nonlinear, slope + slope_more
         return value, slope / self.scale.to(q)
 
     def _scaled(self, q: Tensor) -> Tensor:
@@ -237,12 +237,12 @@ class PoseFeatures(Features):
         for k in reversed(range(len(turns))):
             if k + 1 < len(turns):
                 turns[k] += turns[k + 1]
-            own = pulls[k][:, 0, None] * moves[0, :, k]
+            weighted = pulls[k][:, 0, None] * moves[0, :, k]
             for axis in (1, 2):
-                own.addcmul_(pulls[k][:, axis, None], moves[axis, :, k])
+                weighted.addcmul_(pulls[k][:, axis, None], moves[axis, :, k])
             for axis in (0, 1, 2):  # a length rotates nothing
-                own[:, 1:].addcmul_(turns[k][:, axis, None], spins[axis, 1:, k])
-            work.append(own)
+                weighted[:, 1:].addcmul_(turns[k][:, axis, None], spins[axis, 1:, k])
+            work.append(weighted)
         by_arcs = torch.stack(work[::-1], 2).flatten(1, 2)  # (C, 3 S, N)
         scale = self.scale.to(u)
         if slope.ndim == 2:

@@ -264,9 +264,9 @@ def residuals(
 
 def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:
     """Return tips (N, m), measured (if missing: of the chain), and those of the chain [m]."""
-    found = chain(rows.q).detach()
+    predicted = chain(rows.q).detach()
     tips = torch.from_numpy(rows.tips[:, : chain.n_outputs])
-    return torch.where(tips.isnan(), found, tips), found
+    return torch.where(tips.isnan(), predicted, tips), predicted
 
 
 def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
@@ -275,6 +275,6 @@ def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
     if fitted.calibration is not None or not isinstance(chain, Chain):
         return fitted.messages
     motion = motion_message("y", *known_tips(chain, rows), float(chain.reach))
-    found = [*fitted.messages, *chain.check_actuators(rows.q, "X")]
-    more = chain.contradiction(rows.q, "X"), motion
-    return (*found, *(message for message in more if message is not None))
+    messages = [*fitted.messages, *chain.check_actuators(rows.q, "X")]
+    doubts = chain.contradiction(rows.q, "X"), motion
+    return (*messages, *(message for message in doubts if message is not None))

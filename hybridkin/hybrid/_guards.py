@@ -84,17 +84,17 @@ class Guard(PortableModule):
         long = self.is_long(correction).nonzero()[:, 0]
         if not len(long):
             return correction, J
-        own, J_own = correction[long], J[long]
-        relative = self._relative(own)
-        kept, slope = self._kept(relative)
+        too_long, J_own = correction[long], J[long]
+        relative = self._relative(too_long)
+        remaining, slope = self._kept(relative)
         # Derivative along the correction: the slope; across it: the factor.
         factor, along = (
-            kept / relative,
-            (own / own.norm(dim=-1, keepdim=True))[..., None],
+            remaining / relative,
+            (too_long / too_long.norm(dim=-1, keepdim=True))[..., None],
         )
         change = (slope - factor)[..., None] * along @ (along.mT @ J_own)
         J_own = factor[..., None] * J_own + change
-        return correction.index_copy(0, long, factor * own), J.index_copy(
+        return correction.index_copy(0, long, factor * too_long), J.index_copy(
             0, long, J_own
         )
 
@@ -251,13 +251,13 @@ class QuadraticLeverage(LeverageModule):
         """Return the leverage of training rows q (N, n)."""
         n, directions = q.shape[1], moved_directions(q.numpy())
         scale, still = map(torch.from_numpy, (directions.scale, directions.still))
-        found = cls(center_and_scale(q)[0], scale, identity(2 * n + 1, q))
-        features = found.forward(q)
+        leverage = cls(center_and_scale(q)[0], scale, identity(2 * n + 1, q))
+        features = leverage.forward(q)
         gram = features.mT @ features
         gram.diagonal().add_(alpha)
         gram[1 : n + 1, 1 : n + 1] += _AS_IF**2 * len(q) * still @ still.mT
-        found.factor = torch.linalg.cholesky(gram)
-        return found
+        leverage.factor = torch.linalg.cholesky(gram)
+        return leverage
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the features [1, u, u^2], shape (..., 2 n + 1)."""
@@ -370,9 +370,9 @@ class GroupDistance(PortableModule):
                 break
             picked.append(gap.argmax())
         rows = torch.stack(picked)
-        own, apart = of[rows, None], y.new_full((len(rows),), torch.inf)
+        group, apart = of[rows, None], y.new_full((len(rows),), torch.inf)
         for some, theirs in zip(y.split(_BLOCK), of.split(_BLOCK), strict=True):
-            far = torch.cdist(y[rows], some).masked_fill(own == theirs, torch.inf)
+            far = torch.cdist(y[rows], some).masked_fill(group == theirs, torch.inf)
             apart = torch.minimum(apart, far.amin(1))
         # All training rows are within the gap of a picked row, so distances differ by at most it.
         # If every motion was repeated, the clamp keeps the domain from being empty.

@@ -20,7 +20,11 @@ _HELD_OUT = (
 
 def fitted_rows(model: Any) -> dict[str, object]:
     """Return names and values of what the fit of a hybrid found, for `html_table`."""
-    mechanical, found, play = model.mechanical_model_, model.calibration_, model.play_
+    mechanical, calibration, play = (
+        model.mechanical_model_,
+        model.calibration_,
+        model.play_,
+    )
     fitted = model.module_.as_fitted
     changed = fitted is not model.module_ or fitted.drift is not None
     domain = {None: "everywhere (no guard)", "box": "the training range of q"}
@@ -39,34 +43,40 @@ def fitted_rows(model: Any) -> dict[str, object]:
         "adapted": "after the fit; the errors are those of the fit"
         if changed
         else None,
-        "calibration": None if found is None else {"": repr(found)},
+        "calibration": None if calibration is None else {"": repr(calibration)},
         "geometry": None if mechanical is None else mechanical.html_rows(),
         "training range of q": _range(model),
     }
 
 
 def _calibrated(model: Any) -> str:
-    found, asked = model.calibration_, model.calibrate
-    if found is not None:
+    calibration, setting = model.calibration_, model.calibrate
+    if calibration is not None:
         held_out = (
-            "" if found.cv_rmse is None else f", held-out groups {_mm(found.cv_rmse)}"
+            ""
+            if calibration.cv_rmse is None
+            else f", held-out groups {_mm(calibration.cv_rmse)}"
         )
-        return f"{', '.join(found.values)}; root mean square error {_mm(found.rmse)}{held_out}"
+        return f"{', '.join(calibration.values)}; root mean square error {_mm(calibration.rmse)}{held_out}"
     chosen = (model.cv_results_ or {}).get("parameters")  # of a model from a file
     return str(
         chosen
-        or (asked if isinstance(asked, str) else ", ".join(asked or ()) or "nothing")
+        or (
+            setting
+            if isinstance(setting, str)
+            else ", ".join(setting or ()) or "nothing"
+        )
     )
 
 
 def _error_model(model: Any) -> str:
-    error, asked = model.error_model_, model.error_model
+    error, setting = model.error_model_, model.error_model
     if model.cv_results_ is not None:
         weights = model.cv_results_["weights"].items()
         parts = [f"{share:.2f} {name}" for name, share in weights if share > 0.0]
         return f'{" + ".join(parts)} (chosen by "auto")'
     first = error[0] if type(error) is tuple else error  # of several markers
-    name = f'"{asked}"' if isinstance(asked, str) else type(first).__name__
+    name = f'"{setting}"' if isinstance(setting, str) else type(first).__name__
     rejected = isinstance(first, ReadoutFit) and np.isinf(first.alphas).all()
     return f"{name}, {model.coupling}" + ", rejected by the held-out error" * bool(
         rejected
@@ -88,11 +98,11 @@ def _error(model: Any) -> dict[str, str]:
 
 
 def _radius(model: Any) -> str:
-    radius, share = model.radius_, f"{100 * model.radius_.coverage:g} % of the tips"
+    radius, covered = model.radius_, f"{100 * model.radius_.coverage:g} % of the tips"
     if np.isfinite(radius.inside):
-        return f"{_mm(radius.inside)} covers {share} inside the domain"
+        return f"{_mm(radius.inside)} covers {covered} inside the domain"
     return (
-        f"not known: {share} need at least {radius.least_groups} groups in the domain"
+        f"not known: {covered} need at least {radius.least_groups} groups in the domain"
     )
 
 

@@ -70,8 +70,8 @@ def tuned_kernel(
                 )
             except LinAlgError:
                 return inf
-            found = K[np.ix_(test, train)] @ dual / root[test]
-            total += float(weights[test] @ distance(found, error[test]))
+            predicted = K[np.ix_(test, train)] @ dual / root[test]
+            total += float(weights[test] @ distance(predicted, error[test]))
         return total
 
     widths, penalties = range(len(_GAMMAS)), range(len(_ALPHAS))

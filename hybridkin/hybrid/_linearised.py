@@ -88,13 +88,13 @@ class Linearised:
 
         `less` is the Gram matrix of rows to subtract.
         """
-        kept, gram = (
+        finite, gram = (
             torch.isfinite(penalty),
             self.gram if less is None else self.gram - less,
         )
-        system = gram[:, kept][..., kept].flatten(2).flatten(0, 1)
-        system.diagonal().add_(penalty[kept].repeat(len(self.gram)))
-        return kept, torch.linalg.cholesky(system)
+        system = gram[:, finite][..., finite].flatten(2).flatten(0, 1)
+        system.diagonal().add_(penalty[finite].repeat(len(self.gram)))
+        return finite, torch.linalg.cholesky(system)
 
     def residual(self, readout: Tensor) -> Tensor:
         """Return y - J W phi, shape (N, m)."""
@@ -113,20 +113,26 @@ class Linearised:
         members : list of Tensor, optional
             Rows of every group, the same at every call. None: single rows.
         """
-        kept, L = self.factor(penalty)
-        own = self.residual(solve_kept(self.moment, kept, L))
+        finite, L = self.factor(penalty)
+        residual = self.residual(solve_kept(self.moment, finite, L))
         if members is None:
-            share = self.J @ self._spread(kept, torch.cholesky_inverse(L)) @ self.J.mT
-            return torch.linalg.solve(identity(share.shape[1], share) - share, own)
-        result = torch.empty_like(own)
+            leverage = (
+                self.J @ self._spread(finite, torch.cholesky_inverse(L)) @ self.J.mT
+            )
+            return torch.linalg.solve(
+                identity(leverage.shape[1], leverage) - leverage, residual
+            )
+        result = torch.empty_like(residual)
         few = len(L) if len(members) > _FOLDS else len(L) // 4
         for k, rows in enumerate(members):
             J, phi, y = self.J[rows], self.phi[rows], self.y[rows]
             if y.numel() <= few:
-                A = design(J, phi[:, kept]).flatten(0, 1)
+                A = design(J, phi[:, finite]).flatten(0, 1)
                 white = torch.linalg.solve_triangular(L, A.mT, upper=False)
-                share = identity(len(A), A) - white.mT @ white
-                result[rows] = torch.linalg.solve(share, own[rows].flatten()).view_as(y)
+                leverage = identity(len(A), A) - white.mT @ white
+                result[rows] = torch.linalg.solve(
+                    leverage, residual[rows].flatten()
+                ).view_as(y)
                 continue
             if k not in self._apart:
                 self._apart[k] = _gram(J, Products(phi))
@@ -179,8 +185,8 @@ def moment(J: Tensor, y: Tensor, phi: Tensor) -> Tensor:
 def solve_kept(right: Tensor, kept: Tensor, L: Tensor) -> Tensor:
     """Return the solution (C, K) for a right-hand side (C, K), zero for unused features."""
     solution = torch.zeros_like(right)
-    found = torch.cholesky_solve(right[:, kept].reshape(-1, 1), L)
-    solution[:, kept] = found.reshape(len(right), -1)
+    coefficients = torch.cholesky_solve(right[:, kept].reshape(-1, 1), L)
+    solution[:, kept] = coefficients.reshape(len(right), -1)
     return solution
 
 
@@ -269,11 +275,11 @@ def quasi_newton(
     slope: Tensor, pairs: list[tuple[Tensor, Tensor]], factor: tuple[Tensor, Tensor]
 ) -> Tensor:
     """Return the L-BFGS inverse Hessian times a slope, from changes of readout and slope."""
-    shares = []
+    step_sizes = []
     for moved, turned in reversed(pairs):
-        shares.append((moved * slope).sum() / (moved * turned).sum())
-        slope = slope - shares[-1] * turned
+        step_sizes.append((moved * slope).sum() / (moved * turned).sum())
+        slope = slope - step_sizes[-1] * turned
     step = solve_kept(slope, *factor)
-    for (moved, turned), share in zip(pairs, reversed(shares), strict=True):
+    for (moved, turned), share in zip(pairs, reversed(step_sizes), strict=True):
         step = step + (share - (turned * step).sum() / (moved * turned).sum()) * moved
     return step

@@ -367,8 +367,8 @@ class HybridModule(Hybrid):
     def with_drift(self, drift: AffineModule | None) -> Self:
         """Return the same model with another drift; this model does not change."""
         corrections = [correction for _, correction in self._parts()]
-        others = self.weights, drift, self.tested, self.log_plane
-        return type(self)(self.mechanical, corrections, *others)
+        arguments = self.weights, drift, self.tested, self.log_plane
+        return type(self)(self.mechanical, corrections, *arguments)
 
     def without_learned(self) -> HybridModule:
         """Return the mechanical model alone, as a hybrid."""

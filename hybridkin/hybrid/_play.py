@@ -36,11 +36,11 @@ def play_of(
         return None, []
     ranges = np.ptp(rows.X, axis=0)
     if isinstance(play, str):
-        found = choose_play(calibrated(spec, rows), rows)
-        if found is None or found.width < 0.95 * ranges.max():
-            return found, []
-        return found, [
-            f"play='auto' found a backlash of {found.width:.3g}, as wide as the range of `X`: the "
+        operator_found = choose_play(calibrated(spec, rows), rows)
+        if operator_found is None or operator_found.width < 0.95 * ranges.max():
+            return operator_found, []
+        return operator_found, [
+            f"play='auto' found a backlash of {operator_found.width:.3g}, as wide as the range of `X`: the "
             "log gives no upper limit. Record larger motions, or give the width as `play`."
         ]
     operator = PlayOperator(play)
@@ -93,8 +93,8 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
         network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
         held_out = network.fit(effective, error, counts, motion).left_out_errors_
         distance = np.linalg.norm(held_out.reshape(len(error), -1), axis=1)
-        kept = [motion == a for a in names]
-        return np.array([np.average(distance[k], weights=counts[k]) for k in kept])
+        of_motion = [motion == a for a in names]
+        return np.array([np.average(distance[k], weights=counts[k]) for k in of_motion])
 
     search = search_width(errors_by_motion, np.mean, widths, widest, refine=True)
     return PlayOperator(search.width) if search.kept else None

@@ -96,10 +96,10 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x, n = self.predict(X), len(np.asarray(y))
         weights = np.ones(n) if sample_weight is None else np.asarray(sample_weight)
         both = (np.asarray(values, dtype=float).reshape(n, -1).T for values in (y, x))
-        found = [(a, b, ~np.isnan(a)) for a, b in zip(*both, strict=True)]
+        columns = [(a, b, ~np.isnan(a)) for a, b in zip(*both, strict=True)]
         return float(
             np.mean(
-                [r2_score(a[k], b[k], sample_weight=weights[k]) for a, b, k in found]
+                [r2_score(a[k], b[k], sample_weight=weights[k]) for a, b, k in columns]
             )
         )
 
@@ -175,9 +175,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""
         if not isinstance(chain := self.mechanical_model_, Chain):
             return
-        known, tips = known_tips(chain, rows)
+        measured, tips = known_tips(chain, rows)
         message = motion_message(
-            "y", torch.cat([tips, known]), tips, float(chain.reach)
+            "y", torch.cat([tips, measured]), tips, float(chain.reach)
         )
         if message is not None:
             warnings.warn(message, stacklevel=3)

@@ -72,11 +72,11 @@ def conformal_radius(
         errors[test] = np.nanmax(distances(x, y[test]), axis=1)
     names, of = np.unique(groups[inside], return_inverse=True)
     radius = _quantile(errors[inside], of, rows.counts[inside], coverage)
-    found, n = Radius(radius, inf, coverage, len(y)), len(names)
-    if found.inside < inf:
-        return found, None
-    return found, (
-        f"`coverage` {coverage:g} needs at least {found.least_groups} "
+    estimate, n = Radius(radius, inf, coverage, len(y)), len(names)
+    if estimate.inside < inf:
+        return estimate, None
+    return estimate, (
+        f"`coverage` {coverage:g} needs at least {estimate.least_groups} "
         f"{'rows' if rows.groups is None else 'groups'} inside the domain of the error model when "
         f"they are held out, got {n}: the radius is infinite. Record more motions, or ask for a "
         f"`coverage` of at most {floor(1000 * n / (n + 1) + _ROUNDING) / 1000:g}."

@@ -209,12 +209,12 @@ def _chosen(
         alphas, scores = _linearised.choose(score, alphas)
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
     assert alphas is not None
-    found = _fitted(problem, members, alphas, weights)._replace(scores=scores)
+    fit = _fitted(problem, members, alphas, weights)._replace(scores=scores)
     without = problem.mean_distance(problem.rest.numpy(force=True), 2)
-    if problem.mean_distance(found.residual, 2) > without:
+    if problem.mean_distance(fit.residual, 2) > without:
         # The improvement of the linearised problem is not there in the exact one.
         return _fitted(problem, members, (inf, inf))._replace(scores=scores)
-    return found
+    return fit
 
 
 def _fitted(
@@ -366,13 +366,15 @@ class _Problem:
             if factor is None or k < _FACTORS or k % _REFRESH == 0:
                 factor, pairs = self.linearised(readout).factor(penalty), []
             step = -_linearised.quasi_newton(slope, pairs, factor)
-            share, descent = 1.0, float((slope * step).sum())
-            while share > 1e-6:  # a full step may overshoot, as the tip is nonlinear
-                tried = readout + share * step
+            step_size, descent = 1.0, float((slope * step).sum())
+            while (
+                step_size > 1e-6
+            ):  # a full step may overshoot, as the tip is nonlinear
+                tried = readout + step_size * step
                 new, new_slope = self._value_and_slope(tried, weight, taking_part)
-                if new <= (1.0 + 1e-14) * value + 1e-4 * share * descent:
+                if new <= (1.0 + 1e-14) * value + 1e-4 * step_size * descent:
                     break
-                share *= 0.5
+                step_size *= 0.5
             else:
                 break
             change = tried - readout, new_slope - slope

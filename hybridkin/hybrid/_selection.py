@@ -108,32 +108,32 @@ def select(
     # Held-out rows first, in the order of the log; then the outer ones.
     order = np.concatenate([np.argsort(tests[: len(y)]), np.arange(len(y), len(tests))])
     held_out_rows = _HeldOut.of(predicted[:, order], rows, fold_of, splits[-1][1])
-    shares, results = _chosen([*candidates], held_out_rows, rows)
+    weights, results = _chosen([*candidates], held_out_rows, rows)
     few = len(y) < _FEW_ROWS
     if rows.groups is not None:
         few = len(np.unique(rows.groups)) < _FEW_MOTIONS
-    if spec.left_out and few and len(folds) > 2 and shares[0] < 1.0:
-        without_penalties = _blend(candidates.values(), shares)
-        known = np.tensordot(shares, held_out_rows.predicted, 1)
+    if spec.left_out and few and len(folds) > 2 and weights[0] < 1.0:
+        without_penalties = _blend(candidates.values(), weights)
+        blended = np.tensordot(weights, held_out_rows.predicted, 1)
         before = after = 0.0
         for one, (train, test) in zip(alone[:_ANEW], folds, strict=False):
             anew = fit_hybrid(
                 replace(one, error_model=without_penalties), by_fold.take(train)
             )
-            before += counts[test] @ distance(known[test], y[test])
+            before += counts[test] @ distance(blended[test], y[test])
             after += counts[test] @ distance(anew.predict(rows.X[test]), y[test])
         results["expected_distance"] *= float(after / before)
     name, errors = (
         ("nothing", {}) if geometry is None else (geometry.name, geometry.errors)
     )
-    own = {
+    first_errors = {
         name: Errors(
             *(float(results[key][0]) for key in ("mean_distance", "io_distance"))
         )
     }
     results["parameters"] = name
-    results["mechanical_model"] = {n: one.known() for n, one in (errors or own).items()}
-    return replace(spec, error_model=_blend(settled, shares)), results, modules
+    results["mechanical_model"] = {n: one.known() for n, one in (errors or first_errors).items()}
+    return replace(spec, error_model=_blend(settled, weights)), results, modules
 
 
 def _blend(models: Iterable[ErrorModel], shares: NDArray) -> ErrorModel:
@@ -212,24 +212,24 @@ def _chosen(
     distances = np.array([distance(x, found.y) for x in (*found.predicted, blend)])
     held_out, outer = distances[:, :n], distances[:, n:]
     by_fold = _means_by(found.fold[:n], held_out, counts[:n])
-    shares = found.shares(np.ones(len(blend), dtype=bool))
+    weights = found.shares(np.ones(len(blend), dtype=bool))
     units = (
         by_fold if rows.groups is None else _means_by(rows.groups, held_out, counts[:n])
     )
     gains = units[0] - units[-1]
     if gains.mean() <= gains.std(ddof=1) / np.sqrt(len(gains)):
-        shares = np.eye(len(shares))[0]
+        weights = np.eye(len(weights))[0]
     means = np.average(held_out, axis=1, weights=counts[:n])
-    return shares, {
+    return weights, {
         "candidate": [*names, "blend"],
         "mean_distance": means,
-        "expected_distance": float(means[0 if shares[0] == 1.0 else -1]),
+        "expected_distance": float(means[0 if weights[0] == 1.0 else -1]),
         "std_distance": by_fold.std(axis=1, ddof=1),
         "fold_distance": by_fold,
         "io_distance": np.average(outer, axis=1, weights=counts[n:]),
         "rank": means.argsort().argsort() + 1,
-        "chosen": "blend" if (shares < 1.0).all() else names[int(shares.argmax())],
-        "weights": dict(zip(names, shares.tolist(), strict=True)),
+        "chosen": "blend" if (weights < 1.0).all() else names[int(weights.argmax())],
+        "weights": dict(zip(names, weights.tolist(), strict=True)),
     }
 
 

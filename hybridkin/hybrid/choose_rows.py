@@ -122,15 +122,19 @@ def choose_rows(
         )
     robot = as_forward_model(model).robot
     q = _actuators(robot, candidates, "candidates")
-    known = q[:0] if measured is None else _actuators(robot, measured, "measured")
+    measured_rows = (
+        q[:0] if measured is None else _actuators(robot, measured, "measured")
+    )
     aim = q if target is None else _actuators(robot, target, "target")
     names, places = np.arange(len(q)), np.arange(len(q))[:, None]
     if groups is not None:
         names, places = _few_rows_of(labels(groups, len(q)))
     n = whole(n, "n", 1, len(names))  # of the candidates
     with torch.no_grad():
-        errors = _TipErrors(robot, torch.cat([q, known, aim]))
-        chosen, error = _greedy(errors, q[torch.from_numpy(places)], n, known, aim)
+        errors = _TipErrors(robot, torch.cat([q, measured_rows, aim]))
+        chosen, error = _greedy(
+            errors, q[torch.from_numpy(places)], n, measured_rows, aim
+        )
     return names[chosen], error
 
 
@@ -192,8 +196,10 @@ class _TipErrors:
             )
         most = max(_LARGEST // len(self.units) - n_linear, 0)
         basis = _linearised.basis(self.features(q), n_linear, most)
-        linear, other = basis.tensor_split([n_linear], dim=1)
-        self.basis = self.size * torch.cat([_LINEAR * linear, _OTHER * other], dim=1)
+        linear, nonlinear = basis.tensor_split([n_linear], dim=1)
+        self.basis = self.size * torch.cat(
+            [_LINEAR * linear, _OTHER * nonlinear], dim=1
+        )
         self.variance = (_NOISE * self.size) ** 2
 
     def parts(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -105,8 +105,8 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         model.calibrate = tuple(model.calibrate)
     if "nominal" in stored.parts:
         model.mechanical_model = restorer()(stored.part("nominal"))
-    asked = stored.value("error_model", (str, dict, None))
-    model.error_model = _estimator(asked) if isinstance(asked, dict) else asked
+    setting = stored.value("error_model", (str, dict, None))
+    model.error_model = _estimator(setting) if isinstance(setting, dict) else setting
     check_settings(model)
     model.module_ = restore(stored.part("module"))
     if isinstance(model.module_, PoseHybrid) != (model.output == "pose"):
@@ -137,8 +137,10 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     model.candidates_ = None
     if "play_width" in stored.arrays:
-        one = stored.array("play_width").ndim == 0
-        model.play_ = PlayOperator(stored.array("play_width", () if one else (n,)))
+        single_width = stored.array("play_width").ndim == 0
+        model.play_ = PlayOperator(
+            stored.array("play_width", () if single_width else (n,))
+        )
     if "radius" in stored.arrays:
         inside, outside, coverage, n_rows = stored.array(
             "radius", (4,), finite=False
@@ -161,18 +163,21 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
 
 def training_of(model: HybridForwardModel) -> dict[str, Any]:
     """Return the results of the training of a fitted hybrid as JSON values, errors in metres."""
-    known: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     error = model.error_model_
     error = error.error_models[0] if isinstance(error, Blend) else error
-    known["rows"] = len(model._fitted_rows)
+    results["rows"] = len(model._fitted_rows)
     if isinstance(error, ReadoutFit):
-        known["left_out_rmse"] = error.rmse
-    if (found := model.calibration_) is not None:
-        known["calibration"] = {"rmse": found.rmse, "held_out_rmse": found.cv_rmse}
-        known["calibration"]["converged"] = found.converged
+        results["left_out_rmse"] = error.rmse
+    if (calibration := model.calibration_) is not None:
+        results["calibration"] = {
+            "rmse": calibration.rmse,
+            "held_out_rmse": calibration.cv_rmse,
+        }
+        results["calibration"]["converged"] = calibration.converged
     if model.cv_results_ is not None:
-        known["cv_results"] = model.cv_results_
-    return plain(known)
+        results["cv_results"] = model.cv_results_
+    return plain(results)
 
 
 def _setting(asked: Any, fitted: Any) -> Any:
@@ -204,11 +209,11 @@ def _described(estimator: Any) -> dict[str, Any]:
 
 def _estimator(setting: dict[str, Any]) -> Any:
     """Return the unfitted estimator of a setting."""
-    asked = Stored("error_model", setting)
-    name = asked.value("class", str)
+    entries = Stored("error_model", setting)
+    name = entries.value("class", str)
     if name not in _REGRESSORS:
         raise ValueError(f"unknown error model {name!r:.60}")
-    estimator = estimator_of(_REGRESSORS[name], asked.value("params", dict))
+    estimator = estimator_of(_REGRESSORS[name], entries.value("params", dict))
     estimator._validate_params()
     return estimator
 

@@ -258,18 +258,18 @@ class HybridForwardModel(HybridPredictor):
     ) -> list[str]:
         """Fit, see `fit_quietly`, and return the messages of all warnings."""
         check_settings(self)
-        given = self._checked_rows(X, y, sample_weight, groups)
-        asked = replace(self._spec(given), left_out=held_out)
-        rows = given.distinct()
-        messages = few_rows(rows, asked, self.coverage)
+        log = self._checked_rows(X, y, sample_weight, groups)
+        settings = replace(self._spec(log), left_out=held_out)
+        rows = log.distinct()
+        messages = few_rows(rows, settings, self.coverage)
         self._fitted_rows = np.unique(row_digests(rows.X, rows.tips))
-        spec = with_geometry_chosen(asked, rows, geometry)
-        self.play_, of_play = play_of(self.play, spec, given.in_runs())
+        spec = with_geometry_chosen(settings, rows, geometry)
+        self.play_, of_play = play_of(self.play, spec, log.in_runs())
         messages += of_play
         self._play_state: PlayState | None = None
         if self.play_ is not None:
             spec = replace(spec, commanded=moved_directions(rows.X))
-            rows = replace(given, X=self._effective(given.X, given.groups)).distinct()
+            rows = replace(log, X=self._effective(log.X, log.groups)).distinct()
         self.cv_results_: dict[str, Any] | None = None
         self.candidates_: dict[str, Hybrid] | None = None
         if spec.error_model is None:
@@ -289,7 +289,7 @@ class HybridForwardModel(HybridPredictor):
         self.radius_: Radius | None = None
         if self.coverage is not None:
             self.radius_, message = conformal_radius(
-                replace(asked, commanded=spec.commanded), rows, self.coverage
+                replace(settings, commanded=spec.commanded), rows, self.coverage
             )
             messages += [] if message is None else [message]
         return [*dict.fromkeys([*messages, *fit_messages(fitted, rows)])]
@@ -332,10 +332,10 @@ class HybridForwardModel(HybridPredictor):
         """
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
-        given = [("decay", decay, 1.0)] + (
+        positive = [("decay", decay, 1.0)] + (
             [] if alpha is None else [("alpha", alpha, np.inf)]
         )
-        for name, value, high in given:
+        for name, value, high in positive:
             if not 0.0 < number(value, name) <= high:
                 raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
         rows = self._checked_rows(X, y, sample_weight, None, reset=False)
@@ -454,13 +454,17 @@ class HybridForwardModel(HybridPredictor):
             check_unscaled("X", rows.X, "actuator vectors [m or rad]")
             check_unscaled("y", rows.tips, "tip positions [m]")
             mechanical.check_actuators(rows.q, "X")
-            asked = self.calibrate
-            if asked is None:
-                asked = "auto" if self.error_model == "auto" else ()
-            if isinstance(asked, str):
-                names = mechanical.default_parameters if asked == "default" else asked
+            parameters = self.calibrate
+            if parameters is None:
+                parameters = "auto" if self.error_model == "auto" else ()
+            if isinstance(parameters, str):
+                names = (
+                    mechanical.default_parameters
+                    if parameters == "default"
+                    else parameters
+                )
             else:
-                names = tuple(asked)
+                names = tuple(parameters)
         error_model = None
         if self.error_model != "auto":
             error_model = error_model_of(

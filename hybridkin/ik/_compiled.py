@@ -74,15 +74,15 @@ def core_of(settings: StepSettings, search: bool = False) -> Core | None:
     Poses have kernels for the search only. The core is kept with the settings, and made again if
     the model has changed.
     """
-    kept = vars(settings).get("_program")
+    program = vars(settings).get("_program")
     model = program_of(settings.task.models[0])
-    if kept is None or kept[0] is not model:
+    if program is None or program[0] is not model:
         try:
-            kept = model, None if model is None else Core(settings, model), ""
+            program = model, None if model is None else Core(settings, model), ""
         except (NoKernel, TypeError) as error:
-            kept = model, None, str(error)
-        object.__setattr__(settings, "_program", kept)
-    return kept[1] if search or settings.task.parts == (3,) else None
+            program = model, None, str(error)
+        object.__setattr__(settings, "_program", program)
+    return program[1] if search or settings.task.parts == (3,) else None
 
 
 def why_torch(settings: StepSettings) -> str:
@@ -147,13 +147,13 @@ class Core:
         except IndexError:  # other threads use them
             follower = Follower(self, None, IK_MUST_SEE + IK_FROM_REST)
         follower.q[...] = q
-        found = (
+        result = (
             (follower.state.copy(), self._places)
             if follower.tick(target, dx, tip)
             else None
         )
         self._idle.append(follower)
-        return found
+        return result
 
     def steps(
         self,

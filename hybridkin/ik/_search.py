@@ -120,29 +120,27 @@ class Search:
             nudged = settings.start_at(self._nudged(at_start))
             stay = at_start.reached | ~torch.isfinite(at_start.error)
             q = torch.where(stay[:, None], q, nudged)
-        found = self._attempt(q, target)
-        rows = (~found.reached & row_gram(found.J).is_singular).nonzero()[:, 0]
-        self._try_again(found, rows, self._nudged(found)[rows, None])
-        rows = ((self._cost(found) > _DONE) & torch.isfinite(found.error)).nonzero()[
-            :, 0
-        ]
+        best = self._attempt(q, target)
+        rows = (~best.reached & row_gram(best.J).is_singular).nonzero()[:, 0]
+        self._try_again(best, rows, self._nudged(best)[rows, None])
+        rows = ((self._cost(best) > _DONE) & torch.isfinite(best.error)).nonzero()[:, 0]
         for some in rows.split(_ROWS) if restarts * len(rows) > 0 else ():
-            size = _per_tip(found.J, found.error)[some]
+            size = _per_tip(best.J, best.error)[some]
             starts = nearest_starts(
-                settings, q[some], size, found.target[some], restarts
+                settings, q[some], size, best.target[some], restarts
             )
             for part in starts.tensor_split(_PARTS, dim=1):
-                open_rows = self._cost(found)[some] > _DONE
-                self._try_again(found, some[open_rows], part[open_rows])
+                open_rows = self._cost(best)[some] > _DONE
+                self._try_again(best, some[open_rows], part[open_rows])
         for _ in range(_RETURNS if settings.tip_limits is not None else 0):
-            way = settings.allowed(found.x) - found.x
-            rows = (~found.reached & ~self._within(way)).nonzero()[:, 0]
+            way = settings.allowed(best.x) - best.x
+            rows = (~best.reached & ~self._within(way)).nonzero()[:, 0]
             if rows.numel() == 0:
                 break
-            found.put(rows, self._attempt(found.q[rows], (found.x + 1.5 * way)[rows]))
+            best.put(rows, self._attempt(best.q[rows], (best.x + 1.5 * way)[rows]))
         if settings.has_posture:
-            self._to_posture(found)
-        return found
+            self._to_posture(best)
+        return best
 
     def several(self, best: Found, start: Tensor, restarts: int, count: int) -> Found:
         """Return `count` different points for each row of `best`, the nearest to `start` first.
@@ -159,29 +157,39 @@ class Search:
         )
         fine = replace(self, tol=tol)
         rows = torch.arange(len(start), device=start.device)
-        found = best.take(rows.repeat_interleave(count))
-        further = torch.arange(len(found.q), device=start.device) % count > 0
-        found.q[further] = torch.nan
+        solutions = best.take(rows.repeat_interleave(count))
+        further = torch.arange(len(solutions.q), device=start.device) % count > 0
+        solutions.q[further] = torch.nan
         for some in (self._cost(best) == _DONE).nonzero()[:, 0].split(_ROWS):
             near = start[some].repeat_interleave(n_starts, 0)
-            more = fine._from_even_starts(best.take(some), start[some], restarts)
-            turned = more.q + settings.whole_turns(near - more.q)
-            more.q = torch.where(settings.inside(turned) == turned, turned, more.q)
-            distance = ((more.q - near) / spans).norm(dim=-1)
-            distance = torch.where(fine._cost(more) == _DONE, distance, torch.inf)
+            further_solutions = fine._from_even_starts(
+                best.take(some), start[some], restarts
+            )
+            turned = further_solutions.q + settings.whole_turns(
+                near - further_solutions.q
+            )
+            further_solutions.q = torch.where(
+                settings.inside(turned) == turned, turned, further_solutions.q
+            )
+            distance = ((further_solutions.q - near) / spans).norm(dim=-1)
+            distance = torch.where(
+                fine._cost(further_solutions) == _DONE, distance, torch.inf
+            )
             distance = distance.view(-1, n_starts)
             first = n_starts * torch.arange(len(some), device=some.device)
-            q = more.q.unflatten(0, (-1, n_starts))
-            more.n_starts = best.n_starts[some].repeat_interleave(n_starts) + n_starts
+            q = further_solutions.q.unflatten(0, (-1, n_starts))
+            further_solutions.n_starts = (
+                best.n_starts[some].repeat_interleave(n_starts) + n_starts
+            )
             for place in range(count):
                 nearest, pick = distance.min(1)
                 exists = torch.isfinite(nearest)
-                picked = more.take(first + pick)
-                found.put(count * some[exists] + place, picked.take(exists))
+                picked = further_solutions.take(first + pick)
+                solutions.put(count * some[exists] + place, picked.take(exists))
                 apart = q - picked.q[:, None]
                 apart = ((apart - settings.whole_turns(apart)) / spans).abs().amax(-1)
                 distance = torch.where(apart <= _SAME, torch.inf, distance)
-        return found
+        return solutions
 
     def _from_even_starts(self, best: Found, start: Tensor, restarts: int) -> Found:
         """Return the results from the best points and from `restarts` even starts, row by row."""
@@ -190,22 +198,22 @@ class Search:
         )
         starts = torch.cat([best.q[:, None], starts.expand(len(start), -1, -1)], dim=1)
         target = best.target.repeat_interleave(restarts + 1, 0)
-        found = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
+        solutions = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
         if self.settings.has_posture:
-            self._to_posture(found)
-        return found
+            self._to_posture(solutions)
+        return solutions
 
     def _to_posture(self, found: Found) -> None:
         self._descend(found, lambda q: self.settings.preferred(q) - q)
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
         """Return the result of one start; results outside the domain are moved towards it."""
-        found = self._lower(q, target)
-        rows = (self._cost(found) == _OUTSIDE).nonzero()[:, 0]
-        part = found.take(rows)
+        solution = self._lower(q, target)
+        rows = (self._cost(solution) == _OUTSIDE).nonzero()[:, 0]
+        part = solution.take(rows)
         self._descend(part, self._inward)
-        found.put(rows, part)
-        return found
+        solution.put(rows, part)
+        return solution
 
     def _try_again(self, found: Found, rows: Tensor, starts: Tensor) -> None:
         """Search rows (k,) from further starts (k, s, n) at once, and keep the best results."""
@@ -245,12 +253,12 @@ class Search:
 
     def _lower(self, q: Tensor, target: Tensor) -> Found:
         """Lower the error until it is within tol or cannot be lowered."""
-        found = self._start(q, target)
+        state = self._start(q, target)
         rows = torch.arange(len(q), device=q.device)
-        damping = torch.full_like(found.error, _FIRST_DAMPING)
+        damping = torch.full_like(state.error, _FIRST_DAMPING)
         none = torch.zeros_like(damping)
         live = _Descent(
-            **vars(found), start=found.error, nu=damping, growth=2.0 + none, slow=none
+            **vars(state), start=state.error, nu=damping, growth=2.0 + none, slow=none
         )
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
@@ -261,13 +269,13 @@ class Search:
             live.n_iter = torch.full_like(live.n_iter, iteration)
             going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
             if not going.all():
-                found.put(rows[~going], live.take(~going))
+                state.put(rows[~going], live.take(~going))
                 rows = rows[going]
                 live = live.take(going)
             if rows.numel() == 0:
                 break
             self._lower_once(live)
-        return found
+        return state
 
     def _lower_once(self, live: _Descent) -> None:
         """Try a step of all rows, and take it where it lowers the error."""

@@ -87,13 +87,13 @@ def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
     good = good and bool((size > 0.0).all() and torch.isfinite(size).all())
     shapes = f"of shapes (k, {m}) and (k,), finite, with a direction in every row of A"
     require(good, f"{need} {shapes}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
-    found = HalfSpaces(A / size[:, None], b / size)
-    inside = found.margin(found.way_in(found.offsets[None])) >= -1e-9
+    spaces = HalfSpaces(A / size[:, None], b / size)
+    inside = spaces.margin(spaces.way_in(spaces.offsets[None])) >= -1e-9
     require(
         inside.all(),
         "`tip_limits` must have a common point; these half-spaces have none.",
     )
-    return found
+    return spaces
 
 
 def require(good: bool | Tensor, message: str) -> None:
@@ -183,11 +183,12 @@ class StepSettings(Portable):
     def __post_init__(self) -> None:
         """Check the settings; without `q_pref` the posture is the middle of the limits."""
         sizes = self._sizes()
-        one = "give scalars or one value per actuator"
+        need = "give scalars or one value per actuator"
         good = len(set(sizes.values())) < 2
         names = ", ".join(f"`{name}`" for name in sizes)
         require(
-            good, f"{names} must have the same number of actuators, got {sizes}; {one}."
+            good,
+            f"{names} must have the same number of actuators, got {sizes}; {need}.",
         )
         low = self.q_min.tolist()
         high = self.q_max.tolist()
@@ -202,8 +203,8 @@ class StepSettings(Portable):
         good = 0.0 < self.dt < LARGEST
         require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
         self.rates()
-        share = 0.0 if self.damping == "adaptive" else self.damping
-        good = not isinstance(share, str) and 0.0 <= share < math.inf
+        least = 0.0 if self.damping == "adaptive" else self.damping
+        good = not isinstance(least, str) and 0.0 <= least < math.inf
         text = '"adaptive" or'
         require(
             good,
@@ -254,7 +255,7 @@ class StepSettings(Portable):
 
     def unit_messages(self) -> list[str]:
         """Return warnings if limits or a posture seem to have another unit than the model."""
-        found = []
+        messages = []
         n = self.n_actuators
         for name in ("q_min", "q_max", "dq_max", "q_pref"):
             value = vars(self)[name]
@@ -265,8 +266,8 @@ class StepSettings(Portable):
             ):
                 q = torch.where(torch.isfinite(value), value, 0.0).expand(1, n)
                 factor = _FAST if name == "dq_max" else 1.0
-                found += self.task.models[0].robot.unit_messages(q, name, factor)
-        return found
+                messages += self.task.models[0].robot.unit_messages(q, name, factor)
+        return messages
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if targets lie too far from the robot to be in metres."""
@@ -544,8 +545,10 @@ class StepSettings(Portable):
         `lead` gives the leading axes: "..." any, "T" one, "" none.
         """
         x = as_tensor(value, name, self.task.device)
-        one = shape or self.task.shape
-        check_shape(x, name, [*filter(None, [lead]), *one], "one point [m] per row")
+        point_shape = shape or self.task.shape
+        check_shape(
+            x, name, [*filter(None, [lead]), *point_shape], "one point [m] per row"
+        )
         if shape is None:
             self.task.check(x, name)
         return x if like is None else x.to(like)
@@ -587,14 +590,16 @@ class StepSettings(Portable):
 
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
         """Return one tolerance [m], or one for every part of the task."""
-        given = np.atleast_1d(real_array(tol, "tol").astype(float))
-        require(bool((given > 0.0).all()), f"`tol` must be positive [m], got {tol!r}.")
+        tolerances = np.atleast_1d(real_array(tol, "tol").astype(float))
+        require(
+            bool((tolerances > 0.0).all()), f"`tol` must be positive [m], got {tol!r}."
+        )
         if np.ndim(tol) == 0:
-            return float(given[0])
+            return float(tolerances[0])
         n = len(self.task.parts)
         parts = "one for every part of the task"
         require(
-            given.shape == (n,),
+            tolerances.shape == (n,),
             f"`tol` must be one number [m] or {n}, {parts}, got {tol!r}.",
         )
-        return tuple(given.tolist())
+        return tuple(tolerances.tolist())

@@ -70,8 +70,8 @@ def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> 
         low = lower
     low = low[:, None]
     high = high[:, None]
-    shares = _even_shares(q.shape[-1], count, q.device).to(q)
-    return torch.lerp(low, high, shares).clamp(low, high)
+    fractions = _even_shares(q.shape[-1], count, q.device).to(q)
+    return torch.lerp(low, high, fractions).clamp(low, high)
 
 
 def _even_shares(n: int, count: int, device: torch.device) -> Tensor:

@@ -187,11 +187,13 @@ def _step_inside(
         step, over = taken(wanted)
     else:
         stay, least = taken(limits.way_in(margin), None)
-        share = ((close - least) / (over - least)).clamp(0.0, 1.0)
-        share = torch.where(over > close, share, 1.0).amin(-1, keepdim=True)
-        dq = torch.clamp(stay.dq + share * (step.dq - stay.dq), *bounds)
+        step_size = ((close - least) / (over - least)).clamp(0.0, 1.0)
+        step_size = torch.where(over > close, step_size, 1.0).amin(-1, keepdim=True)
+        dq = torch.clamp(stay.dq + step_size * (step.dq - stay.dq), *bounds)
         held = (dq <= bounds[0]) | (dq >= bounds[1])
-        step = step._replace(dq=torch.where(share < 1.0, dq, step.dq), saturated=held)
+        step = step._replace(
+            dq=torch.where(step_size < 1.0, dq, step.dq), saturated=held
+        )
     return step._replace(stopped=((wanted - v).abs() > close).any(-1))
 
 
@@ -333,9 +335,11 @@ def _arriving(
                 break
             low = lower - end.dq
             high = upper - end.dq
-            more = limited_step(settings, end.J, end.missing, None, low, high).dq
-            dq = torch.clamp(end.dq + more, lower, upper)
-            dq = torch.where(more <= low, lower, torch.where(more >= high, upper, dq))
+            correction = limited_step(settings, end.J, end.missing, None, low, high).dq
+            dq = torch.clamp(end.dq + correction, lower, upper)
+            dq = torch.where(
+                correction <= low, lower, torch.where(correction >= high, upper, dq)
+            )
             end = end_of(dq, motion)
             best = best.where(going & (end.distance < best.distance), end)
         return best
@@ -352,14 +356,16 @@ def _arriving(
     to = torch.where(slack & torch.isfinite(to), to, end.dq)
     way = to - end.dq
     weak &= (way != 0.0).any(-1, keepdim=True)
-    share = 1.0
-    while share > IK_LEAST_PULL and weak.any():
-        pulled = approach(torch.clamp(to - (1.0 - share) * way, lower, upper), v, slip)
+    fraction = 1.0
+    while fraction > IK_LEAST_PULL and weak.any():
+        pulled = approach(
+            torch.clamp(to - (1.0 - fraction) * way, lower, upper), v, slip
+        )
         # A slack tendon moves the tip by rounding alone.
         better = weak & (pulled.distance <= (1.0 + eps**0.5) * end.distance)
         end = end.where(better, pulled)
         weak = weak & ~better
-        share *= IK_PULL_RATIO
+        fraction *= IK_PULL_RATIO
     held = (end.dq <= lower) | (end.dq >= upper)
     return step._replace(dq=end.dq, saturated=held)
 

@@ -268,6 +268,8 @@ def _tally(status: np.ndarray | Tensor) -> str:
 
 
 def _errors(error: np.ndarray | Tensor) -> str:
-    known = as_array(error)[np.isfinite(as_array(error))]
+    finite = as_array(error)[np.isfinite(as_array(error))]
     mean_and_max = "error mean {:.3g} m, max {:.3g} m".format
-    return mean_and_max(known.mean(), known.max()) if known.size else "no error known"
+    return (
+        mean_and_max(finite.mean(), finite.max()) if finite.size else "no error known"
+    )

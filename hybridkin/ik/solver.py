@@ -160,10 +160,10 @@ class InverseKinematics:
         task = as_task(model)
         good = 0 not in np.shape(task.models[0].robot.limits["q_min"])
         require(good, "`model` must have an actuator, but all its joints are fixed.")
-        given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
-        of_model = tuple(name for name, value in given.items() if value is None)
+        box = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
+        of_model = tuple(name for name, value in box.items() if value is None)
         bounds = limits_of(task, of_model)
-        for name, value in given.items():
+        for name, value in box.items():
             if value is not None:
                 bounds[name] = bound(value, name, positive=name == "dq_max")
         self._settings = StepSettings(
@@ -253,15 +253,15 @@ class InverseKinematics:
             `ddq_max` it brakes first); outside the limits its known actuators return to them.
         """
         core = core_of(self.settings)
-        found = (
+        result = (
             None
             if core is None or dq is not None
             else core.step(q, x_target, dx, x_measured)
         )
-        if found is None:
+        if result is None:
             return self._steps(core, q, x_target, dx, x_measured, dq)
         step = object.__new__(Step)  # its constructor takes longer than the step
-        vars(step)["_row"] = found
+        vars(step)["_row"] = result
         return step
 
     @torch.no_grad()
@@ -274,26 +274,30 @@ class InverseKinematics:
         as_numpy = is_numpy(q)
         axes = len(task.shape)
         rows = settings.configurations(q, "q")
-        given = [(rows, 1), (settings.points(x_target, "x_target", rows), axes)]
+        arguments = [(rows, 1), (settings.points(x_target, "x_target", rows), axes)]
         if tip is not None:
-            given.append((settings.points(tip, "x_measured", rows), axes))
+            arguments.append((settings.points(tip, "x_measured", rows), axes))
         if dx is not None:
-            given.append((settings.points(dx, "dx", rows, shape=(sum(task.parts),)), 1))
+            arguments.append(
+                (settings.points(dx, "dx", rows, shape=(sum(task.parts),)), 1)
+            )
         if last is not None:
-            given.append((settings.configurations(last, "dq").to(rows), 1))
-        lead = leading(given)
-        rows, target, *others = (rows_of(a, lead, trailing) for a, trailing in given)
-        before = None if last is None else others.pop()
+            arguments.append((settings.configurations(last, "dq").to(rows), 1))
+        lead = leading(arguments)
+        rows, target, *optional = (
+            rows_of(a, lead, trailing) for a, trailing in arguments
+        )
+        before = None if last is None else optional.pop()
         before = before if settings.accelerates else None
-        feed_forward = None if dx is None else settings.dt * others.pop()
-        measured = others.pop() if others else None
+        feed_forward = None if dx is None else settings.dt * optional.pop()
+        measured = optional.pop() if optional else None
         if core is not None and as_numpy and rows.dtype == torch.float64:
             parts = core.steps(rows, target, feed_forward, measured, before)
             return Step(*give_back(parts, lead, as_numpy))
         x, J = settings.evaluate(rows)
-        seen = x if measured is None else measured
-        e = task.difference(seen, target)
-        step = control_step(settings, rows, J, e, feed_forward, last=before, tip=seen)
+        known_tip = x if measured is None else measured
+        e = task.difference(known_tip, target)
+        step = control_step(settings, rows, J, e, feed_forward, last=before, tip=known_tip)
         parts = (
             step.dq,
             x,
@@ -395,21 +399,21 @@ class InverseKinematics:
             search = core.search(tolerance, max_iter)
             settings = core.settings
             task = settings.task
-        found = search.solve(q, target, q0 is None, restarts)
+        solution = search.solve(q, target, q0 is None, restarts)
         if n_solutions is not None:
-            found = search.several(found, q, restarts, places)
+            solution = search.several(solution, q, restarts, places)
             lead = (*lead, places)
             target = target.repeat_interleave(places, 0)
         # by tip limits
-        q = found.q
-        moved = (found.target != target).flatten(1).any(-1)
+        q = solution.q
+        moved = (solution.target != target).flatten(1).any(-1)
         if differentiable:
             with torch.enable_grad():
                 goal = rows_of(
                     torch.as_tensor(x_target, device=q.device).to(q), lead, axes
                 )
                 q = with_derivatives(
-                    settings, q, goal, found.reached & ~moved, tolerance
+                    settings, q, goal, solution.reached & ~moved, tolerance
                 )
         # Error and status refer to the returned q.
         x, J = settings.evaluate(q.detach())
@@ -418,10 +422,10 @@ class InverseKinematics:
         gram = row_gram(J)
         reached = task.reached(e, tolerance)
         status = statuses(
-            task, q.detach(), error, reached, found.held, gram.is_singular
+            task, q.detach(), error, reached, solution.held, gram.is_singular
         )
         missed = ~reached & torch.isfinite(error)
-        status[missed & found.stationary] = IKStatus.MAX_ITER
+        status[missed & solution.stationary] = IKStatus.MAX_ITER
         beyond = moved | (settings.misses(target) > np.max(tolerance))
         status[missed & beyond] = IKStatus.UNREACHABLE
         further = torch.arange(len(q), device=q.device) % places > 0
@@ -432,8 +436,8 @@ class InverseKinematics:
             x,
             error,
             status,
-            found.n_iter,
-            found.n_starts,
+            solution.n_iter,
+            solution.n_starts,
             gram.sigma_min,
             margin,
         )
@@ -547,7 +551,7 @@ class InverseKinematics:
     def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
         settings = self.settings
-        given = q0 is not None
+        has_start = q0 is not None
         if q0 is None:
             start = settings.start(target)[None]
             q0 = nearest_starts(settings, start, start[:, 0], target, _GUESSES)[0]
@@ -555,13 +559,13 @@ class InverseKinematics:
         away = settings.task.distances(settings.evaluate(q0)[0][None], target)[0]
         away[0] = -1.0  # stays the first
         q0 = q0[away.argsort()[: _GUESSES + 1]]
-        found = self.solve(target[0], q0, max_iter=200)
-        if given:
-            yield found.q[0]
+        solution = self.solve(target[0], q0, max_iter=200)
+        if has_start:
+            yield solution.q[0]
         for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN):
-            regular = torch.where(found.status == wanted, found.sigma_min, -1.0)
+            regular = torch.where(solution.status == wanted, solution.sigma_min, -1.0)
             if regular.max() >= 0.0:
-                yield found.q[regular.argmax()]
+                yield solution.q[regular.argmax()]
                 return
 
     def _followed(

@@ -275,9 +275,11 @@ class PoseTask(Task):
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return distances of x to targets, with chords instead of angles of rotations."""
-        share = self.units[1] / math.sqrt(2.0)
+        metres_per_radian = self.units[1] / math.sqrt(2.0)
         x, x_target = (
-            torch.cat([T[..., :3, 3], share * T[..., :3, :3].flatten(-2)], dim=-1)
+            torch.cat(
+                [T[..., :3, 3], metres_per_radian * T[..., :3, :3].flatten(-2)], dim=-1
+            )
             for T in (x, x_target)
         )
         if len(x) == 1:  # much faster

@@ -159,18 +159,18 @@ class Tracker(Portable):
         q : array-like of shape (n,)
             Actuator vector, in the unit of q. From outside the limits it returns at `dq_max`.
         """
-        given = as_tensor(q, "q", self._settings.task.device)
+        start = as_tensor(q, "q", self._settings.task.device)
         n = self._settings.n_actuators
         good = (
-            given.ndim == 1 and n in (None, len(given)) and torch.isfinite(given).all()
+            start.ndim == 1 and n in (None, len(start)) and torch.isfinite(start).all()
         )
         need = f"finite and of shape ({n or 'n'},)"
         require(
-            good, f"`q` must be {need}, got {given.tolist()}; read it from the robot."
+            good, f"`q` must be {need}, got {start.tolist()}; read it from the robot."
         )
         with self._lock:
-            self._like = given.clone()
-            self._start(self._like, torch.zeros_like(given))
+            self._like = start.clone()
+            self._start(self._like, torch.zeros_like(start))
 
     def _start(self, q: Tensor, dq: Tensor) -> None:
         """Read the model, and start at q (n,) after a step dq (n,)."""
@@ -264,7 +264,7 @@ class Tracker(Portable):
         n = len(targets)
         ahead = task.difference(targets, torch.cat([targets[1:], targets[-1:]]))
         ahead = torch.where(torch.isfinite(ahead).all(-1, keepdim=True), ahead, 0.0)
-        known = torch.isfinite(targets.flatten(1)).all(-1).tolist()
+        finite = torch.isfinite(targets.flatten(1)).all(-1).tolist()
         unread = torch.full_like(targets[:1], math.nan)
         held = damped = torch.zeros(1, dtype=torch.bool, device=targets.device)
         rows = []
@@ -274,17 +274,17 @@ class Tracker(Portable):
             tip = None if plant is None else self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
             ahead_now = ahead[i : i + 1]
-            target = target if known[i] else None
+            target = target if finite[i] else None
             tick = self._robot.advance(periods[i], target, ahead_now, used)
             rows.append(
                 (tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped)
             )
             held = tick.step.saturated.any(-1) | tick.step.stopped
             damped = tick.step.damping > 0.0
-        q, x, seen, J, held, damped = (
+        q, x, measured, J, held, damped = (
             torch.cat(parts) for parts in zip(*rows, strict=True)
         )
-        return [q, x, seen, row_gram(J).sigma_min, held, damped]
+        return [q, x, measured, row_gram(J).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
         """Return the plant's tip (1, ...), NaN if the plant raises.
@@ -355,10 +355,10 @@ class _InTorch:
                 # without memory, use no error.
                 error = task.difference(tip, target)
                 offset = used - error
-                seen = torch.isfinite(offset).all(-1, keepdim=True)
+                finite = torch.isfinite(offset).all(-1, keepdim=True)
                 remembered = used if self._memory is None else self._offset
-                used = torch.where(seen, error, used - remembered)
-                self._offset = torch.where(seen, offset, self._offset)
+                used = torch.where(finite, error, used - remembered)
+                self._offset = torch.where(finite, offset, self._offset)
         seconds = period or settings.dt
         last = self._last.step.dq * (seconds / self._period)
         at = None if settings.tip_limits is None else x + self._offset

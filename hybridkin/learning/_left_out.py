@@ -103,18 +103,19 @@ class LeftOut:
         for part in self._in_parts(splits, self._rows_at_a_time(len(alphas))):
             rows = np.concatenate([out for out, _ in part])
             if not self._wide and len(rows) > len(self._center) and len(part) == 1:
-                out, asked = part[0]
-                yield asked, self._refitted(out, asked, alphas)
+                out, held_out = part[0]
+                yield held_out, self._refitted(out, held_out, alphas)
                 continue
             Z = self._z(rows)
             residuals = self._residuals(Z, D, rows)
             start = 0
-            for out, asked in part:
+            for out, held_out in part:
                 stop = start + len(out)
                 errors = self._solved(Z[start:stop], D, residuals[:, start:stop], out)
                 yield (
-                    asked,
-                    errors[:, np.searchsorted(out, asked)] / self._root[asked, None],
+                    held_out,
+                    errors[:, np.searchsorted(out, held_out)]
+                    / self._root[held_out, None],
                 )
                 start = stop
 

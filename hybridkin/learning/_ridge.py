@@ -105,10 +105,10 @@ def ridge(G, C, alpha):
     eigenvalues, V = linalg.eigh(G)
     shifted = eigenvalues + alpha
     cutoff = max(eps * shifted[-1], np.finfo(np.float64).tiny)
-    kept = shifted > cutoff
-    W = V[:, kept] @ ((V[:, kept].T @ C) / shifted[kept, None])
+    regular = shifted > cutoff
+    W = V[:, regular] @ ((V[:, regular].T @ C) / shifted[regular, None])
     R = V / np.sqrt(np.maximum(shifted, cutoff))
-    return W, R, np.sum(eigenvalues[kept] / shifted[kept]), "eigh"
+    return W, R, np.sum(eigenvalues[regular] / shifted[regular]), "eigh"
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -338,10 +338,10 @@ class ELMRegressor(FittedNetwork):
                     f"its {name.rstrip('_')} differs; give both models the same int as "
                     f"`random_state`, the same parameters, and bounds as `input_scaling`."
                 )
-        shape, given = (m.module_.output_weights.shape for m in (self, other))
-        if shape != given:
+        shape, other_shape = (m.module_.output_weights.shape for m in (self, other))
+        if shape != other_shape:
             raise ValueError(
-                f"`other` must have output_weights_ of shape {tuple(shape)}, got {tuple(given)}; "
+                f"`other` must have output_weights_ of shape {tuple(shape)}, got {tuple(other_shape)}; "
                 f"fit both models with the same `direct_link` and the same columns of `y`."
             )
         return self._solve(merge(self._stats, other._stats), self.module_)

@@ -306,10 +306,10 @@ class _Candidate(NamedTuple):
 @np.errstate(all="ignore")  # errors that overflow are never the smallest
 def _candidate(params, relevance, task):
     X, targets, sample_weight, weights, splits, alphas = task
-    asked = ELMRegressor(**params)
-    elm = draw_layer(asked, X, sample_weight).to(device_named(asked.device))
-    stats = gather(None, elm, X, targets, sample_weight, asked.block_size)
-    left_out = LeftOut(elm, stats, X, targets, weights, asked.fit_intercept)
+    candidate = ELMRegressor(**params)
+    elm = draw_layer(candidate, X, sample_weight).to(device_named(candidate.device))
+    stats = gather(None, elm, X, targets, sample_weight, candidate.block_size)
+    left_out = LeftOut(elm, stats, X, targets, weights, candidate.fit_intercept)
     largest = left_out.eigenvalues[-1] or 1.0
     alphas = (
         _AUTO_ALPHAS * largest
@@ -389,20 +389,22 @@ def _splits(cv, groups, n_rows, place):
     rows = np.arange(len(place))
     splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
     with TURNS.filters:
-        found = [*splitter.split(rows, rows, groups)]
-    for train, test in found:
+        all_splits = [*splitter.split(rows, rows, groups)]
+    for train, test in all_splits:
         if np.isin(rows[test], rows[train]).any():
             raise ValueError(
                 "`cv` must not test on rows that it trains on, but one of its splits does; use a "
                 "splitter of sklearn.model_selection."
             )
         out = np.ones(n_rows + 1, dtype=bool)
-        asked = np.zeros(n_rows + 1, dtype=bool)
-        out[place[train]], asked[place[test]] = (
+        tested = np.zeros(n_rows + 1, dtype=bool)
+        out[place[train]], tested[place[test]] = (
             False,
             True,
         )  # the last: rows of weight 0
-        splits.append((np.flatnonzero((out | asked)[:-1]), np.flatnonzero(asked[:-1])))
+        splits.append(
+            (np.flatnonzero((out | tested)[:-1]), np.flatnonzero(tested[:-1]))
+        )
     return [split for split in splits if len(split[1])]
 
 
@@ -411,10 +413,10 @@ def _positive(values, name, integer=False):
     kind = np.integer if integer else np.number
     fits = array.ndim == 1 and array.size and np.issubdtype(array.dtype, kind)
     if not fits or not (np.isfinite(array) & (array > 1.0 / LARGEST)).all():
-        what = (
+        need = (
             "positive integers"
             if integer
             else f"positive numbers, over {1.0 / LARGEST:g}"
         )
-        raise ValueError(f"`{name}` must be one or more {what}, got {values!r}.")
+        raise ValueError(f"`{name}` must be one or more {need}, got {values!r}.")
     return array

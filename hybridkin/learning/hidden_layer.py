@@ -96,8 +96,8 @@ def _validated(estimator, X, *y, good=True, **checks):
     good = good and _is_finite(X, 2) and all(len(X) == len(a) for a in y)
     checks |= {"dtype": DTYPES, "order": "C", "skip_check_array": good}
     with np.errstate(invalid="ignore"):  # a sum of both infinities
-        found = validate_data(estimator, X, *y, **checks)
-    return [*map(np.asarray, (X, *y) if good else found if y else [found])]
+        validated = validate_data(estimator, X, *y, **checks)
+    return [*map(np.asarray, (X, *y) if good else validated if y else [validated])]
 
 
 def draw_layer(params, X, sample_weight):

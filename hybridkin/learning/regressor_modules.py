@@ -175,10 +175,10 @@ class PolynomialModule(ForwardModel):
         lower = exponents[k] - np.eye(self.n_actuators)[j]
         both = np.vstack([exponents, lower])
         distinct, where = np.unique(both, axis=0, return_inverse=True)
-        own, below = np.split(where.reshape(-1), [len(exponents)])
+        places, below = np.split(where.reshape(-1), [len(exponents)])
         values = np.zeros((len(distinct), self.n_outputs))
         slope = np.zeros((len(distinct), self.n_actuators, self.n_outputs))
-        np.add.at(values, own, coef)
+        np.add.at(values, places, coef)
         np.add.at(slope, (below, j), exponents[k, j][:, None] * coef[k])
         slope = (slope.swapaxes(1, 2) / np.asarray(scale)).reshape(len(distinct), -1)
         _register(
@@ -377,9 +377,9 @@ def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
         gamma = fitted.gamma if fitted.gamma is not None else 1.0 / rows.shape[1]
         return rows, weights.reshape(len(rows), -1), (2.0 * gamma) ** -0.5, 0.0
     if kind is GaussianProcessRegressor:
-        found = _gaussian(fitted.kernel_)
-        if found is not None:
-            height, widths = found
+        kernel = _gaussian(fitted.kernel_)
+        if kernel is not None:
+            height, widths = kernel
             rows = fitted.X_train_
             weights = (
                 height * fitted.alpha_.reshape(len(rows), -1) * fitted._y_train_std
@@ -394,17 +394,17 @@ def _gaussian(kernel: gp.Kernel) -> tuple[float, Any] | None:
         return 1.0, kernel.length_scale
     if isinstance(kernel, gp.KernelOperator):
         for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):
-            found = _gaussian(one)
+            part = _gaussian(one)
             if (
-                found
+                part
                 and isinstance(kernel, gp.Sum)
                 and isinstance(other, gp.WhiteKernel)
             ):
-                return found
+                return part
             if (
-                found
+                part
                 and isinstance(kernel, gp.Product)
                 and isinstance(other, gp.ConstantKernel)
             ):
-                return other.constant_value * found[0], found[1]
+                return other.constant_value * part[0], part[1]
     return None

@@ -197,7 +197,7 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
         f"#define HK_{a} {number}"
         for a, number in {**sizes, "KINDS": f"{kinds}u"}.items()
     ]
-    found = {
+    fields = {
         "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
         "CODE": _literals(plan.code),
         "DATA": _literals(plan.data.astype(dtype)),
@@ -208,12 +208,12 @@ def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
     if steps:
         limits, dt = _limits(plan)
         words = (", ".join(f"{v:.6g}" for v in row) for row in limits)
-        found |= zip(("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX"), words, strict=True)
-        found |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
+        fields |= zip(("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX"), words, strict=True)
+        fields |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
         sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
-        found["LIMITS"] = _filled(sentence, found)
-        found["NEWTON"] = f"{10 * plan.n_inputs**2 + 80 * plan.n_inputs:,}"
-    return found
+        fields["LIMITS"] = _filled(sentence, fields)
+        fields["NEWTON"] = f"{10 * plan.n_inputs**2 + 80 * plan.n_inputs:,}"
+    return fields
 
 
 def _check_stack(plan: Plan, dtype: str) -> None:
@@ -263,8 +263,12 @@ def _literals(values: NDArray) -> str:
     """Return numbers as the entries of a C array."""
     single = "f" if values.dtype == np.float32 else ""
     cast = "" if single else "(double)"
-    known = {"inf": f"{cast}INFINITY", "-inf": f"-{cast}INFINITY", "nan": f"{cast}NAN"}
-    words = [known.get(word, word + single) for word in map(str, values.ravel())]
+    special = {
+        "inf": f"{cast}INFINITY",
+        "-inf": f"-{cast}INFINITY",
+        "nan": f"{cast}NAN",
+    }
+    words = [special.get(word, word + single) for word in map(str, values.ravel())]
     lines = (", ".join(words[i : i + 6]) for i in range(0, len(words), 6))
     return "\n    " + ",\n    ".join(lines) + ",\n"
 
@@ -291,14 +295,14 @@ def _vectors(
         x, J = (a.numpy() for a in double.forward_and_jacobian(at))
         distance = double.domain_distance(at).numpy()
     arrays = {"Q": rows, "X": x, "J": J, "DISTANCE": distance, "HOME": rows[0]}
-    found = {f"{key}_SCALE": float(np.nanmax(abs(a[:8]))) for key, a in arrays.items()}
+    fields = {f"{key}_SCALE": float(np.nanmax(abs(a[:8]))) for key, a in arrays.items()}
     if controller is not None:
         arrays |= _runs(controller, plan, rows[:8], x[:8], dtype)
-        found |= {"STEPS": _STEPS, "MEMORY": _MEMORY * _limits(plan)[1]}
-        found["COMPARED"] = 8 if dtype == "float64" else 4
+        fields |= {"STEPS": _STEPS, "MEMORY": _MEMORY * _limits(plan)[1]}
+        fields["COMPARED"] = 8 if dtype == "float64" else 4
     return {
         "ROWS": len(rows),
-        **found,
+        **fields,
         **{key: _literals(a) for key, a in arrays.items()},
     }
 
@@ -336,25 +340,25 @@ def _runs(
     changes[[0, 2]] += tips[:, None]
     target, dx, measured = changes.astype(dtype)
     measured[:, 2] = math.nan  # no measurement
-    found = []
+    fields = []
     for q, *run in zip(starts, target, dx, measured, strict=True):
         tracker = controller.tracker(
             torch.from_numpy(q.astype(float)), memory=_MEMORY * dt
         )
         for i, rows in enumerate(zip(*run, strict=True)):
             goal, speed, tip = (torch.from_numpy(a.astype(float)) for a in rows)
-            seen = tip if i < _STEPS - 1 else None  # as in the template
-            q = tracker.step(goal, speed, x_measured=seen).numpy()
-            found.append([*q, tracker.sigma_min**2])
-    command, squares = np.split(np.array(found), [plan.n_inputs], axis=1)
-    found = {
+            reading = tip if i < _STEPS - 1 else None  # as in the template
+            q = tracker.step(goal, speed, x_measured=reading).numpy()
+            fields.append([*q, tracker.sigma_min**2])
+    command, squares = np.split(np.array(fields), [plan.n_inputs], axis=1)
+    fields = {
         "STARTS": starts,
         "LOW": low,
         "HIGH": high,
         "COMMAND": command,
         "SIGMA_SQ": squares,
     }
-    return found | {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
+    return fields | {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
 
 
 def _measured(source: str, texts: dict[str, str]) -> str:

@@ -291,10 +291,10 @@ def play(
     vectors = np.empty((3, n))
     vectors[0], vectors[1], vectors[2] = half, *state
     at = _address(vectors)
-    found = np.empty_like(rows)
-    places = at, _address(rows), at + 8 * n, at + 16 * n, _address(found)
+    effective = np.empty_like(rows)
+    places = at, _address(rows), at + 8 * n, at + 16 * n, _address(effective)
     opened_library().hk_play(len(rows), n, lead, *places)
-    return [found, vectors[1], vectors[2]]
+    return [effective, vectors[1], vectors[2]]
 
 
 def _address(a: NDArray | None) -> int | None:
@@ -406,12 +406,12 @@ def evaluate(
             a for a in program.evaluate(q, jacobian, distance) if a is not None
         )
     rows = torch.from_numpy(q)
-    found = ()
+    results = ()
     with torch.no_grad():
         if jacobian:
-            found = model.forward_and_jacobian(rows)
+            results = model.forward_and_jacobian(rows)
         elif value:
-            found = (model(rows),)
+            results = (model(rows),)
         if distance:
-            found = *found, model.domain_distance(rows)
-    return tuple(part.numpy() for part in found)
+            results = *results, model.domain_distance(rows)
+    return tuple(part.numpy() for part in results)

@@ -136,12 +136,12 @@ def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """
     colors = [model_color(name, "") for name in names]
     left = itertools.cycle([color for color in COLORS if color not in colors] or COLORS)
-    looks, seen = [], Counter[str]()
+    looks, counts = [], Counter[str]()
     for color in (color or next(left) for color in colors):
         first = next((style for _, of, style in _MODELS if of == color), "-")
-        style = STYLES[(STYLES.index(first) + seen[color]) % len(STYLES)]
+        style = STYLES[(STYLES.index(first) + counts[color]) % len(STYLES)]
         looks.append({"color": color, "linestyle": style, "linewidth": 1.5})
-        seen[color] += 1
+        counts[color] += 1
     return looks
 
 

@@ -176,9 +176,9 @@ class TrackAnimation(Display):
             tips if x is None else x,
         )
         if x is None:
-            known = np.isfinite(q).all(axis=1)
+            finite = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
-            x[known] = predicted(model, q[known])
+            x[finite] = predicted(model, q[finite])
         shown: Any = {"body": body, "rows": rows, "name": name, "expected": expected}
         return cls(x, target=target, t=t, **shown)
 
@@ -302,15 +302,15 @@ class TrackAnimation(Display):
         Those of the body, and with a target the error: a line from the tip to its target.
         """
         x = self.x[self.rows]
-        found = [] if self.body is None else self.body.lines(tip=False)
+        artists = [] if self.body is None else self.body.lines(tip=False)
         if self.target is not None:
             way = np.stack([self.target[self.rows], x], axis=1)
-            found.append(Line("tip error", way, "black", 2.0))
-            found.append(Line("", way[:, :1], "black", 1.0, marker="x", style="none"))
-        found.append(
+            artists.append(Line("tip error", way, "black", 2.0))
+            artists.append(Line("", way[:, :1], "black", 1.0, marker="x", style="none"))
+        artists.append(
             Line(self.name, x[:, None], COLORS[0], 1.0, marker="o", style="none")
         )
-        return found
+        return artists
 
     def limits(self) -> tuple[NDArray, NDArray]:
         """Return the corners (3,) of a box around all points, with a margin [m]."""
@@ -318,10 +318,10 @@ class TrackAnimation(Display):
         everything = np.concatenate(
             parts if self.target is None else [*parts, self.target]
         )
-        known = everything[np.isfinite(everything).all(axis=1)]
-        if len(known) == 0:
+        finite = everything[np.isfinite(everything).all(axis=1)]
+        if len(finite) == 0:
             raise ValueError("`x` must hold at least one known tip; all rows are NaN.")
-        low, high = known.min(axis=0), known.max(axis=0)
+        low, high = finite.min(axis=0), finite.max(axis=0)
         margin = 0.04 * float((high - low).max()) or 1e-3
         return low - margin, high + margin
 

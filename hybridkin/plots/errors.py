@@ -114,12 +114,12 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         ErrorHistogramDisplay
             Itself, drawn.
         """
-        known = self._known(unit)
+        finite = self._known(unit)
         ax = axes_or_new(ax)
         bins = whole(bins, "bins", most=10_000)
-        top = max(float(values.max()) for values in known.values()) or 1e-3
+        top = max(float(values.max()) for values in finite.values()) or 1e-3
         edges = np.linspace(0.0, top, bins + 1).tolist()
-        for look, (name, values) in zip(looks_of(known), known.items(), strict=True):
+        for look, (name, values) in zip(looks_of(finite), finite.items(), strict=True):
             color = look["color"]
             label = f"{name}: mean {values.mean():.2f}, max {values.max():.1f} {unit}"
             ax.hist(values, edges, histtype="stepfilled", color=color, alpha=0.25)
@@ -168,9 +168,9 @@ class ErrorBoxDisplay(_ErrorDisplay):
         ErrorBoxDisplay
             Itself, drawn.
         """
-        known = self._known(unit)
+        finite = self._known(unit)
         ax = axes_or_new(ax)
-        values = [*known.values()]
+        values = [*finite.values()]
         places = np.arange(len(values), 0, -1)
         box = ax.boxplot(
             values,
@@ -182,13 +182,13 @@ class ErrorBoxDisplay(_ErrorDisplay):
             patch_artist=True,
             medianprops={"color": "black"},
         )
-        for patch, look in zip(box["boxes"], looks_of(known), strict=True):
+        for patch, look in zip(box["boxes"], looks_of(finite), strict=True):
             patch.set(facecolor=look["color"], alpha=0.5)
         means = np.array([errors.mean() for errors in values])
         largest = np.array([errors.max() for errors in values])
         ax.plot(means, places, "o", color="black", label="mean")
         ax.plot(largest, places, "x", color="black", label="maximum")
-        ax.set_yticks(places, [*known])
+        ax.set_yticks(places, [*finite])
         ax.set(xlabel=f"tip error [{unit}]")
         if log:
             low = min(float(np.percentile(errors, 5)) for errors in values)

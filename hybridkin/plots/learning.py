@@ -179,10 +179,10 @@ class LearningCurveDisplay(Display):
         """
         scale, ax, looks = scale_of(unit), axes_or_new(ax), looks_of(self.errors)
         for i, (name, errors) in enumerate(self.errors.items()):
-            own = (looks[i]["color"], MARKERS[i % 8] + looks[i]["linestyle"])
-            color, form = (styles or {}).get(name, own)
-            known = np.isfinite(errors).any(axis=1)
-            sizes, values = self.sizes[known], scale * errors[known]
+            style = (looks[i]["color"], MARKERS[i % 8] + looks[i]["linestyle"])
+            color, form = (styles or {}).get(name, style)
+            finite = np.isfinite(errors).any(axis=1)
+            sizes, values = self.sizes[finite], scale * errors[finite]
             ax.plot(
                 sizes,
                 np.nanmean(values, axis=1),
@@ -234,9 +234,12 @@ def _ordered(
     """Return the training rows in random order, motion by motion."""
     if groups is None:
         return rng.permutation(train)
-    own = groups[train]
+    train_groups = groups[train]
     return np.concatenate(
-        [train[own == group] for group in rng.permutation(np.unique(own))]
+        [
+            train[train_groups == group]
+            for group in rng.permutation(np.unique(train_groups))
+        ]
     )
 
 

@@ -92,9 +92,9 @@ class TrackingDisplay(Display):
         TrackingDisplay
             Not drawn yet.
         """
-        first, *others = named(tracks, "tracks").values()
+        first, *further = named(tracks, "tracks").values()
         target = shaped(first.target, "target", "T3")
-        for other in others:
+        for other in further:
             if not np.array_equal(plain(other.target), target, equal_nan=True):
                 raise ValueError(
                     "`tracks` must follow one path, got different targets."
@@ -257,9 +257,9 @@ class ActuatorDisplay:
         names: Sequence[str] | None = None,
         limits: ArrayLike | None = None,
     ) -> None:
-        given = np.ravel(np.asarray(actuators_per_segment, dtype=object))
+        counts = np.ravel(np.asarray(actuators_per_segment, dtype=object))
         self.actuators_per_segment = tuple(
-            whole(k, "actuators_per_segment") for k in given
+            whole(k, "actuators_per_segment") for k in counts
         )
         n = sum(self.actuators_per_segment)
         self.paths = {

@@ -50,20 +50,20 @@ def packed(stored: Stored) -> tuple[Header, Arrays]:
     names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
 
     def entries(stored: Stored, prefix: str) -> Header:
-        own = {}
+        references = {}
         for name, array in stored.arrays.items():
             content = hashlib.sha256(array.tobytes()).digest()
-            own[name] = names.setdefault(
+            references[name] = names.setdefault(
                 (array.dtype.name, array.shape, content), prefix + name
             )
-            arrays[own[name]] = array
+            arrays[references[name]] = array
         parts = {
             key: entries(part, f"{prefix}{key}.") for key, part in stored.parts.items()
         }
         return {
             "kind": stored.kind,
             "settings": stored.settings,
-            "arrays": own,
+            "arrays": references,
             "parts": parts,
         }
 
@@ -95,9 +95,13 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
             raise ValueError(f"the array {missing[0]!r:.60} is missing")
         entry = json.dumps({key: header[key] for key in kinds}, sort_keys=True)
         if entry not in found:
-            own = {key: arrays[name] for key, name in header["arrays"].items()}
+            arrays_of_entry = {
+                key: arrays[name] for key, name in header["arrays"].items()
+            }
             parts = {key: described(part) for key, part in header["parts"].items()}
-            found[entry] = Stored(header["kind"], header["settings"], own, parts)
+            found[entry] = Stored(
+                header["kind"], header["settings"], arrays_of_entry, parts
+            )
         return found[entry]
 
     return described(header)
@@ -127,8 +131,8 @@ def write(path: Path, header: Header, arrays: Arrays) -> None:
 def read(path: Path) -> tuple[Header, Arrays]:
     """Return header and arrays of a file; raise if it is damaged or of another version."""
     if path.is_dir():
-        found = sorted(file.name for file in path.glob("[!.]*.safetensors"))
-        hint = f"; it contains {found[0]}." if found else " without a saved model."
+        names = sorted(file.name for file in path.glob("[!.]*.safetensors"))
+        hint = f"; it contains {names[0]}." if names else " without a saved model."
         raise FileNotFoundError(
             f"`path` must name a saved model, got the folder {path}{hint}"
         )
@@ -155,8 +159,8 @@ def read(path: Path) -> tuple[Header, Arrays]:
 
 
 def _check_version(path: Path, header: Any) -> None:
-    known = isinstance(header, dict) and header.get("format") == FORMAT
-    if not known or type(header.get("version")) is not int or header["version"] < 1:
+    is_ours = isinstance(header, dict) and header.get("format") == FORMAT
+    if not is_ours or type(header.get("version")) is not int or header["version"] < 1:
         raise ValueError(
             f"{path} is not a model saved by hybridkin: its header does not match."
         )

@@ -89,9 +89,9 @@ def save_model(
     now = float(os.environ.get("SOURCE_DATE_EPOCH", time.time()))
     created = datetime.fromtimestamp(now, timezone.utc).date().isoformat()
     header: dict[str, Any] = {"versions": versions, "created": created}
-    known: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     if isinstance(model, HybridForwardModel):
-        stored, known = stored_hybrid(model), training_of(model)
+        stored, results = stored_hybrid(model), training_of(model)
         header["units"] = _units(model.mechanical_model_, model.output)
         header["domain"] = _domain(model)
     elif isinstance(model, Model):
@@ -103,9 +103,9 @@ def save_model(
             f"fitted HybridForwardModel or a fitted ELM, got {type(model).__name__}."
         )
     if stored.kind == "elm_regressor":
-        known = {"rows": stored.settings["n_samples_seen"]}
+        results = {"rows": stored.settings["n_samples_seen"]}
     entries, arrays = packed(stored)
-    header["training"] = {**known, **_checked(training)}
+    header["training"] = {**results, **_checked(training)}
     write(as_path(path), {**header, **entries}, arrays)
 
 
@@ -150,8 +150,8 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
         model.module_.to(at)
         return model
     except _DAMAGE as error:
-        what = (str(error) or repr(error))[:400].rstrip(".")
-        raise ValueError(f"{path} is damaged: {what}.") from error
+        reason = (str(error) or repr(error))[:400].rstrip(".")
+        raise ValueError(f"{path} is damaged: {reason}.") from error
 
 
 def model_header(path: str | Path) -> dict[str, Any]:
@@ -196,14 +196,14 @@ def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
         raise TypeError(
             f"`training` must be a mapping of names to numbers, got {training!r:.80}."
         )
-    given = plain(dict(training or {}))
+    entries = plain(dict(training or {}))
     try:
-        json.dumps(given)
+        json.dumps(entries)
     except TypeError as error:
         raise TypeError(
             f"`training` must hold numbers, strings and lists of them, got {training!r}."
         ) from error
-    return given
+    return entries
 
 
 def _units(model: object, output: str = "position") -> dict[str, str | list[str]]:

@@ -81,13 +81,13 @@ def path_limits(
         If the range of the actuators is not known.
     """
     n = loaded.n_actuators
-    given: dict[str, NDArray] = {}
+    bounds: dict[str, NDArray] = {}
     for name, value in zip(_NAMES, (q_min, q_max, dq_max, ddq_max), strict=True):
         if value is not None:
-            given[name] = real_array(value, name).astype(float)
-            if given[name].shape not in ((), (1,), (n,)):
+            bounds[name] = real_array(value, name).astype(float)
+            if bounds[name].shape not in ((), (1,), (n,)):
                 raise ValueError(
-                    f"`{name}` must be one number or {n}, got {given[name].size}."
+                    f"`{name}` must be one number or {n}, got {bounds[name].size}."
                 )
     described = robots.Limits()
     if loaded.description is not None:
@@ -97,8 +97,8 @@ def path_limits(
         trained = loaded.trained_range or trained
     half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
     limits = described.narrowed(half_play).intersect(trained)
-    overrides = robots.Limits(**given).narrowed(half_play)
-    limits = replace(limits, **{name: getattr(overrides, name) for name in given})
+    overrides = robots.Limits(**bounds).narrowed(half_play)
+    limits = replace(limits, **{name: getattr(overrides, name) for name in bounds})
     if limits.q_min is None or limits.q_max is None:
         raise ValueError(
             "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
@@ -114,7 +114,7 @@ def path_limits(
     speed = None if limits.dq_max is None else _of_actuators(limits.dq_max, n)
     acceleration = None if limits.ddq_max is None else _of_actuators(limits.ddq_max, n)
     return PathLimits(
-        low, high, speed, acceleration, _source(given, described, trained)
+        low, high, speed, acceleration, _source(bounds, described, trained)
     )
 
 
@@ -127,15 +127,15 @@ def _source(
     given: Iterable[str], described: robots.Limits, trained: robots.Limits
 ) -> str:
     """Return in words where the range of the actuators comes from."""
-    known = []
+    sources = []
     if described.q_min is not None:
-        known.append("robot description")
+        sources.append("robot description")
     if trained.q_min is not None:
-        known.append("training range")
+        sources.append("training range")
     n_given = len({"q_min", "q_max"}.intersection(given))
     if n_given == 2:
         return "given"
-    return "given and " * n_given + ", within the ".join(known)
+    return "given and " * n_given + ", within the ".join(sources)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,11 +239,11 @@ class Domain:
         q = gains * (q - rest)
         angles = as_array(chain.angles.detach())
         ends = np.cumsum(chain.actuators_per_segment)
-        for own in np.split(np.arange(len(low)), ends[:-1]):
-            axes = np.stack([np.cos(angles[own]), np.sin(angles[own])], axis=1)
-            q[:, own] = q[:, own] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
-            q[:, own] -= (
-                (q[:, own] - high[own]).max(axis=1, keepdims=True).clip(min=0.0)
+        for planar in np.split(np.arange(len(low)), ends[:-1]):
+            axes = np.stack([np.cos(angles[planar]), np.sin(angles[planar])], axis=1)
+            q[:, planar] = q[:, planar] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
+            q[:, planar] -= (
+                (q[:, planar] - high[planar]).max(axis=1, keepdims=True).clip(min=0.0)
             )
         return rest + q[((q >= low) & (q <= high)).all(axis=1)] / gains
 

@@ -82,8 +82,8 @@ def write_comparison(
         "sample, because rows of a motion have similar errors. 95 %: quantile over rows."
     )
     present = [name for name in _SHOWN if name in record]
-    first, *others = ((name, record[name]["mean"]) for name in present)
-    ratios = [f"by that of {name}: **{first[1] / mean:.2f}**" for name, mean in others]
+    first, *rivals = ((name, record[name]["mean"]) for name in present)
+    ratios = [f"by that of {name}: **{first[1] / mean:.2f}**" for name, mean in rivals]
     best = min(record, key=lambda name: record[name]["mean"])
     start = "the calibrated model" if present[0] == _SHOWN[0] else "the linear model"
     report.text(
@@ -163,16 +163,18 @@ def auto_entry(model: HybridForwardModel) -> dict[str, Any]:
         "candidates" with their held-out error [m]; the error "expected" on new motions [m]; "play"
         of every actuator [m] or None; "words".
     """
-    found = model.cv_results_ or {}
+    results = model.cv_results_ or {}
     entry = {
-        "chosen": str(found["chosen"]),
-        "weights": {name: float(w) for name, w in found["weights"].items() if w > 0.0},
-        "taken": found.get("parameters", type(model.mechanical_model_).__name__),
-        "mechanical_models": found["mechanical_model"],
+        "chosen": str(results["chosen"]),
+        "weights": {
+            name: float(w) for name, w in results["weights"].items() if w > 0.0
+        },
+        "taken": results.get("parameters", type(model.mechanical_model_).__name__),
+        "mechanical_models": results["mechanical_model"],
         "candidates": dict(
-            zip(found["candidate"], map(float, found["mean_distance"]), strict=True)
+            zip(results["candidate"], map(float, results["mean_distance"]), strict=True)
         ),
-        "expected": float(found["expected_distance"]),
+        "expected": float(results["expected_distance"]),
         "play": play_widths(model),
         "play_asked": model.play is not None,
     }
@@ -194,12 +196,12 @@ def radius_entry(model: HybridForwardModel) -> dict[str, Any] | None:
     if model.radius_ is None:
         return None
     radius = model.radius_
-    known = (
+    text = (
         f"not known; at least {radius.least_groups} motions in the domain are needed."
     )
     if np.isfinite(radius.inside):
-        known = f"{1e3 * radius.inside:.3g} mm, in the domain and for motions as in the log."
-    words = f"Estimated error radius covering {100 * radius.coverage:g} % of the tips: {known}"
+        text = f"{1e3 * radius.inside:.3g} mm, in the domain and for motions as in the log."
+    words = f"Estimated error radius covering {100 * radius.coverage:g} % of the tips: {text}"
     return {**radius._asdict(), "words": words}
 
 

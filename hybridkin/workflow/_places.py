@@ -45,11 +45,11 @@ def placed(domain: Domain, path: Trajectory, tol: float) -> tuple[Trajectory, fl
 
 def better_place(domain: Domain, path: Trajectory, tol: float) -> str:
     """Return in words how a path that leaves the domain could lie in it."""
-    moved, share = placed(domain, path, tol)
+    moved, share_inside = placed(domain, path, tol)
     center = in_millimetres(0.5 * (moved.x.min(axis=0) + moved.x.max(axis=0)))
-    if share == 1.0:
+    if share_inside == 1.0:
         return f"move its centre to {center}"
-    return f"make it smaller (--scale); with its centre at {center}, {100 * share:.0f} % is inside"
+    return f"make it smaller (--scale); with its centre at {center}, {100 * share_inside:.0f} % is inside"
 
 
 def solver(domain: Domain) -> InverseKinematics:

@@ -164,10 +164,10 @@ class _Rows(NamedTuple):
             messages = [*geometry.messages]
         if chain is None or not names:
             return chain, None, messages
-        result, more = fit_geometry(
+        result, of_fit = fit_geometry(
             chain, self.q, self.x, names, self.settings.loss, start=start
         )
-        return chain, result, messages + more
+        return chain, result, messages + of_fit
 
     def rival_entries(self) -> list[dict[str, Any]]:
         """Return the `geometry_entries` of all sets of parameters with nearly the same errors."""
@@ -268,7 +268,7 @@ def compare_by_group(
         rows = rows.with_play_detected(log, chain)
     jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in parts)
     fold, distance = np.empty(len(log.q), dtype=int), np.empty(len(log.q))
-    found = Comparison({}, {}, fold, distance, [])
+    comparison = Comparison({}, {}, fold, distance, [])
     most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
     most = min(effective_n_jobs(n_jobs or 1), len(parts), most)
     # Otherwise torch and BLAS start threads in every process, which wait for each other.
@@ -282,23 +282,23 @@ def compare_by_group(
         zip(parts, results, strict=True)
     ):
         fitted_folds.append(errors)
-        found.fold[test] = i
+        comparison.fold[test] = i
         held_out = held_out_distances(log.q[train], log.motions[train], log.q[test])
-        found.distance[test] = held_out
-        found.choices.append(chosen)
+        comparison.distance[test] = held_out
+        comparison.choices.append(chosen)
         progress("cross-validation by motion", i + 1, len(parts))
     for name in sorted(fitted_folds[0], key=_kind_of_model):
         if any(
             name not in errors for errors in fitted_folds
         ):  # kernel ridge: up to 2000 rows
             continue
-        found.markers[name] = np.empty((len(log.q), log.x.shape[1] // 3))
+        comparison.markers[name] = np.empty((len(log.q), log.x.shape[1] // 3))
         for (_, test), errors in zip(parts, fitted_folds, strict=True):
-            found.markers[name][test] = errors[name]
-    found.errors.update(
-        (name, np.nanmean(values, 1)) for name, values in found.markers.items()
+            comparison.markers[name][test] = errors[name]
+    comparison.errors.update(
+        (name, np.nanmean(values, 1)) for name, values in comparison.markers.items()
     )
-    return found
+    return comparison
 
 
 def fit_log(
@@ -443,7 +443,7 @@ def _add_model(
     log: MeasuredLog,
 ) -> None:
     """Add the model and the description of its robot to the files of the report."""
-    kept = (
+    entries = (
         "log",
         "robot",
         "n_whole",
@@ -453,7 +453,7 @@ def _add_model(
         "saved",
         "chosen",
     )
-    training = {key: report.record[key] for key in (*kept, "held_out", "promise")}
+    training = {key: report.record[key] for key in (*entries, "held_out", "promise")}
     training |= {"rows": report.record["n"], "split": log.split}
     report.file(
         "model.safetensors", lambda path: save_model(model, path, training=training)

@@ -28,11 +28,11 @@ class LogError(ValueError):
 
     def __init__(self, report: LogReport) -> None:
         first = report.errors[0]
-        more = (
+        further = (
             f" ({len(report.errors) - 1} more above)" if len(report.errors) > 1 else ""
         )
         super().__init__(
-            f"the log did not pass its check: {first.message} {first.advice}{more}"
+            f"the log did not pass its check: {first.message} {first.advice}{further}"
         )
         self.report = report
 
@@ -91,9 +91,9 @@ class MeasuredLog(Log):
 
     def misread(self, calibrated: Chain) -> list[str]:
         """Return new findings on order and signs of q, from a check with the calibrated chain."""
-        known = {f.kind for f in self.report.misread}
-        found = check_log(self, chain=calibrated).misread
-        return [f"{f.message} {f.advice}" for f in found if f.kind not in known]
+        kinds = {f.kind for f in self.report.misread}
+        misread = check_log(self, chain=calibrated).misread
+        return [f"{f.message} {f.advice}" for f in misread if f.kind not in kinds]
 
     def thinned(self, max_rows: int | None) -> MeasuredLog:
         """Return every k-th row, so that at most `max_rows` remain; None: all rows."""
@@ -154,15 +154,15 @@ def read_log(
         raise ValueError("`exclude` needs `groups`, the column that names the motions.")
     if log.groups is not None:
         motions = [str(name).removesuffix(suffix) for name in log.groups]
-        kept = np.array(
+        included = np.array(
             [not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions]
         )
-        if not kept.any():
+        if not included.any():
             raise ValueError(
                 f"`exclude` must leave at least 2 motions, but leaves none of {len({*motions})}; "
                 "use fewer patterns."
             )
-        log = replace(log, groups=np.array(motions)).rows(kept)
+        log = replace(log, groups=np.array(motions)).rows(included)
     report = check_log(
         log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
     )

@@ -165,13 +165,13 @@ class LoadedModel:
         They are those of held-out motions at the same distance from the log. Empty if the file
         does not have them.
         """
-        known = self.held_out
-        if known is None:
+        held_out = self.held_out
+        if held_out is None:
             return {}
         constant = {
-            "at_rows": known["mean"],
+            "at_rows": held_out["mean"],
             "per_distance": 0.0,
-            "p95": known["p95"] / known["mean"],
+            "p95": held_out["p95"] / held_out["mean"],
         }
         promise, far = (
             Promise(**self._training.get("promise", constant)),
@@ -186,11 +186,11 @@ class LoadedModel:
     def expected_errors(self, q: NDArray) -> dict[str, NDArray]:
         """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""
         words = {"mean": "held-out motions, mean", "p95": "held-out motions, 95 %"}
-        found = {words[k]: errors for k, errors in self.promised_errors(q).items()}
+        expected = {words[k]: errors for k, errors in self.promised_errors(q).items()}
         if self.hybrid is not None and (radius := self.hybrid.radius_) is not None:
             name = f"estimated error radius, {100 * radius.coverage:g} %"
-            found[name] = radius.at(self.domain_distance(q) <= 1.0)
-        return found
+            expected[name] = radius.at(self.domain_distance(q) <= 1.0)
+        return expected
 
     def plane_in_words(self) -> str:
         """Return which motions the log lacks and no command makes, in its names; "" if none."""

@@ -85,10 +85,12 @@ def next_rows(
         candidates = np.concatenate([target, candidates])
         far = distance(loaded.tips(target), path.x).max()
         where = f"along the path, which the model reaches to within {1e3 * far:.3g} mm"
-    known = None if measured is None else loaded.effective(measured.q, measured.motions)
+    measured_q = (
+        None if measured is None else loaded.effective(measured.q, measured.motions)
+    )
     progress("choosing configurations", 0, 1)
     rows, errors = choose_rows(
-        loaded.model, candidates, n, measured=known, target=target
+        loaded.model, candidates, n, measured=measured_q, target=target
     )
     sent = (
         candidates[rows]
@@ -96,7 +98,7 @@ def next_rows(
         else loaded.play.command(candidates[rows])[0]
     )
     report = Report(f"{loaded.name}: {n} configurations to measure next")
-    n_measured = 0 if known is None else len(known)
+    n_measured = 0 if measured_q is None else len(measured_q)
     report.record.update(
         model=str(loaded.path), n=n, n_measured=n_measured, where=where
     )

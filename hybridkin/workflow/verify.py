@@ -102,18 +102,18 @@ def verify_track(
     parts = {
         name: _entry(errors, promised, part) for name, part in _parts(loaded, q).items()
     }
-    kept = None
+    is_kept = None
     if promised:
-        kept = bool(parts["path"]["mean"] <= _KEPT * parts["path"]["promised"])
+        is_kept = bool(parts["path"]["mean"] <= _KEPT * parts["path"]["promised"])
     likely = max(causes, key=causes.__getitem__)
-    cause = likely if not kept and causes[likely] > _LIKELY else None
+    cause = likely if not is_kept and causes[likely] > _LIKELY else None
     report = Report(
         f"{loaded.name}: {Path(track).name} against {Path(log.source).name}"
     )
     report.record.update(
         command="verify", model=str(loaded.path), track=str(track), log=log.source
     )
-    report.record.update(parts=parts, kept=kept, causes=causes, cause=cause)
+    report.record.update(parts=parts, kept=is_kept, causes=causes, cause=cause)
     _write(report)
     return report, [] if out is None else report.write(out)
 
@@ -231,11 +231,11 @@ def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
 
 def _write(report: Report) -> None:
     parts = report.record["parts"]
-    kept = report.record["kept"]
+    is_kept = report.record["kept"]
     cause = report.record["cause"]
     path = {key: f"{1e3 * value:.3g} mm" for key, value in parts["path"].items()}
     promise = "The model promised no error"
-    if kept is not None:
+    if is_kept is not None:
         promise = "Promised: mean {promised}, 95 % below {promised_p95}".format(**path)
     report.text(
         f"{promise}. Robot: mean {{mean}}, 95 % below {{p95}}, max {{max}}.".format(
@@ -243,11 +243,11 @@ def _write(report: Report) -> None:
         )
     )
     report.errors(parts, _COLUMNS)
-    shares = report.record["causes"].items()
+    causes = report.record["causes"].items()
     report.table(
-        ["cause", "explains [%]"], [[name, f"{100 * v:.0f}"] for name, v in shares]
+        ["cause", "explains [%]"], [[name, f"{100 * v:.0f}"] for name, v in causes]
     )
-    if kept:
+    if is_kept:
         report.text("The promise is kept.")
     elif cause is None:
         report.text("None of these explains the error; check load, friction and delay.")
