@@ -92,7 +92,7 @@ def number(value: Any, name: str) -> float:
     return float(numbers)
 
 
-def whole(value: Any, name: str, least: int = 1, most: float = math.inf) -> int:
+def whole(value: object, name: str, least: int = 1, most: float = math.inf) -> int:
     """Return a caller's whole number between `least` and `most`."""
     if not isinstance(value, (int, np.integer)) or not least <= value <= most:
         need = f"at least {least}" if most == math.inf else f"{least} to {most}"
@@ -111,7 +111,7 @@ def random_generator(
     return np.random.default_rng(random_state)
 
 
-def one_of(value: Any, name: str, known: Collection[str], hint: str = "") -> str:
+def one_of(value: object, name: str, known: Collection[str], hint: str = "") -> str:
     """Return a caller's choice from the known names."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(
@@ -120,7 +120,7 @@ def one_of(value: Any, name: str, known: Collection[str], hint: str = "") -> str
     return value
 
 
-def as_path(value: Any, name: str = "path") -> Path:
+def as_path(value: object, name: str = "path") -> Path:
     """Return a caller's path."""
     if not isinstance(value, (str, os.PathLike)) or "\0" in str(value):
         raise TypeError(f"`{name}` must be a path, got {value!r:.80}.")
@@ -177,13 +177,14 @@ def table(value: Any, name: str) -> Any:
     return value if name == "X" and hasattr(value, "columns") else array
 
 
-def labels(groups: Any, n_rows: int) -> NDArray:
+def labels(groups: object, n_rows: int) -> NDArray:
     """Return the label of the motion of every row, shape (N,)."""
     if isinstance(groups, Tensor):
         as_tensor(groups, "groups")
-    names = (
-        groups.numpy(force=True) if isinstance(groups, Tensor) else np.asarray(groups)
-    )
+    if isinstance(groups, Tensor):
+        names = groups.numpy(force=True)
+    else:
+        names = np.asarray(groups)
     check_shape(names, "groups", [n_rows], "one entry for each row of the log")
     if names.dtype.kind == "f" and not np.isfinite(names).all():
         need = "must name the motion of every row, got NaN or infinity"

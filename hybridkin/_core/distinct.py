@@ -41,11 +41,10 @@ def distinct_rows(
     place : ndarray of int of shape (N,)
         Index into `first` for each row; -1 for rows of weight 0.
     """
-    labels = (
-        np.zeros(len(X))
-        if groups is None
-        else np.unique(groups, return_inverse=True)[1]
-    )
+    if groups is None:
+        labels = np.zeros(len(X))
+    else:
+        labels = np.unique(groups, return_inverse=True)[1]
     rows = np.column_stack([as_array(X), as_array(y), labels]).astype(np.float64)
     rows += 0.0  # -0.0 equals 0.0
     times = np.ones(len(rows)) if weights is None else as_array(weights)

@@ -84,7 +84,11 @@ IK_OFFSET = 16  # last measured tip minus model
 IK_X = 19
 IK_ERROR = 22
 IK_Q = 25  # then step, q before, whether it was held (n each), and J (3 n)
-IK_HAS_TARGET, IK_HAS_FEED, IK_HAS_TIP, IK_MUST_SEE, IK_FROM_REST = 1, 2, 4, 8, 16
+IK_HAS_TARGET = 1
+IK_HAS_FEED = 2
+IK_HAS_TIP = 4
+IK_MUST_SEE = 8
+IK_FROM_REST = 16
 
 # The search for configurations.
 IK_LOWERS, IK_TO_DOMAIN, IK_TO_POSTURE = 1, 2, 4  # modes

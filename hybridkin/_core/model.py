@@ -57,14 +57,14 @@ class Portable:
         vars(self).update(_opened(state))
 
 
-def _closed(value: Any) -> Any:
+def _closed(value: object) -> Any:
     if isinstance(value, dict):
         return type(value)((key, _closed(entry)) for key, entry in value.items())
     tensor = isinstance(value, Tensor)
     return _Closed(value.numpy(force=True), str(value.device)) if tensor else value
 
 
-def _opened(value: Any) -> Any:
+def _opened(value: object) -> Any:
     if isinstance(value, dict):
         return type(value)((key, _opened(entry)) for key, entry in value.items())
     if not isinstance(value, _Closed):
@@ -314,9 +314,12 @@ class FunctionModel(ForwardModel):
         own_jacobian, pair, self.own_domain, n = (
             getattr(function, name, None) for name in names
         )
-        self.own_jacobian, self.own_pair = (
-            (own_jacobian, pair) if jacobian is None else (jacobian, None)
-        )
+        if jacobian is None:
+            self.own_jacobian = own_jacobian
+            self.own_pair = pair
+        else:
+            self.own_jacobian = jacobian
+            self.own_pair = None
         self.n_actuators = int(n or 0)
 
     def frozen(self) -> Self:
@@ -350,7 +353,7 @@ class Fitted(Protocol):
     module_: nn.Module
 
 
-def as_forward_model(model: Any) -> ForwardModel:
+def as_forward_model(model: object) -> ForwardModel:
     """Return a model of a robot as a `ForwardModel`.
 
     Parameters
@@ -401,7 +404,7 @@ def as_forward_model(model: Any) -> ForwardModel:
     return FunctionModel(model)
 
 
-def jacobian(model: Any, q: Tensor) -> Tensor:
+def jacobian(model: object, q: Tensor) -> Tensor:
     """Return dx/dq of any model that maps each row of q independently to a row of x.
 
     In closed form if the model has one, else by one backward pass per output coordinate.
@@ -450,7 +453,7 @@ def slopes(x: Tensor, leaf: Tensor, create_graph: bool = False) -> Tensor:
     return torch.stack([slope(a.sum(), leaf)[0] for a in x.unbind(-1)], dim=-2)
 
 
-def _checked(x: Any) -> Tensor:
+def _checked(x: object) -> Tensor:
     if not isinstance(x, Tensor):
         raise TypeError(
             f"`model` must return torch tensors, got {type(x).__name__}; for NumPy functions use "

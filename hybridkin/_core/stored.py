@@ -201,7 +201,7 @@ Restore = Callable[[Stored], Any]
 """A function that returns the model of a description, and a list for a list of them."""
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value as JSON can express it: arrays as lists, NaN and infinity as null."""
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}

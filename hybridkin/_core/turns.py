@@ -18,7 +18,8 @@ class _Turns:
     """
 
     def __init__(self) -> None:
-        self.filters, self.limits = threading.RLock(), threading.RLock()
+        self.filters = threading.RLock()
+        self.limits = threading.RLock()
 
 
 TURNS = _Turns()

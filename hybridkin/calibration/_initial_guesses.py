@@ -133,8 +133,6 @@ def _ringed(chain: ArcChain, mirrored: tuple[bool, ...], turns: NDArray) -> ArcC
 
 
 def _scaled(chain: _Chain, scale: float) -> _Chain:
-    return (
-        chain
-        if scale == 1.0
-        else chain.with_geometry(radii=scale * chain.geometry()["radii"])
-    )
+    if scale == 1.0:
+        return chain
+    return chain.with_geometry(radii=scale * chain.geometry()["radii"])

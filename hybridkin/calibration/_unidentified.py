@@ -59,9 +59,10 @@ def sentences(
         terms = _terms(problem, move * to_steps, lead)
         shown = [term for term in terms if abs(term.size) > _SMALL][:_N_TERMS]
         n_hidden = sum(noticed[term.place] for term in terms if term not in shown)
-        effect = (
-            f"moves the tips by {tips:.2g} mm rms" if tips >= _STILL else _NO_EFFECT
-        )
+        if tips >= _STILL:
+            effect = f"moves the tips by {tips:.2g} mm rms"
+        else:
+            effect = _NO_EFFECT
         words = [
             f"{label} {size:+.3g} {steps[place][1]}" for label, size, place in shown
         ]

@@ -246,9 +246,10 @@ def fit_geometry(
         groups = labels(groups, len(q))
     weights = _check_weights(sample_weight, q)
     first, counts, _ = distinct_rows(q, x, weights, groups)
-    weights = (
-        q.new_ones(len(first)) if counts is None else torch.from_numpy(counts).to(q)
-    )
+    if counts is None:
+        weights = q.new_ones(len(first))
+    else:
+        weights = torch.from_numpy(counts).to(q)
     rows = Rows(q[first], x[first], weights)
     if start is None:
         stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)

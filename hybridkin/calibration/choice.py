@@ -179,15 +179,17 @@ def choose_geometry(
     q, x, _ = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))
-    chosen_rows = (
-        np.arange(len(q)) if groups is None else np.argsort(groups, kind="stable")
-    )
+    if groups is None:
+        chosen_rows = np.arange(len(q))
+    else:
+        chosen_rows = np.argsort(groups, kind="stable")
     chosen_rows = np.sort(
         chosen_rows[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)]
     )
-    counts = (
-        q.new_ones(len(q)) if weights is None else as_tensor(weights, "weights").to(q)
-    )
+    if weights is None:
+        counts = q.new_ones(len(q))
+    else:
+        counts = as_tensor(weights, "weights").to(q)
     rows = Rows(q[chosen_rows], x[chosen_rows], counts[chosen_rows])
     with torch.no_grad():
         rungs = _rungs(chain, q, parameters)

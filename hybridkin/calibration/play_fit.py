@@ -122,12 +122,14 @@ def fit_play(
     >>> fit.kept, fit.width
     (True, 0.0004)
     """
-    size = (
-        float(chain.gains.detach().abs().mean()) if isinstance(chain, ArcChain) else 1.0
-    )
-    tried_widths = (
-        _WIDTHS / size if widths is None else real_array(widths, "widths").ravel()
-    )
+    if isinstance(chain, ArcChain):
+        size = float(chain.gains.detach().abs().mean())
+    else:
+        size = 1.0
+    if widths is None:
+        tried_widths = _WIDTHS / size
+    else:
+        tried_widths = real_array(widths, "widths").ravel()
     tried = np.unique(np.concatenate([[0.0], tried_widths])).tolist()
     names = tuple(chain.default_parameters) if parameters is None else parameters
     q = real_array(q, "q")

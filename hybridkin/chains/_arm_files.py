@@ -143,11 +143,10 @@ def mjcf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[J
     bodies = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
     sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
     in_robot(end_link, [*bodies, *sites], "`end_link`")
-    root = (
-        0
-        if root_link is None
-        else bodies[in_robot(root_link, list(bodies), "`root_link`")]
-    )
+    if root_link is None:
+        root = 0
+    else:
+        root = bodies[in_robot(root_link, list(bodies), "`root_link`")]
     path: list[Joint] = []
     body = bodies.get(end_link, -1)
     if body < 0:
@@ -258,9 +257,10 @@ def chain_path(chain: Chain) -> list[Joint]:
             if offset is not None:
                 origin = origin @ offset.get_matrix()[0].detach().cpu().double().numpy()
         joint = frame.joint
-        joint_name = (
-            "" if joint.name in (earlier.name for earlier in path) else joint.name
-        )
+        if joint.name in (earlier.name for earlier in path):
+            joint_name = ""
+        else:
+            joint_name = joint.name
         axis = joint.axis.detach().cpu().double().numpy()
         limits = (
             joint.limits if any(joint.limits or ()) else None

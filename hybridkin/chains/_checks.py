@@ -25,7 +25,7 @@ _MOST_UNLIKE = (
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
-def float_dtype(dtype: Any) -> torch.dtype:
+def float_dtype(dtype: object) -> torch.dtype:
     """Return the torch dtype given by torch, NumPy or a string."""
     name = str(np.dtype(dtype) if isinstance(dtype, type) else dtype).removeprefix(
         "torch."
@@ -194,9 +194,10 @@ def numeric(
 
     With `need` the shape is checked, see `arrays.shaped`. With ``finite=False`` only NaN raises.
     """
-    array = (
-        real_array(value, name) if need is None else shaped(value, name, need, length)
-    )
+    if need is None:
+        array = real_array(value, name)
+    else:
+        array = shaped(value, name, need, length)
     tensor = torch.tensor(array, dtype=dtype, device="cpu")
     if (not torch.isfinite(tensor).all() and finite) or torch.isnan(tensor).any():
         raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")

@@ -165,11 +165,10 @@ class JointChain(Chain):
         if links is not None:
             column = nn.functional.pad(links, (0, 1), value=1.0)[..., None]
             self.origins = torch.cat([self.origins[..., :3], column], dim=-1)
-        zeros = (
-            self.joint_zeros
-            if self.couplings is None
-            else self.couplings @ self.joint_zeros
-        )
+        if self.couplings is None:
+            zeros = self.joint_zeros
+        else:
+            zeros = self.couplings @ self.joint_zeros
         motions = joint_motions(self.origins, self.axes, self.slides, zeros)
         self.register_buffer("motions", motions)
         carriers = column_carriers(motions, self.origins, self.axes)

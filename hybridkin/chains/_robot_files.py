@@ -46,7 +46,7 @@ def _is_positive(value: Any) -> bool:
     return _is_number(value) and value >= _LEAST
 
 
-def _is_text(value: Any) -> bool:
+def _is_text(value: object) -> bool:
     return isinstance(value, str) and bool(value.strip())
 
 
@@ -158,9 +158,10 @@ def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
     for key, value in table.items():
         if key not in needs:
             close = difflib.get_close_matches(key, needs, n=1)
-            hint = (
-                f"did you mean `{close[0]}`?" if close else f"known: {sorted(needs)}."
-            )
+            if close:
+                hint = f"did you mean `{close[0]}`?"
+            else:
+                hint = f"known: {sorted(needs)}."
             raise ValueError(f"`{key:.40}` in {where} is not known; {hint}")
         words, fits = needs[key]
         if not fits(value):
@@ -214,11 +215,9 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
         filter(None, arguments["radii"]), 1.0
     )  # for stages it has no effect
     arguments["radii"] = [radius or any_radius for radius in arguments["radii"]]
-    return (
-        ElasticTendonChain(**arguments)
-        if elastic
-        else ConstantCurvatureChain(**arguments)
-    )
+    if elastic:
+        return ElasticTendonChain(**arguments)
+    return ConstantCurvatureChain(**arguments)
 
 
 def _segment(

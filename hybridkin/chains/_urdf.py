@@ -88,9 +88,9 @@ def urdf_text(text_or_path: Any) -> str:
     """Return the text of a URDF; `_bytes` restores bytes that are not UTF-8."""
     source = source_of(text_or_path)
     data = source if isinstance(source, str) else source.read_bytes()
-    return (
-        data if isinstance(data, str) else data.decode("utf-8-sig", "surrogateescape")
-    )
+    if isinstance(data, str):
+        return data
+    return data.decode("utf-8-sig", "surrogateescape")
 
 
 def _bytes(text: str) -> bytes:
@@ -135,7 +135,9 @@ def _elements(
     return path[::-1]
 
 
-def urdf_path(text_or_path: Any, end_link: str, root_link: str | None) -> list[Joint]:
+def urdf_path(
+    text_or_path: object, end_link: str, root_link: str | None
+) -> list[Joint]:
     """Return the joints of a URDF from one link to another."""
     elements = _elements(urdf_text(text_or_path), end_link, root_link)
     path = [joint for _, joints in elements for joint in joints]

@@ -354,11 +354,9 @@ class ConstantCurvatureChain(ArcChain):
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         arcs = self._linear(rows)
         matrix = self.arc_matrix.to(rows)
-        return (
-            (arcs, matrix)
-            if self.stage is None
-            else turned_by_first(arcs, matrix[..., None])
-        )
+        if self.stage is None:
+            return (arcs, matrix)
+        return turned_by_first(arcs, matrix[..., None])
 
     def _linear(self, rows: Tensor) -> Tensor:
         """Return the arcs (3 S, N) of rows (N, n) before the stage turns them by length 0."""

@@ -190,11 +190,10 @@ class ElasticTendonChain(ArcChain):
             raise ValueError(
                 f"`n_actuators` must be at most {_slack.MOST} in all, got {self.n_actuators}."
             )
-        bending = (
-            0.01 * geometry["radii"] ** 2
-            if bending_stiffness is None
-            else bending_stiffness
-        )
+        if bending_stiffness is None:
+            bending = 0.01 * geometry["radii"] ** 2
+        else:
+            bending = bending_stiffness
         axial = 10.0 if axial_stiffness is None else axial_stiffness
         for name, value in (("bending_stiffness", bending), ("axial_stiffness", axial)):
             geometry[name] = filled(value, name, dtype, (self.n_segments,))
@@ -322,11 +321,10 @@ class ElasticTendonChain(ArcChain):
             value.requires_grad for value in shaping
         )
         passing = learning or any(value.is_inference() for value in shaping)
-        key = (
-            None
-            if passing
-            else (rows.dtype, rows.device, *(v._version for v in shaping))
-        )
+        if passing:
+            key = None
+        else:
+            key = (rows.dtype, rows.device, *(v._version for v in shaping))
         if key is not None and self._table is not None:
             kept_elasticity, kept_key, responses = self._table
             if key == kept_key and all(
@@ -335,11 +333,10 @@ class ElasticTendonChain(ArcChain):
                 return responses
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
         # Outside inference mode: derivatives cannot use inference tensors.
-        guard = (
-            torch.inference_mode(False)
-            if torch.is_inference_mode_enabled()
-            else nullcontext()
-        )
+        if torch.is_inference_mode_enabled():
+            guard = torch.inference_mode(False)
+        else:
+            guard = nullcontext()
         with guard:
             elasticity = _slack.Elasticity(
                 *(part.double() for part in self._elasticity())

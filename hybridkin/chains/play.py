@@ -68,7 +68,7 @@ class PlayOperator:
                 f"`width` must be one or (n,) finite numbers, zero or more, got {width!r}."
             )
 
-    def apply(self, q: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
+    def apply(self, q: object, state: PlayState | None = None) -> tuple[Any, PlayState]:
         """Return the effective changes of a motion, and the state at its end.
 
         Parameters
@@ -92,7 +92,9 @@ class PlayOperator:
         """
         return self._run(q, state, "q", lead=False)
 
-    def command(self, y: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
+    def command(
+        self, y: object, state: PlayState | None = None
+    ) -> tuple[Any, PlayState]:
         """Return the commands that give the effective changes y: the inverse of `apply`.
 
         A moving tendon gets a command half the width ahead; a tendon at rest keeps its command.
@@ -146,11 +148,9 @@ class PlayOperator:
         starts = np.flatnonzero(groups[order][1:] != groups[order][:-1]) + 1
         parts = [self.apply(q[at])[0] for at in np.split(order, starts)]
         back = np.argsort(order)
-        return (
-            torch.cat(parts)[back]
-            if isinstance(q, Tensor)
-            else np.concatenate(parts)[back]
-        )
+        if isinstance(q, Tensor):
+            return torch.cat(parts)[back]
+        return np.concatenate(parts)[back]
 
     def __repr__(self) -> str:
         return f"PlayOperator(width={self.width.tolist()})"
@@ -171,11 +171,10 @@ class PlayOperator:
             raise ValueError(
                 f"`{name}` must hold at least one row if `state` is not given."
             )
-        start = (
-            PlayState(rows[0], rows[0])
-            if state is None
-            else _checked(state, rows.shape[1])
-        )
+        if state is None:
+            start = PlayState(rows[0], rows[0])
+        else:
+            start = _checked(state, rows.shape[1])
         if isinstance(rows, Tensor):
             return self._by_torch(rows, start, lead)
         if len(rows) and rows.dtype == np.float64 and available():
@@ -211,7 +210,7 @@ def _is_finite(a: Any) -> bool:
     return bool((a.isfinite() if isinstance(a, Tensor) else np.isfinite(a)).all())
 
 
-def _checked(state: Any, n: int) -> PlayState:
+def _checked(state: object, n: int) -> PlayState:
     """Return a caller's state for n tendons, checked."""
     parts = state if isinstance(state, (tuple, list)) else ()
     vectors = [real_array(part, "state") for part in parts]

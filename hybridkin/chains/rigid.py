@@ -162,9 +162,10 @@ class RigidChain(JointChain):
                 raise TypeError(
                     f"`{name}` must be a sequence of strings, got {value!r:.80}."
                 )
-        self.kinds = (
-            ("revolute",) * n_joints if kinds is None else tuple(map(str, kinds))
-        )
+        if kinds is None:
+            self.kinds = ("revolute",) * n_joints
+        else:
+            self.kinds = tuple(map(str, kinds))
         default = [f"joint_{k + 1}" for k in range(n)]
         self.names = tuple(map(str, default if names is None else names))
         if len(self.kinds) != n_joints or not set(self.kinds) <= set(_KINDS):

@@ -366,10 +366,12 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
     geometry_names = () if chain is None else (*chain.geometry(), *ALIASES)
     if names == "default" and chain is not None:
         names = chain.default_parameters
-    if names != "auto" and (not {*names} <= {*geometry_names} or len({*names}) < len(names)):
+    if names != "auto" and (
+        not {*names} <= {*geometry_names} or len({*names}) < len(names)
+    ):
         raise ValueError(
-            f'`calibrate` must name different entries of {geometry_names}, or be "auto" or "default", got '
-            f"{names}."
+            f"`calibrate` must name different entries of {geometry_names}, or be "
+            f'"auto" or "default", got {names}.'
         )
     names = names if isinstance(names, str) else tuple(names)
     robot = RobotDescription(tables.get("name", stem), chain, names, log)

@@ -13,7 +13,8 @@ import hybridkin
 if TYPE_CHECKING:
     from hybridkin.workflow import Report
 
-_ROWS, _BLOCK = 240, 12
+_ROWS = 240
+_BLOCK = 12
 _SHOWN = ("mechanical, nominal", "mechanical, calibrated", "data-driven, quadratic")
 
 
@@ -46,8 +47,10 @@ def steps(out: Path) -> dict[str, str]:
 
 def summary(out: Path, records: dict[str, dict[str, Any]]) -> Report:
     """Return what the steps have shown, from their records by the name of the command."""
-    fit, track = records["fit"], records["track"]
-    held_out, saved = fit["held_out"], fit["saved"]
+    fit = records["fit"]
+    track = records["track"]
+    held_out = fit["held_out"]
+    saved = fit["saved"]
     means = {name: 1e3 * entry["mean"] for name, entry in held_out.items()}
     report = hybridkin.workflow.Report("From a log to a film, on SIMULATED data")
     report.record.update(records)

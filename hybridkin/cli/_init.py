@@ -89,17 +89,17 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
     defaults of columns come from the header of the log.
     """
     answers: _Answers = {"q_sign": 1}
-    missing, columns = [], {}
+    missing = []
+    columns = {}
     for question in QUESTIONS:
         name = question.name
         if _is_needless(name, answers, given):
             continue
         if name == "q":
-            columns = (
-                {"q": (), "x": ()}
-                if missing
-                else _proposed(answers, given["delimiter"])
-            )
+            if missing:
+                columns = {"q": (), "x": ()}
+            else:
+                columns = _proposed(answers, given["delimiter"])
         question = question._replace(default=columns.get(name, question.default))
         value = given[name]
         if value is None:
@@ -114,7 +114,8 @@ def _is_needless(name: str, answers: _Answers, given: _Answers) -> bool:
     """Return whether the earlier answers leave no need to answer a question."""
     if name in ("length", "q_sign"):
         return answers["kind"] == "chambers"
-    unit, spools = answers.get("q_unit"), answers.get("spool_radius")
+    unit = answers.get("q_unit")
+    spools = answers.get("spool_radius")
     if name == "counts_per_turn":
         return spools is None or unit in ("deg", "rad")
     if name not in ("spool_radius", "gain") or given[name] is not None:
@@ -125,9 +126,10 @@ def _is_needless(name: str, answers: _Answers, given: _Answers) -> bool:
 def _asked(question: _Question) -> Any:
     """Return what the user answers to a question on standard error; empty: the default."""
     name, text, parse, default = question
-    proposal = (
-        ",".join(map(str, default)) if isinstance(default, tuple | list) else default
-    )
+    if isinstance(default, tuple | list):
+        proposal = ",".join(map(str, default))
+    else:
+        proposal = default
     hint = "" if default is _NEEDED else f" [{proposal or 'none'}]"
     while True:
         print(f"{name}: {text}{hint}: ", end="", file=sys.stderr, flush=True)
@@ -196,7 +198,8 @@ def description(answers: _Answers, name: str) -> str:
 
 def _of_segments(answers: _Answers, key: str) -> Sequence[tuple[str, float | None]]:
     """Return a key and its value for every segment."""
-    values, n = answers.get(key) or (None,), answers["segments"]
+    values = answers.get(key) or (None,)
+    n = answers["segments"]
     if len(values) not in (1, n):
         option = f"--{key.replace('_', '-')}"
         raise ValueError(

@@ -54,7 +54,8 @@ def parser() -> argparse.ArgumentParser:
         "--version", action="version", version=f"hybridkin {hybridkin.__version__}"
     )
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    begin, use = (_demo, _init, _describe, _fit, _evaluate), (_track, _verify, _animate)
+    begin = (_demo, _init, _describe, _fit, _evaluate)
+    use = (_track, _verify, _animate)
     for add_options in (*begin, *use, _next, _export):
         text = _help(add_options)
         line = text["description"].partition("\n")[0].rstrip(".")

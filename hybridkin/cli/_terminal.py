@@ -48,7 +48,9 @@ class Stages:
         now = time.monotonic()
         if self._what != what:
             self._end()
-            self._what, self._began, self._said = what, now, now
+            self._what = what
+            self._began = now
+            self._said = now
             if self._console.is_terminal:
                 text = TextColumn("{task.description}", markup=False)
                 columns = text, BarColumn(), TimeElapsedColumn()
@@ -76,7 +78,7 @@ class Stages:
         if important or not self.quiet:
             print(text, file=sys.stderr)
 
-    def warn(self, message: Any, *_: Any) -> None:
+    def warn(self, message: object, *_: Any) -> None:
         """Print a warning, of those that differ in numbers only the first."""
         text = str(message)
         kind = re.sub(r"[\d.]+", "", text)
@@ -108,11 +110,9 @@ def _in_words(seconds: float) -> str:
 def shown(report: Report) -> str:
     """Return a report as text, with ruled tables on a terminal and plain ones elsewhere."""
     console = Console()
-    return (
-        report.plain(partial(_ruled, console))
-        if console.is_terminal
-        else report.plain()
-    )
+    if console.is_terminal:
+        return report.plain(partial(_ruled, console))
+    return report.plain()
 
 
 def _ruled(

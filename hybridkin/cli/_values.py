@@ -58,7 +58,8 @@ def between(low: float, high: float, kind: type = float) -> Callable[[str], Any]
     return number
 
 
-positive, share = between(0.0, float("inf")), between(0.0, 1.0)
+positive = between(0.0, float("inf"))
+share = between(0.0, 1.0)
 count = between(0, float("inf"), int)
 
 

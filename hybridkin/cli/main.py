@@ -66,16 +66,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.showwarning = stages.warn
             outcome = _RUN[arguments.command](arguments, stages)
     except (KeyboardInterrupt, EOFError) as stop:  # EOFError: no answer to a question
-        fate = (
-            "nothing was written"
-            if _stamps(arguments) == before
-            else "files were written"
-        )
+        if _stamps(arguments) == before:
+            fate = "nothing was written"
+        else:
+            fate = "files were written"
         code = 143 if isinstance(stop, _Terminated) else 130
         return failed(f"interrupted; {fate}", code, arguments.json)
     except _OF_INPUT as error:
         return failed(f"error: {error}", 2, arguments.json)
-    text, paths = outcome.text, [*map(str, outcome.paths)]
+    text = outcome.text
+    paths = [*map(str, outcome.paths)]
     if arguments.json:
         written = {"written": paths} if paths else {}
         text = hybridkin.workflow.json_text({**outcome.record, **written})
@@ -115,7 +115,7 @@ def _interruptible() -> Iterator[None]:
     ]
     caught: list[KeyboardInterrupt] = []
 
-    def stop(number: int, _: Any) -> None:
+    def stop(number: int, _: object) -> None:
         caught.append(
             _Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
         )
@@ -249,7 +249,8 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     if arguments.path is not None:
         path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
     else:
-        center, metre = arguments.center, METRES[unit]
+        center = arguments.center
+        metre = METRES[unit]
         path = workflow.shape_path(
             loaded,
             limits,
@@ -302,7 +303,8 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         n_frames=arguments.frames,
         progress=stages,
     )
-    speed, size = f"{record['fps']:.3g} a second", f"{record['bytes'] / 1e6:.2f} MB"
+    speed = f"{record['fps']:.3g} a second"
+    size = f"{record['bytes'] / 1e6:.2f} MB"
     return _Outcome(
         record, f"{record['frames']} frames, {speed}, {size}", [arguments.out]
     )
@@ -337,7 +339,8 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
 
 
 def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
-    out, given = arguments.out, vars(arguments)
+    out = arguments.out
+    given = vars(arguments)
     if out.exists() and not arguments.force:
         raise FileExistsError(
             f"{out} exists; name another file, or replace it with --force."
@@ -348,7 +351,9 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     if missing:
         need = f"`init` needs {', '.join(missing)} where it cannot ask on a terminal"
         raise ValueError(f"{need}; see `hybridkin init --help`.")
-    text, log, code = description(answers, out.stem), answers["log"], 0
+    text = description(answers, out.stem)
+    log = answers["log"]
+    code = 0
     with tempfile.TemporaryDirectory() as folder:  # errors leave no file
         draft = Path(folder) / "robot.toml"
         draft.write_text(text, encoding="utf-8")
@@ -359,7 +364,8 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     log_format: Any = robot.log
     report = hybridkin.workflow.Report(f"{robot.name}: {robot.n_actuators} actuators")
     report.record.update(columns=vars(log_format), log_check=None)
-    q, x = ", ".join(log_format.q), ", ".join(log_format.x)
+    q = ", ".join(log_format.q)
+    x = ", ".join(log_format.x)
     report.text(
         f"Columns: actuators {q}; tip {x}; motion {log_format.groups or '(none)'}."
     )
@@ -369,10 +375,8 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
             log, log_format, chain=robot.chain, **options
         )
         _note(read.report, stages)
-        report.record["log_check"], code = (
-            read.report.to_dict(),
-            0 if read.report.ok else 1,
-        )
+        report.record["log_check"] = read.report.to_dict()
+        code = 0 if read.report.ok else 1
     log_name, robot_name = (shlex.quote(str(path)) for path in (log or "log.csv", out))
     fit = f"hybridkin fit {log_name} --robot {robot_name} --out model"
     report.text(f"Read through {out}, then fit a model:\n$ {fit}")
@@ -381,7 +385,8 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
 
 
 def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
-    out, done = arguments.out, {}
+    out = arguments.out
+    done = {}
     if out.exists() and not (out.is_dir() and not [*out.iterdir()]):
         raise FileExistsError(
             f"{out} is not an empty folder; name another one by --out."

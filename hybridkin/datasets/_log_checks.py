@@ -159,9 +159,10 @@ class _Rows(NamedTuple):
 
     def same_motion(self) -> NDArray:
         """Return whether each row and the next belong to the same motion, shape (N - 1,)."""
-        groups = (
-            np.zeros(len(self.log.q)) if self.log.groups is None else self.log.groups
-        )
+        if self.log.groups is None:
+            groups = np.zeros(len(self.log.q))
+        else:
+            groups = self.log.groups
         return groups[1:] == groups[:-1]
 
 
@@ -203,8 +204,10 @@ def _runs(still: NDArray) -> list[tuple[int, int]]:
 
 
 def _frozen(rows: _Rows) -> Iterator[LogFinding]:
-    q, x = rows.log.q, rows.log.x
-    tips, steps = np.empty(0, dtype=int), np.diff(x, axis=0) == 0
+    q = rows.log.q
+    x = rows.log.x
+    tips = np.empty(0, dtype=int)
+    steps = np.diff(x, axis=0) == 0
     parts = [("the tip", "error", 1.0, steps.all(axis=1))]
     for (name, _), still in zip(rows.columns("x"), steps.T, strict=True):
         parts.append((f"column {name!r}", "warning", 0.2, still))
@@ -314,15 +317,16 @@ def _first_alike(columns: NDArray) -> NDArray:
 
 
 def _duplicates(rows: _Rows) -> Iterator[LogFinding]:
-    q, x, groups = rows.log.q, rows.log.x, rows.log.groups
+    q = rows.log.q
+    x = rows.log.x
+    groups = rows.log.groups
     original = _first_alike(np.column_stack([q, x]))
     copies = np.flatnonzero(original != np.arange(len(q)))
     if len(copies):
-        n = (
-            0
-            if groups is None
-            else int((groups[copies] != groups[original[copies]]).sum())
-        )
+        if groups is None:
+            n = 0
+        else:
+            n = int((groups[copies] != groups[original[copies]]).sum())
         across = f", {n} of them in another motion" if n else ""
         message = f"{len(copies)} rows are exact copies of earlier ones{across}"
         advice = "delete them: copies in training and test rows make held-out errors too small."
@@ -352,7 +356,9 @@ def _duplicates(rows: _Rows) -> Iterator[LogFinding]:
 
 
 def _jumps(rows: _Rows) -> Iterator[LogFinding]:
-    q, x, same = rows.log.q, rows.log.x, rows.same_motion()
+    q = rows.log.q
+    x = rows.log.x
+    same = rows.same_motion()
     dq, dx = (np.linalg.norm(np.diff(array, axis=0), axis=1) for array in (q, x))
     if len(q) < _FEW_ROWS or not dx.any():
         return
@@ -374,7 +380,8 @@ def _jumps(rows: _Rows) -> Iterator[LogFinding]:
 def _times(rows: _Rows) -> Iterator[LogFinding]:
     if rows.log.time is None:
         return
-    step, same = np.diff(rows.log.time), rows.same_motion()
+    step = np.diff(rows.log.time)
+    same = rows.same_motion()
     late = np.flatnonzero(step <= 0) + 1
     if len(late):
         message = f"times do not increase at {len(late)} rows ({rows.named(late)})."
@@ -395,7 +402,8 @@ def _times(rows: _Rows) -> Iterator[LogFinding]:
 
 
 def _motions(rows: _Rows) -> Iterator[LogFinding]:
-    n_rows, groups = len(rows.log.q), rows.log.groups
+    n_rows = len(rows.log.q)
+    groups = rows.log.groups
     if n_rows < _FEW_ROWS:
         advice = "record some hundred rows, spread over the whole workspace."
         yield rows.finding("rows", f"the log has only {n_rows} rows.", advice)

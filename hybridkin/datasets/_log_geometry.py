@@ -135,7 +135,7 @@ def in_metres(log: Log, chain: Any) -> tuple[Log, Any]:
     )
 
 
-def geometry_findings(log: Log, chain: Any, base_is_free: bool) -> list[LogFinding]:
+def geometry_findings(log: Log, chain: object, base_is_free: bool) -> list[LogFinding]:
     """Return contradictions to the chain; units first, because the other checks need them."""
     robot = _Robot(chain)
     findings = [*_kind_findings(log, robot)] or [*_unit_findings(log, robot)]
@@ -209,11 +209,10 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         relative_spread = spread / max(
             float(np.linalg.norm(np.ptp(tips, axis=0))), np.finfo(float).tiny
         )
-        x_factor = (
-            _factor(relative_spread, 1.0)
-            if 0.0 < relative_spread < _SMALL_SHARE
-            else None
-        )
+        if 0.0 < relative_spread < _SMALL_SHARE:
+            x_factor = _factor(relative_spread, 1.0)
+        else:
+            x_factor = None
     if max(robot.length, 10.0 * radii.max()) > _LONGEST and (q_factor or x_factor):
         message = (
             f"the robot is described with a length of {robot.length:g} m and radii up to "
@@ -227,7 +226,7 @@ def _unit_findings(log: Log, robot: _Robot) -> Iterator[LogFinding]:
         return
     if q_factor is not None:
         problem = "the chambers are" if robot.extensible else "the longest stroke is"
-        problem = f"{problem} {1e3 * size:.4g} mm, {stroke:.3g} times the radii ({1e3 * radius:.4g} mm)"
+        problem += f" {1e3 * size:.4g} mm, {stroke:.3g} times the radii ({1e3 * radius:.4g} mm)"
         yield _unit_finding("q", problem, log.file_units["q"], q_factor)
     if x_factor is not None:
         problem = f"the tip moves within {1e3 * spread:.4g} mm, {reach:.3g} of the robot's reach"
@@ -344,7 +343,7 @@ def _orientation_findings(
         yield LogFinding("geometry", "warning", message, _ADVICE["geometry"])
 
 
-def _exchanged(chain: Any, q: NDArray, x: NDArray) -> tuple[float, int, int]:
+def _exchanged(chain: object, q: NDArray, x: NDArray) -> tuple[float, int, int]:
     """Return the error after the best exchange of a column of q with one of x, and the columns."""
     exchanges = []
     for i, j in itertools.product(range(q.shape[1]), range(3)):
@@ -366,14 +365,16 @@ def _way_finding(log: Log, robot: _Robot, way: Way, compared: str) -> LogFinding
     causes = []
     advice = []
     if names != declared and way.order == clockwise:
-        kind, causes = "numbering", ["the actuators numbered in the other direction"]
+        kind = "numbering"
+        causes = ["the actuators numbered in the other direction"]
         first, second = robot.chain.angles[:2].tolist()
         counted = f"set clockwise = {str(np.sin(second - first) > 0).lower()} in every [[segment]]"
         advice = [
             f"{counted} (or negate angles_deg); the axes of the tip must be right-handed."
         ]
     elif names != declared:
-        kind, causes = "order", [f"the columns of q in the order {', '.join(names)}"]
+        kind = "order"
+        causes = [f"the columns of q in the order {', '.join(names)}"]
         listed = f"set q = {json.dumps(names)} in [log] of the robot description."
         advice = [listed if log.q_names else f"use q[:, {[*way.order]}]."]
     if min(way.sign) < 0:

@@ -105,7 +105,7 @@ def _segments_listed(counts: list[int], listed: Sequence[int]) -> Way:
     return as_declared(len(order))._replace(order=tuple(order))
 
 
-def misses(chain: Any, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
+def misses(chain: object, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
     """Return for each q (N, n) of qs (K, N, n) the relative error of the chain's tips.
 
     This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 SEVERITIES = ("error", "warning", "note")
 MISREAD = ("units", "order", "sign", "numbering", "axes", "size")
-_WIDTH, _ARROW = 96, " " * 11 + "-> "
+_WIDTH = 96
+_ARROW = " " * 11 + "-> "
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +129,10 @@ class LogReport:
 
     def __str__(self) -> str:
         """Return the report as text, one paragraph for each finding."""
-        motions = (
-            "motions not named"
-            if self.n_motions is None
-            else f"{self.n_motions} motions"
-        )
+        if self.n_motions is None:
+            motions = "motions not named"
+        else:
+            motions = f"{self.n_motions} motions"
         spans = 1e3 * np.ptp(self.x_range, axis=1)
         scale, unit = {"m": (1e3, " mm"), "rad": (180.0 / np.pi, " deg")}.get(
             self.q_unit, (1, "")

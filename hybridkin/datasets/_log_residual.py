@@ -15,10 +15,11 @@ from hybridkin.datasets._logs import Log
 _LAGS = 10  # largest lag of the tip in rows, in both directions
 # Limits of the rms residual of a model with a drift, and with a lag, relative to that without. For
 # simulated logs and recordings of real robots without drift or lag it was above 0.89.
-_DRIFT, _LAG = 0.8, 0.6
+_DRIFT = 0.8
+_LAG = 0.6
 
 
-def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFinding]:
+def residual_findings(log: Log, chain: object, same: NDArray) -> Iterator[LogFinding]:
     """Yield findings on a drift of the tip and on lags.
 
     Parameters
@@ -30,14 +31,14 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
     same : ndarray of shape (N - 1,)
         Whether each row and the next belong to the same motion.
     """
-    features, x = _features(log.q, chain), log.x
+    features = _features(log.q, chain)
+    x = log.x
     if len(x) < 3 * features.shape[1] or not np.ptp(x, axis=0).any():
         return
-    size, t = (
-        1e3 * np.sqrt(x.var(axis=0).sum()),
-        np.linspace(-1.0, 1.0, len(x))[:, None],
-    )
-    left, drifted = _left(features, x), _left(np.hstack([features, t, t**2]), x)
+    size = 1e3 * np.sqrt(x.var(axis=0).sum())
+    t = np.linspace(-1.0, 1.0, len(x))[:, None]
+    left = _left(features, x)
+    drifted = _left(np.hstack([features, t, t**2]), x)
     if drifted < _DRIFT * left:
         message = (
             f"the tip drifts or steps during the log: the residual of a rough model falls from "
@@ -48,12 +49,11 @@ def residual_findings(log: Log, chain: Any, same: NDArray) -> Iterator[LogFindin
             "parts separately, or leave the moved part out."
         )
         yield LogFinding("drift", "warning", message, advice)
-    run, lagged = np.concatenate([[0], np.cumsum(~same)]), {0: left}
+    run = np.concatenate([[0], np.cumsum(~same)])
+    lagged = {0: left}
     for k in range(-_LAGS, _LAGS + 1):
-        early, late = (
-            slice(max(-k, 0), min(-k, 0) or None),
-            slice(max(k, 0), min(k, 0) or None),
-        )
+        early = slice(max(-k, 0), min(-k, 0) or None)
+        late = slice(max(k, 0), min(k, 0) or None)
         same_run = run[early] == run[late]
         if k and same_run.sum() > 0.3 * len(x):
             lagged[k] = _left(features[early][same_run], x[late][same_run])

@@ -89,7 +89,8 @@ class Log:
         for name in ("q", "x", "time"):
             if vars(self)[name] is not None:
                 vars(self)[name] = real_array(vars(self)[name], name)
-        q, x = np.shape(self.q), np.shape(self.x)
+        q = np.shape(self.q)
+        x = np.shape(self.x)
         if (
             len(q) != 2
             or len(x) != 2
@@ -114,9 +115,10 @@ class Log:
         tips = self.x[:, -3:]
         sides = np.fmax.reduce(tips) - np.fmin.reduce(tips)
         span = " x ".join(f"{side:.3g}" for side in sides)
-        motions = (
-            "" if self.groups is None else f", {len(np.unique(self.groups))} motions"
-        )
+        if self.groups is None:
+            motions = ""
+        else:
+            motions = f", {len(np.unique(self.groups))} motions"
         lines = [f"{type(self).__name__} of {self.source}: {len(self.q)} rows{motions}"]
         lines += [f"{self.q.shape[1]} actuators: {', '.join(column_names(self, 'q'))}"]
         lines[-1] += f"; {self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
@@ -222,7 +224,8 @@ def load_log(
     (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
     table = _read(as_path(path), delimiter)
-    q, x = table.names("q", q), table.names("x", x)
+    q = table.names("q", q)
+    x = table.names("x", x)
     if len(x) % 3:
         raise ValueError(
             f"`x` must name 3 columns, or 3 for each of several markers, got {len(x)}: {x}."
@@ -345,7 +348,8 @@ class _Table(NamedTuple):
             raise TypeError(
                 f"`groups` and `time` must be names of columns, got {name!r:.80}."
             )
-        count, path = self.header.count(name), str(self.path)
+        count = self.header.count(name)
+        path = str(self.path)
         if count > 1:
             raise ValueError(
                 f"Column {name!r} occurs {count} times in {path!r}; rename it."
@@ -388,10 +392,8 @@ class _Table(NamedTuple):
         self, names: list[str], time: str | None, groups: str | None
     ) -> tuple[NDArray, NDArray | None]:
         """Return columns as numbers (N, k), that of the time in seconds, and the groups."""
-        columns, labels = (
-            {name: self.numbers(name, name == time) for name in names},
-            None,
-        )
+        columns = {name: self.numbers(name, name == time) for name in names}
+        labels = None
         if len(columns) < len(names):
             raise ValueError(
                 f"`q`, `x` and `time` must name a column once, got {names}."
@@ -467,8 +469,8 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
         n_lines = len(text.splitlines()) - 1
         if n_lines > 0 and text.count(delimiter) >= len(row) + n - 2:
             raise ValueError(
-                f'A quote (") in line {line - n_lines} of {str(path)!r} hides rows up to line {line}; '
-                "close or remove it."
+                f'A quote (") in line {line - n_lines} of {str(path)!r} hides rows up to line '
+                f"{line}; close or remove it."
             )
     lines, cells = zip(*rows, strict=True)
     header = [name.strip() for name in cells[0]]

@@ -120,7 +120,8 @@ def load_armlab(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     file = _arrays(path, {"cable_shortening_mm": (3,), "tip_mm": (3,), "row": ()})
     # Commands are multiples of 0.1 mm, stored in single precision.
     tenths = np.rint(file["cable_shortening_mm"].astype(float) * 10).astype(int)
-    x, row = file["tip_mm"] * 1e-3, file["row"]
+    x = file["tip_mm"] * 1e-3
+    row = file["row"]
     groups = np.where(tenths[:, 0] == 0, tenths[:, 1], 100 + tenths[:, 0])
     return Bunch(
         q=tenths * -1e-4 + 0.0,
@@ -200,9 +201,10 @@ def _locate(
     home = os.environ.get(DATA_HOME) if data_home is None else data_home
     path = None if not home else Path(home) / folder / name
     if path is None or not path.is_file():
-        looked = (
-            "no data_home was given" if path is None else f"there is no {str(path)!r}"
-        )
+        if path is None:
+            looked = "no data_home was given"
+        else:
+            looked = f"there is no {str(path)!r}"
         raise FileNotFoundError(
             f"{folder}/{name} is not part of hybridkin, and {looked}. Its source: {source}. Put "
             f"the file into a folder {folder!r} and give its parent folder as `data_home` or as "

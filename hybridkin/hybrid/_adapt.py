@@ -83,7 +83,8 @@ def _likeliest_change(
 ) -> tuple[NDArray, NDArray]:
     """Return the most probable change theta, and the residual after it, relative to the noise."""
     theta = std = np.zeros(6 + len(problem.scale))
-    misfit, residual = 1.0, np.zeros(0)
+    misfit = 1.0
+    residual = np.zeros(0)
     if "base" in parameters:
         theta = problem.registered(noise)
     for k in range(_ROUNDS):
@@ -93,7 +94,8 @@ def _likeliest_change(
         if k < _CHOOSING:
             std, misfit = _likeliest_scales(A, target, parameters)
         system = std[:, None] * (A.T @ A) * std + misfit * np.eye(len(std))
-        previous, theta = theta, std * np.linalg.solve(system, std * (A.T @ target))
+        previous = theta
+        theta = std * np.linalg.solve(system, std * (A.T @ target))
         if np.abs(theta - previous).max() <= _SETTLED:
             break
     return theta, residual
@@ -131,17 +133,23 @@ class _Problem:
     """The new rows, and the model as a function of the change of the robot."""
 
     def __init__(self, fitted: Hybrid, rows: Rows, scale: NDArray) -> None:
-        self.fitted, self.q, self.y = fitted, rows.q, torch.from_numpy(rows.tips)
+        self.fitted = fitted
+        self.q = rows.q
+        self.y = torch.from_numpy(rows.tips)
         self.measured = ~np.isnan(rows.tips)
-        robot, self.pivot, self.reach = fitted.robot, self.q.new_zeros(3), 1.0
+        robot = fitted.robot
+        self.pivot = self.q.new_zeros(3)
+        self.reach = 1.0
         if isinstance(robot, Chain):
-            self.pivot, self.reach = robot.base[:3, 3].to(self.q), float(robot.reach)
+            self.pivot = robot.base[:3, 3].to(self.q)
+            self.reach = float(robot.reach)
         self.scale = torch.from_numpy(scale)
 
     def model(self, theta: NDArray) -> AdaptedModel:
         """Return the model after a change theta (6 + n,)."""
         change = torch.from_numpy(theta)
-        R, motion = rotation(change[:3])[0], identity(4, change)
+        R = rotation(change[:3])[0]
+        motion = identity(4, change)
         motion[:3, :3] = R
         motion[:3, 3] = self.pivot - R @ self.pivot + self.reach * change[3:6]
         shift = self.scale * change[6:]
@@ -155,12 +163,11 @@ class _Problem:
         Arun, Huang & Blostein (1987); the rotation stays small about axes that are not identified.
         """
         x = torch.from_numpy(evaluate(self.fitted, self.q.numpy())[0])
-        y, theta = (
-            self.y[:, : x.shape[1]].reshape(-1, 3),
-            self.q.new_zeros(6 + len(self.scale)),
-        )
+        y = self.y[:, : x.shape[1]].reshape(-1, 3)
+        theta = self.q.new_zeros(6 + len(self.scale))
         measured = ~y.isnan().any(1)
-        x, y = x.reshape(-1, 3)[measured], y[measured]
+        x = x.reshape(-1, 3)[measured]
+        y = y[measured]
         moments = (y - y.mean(0)).mT @ (x - x.mean(0)) + noise**2 * identity(3, x)
         R, _ = nearest_rotation(moments)
         theta[:3] = rotation_vector(R)
@@ -176,7 +183,8 @@ class _Problem:
         """
         model = self.model(theta).rows()
         x, J = map(torch.from_numpy, evaluate(model, self.q.numpy(), jacobian=True))
-        residual, J = self.y - x, J * self.scale
+        residual = self.y - x
+        J = J * self.scale
         A = torch.cat([J.new_zeros(*x.shape, 6), J], dim=-1)
         spin = rotation(torch.from_numpy(theta[:3]))[1]
         K = x.shape[1] // 3
@@ -188,7 +196,8 @@ class _Problem:
         if isinstance(self.fitted, PoseHybrid):
             turn = rotation(self.y[:, 3:])[0] @ rotation(x[:, 3:])[0].mT
             residual[:, 3:] = self.reach * rotation_vector(turn)
-            A[:, 3:, :3], A[:, 3:, 3:6] = spin, 0.0
+            A[:, 3:, :3] = spin
+            A[:, 3:, 3:6] = 0.0
             A[:, 3:] *= self.reach
         A[~self.measured] = residual[~self.measured] = 0.0
         return residual.numpy(), A.numpy()

@@ -16,7 +16,8 @@ _ALPHAS = np.append(inf, 10.0 ** np.arange(3.0, -6.1, -0.5))  # penalties to cho
 # Evidence for a change of a robot: the gain in log evidence that each part of a change needs, and
 # the candidates for the variance that no change explains, relative to that of the fit. Each
 # doubling of this variance needs a gain of one.
-SWITCH, MISFITS = 2.0, 2.0 ** np.arange(5)
+SWITCH = 2.0
+MISFITS = 2.0 ** np.arange(5)
 
 
 def too_far() -> ValueError:
@@ -95,7 +96,9 @@ class Drift(NamedTuple):
         """
         sizes, axes = np.linalg.eigh(self.gram)
         along = (self.moment.T[:, None] @ axes).ravel() ** 2
-        sizes, alphas, misfits = sizes.ravel(), _ALPHAS[:, None], MISFITS[:, None]
+        sizes = sizes.ravel()
+        alphas = _ALPHAS[:, None]
+        misfits = MISFITS[:, None]
         explained = (along / (sizes + alphas)).sum(1)
         spread = np.log1p(sizes.clip(min=0.0) / alphas).sum(1)
         left = (self.squares - explained) / (misfits * noise**2)

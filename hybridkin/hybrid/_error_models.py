@@ -296,7 +296,7 @@ class RegressorModel(ErrorModel):
         It is cloned.
     """
 
-    def __init__(self, regressor: Any) -> None:
+    def __init__(self, regressor: object) -> None:
         self.regressor = regressor
 
     def fit(self, residuals: Residuals) -> FittedError:
@@ -328,10 +328,10 @@ class RegressorModel(ErrorModel):
         with TURNS.filters if isinstance(regressor, KernelRidge) else nullcontext():
             return regressor.fit(rows.X, rows.y, **options)
 
-    def _settled(self, regressor: Any) -> ErrorModel:
+    def _settled(self, regressor: object) -> ErrorModel:
         return self
 
-    def _noise(self, regressor: Any, module: ForwardModel, rows: Rows) -> float:
+    def _noise(self, regressor: object, module: ForwardModel, rows: Rows) -> float:
         """Return the spread of training errors; regressors may overfit, so it has a least share."""
         rows = rows.thinned(_MOST)
         before = rows.tips
@@ -382,7 +382,7 @@ class KernelModel(RegressorModel):
         tuned = tuned_kernel(rows.X, rows.y, rows.counts, rows.groups)
         return RegressorModel(tuned)._fitted(rows)
 
-    def _settled(self, regressor: Any) -> ErrorModel:
+    def _settled(self, regressor: object) -> ErrorModel:
         return RegressorModel(clone(regressor))
 
 

@@ -27,7 +27,8 @@ def center_and_scale(q: Tensor) -> tuple[Tensor, Tensor]:
 
     Columns that are constant, up to rounding, get the scale 1.
     """
-    low, high = q.amin(0), q.amax(0)
+    low = q.amin(0)
+    high = q.amax(0)
     scale = 0.5 * (high - low)
     flat = scale <= 4.0 * torch.finfo(q.dtype).eps * q.abs().amax(0)
     return 0.5 * (low + high), torch.where(flat, torch.ones_like(scale), scale)
@@ -74,7 +75,8 @@ class Features(PortableModule):
         slope = linear[:, 1:].expand(*u.shape[:-1], *linear[:, 1:].shape)
         if bent.shape[1]:
             nonlinear, slope_more = self._bent_readout(u, bent)
-            value, slope = value + nonlinear, slope + slope_more
+            value = value + nonlinear
+            slope = slope + slope_more
         return value, slope / self.scale.to(q)
 
     def _scaled(self, q: Tensor) -> Tensor:
@@ -107,7 +109,8 @@ class QuadraticFeatures(Features):
     def _bent_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         n = len(self.center)
         i, j = torch.triu_indices(n, n, 1, device=u.device)
-        crossed, squared = weights[:, : len(i)], weights[:, len(i) :]
+        crossed = weights[:, : len(i)]
+        squared = weights[:, len(i) :]
         hessian = weights.new_zeros(len(weights), n, n)
         hessian[:, i, j] = crossed
         hessian = hessian + hessian.mT + torch.diag_embed(3.0 * squared)
@@ -213,11 +216,9 @@ class PoseFeatures(Features):
         # Virtual work: the weights are forces on vectors. Each segment before a frame rotates all
         # vectors of that frame; each segment after it moves the end of its lever.
         vectors, lever, frames = self._vectors(u)
-        moves, spins, slope = (
-            frames.moves / self.chain.reach.to(u),
-            frames.spins,
-            frames.slope,
-        )
+        moves = frames.moves / self.chain.reach.to(u)
+        spins = frames.spins
+        slope = frames.slope
         C = len(weights)
         at_base, *forces = weights.split([3, *(len(part) for part in vectors)], dim=1)
         value = at_base @ lever
@@ -280,9 +281,12 @@ def _turning(forces: Tensor) -> Tensor:
 
 def _write_readout(plan: Plan, stored: Stored) -> int:
     """Write the node of W phi(q), by the kind of its features."""
-    features, weights = stored.part("features"), stored.array("weights")
-    center, scale = features.array("center"), features.array("scale")
-    n, m = len(center), len(weights)
+    features = stored.part("features")
+    weights = stored.array("weights")
+    center = features.array("center")
+    scale = features.array("scale")
+    n = len(center)
+    m = len(weights)
     constant, linear, bent = np.split(weights, [1, 1 + n], axis=1)
     readout = constant, linear, bent
     if features.kind == "linear_features":
@@ -332,7 +336,8 @@ class Readout(ForwardModel):
         super().__init__()
         self.features = features
         self.register_buffer("weights", weights)
-        self.n_actuators, self.n_outputs = len(features.center), len(weights)
+        self.n_actuators = len(features.center)
+        self.n_outputs = len(weights)
 
     def up_to(self, chain: ArcChain) -> Readout:
         """Return the readout for the arcs up to the tip of a chain, from that for all arcs."""
@@ -381,7 +386,8 @@ class Projected(ForwardModel):
         self.model = model
         self.register_buffer("matrix", matrix)
         self.register_buffer("offset", offset)
-        self.n_actuators, self.n_outputs = len(offset), model.n_outputs
+        self.n_actuators = len(offset)
+        self.n_outputs = model.n_outputs
 
     def moved(self, q: Tensor) -> Tensor:
         """Return the part of q (..., n) along the directions that the rows moved."""

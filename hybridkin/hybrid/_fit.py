@@ -151,7 +151,8 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
             f"`X` must hold at least {least} different rows of positive weight, got "
             f"n_samples={n_rows}; record at least {10 * (n + 1)}."
         )
-    low, high = rows.counts.min(), rows.counts.max()
+    low = rows.counts.min()
+    high = rows.counts.max()
     if not (low > high / _COUNTS and 1.0 / _COUNTS < high < _COUNTS):
         raise ValueError(
             f"`sample_weight` must lie within a factor of {_COUNTS:g} of the other weights and "

@@ -84,14 +84,13 @@ class Guard(PortableModule):
         long = self.is_long(correction).nonzero()[:, 0]
         if not len(long):
             return correction, J
-        too_long, J_own = correction[long], J[long]
+        too_long = correction[long]
+        J_own = J[long]
         relative = self._relative(too_long)
         remaining, slope = self._kept(relative)
         # Derivative along the correction: the slope; across it: the factor.
-        factor, along = (
-            remaining / relative,
-            (too_long / too_long.norm(dim=-1, keepdim=True))[..., None],
-        )
+        factor = remaining / relative
+        along = (too_long / too_long.norm(dim=-1, keepdim=True))[..., None]
         change = (slope - factor)[..., None] * along @ (along.mT @ J_own)
         J_own = factor[..., None] * J_own + change
         return correction.index_copy(0, long, factor * too_long), J.index_copy(
@@ -176,7 +175,8 @@ class LeverageGuard(Guard):
 
 
 def _write_box_guard(plan: Plan, stored: Stored) -> int:
-    low, high = stored.array("low"), stored.array("high")
+    low = stored.array("low")
+    high = stored.array("high")
     width = np.where(high > low, high - low, 1.0)
     return plan.node(
         "box_guard", len(low), 0, [stored.array("largest"), low, high, 1.0 / width]
@@ -207,14 +207,16 @@ class BoxGuard(Guard):
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return 1 inside the box, more outside, shape (...)."""
-        low, high = self.low.to(q), self.high.to(q)
+        low = self.low.to(q)
+        high = self.high.to(q)
         width = torch.where(high > low, high - low, torch.ones_like(low))
         outside = (low - q).clamp(min=0.0) + (q - high).clamp(min=0.0)
         return 1.0 + (HK_BOX_STEEPNESS * (outside / width).square()).sum(-1)
 
 
 def _write_quadratic_leverage(plan: Plan, stored: Stored) -> int:
-    center, half_width = stored.array("center"), stored.array("half_width")
+    center = stored.array("center")
+    half_width = stored.array("half_width")
     # |L^-1 phi|^2 in the form of a network's leverage: R = L^-T is upper triangular.
     identity_matrix = np.eye(2 * len(center) + 1)
     factor = solve_triangular(stored.array("factor"), identity_matrix, lower=True).T
@@ -249,7 +251,8 @@ class QuadraticLeverage(LeverageModule):
     @classmethod
     def fit(cls, q: Tensor, alpha: float = 0.1) -> QuadraticLeverage:
         """Return the leverage of training rows q (N, n)."""
-        n, directions = q.shape[1], moved_directions(q.numpy())
+        n = q.shape[1]
+        directions = moved_directions(q.numpy())
         scale, still = map(torch.from_numpy, (directions.scale, directions.still))
         leverage = cls(center_and_scale(q)[0], scale, identity(2 * n + 1, q))
         features = leverage.forward(q)
@@ -303,15 +306,14 @@ def fit_guard(
     with torch.no_grad():
         if not isinstance(model, LeverageModule):
             # Every configuration counts once, even if the log repeats it.
-            model, times = (
-                QuadraticLeverage.fit(torch.unique(q, dim=0)),
-                torch.ones_like(times),
-            )
+            model = QuadraticLeverage.fit(torch.unique(q, dim=0))
+            times = torch.ones_like(times)
         return LeverageGuard.fit(model, q, largest, times)
 
 
 def _write_group_distance(plan: Plan, stored: Stored) -> int:
-    rows, axes = stored.array("rows"), stored.array("axes") / stored.array("farthest")
+    rows = stored.array("rows")
+    axes = stored.array("axes") / stored.array("farthest")
     center = rows.mean(0)
     padding = (0, -len(rows) % HK_GROUP), (0, 0)
     placed = np.pad((rows - center) @ axes, padding, mode="edge")
@@ -359,7 +361,8 @@ class GroupDistance(PortableModule):
         axes = torch.from_numpy(directions.moved / directions.scale[:, None])
         y = (q - q.mean(0)) @ axes
         # Each added row is the farthest from the rows before.
-        picked, gap = [y.square().sum(1).argmax()], y.new_full((len(y),), torch.inf)
+        picked = [y.square().sum(1).argmax()]
+        gap = y.new_full((len(y),), torch.inf)
         step = torch.empty_like(
             y
         )  # reused: allocating it each time costs more than the sums
@@ -370,7 +373,8 @@ class GroupDistance(PortableModule):
                 break
             picked.append(gap.argmax())
         rows = torch.stack(picked)
-        group, apart = of[rows, None], y.new_full((len(rows),), torch.inf)
+        group = of[rows, None]
+        apart = y.new_full((len(rows),), torch.inf)
         for some, theirs in zip(y.split(_BLOCK), of.split(_BLOCK), strict=True):
             far = torch.cdist(y[rows], some).masked_fill(group == theirs, torch.inf)
             apart = torch.minimum(apart, far.amin(1))
@@ -412,7 +416,8 @@ class GroupDistance(PortableModule):
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the squared relative distance of rows q (N, n) from the nearest row, (N,)."""
-        rows, axes = self.rows.to(q), self.axes.to(q) / self.farthest.to(q)
+        rows = self.rows.to(q)
+        axes = self.axes.to(q) / self.farthest.to(q)
         with torch.no_grad():
             nearest = torch.cdist(q @ axes, rows @ axes).argmin(1)
         return ((q - rows[nearest]) @ axes).square().sum(1)

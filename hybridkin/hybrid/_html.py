@@ -20,11 +20,9 @@ _HELD_OUT = (
 
 def fitted_rows(model: Any) -> dict[str, object]:
     """Return names and values of what the fit of a hybrid found, for `html_table`."""
-    mechanical, calibration, play = (
-        model.mechanical_model_,
-        model.calibration_,
-        model.play_,
-    )
+    mechanical = model.mechanical_model_
+    calibration = model.calibration_
+    play = model.play_
     fitted = model.module_.as_fitted
     changed = fitted is not model.module_ or fitted.drift is not None
     domain = {None: "everywhere (no guard)", "box": "the training range of q"}
@@ -50,14 +48,15 @@ def fitted_rows(model: Any) -> dict[str, object]:
 
 
 def _calibrated(model: Any) -> str:
-    calibration, setting = model.calibration_, model.calibrate
+    calibration = model.calibration_
+    setting = model.calibrate
     if calibration is not None:
-        held_out = (
-            ""
-            if calibration.cv_rmse is None
-            else f", held-out groups {_mm(calibration.cv_rmse)}"
-        )
-        return f"{', '.join(calibration.values)}; root mean square error {_mm(calibration.rmse)}{held_out}"
+        if calibration.cv_rmse is None:
+            held_out = ""
+        else:
+            held_out = f", held-out groups {_mm(calibration.cv_rmse)}"
+        error = f"root mean square error {_mm(calibration.rmse)}"
+        return f"{', '.join(calibration.values)}; {error}{held_out}"
     chosen = (model.cv_results_ or {}).get("parameters")  # of a model from a file
     return str(
         chosen
@@ -70,7 +69,8 @@ def _calibrated(model: Any) -> str:
 
 
 def _error_model(model: Any) -> str:
-    error, setting = model.error_model_, model.error_model
+    error = model.error_model_
+    setting = model.error_model
     if model.cv_results_ is not None:
         weights = model.cv_results_["weights"].items()
         parts = [f"{share:.2f} {name}" for name, share in weights if share > 0.0]
@@ -86,9 +86,10 @@ def _error_model(model: Any) -> str:
 def _error(model: Any) -> dict[str, str]:
     """Return the error on held-out rows or, where it is not known, on training rows."""
     if (results := model.cv_results_) is not None:
-        first = (
-            "a linear model" if model.mechanical_model is None else "mechanical model"
-        )
+        if model.mechanical_model is None:
+            first = "a linear model"
+        else:
+            first = "mechanical model"
         alone = f", {first} alone {_mm(results['mean_distance'][0])}"
         return {"held-out error": f"mean {_mm(results['expected_distance'])}{alone}"}
     error = model.error_model_
@@ -98,7 +99,8 @@ def _error(model: Any) -> dict[str, str]:
 
 
 def _radius(model: Any) -> str:
-    radius, covered = model.radius_, f"{100 * model.radius_.coverage:g} % of the tips"
+    radius = model.radius_
+    covered = f"{100 * model.radius_.coverage:g} % of the tips"
     if np.isfinite(radius.inside):
         return f"{_mm(radius.inside)} covers {covered} inside the domain"
     return (

@@ -16,7 +16,9 @@ from hybridkin._core.turns import TURNS
 from hybridkin.calibration.measured import distance, folds
 
 _MOST = 10_000  # rows; the matrices then take 3 GB
-_FOLDS, _FOLDS_OF_FEW, _FEW = 5, 10, 200
+_FOLDS = 5
+_FOLDS_OF_FEW = 10
+_FEW = 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 _GAMMAS = (
     0.003,
@@ -60,7 +62,9 @@ def tuned_kernel(
     @cache
     def held_out(at: tuple[int, int]) -> float:
         """Return the sum of held-out distances."""
-        total, K, alpha = 0.0, kernel(at[0]), _ALPHAS[at[1]]
+        total = 0.0
+        K = kernel(at[0])
+        alpha = _ALPHAS[at[1]]
         for train, test in splits:
             system = K[np.ix_(train, train)]
             system.flat[:: len(train) + 1] += alpha
@@ -74,12 +78,16 @@ def tuned_kernel(
             total += float(weights[test] @ distance(predicted, error[test]))
         return total
 
-    widths, penalties = range(len(_GAMMAS)), range(len(_ALPHAS))
-    best, previous = min(product(widths[::2], penalties[1::2]), key=held_out), None
+    widths = range(len(_GAMMAS))
+    penalties = range(len(_ALPHAS))
+    best = min(product(widths[::2], penalties[1::2]), key=held_out)
+    previous = None
     while best != previous:
         width, penalty = best
         near = product(range(width - 1, width + 2), range(penalty - 1, penalty + 2))
         allowed = (at for at in near if at[0] in widths and at[1] in penalties)
-        previous, best = best, min(allowed, key=held_out)
-    width, alpha = _GAMMAS[best[0]] / spread, _ALPHAS[best[1]]
+        previous = best
+        best = min(allowed, key=held_out)
+    width = _GAMMAS[best[0]] / spread
+    alpha = _ALPHAS[best[1]]
     return KernelRidge(kernel="rbf", gamma=width).set_params(alpha=alpha)

@@ -16,7 +16,8 @@ from hybridkin._core.arrays import identity
 
 Pair = tuple[float, float]
 _GRID = (inf, 4.0, 0.0, -4.0)  # penalties to start with, in half decades
-_LOW, _HIGH = (-6.0, -12.0), 8.0
+_LOW = (-6.0, -12.0)
+_HIGH = 8.0
 _EQUAL = 1e-3
 _RANK = 1e-8  # least share of the features' sum of squares for an axis to be kept
 _FOLDS = 10  # up to this number of groups, Gram matrices are kept even for groups of few rows
@@ -75,7 +76,9 @@ class Linearised:
     def __init__(
         self, J: Tensor, phi: Tensor, y: Tensor, products: Products | None = None
     ) -> None:
-        self.J, self.phi, self.y = J, phi, y
+        self.J = J
+        self.phi = phi
+        self.y = y
         self._products = Products(phi) if products is None else products
         self.gram = _gram(J, self._products)
         self.moment = moment(J, y, phi)
@@ -88,10 +91,8 @@ class Linearised:
 
         `less` is the Gram matrix of rows to subtract.
         """
-        finite, gram = (
-            torch.isfinite(penalty),
-            self.gram if less is None else self.gram - less,
-        )
+        finite = torch.isfinite(penalty)
+        gram = self.gram if less is None else self.gram - less
         system = gram[:, finite][..., finite].flatten(2).flatten(0, 1)
         system.diagonal().add_(penalty[finite].repeat(len(self.gram)))
         return finite, torch.linalg.cholesky(system)
@@ -125,7 +126,9 @@ class Linearised:
         result = torch.empty_like(residual)
         few = len(L) if len(members) > _FOLDS else len(L) // 4
         for k, rows in enumerate(members):
-            J, phi, y = self.J[rows], self.phi[rows], self.y[rows]
+            J = self.J[rows]
+            phi = self.phi[rows]
+            y = self.y[rows]
             if y.numel() <= few:
                 A = design(J, phi[:, finite]).flatten(0, 1)
                 white = torch.linalg.solve_triangular(L, A.mT, upper=False)
@@ -143,13 +146,15 @@ class Linearised:
 
     def _spread(self, kept: Tensor, inverse: Tensor) -> Tensor:
         """Return the covariance (N, C, C) of W phi, from that of W (D, D)."""
-        C, at = self.J.shape[2], kept.nonzero()[:, 0].numpy()
+        C = self.J.shape[2]
+        at = kept.nonzero()[:, 0].numpy()
         K = int(at.max(initial=-1)) + 1
         whole = np.zeros((C * K, C * K))
         whole[np.ix_(*[np.add.outer(K * np.arange(C), at).ravel()] * 2)] = (
             inverse.numpy()
         )
-        (a, b), (k, j) = np.tril_indices(C), np.tril_indices(K)
+        (a, b) = np.tril_indices(C)
+        (k, j) = np.tril_indices(K)
         blocks = whole.reshape(C, K, C, K)[a, :, b]
         folded = blocks[:, k, j] + blocks[:, j, k]
         folded[:, k == j] *= 0.5
@@ -259,7 +264,8 @@ def choose(
                 ]
                 for own, low in zip(at, _LOW, strict=True)
             ]
-            previous, at = at, best_of((a, b) for a in near[0] for b in near[1])
+            previous = at
+            at = best_of((a, b) for a in near[0] for b in near[1])
     return _penalties(at), {_penalties(pair): value for pair, value in scores.items()}
 
 

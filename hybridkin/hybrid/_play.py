@@ -40,8 +40,8 @@ def play_of(
         if operator_found is None or operator_found.width < 0.95 * ranges.max():
             return operator_found, []
         return operator_found, [
-            f"play='auto' found a backlash of {operator_found.width:.3g}, as wide as the range of `X`: the "
-            "log gives no upper limit. Record larger motions, or give the width as `play`."
+            f"play='auto' found a backlash of {operator_found.width:.3g}, as wide as the range of "
+            "`X`: the log gives no upper limit. Record larger motions, or give the width as `play`."
         ]
     operator = PlayOperator(play)
     if operator.width.size not in (1, len(ranges)):
@@ -76,12 +76,14 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     strokes = np.subtract(*np.percentile(X, (95, 5), axis=0))
     least = _LEAST * float(np.median(strokes[strokes > 0.0])) if strokes.any() else 0.0
     # The error can have several minima over the width, so widths of all sizes are tried.
-    doubled, widest = least * 2.0 ** np.arange(20), float(np.ptp(X, axis=0).max())
+    doubled = least * 2.0 ** np.arange(20)
+    widest = float(np.ptp(X, axis=0).max())
     widths = [0.0, *doubled[(doubled > 0.0) & (doubled < widest)].tolist(), widest]
     # A motion is one sample, as its rows have similar errors. A single motion is cut into ten.
     parts = motions if len(np.unique(motions)) > 1 else np.arange(len(X)) * 10 // len(X)
     counted = (rows.counts > 0) & ~np.isnan(rows.tips).any(axis=1)
-    counts, motion = rows.counts[counted], parts[counted]
+    counts = rows.counts[counted]
+    motion = parts[counted]
     names = np.unique(motion)
     if len(names) < 2:
         return None

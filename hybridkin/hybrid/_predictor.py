@@ -42,7 +42,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _fitted_range: TrainingRange
 
     def predict(
-        self, X: Any, return_radius: bool = False, groups: ArrayLike | None = None
+        self, X: object, return_radius: bool = False, groups: ArrayLike | None = None
     ) -> Any:
         """Return tip positions f_mech(q) + w(q) eps(q).
 
@@ -93,7 +93,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers."""
-        x, n = self.predict(X), len(np.asarray(y))
+        x = self.predict(X)
+        n = len(np.asarray(y))
         weights = np.ones(n) if sample_weight is None else np.asarray(sample_weight)
         both = (np.asarray(values, dtype=float).reshape(n, -1).T for values in (y, x))
         columns = [(a, b, ~np.isnan(a)) for a, b in zip(*both, strict=True)]
@@ -193,7 +194,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _evaluated(
         self,
         function: Callable[[Hybrid, NDArray], Sequence[NDArray]],
-        X: Any,
+        X: object,
         groups: ArrayLike | None,
         warn: bool = True,
     ) -> list[NDArray]:

@@ -52,9 +52,11 @@ def conformal_radius(
     groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
     spec = replace(spec, left_out=False)
-    X, y = rows.X, rows.tips
+    X = rows.X
+    y = rows.tips
     groups = np.arange(len(y)) if rows.groups is None else rows.groups
-    inside, errors = np.zeros(len(y), dtype=bool), np.full(len(y), np.nan)
+    inside = np.zeros(len(y), dtype=bool)
+    errors = np.full(len(y), np.nan)
     for train, test in folds(X, rows.groups):
         part = rows.take(train)
         if part.groups is not None and len(np.unique(part.groups)) == 1:
@@ -72,7 +74,8 @@ def conformal_radius(
         errors[test] = np.nanmax(distances(x, y[test]), axis=1)
     names, of = np.unique(groups[inside], return_inverse=True)
     radius = _quantile(errors[inside], of, rows.counts[inside], coverage)
-    estimate, n = Radius(radius, inf, coverage, len(y)), len(names)
+    estimate = Radius(radius, inf, coverage, len(y))
+    n = len(names)
     if estimate.inside < inf:
         return estimate, None
     return estimate, (

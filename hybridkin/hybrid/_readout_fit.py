@@ -202,7 +202,9 @@ def _chosen(
     problem: _Problem, members: list[Tensor] | None, start: Pair | None = None
 ) -> ReadoutFit:
     """Return the fit with the penalties of least held-out error."""
-    weights, alphas, scores = problem.nothing, start, {}
+    weights = problem.nothing
+    alphas = start
+    scores = {}
     for _ in range(2):
         # Linearised first without a correction, then about the one found.
         score = partial(problem.score, problem.linearised(weights), members)
@@ -233,7 +235,8 @@ def _fitted(
         left_out = problem.in_metres(
             problem.linearised(weights).left_out(penalty, members)
         )
-    readout, ratio = problem.readout(weights), problem.noise_ratio
+    readout = problem.readout(weights)
+    ratio = problem.noise_ratio
     return ReadoutFit(readout, alphas, left_out.numpy(force=True), {}, gradient, ratio)
 
 
@@ -249,9 +252,14 @@ class _Problem:
         weight: Tensor,
         serial: bool,
     ) -> None:
-        self.mechanical, self.features = mechanical, features
-        self.q, self.x, self.root = q, x, weight.sqrt()[:, None]
-        self.noise_ratio, self.whitening, self._last = inf, None, None
+        self.mechanical = mechanical
+        self.features = features
+        self.q = q
+        self.x = x
+        self.root = weight.sqrt()[:, None]
+        self.noise_ratio = inf
+        self.whitening = None
+        self._last = None
         self._tips = _tips(mechanical) if serial else _at_tip
         self.z = mechanical.coordinates(q)[0] if serial else mechanical(q)
         self.seen = ~x.isnan()
@@ -291,7 +299,8 @@ class _Problem:
             * self.seen.all(1, keepdim=True)
             * torch.ones_like(squares)
         )
-        total, mean = weights.sum(), (weights * spread).sum() / weights.sum()
+        total = weights.sum()
+        mean = (weights * spread).sum() / weights.sum()
 
         def unlikely(ratio: float) -> float:
             variance = spread + ratio if ratio < inf else torch.ones_like(spread)
@@ -364,9 +373,11 @@ class _Problem:
             if float(slope.norm()) <= _SETTLED * scale:
                 break
             if factor is None or k < _FACTORS or k % _REFRESH == 0:
-                factor, pairs = self.linearised(readout).factor(penalty), []
+                factor = self.linearised(readout).factor(penalty)
+                pairs = []
             step = -_linearised.quasi_newton(slope, pairs, factor)
-            step_size, descent = 1.0, float((slope * step).sum())
+            step_size = 1.0
+            descent = float((slope * step).sum())
             while (
                 step_size > 1e-6
             ):  # a full step may overshoot, as the tip is nonlinear
@@ -380,7 +391,9 @@ class _Problem:
             change = tried - readout, new_slope - slope
             if float((change[0] * change[1]).sum()) > 0.0:
                 pairs = [*pairs[-20:], change]
-            readout, value, slope = tried, new, new_slope
+            readout = tried
+            value = new
+            slope = new_slope
         return readout, float(slope.norm()) / scale
 
     def readout(self, weights: Tensor) -> Readout:

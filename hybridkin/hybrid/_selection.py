@@ -71,7 +71,9 @@ def select(
     modules : dict of str to Hybrid
         Every candidate, fitted to all rows.
     """
-    y, counts, folds = rows.tips, rows.counts, folds_of(rows.X, rows.groups)
+    y = rows.tips
+    counts = rows.counts
+    folds = folds_of(rows.X, rows.groups)
     fold_of = np.empty(len(y), dtype=int)
     for k, (_, test) in enumerate(folds):
         fold_of[test] = k
@@ -123,16 +125,21 @@ def select(
             before += counts[test] @ distance(blended[test], y[test])
             after += counts[test] @ distance(anew.predict(rows.X[test]), y[test])
         results["expected_distance"] *= float(after / before)
-    name, errors = (
-        ("nothing", {}) if geometry is None else (geometry.name, geometry.errors)
-    )
+    if geometry is None:
+        name = "nothing"
+        errors = {}
+    else:
+        name = geometry.name
+        errors = geometry.errors
     first_errors = {
         name: Errors(
             *(float(results[key][0]) for key in ("mean_distance", "io_distance"))
         )
     }
     results["parameters"] = name
-    results["mechanical_model"] = {n: one.known() for n, one in (errors or first_errors).items()}
+    results["mechanical_model"] = {
+        n: one.known() for n, one in (errors or first_errors).items()
+    }
     return replace(spec, error_model=_blend(settled, weights)), results, modules
 
 
@@ -162,8 +169,10 @@ class _HeldOut(NamedTuple):
         cls, predicted: NDArray, rows: Rows, fold_of: NDArray, outer: NDArray
     ) -> _HeldOut:
         """Return both kinds of rows, weighted by the errors of the first candidate, f_mech."""
-        n, at = len(rows.X), np.concatenate([np.arange(len(rows.X)), outer])
-        y, counts = rows.tips[at], rows.counts[at]
+        n = len(rows.X)
+        at = np.concatenate([np.arange(len(rows.X)), outer])
+        y = rows.tips[at]
+        counts = rows.counts[at]
         weights = counts.copy()
         for part, share in ((slice(0, n), 1.0 - _OUTSIDE), (slice(n, None), _OUTSIDE)):
             total = counts[part] @ distance(predicted[0, part], y[part])
@@ -179,12 +188,11 @@ class _HeldOut(NamedTuple):
         ----------
         Caruana et al., Ensemble selection from libraries of models, ICML 2004.
         """
-        predicted, y, weights = (
-            self.predicted[:, rows],
-            self.y[rows],
-            self.weights[rows],
-        )
-        picks, total = np.zeros(len(predicted)), np.zeros_like(y)
+        predicted = self.predicted[:, rows]
+        y = self.y[rows]
+        weights = self.weights[rows]
+        picks = np.zeros(len(predicted))
+        total = np.zeros_like(y)
         for k in range(1, _PICKS + 1):
             means = [weights @ distance((total + x) / k, y) for x in predicted]
             best = int(
@@ -203,19 +211,22 @@ def _chosen(
     If the gain of the blend over the mechanical model, paired by motion or fold, is within its
     standard error, the mechanical model is chosen.
     """
-    n, counts = found.n, found.counts
+    n = found.n
+    counts = found.counts
     # On each fold the blend is scored with weights chosen without that fold.
     blend = np.empty_like(found.y)
     for fold in np.unique(found.fold):
         test = found.fold == fold
         blend[test] = np.tensordot(found.shares(~test), found.predicted[:, test], 1)
     distances = np.array([distance(x, found.y) for x in (*found.predicted, blend)])
-    held_out, outer = distances[:, :n], distances[:, n:]
+    held_out = distances[:, :n]
+    outer = distances[:, n:]
     by_fold = _means_by(found.fold[:n], held_out, counts[:n])
     weights = found.shares(np.ones(len(blend), dtype=bool))
-    units = (
-        by_fold if rows.groups is None else _means_by(rows.groups, held_out, counts[:n])
-    )
+    if rows.groups is None:
+        units = by_fold
+    else:
+        units = _means_by(rows.groups, held_out, counts[:n])
     gains = units[0] - units[-1]
     if gains.mean() <= gains.std(ddof=1) / np.sqrt(len(gains)):
         weights = np.eye(len(weights))[0]

@@ -42,7 +42,8 @@ def missing_markers(estimator: BaseEstimator, y: Any) -> NDArray[np.bool_]:
 def check_settings(estimator: BaseEstimator) -> None:
     """Raise if a setting of a HybridForwardModel is not allowed."""
     model = SimpleNamespace(**estimator.get_params(deep=False))
-    error_model, mechanical = model.error_model, model.mechanical_model
+    error_model = model.error_model
+    mechanical = model.mechanical_model
     names = ("auto", "drop", *_REGRESSORS, *FEATURES)
     chosen = ("coupling", model.coupling, COUPLINGS), ("guard", model.guard, GUARDS)
     for name, value, allowed in (*chosen, ("output", model.output, _OUTPUTS)):

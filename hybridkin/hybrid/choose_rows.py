@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +21,11 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 
 # Standard deviations at the tip, in reaches of the robot. Priors: weights of linear features and of
 # other features, translation of the base, its rotation [rad]. Last: noise of a measured tip.
-_LINEAR, _OTHER, _SHIFT, _TURN, _NOISE = 0.055, 0.0165, 0.033, 0.1, 0.0055
+_LINEAR = 0.055
+_OTHER = 0.0165
+_SHIFT = 0.033
+_TURN = 0.1
+_NOISE = 0.0055
 _LARGEST, _MOST = (
     1000,
     5000,
@@ -35,7 +38,7 @@ _ROWS, _WORTH = (
 
 
 def choose_rows(
-    model: Any,
+    model: object,
     candidates: ArrayLike,
     n: int,
     *,
@@ -122,11 +125,13 @@ def choose_rows(
         )
     robot = as_forward_model(model).robot
     q = _actuators(robot, candidates, "candidates")
-    measured_rows = (
-        q[:0] if measured is None else _actuators(robot, measured, "measured")
-    )
+    if measured is None:
+        measured_rows = q[:0]
+    else:
+        measured_rows = _actuators(robot, measured, "measured")
     aim = q if target is None else _actuators(robot, target, "target")
-    names, places = np.arange(len(q)), np.arange(len(q))[:, None]
+    names = np.arange(len(q))
+    places = np.arange(len(q))[:, None]
     if groups is not None:
         names, places = _few_rows_of(labels(groups, len(q)))
     n = whole(n, "n", 1, len(names))  # of the candidates
@@ -141,7 +146,8 @@ def choose_rows(
 def _few_rows_of(groups: NDArray) -> tuple[NDArray, NDArray]:
     """Return the labels of all motions (G,), and R rows of each, from first to last, (G, R)."""
     names, of_row, counts = np.unique(groups, return_inverse=True, return_counts=True)
-    order, ends = np.argsort(of_row, kind="stable"), np.cumsum(counts)
+    order = np.argsort(of_row, kind="stable")
+    ends = np.cumsum(counts)
     return names, order[
         np.rint(np.linspace(ends - counts, ends - 1, _ROWS).T).astype(int)
     ]
@@ -178,16 +184,19 @@ class _TipErrors:
     def __init__(self, robot: ForwardModel, q: Tensor) -> None:
         arcs = isinstance(robot, ArcChain)
         self.robot = robot
-        self.features = (
-            PoseFeatures.of_range(q, robot) if arcs else QuadraticFeatures.of_range(q)
-        )
+        if arcs:
+            self.features = PoseFeatures.of_range(q, robot)
+        else:
+            self.features = QuadraticFeatures.of_range(q)
         tips, J = robot.from_coordinates_and_jacobian(robot.coordinates(q)[0])
         moved = J.square().sum(1).mean(0).sqrt()
         self.units = torch.where(moved > 1e-9 * moved.max(), 1.0 / moved, 0.0)
-        self.center, size = tips.mean(0), (tips - tips.mean(0)).norm(dim=1).max()
+        self.center = tips.mean(0)
+        size = (tips - tips.mean(0)).norm(dim=1).max()
         self.size = torch.where(size > 0.0, size, 1.0)
         if isinstance(robot, Chain):
-            self.center, self.size = robot.base[:3, 3].to(q), robot.reach.to(q)
+            self.center = robot.base[:3, 3].to(q)
+            self.size = robot.reach.to(q)
         n_linear = self.features.n_linear
         if len(self.units) * n_linear > _MOST:
             raise ValueError(
@@ -232,7 +241,8 @@ def _greedy(
     """
     size = q.shape[1]
     J, phi, base = errors.parts(q.flatten(0, 1))
-    (_, m, C), K = J.shape, phi.shape[1]
+    (_, m, C) = J.shape
+    K = phi.shape[1]
     M = errors.gram(aim) / len(aim)
     information = identity(len(M), M) + errors.gram(known) / errors.variance
     S = torch.cholesky_inverse(torch.linalg.cholesky(information))
@@ -243,7 +253,9 @@ def _greedy(
     spread, worth = (torch.cat(part) for part in zip(*about, strict=True))
     # Rows of a motion have similar errors.
     noise = max(1.0, size / _WORTH) * errors.variance * identity(size * m, q)
-    left, chosen, squares = (M * S).sum(), [], []
+    left = (M * S).sum()
+    chosen = []
+    squares = []
     free = torch.ones_like(spread[:, 0, 0], dtype=torch.bool)
     for _ in range(n):
         gain = torch.linalg.solve(spread + noise, worth).diagonal(dim1=1, dim2=2).sum(1)
@@ -259,7 +271,8 @@ def _greedy(
         a, b = moved.view(len(q), size * m, -1).split(size * m, dim=2)
         cross = a @ b.mT
         worth = worth - cross - cross.mT + a @ (G.mT @ MG) @ a.mT
-        spread, S = spread - a @ a.mT, S - G @ G.mT
+        spread = spread - a @ a.mT
+        S = S - G @ G.mT
         left = left - (G * MG).sum()
         chosen.append(k)
         squares.append(float(left))

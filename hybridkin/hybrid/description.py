@@ -97,9 +97,10 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     )
 
 
-def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
+def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     """Return the fitted hybrid from its description and the result of `training_of`."""
-    n, restore = stored.value("n_features_in", int), restorer()
+    n = stored.value("n_features_in", int)
+    restore = restorer()
     model = estimator_of(HybridForwardModel, stored.value("params", dict))
     if isinstance(model.calibrate, list):
         model.calibrate = tuple(model.calibrate)
@@ -154,9 +155,10 @@ def hybrid_of(stored: Stored, training: Any) -> HybridForwardModel:
         model.radius_ = Radius(inside, inf, coverage, int(n_rows))
     model._fitted_rows = stored.array("fitted_rows", "N")
     results = training.get("cv_results") if isinstance(training, dict) else None
-    model.cv_results_ = (
-        {key: _array(value) for key, value in results.items()} if results else None
-    )
+    if results:
+        model.cv_results_ = {key: _array(value) for key, value in results.items()}
+    else:
+        model.cv_results_ = None
     model._noise = stored.value("noise", float)
     return model
 
@@ -180,7 +182,7 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
     return plain(results)
 
 
-def _setting(asked: Any, fitted: Any) -> Any:
+def _setting(asked: object, fitted: object) -> Any:
     """Return the setting `error_model` as JSON, or the fitted error model if that is not JSON."""
     if asked is None or isinstance(asked, str):
         return asked
@@ -218,7 +220,7 @@ def _estimator(setting: dict[str, Any]) -> Any:
     return estimator
 
 
-def _stored_error(error: Any) -> Stored | None:
+def _stored_error(error: object) -> Stored | None:
     """Return the description of a fitted error model, None if there is none."""
     if error is None or isinstance(error, (ReadoutFit, ELMRegressor, ELMRegressorCV)):
         return None if error is None else error.stored()
@@ -265,7 +267,7 @@ def _restored_error(stored: Stored | None, restore: Restore, n: int) -> Any:
     return error
 
 
-def _array(value: Any) -> Any:
+def _array(value: object) -> Any:
     """Return a (nested) list of numbers, null for NaN, as an array; other values unchanged."""
     if not isinstance(value, list) or any(isinstance(entry, str) for entry in value):
         return value

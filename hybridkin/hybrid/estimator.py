@@ -199,8 +199,8 @@ class HybridForwardModel(HybridPredictor):
 
     def fit(
         self,
-        X: Any,
-        y: Any,
+        X: object,
+        y: object,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
     ) -> HybridForwardModel:
@@ -248,8 +248,8 @@ class HybridForwardModel(HybridPredictor):
 
     def _fit(
         self,
-        X: Any,
-        y: Any,
+        X: object,
+        y: object,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
         geometry: GeometryChoice | None = None,
@@ -275,11 +275,10 @@ class HybridForwardModel(HybridPredictor):
         if spec.error_model is None:
             spec, self.cv_results_, self.candidates_ = select(spec, rows, progress)
         fitted = fit_hybrid(spec, rows)
-        self.mechanical_model_, self.calibration_ = (
-            fitted.mechanical,
-            fitted.calibration,
-        )
-        self.error_model_, self.module_ = fitted.error.result, fitted.module
+        self.mechanical_model_ = fitted.mechanical
+        self.calibration_ = fitted.calibration
+        self.error_model_ = fitted.error.result
+        self.module_ = fitted.module
         self._single_output = rows.y.ndim == 1
         self._fitted_range = TrainingRange.of(rows.X)
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
@@ -296,8 +295,8 @@ class HybridForwardModel(HybridPredictor):
 
     def partial_fit(
         self,
-        X: Any,
-        y: Any,
+        X: object,
+        y: object,
         sample_weight: ArrayLike | None = None,
         *,
         decay: float = 0.98,
@@ -360,8 +359,8 @@ class HybridForwardModel(HybridPredictor):
 
     def adapt(
         self,
-        X: Any,
-        y: Any,
+        X: object,
+        y: object,
         *,
         parameters: Sequence[str] = PARAMETERS,
         groups: ArrayLike | None = None,
@@ -426,14 +425,16 @@ class HybridForwardModel(HybridPredictor):
         if message is not None:
             warnings.warn(message, stacklevel=2)
         self.mechanical_model_ = self.module_.mechanical
-        self._drift, self._play_state = self._drift.emptied(), None
+        self._drift = self._drift.emptied()
+        self._play_state = None
         return self
 
     def _checked_rows(
         self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
     ) -> Rows:
         """Return the measured rows, checked."""
-        X, y = table(X, "X"), table(y, "y")
+        X = table(X, "X")
+        y = table(y, "y")
         missing = missing_markers(self, y)
         y = y if y is None else np.where(missing, 0.0, y)
         check_finite(X=X, y=y)
@@ -447,7 +448,8 @@ class HybridForwardModel(HybridPredictor):
 
     def _spec(self, rows: Rows) -> Spec:
         """Return the settings as a specification, with a copy of the mechanical model."""
-        mechanical, names = copy.deepcopy(self.mechanical_model), ()
+        mechanical = copy.deepcopy(self.mechanical_model)
+        names = ()
         if mechanical is not None:
             mechanical = as_forward_model(mechanical)
         if isinstance(mechanical, Chain):
@@ -458,11 +460,10 @@ class HybridForwardModel(HybridPredictor):
             if parameters is None:
                 parameters = "auto" if self.error_model == "auto" else ()
             if isinstance(parameters, str):
-                names = (
-                    mechanical.default_parameters
-                    if parameters == "default"
-                    else parameters
-                )
+                if parameters == "default":
+                    names = mechanical.default_parameters
+                else:
+                    names = parameters
             else:
                 names = tuple(parameters)
         error_model = None

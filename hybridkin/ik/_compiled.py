@@ -137,7 +137,7 @@ class Core:
         return Core, self._made_of
 
     def step(
-        self, q: Any, target: Any, dx: Any, tip: Any
+        self, q: object, target: object, dx: object, tip: object
     ) -> tuple[NDArray, dict] | None:
         """Return the state of a step of one row and the places of its fields; else None."""
         if type(q) is not np.ndarray or q.dtype is not _FLOAT64 or q.shape != (self.n,):
@@ -147,11 +147,10 @@ class Core:
         except IndexError:  # other threads use them
             follower = Follower(self, None, IK_MUST_SEE + IK_FROM_REST)
         follower.q[...] = q
-        result = (
-            (follower.state.copy(), self._places)
-            if follower.tick(target, dx, tip)
-            else None
-        )
+        if follower.tick(target, dx, tip):
+            result = (follower.state.copy(), self._places)
+        else:
+            result = None
         self._idle.append(follower)
         return result
 
@@ -290,7 +289,7 @@ class Follower:
         state[IK_Q + n : IK_Q + 2 * n] = dq[0]
         self.q[:] = state[IK_Q + 2 * n : IK_Q + 3 * n] = q[0]
 
-    def tick(self, target: Any, dx: Any, tip: Any) -> bool:
+    def tick(self, target: object, dx: object, tip: object) -> bool:
         """Do a tick with plain arrays: the target, its velocity, the measured tip.
 
         Returns False, and does nothing, if one of them needs full checks.
@@ -312,7 +311,7 @@ class Follower:
         self._follow(self._call.place)
         return True
 
-    def _put(self, at: int, point: Any) -> bool:
+    def _put(self, at: int, point: object) -> bool:
         """Write a point into the state, if it is an array or a list of three numbers."""
         if type(point) is np.ndarray:
             if point.dtype is not _FLOAT64 or point.shape != (3,):

@@ -150,11 +150,10 @@ class Search:
         settings = self.settings
         n_starts = restarts + 1
         spans = settings.spans.to(start)
-        tol = (
-            tuple(_FINE * t for t in self.tol)
-            if isinstance(self.tol, tuple)
-            else _FINE * self.tol
-        )
+        if isinstance(self.tol, tuple):
+            tol = tuple(_FINE * t for t in self.tol)
+        else:
+            tol = _FINE * self.tol
         fine = replace(self, tol=tol)
         rows = torch.arange(len(start), device=start.device)
         solutions = best.take(rows.repeat_interleave(count))
@@ -232,7 +231,8 @@ class Search:
         )
         better = self._cost(again) < self._cost(found)[rows]
         found.put(rows[better], again.take(better))
-        found.n_iter[rows], found.n_starts[rows] = n_iter, n_tried
+        found.n_iter[rows] = n_iter
+        found.n_starts[rows] = n_tried
 
     def _cost(self, found: Found) -> Tensor:
         """Return the error, or -1 for rows reached outside the domain, -2 for inside."""

@@ -272,11 +272,9 @@ class StepSettings(Portable):
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if targets lie too far from the robot to be in metres."""
         points = self._positions(x)
-        return (
-            self.task.models[0].robot.far_messages(points, name)
-            if points.shape[-1] == 3
-            else []
-        )
+        if points.shape[-1] == 3:
+            return self.task.models[0].robot.far_messages(points, name)
+        return []
 
     def misses(self, target: Tensor) -> Tensor:
         """Return proven lower bounds (N,) of the errors at targets [m]; not positive: no proof."""
@@ -362,9 +360,10 @@ class StepSettings(Portable):
             "pulls": self.pulls,
         }
         arrays = {name: np.broadcast_to(as_array(a), n) for name, a in arrays.items()}
-        arrays["normals"] = (
-            np.zeros((n, 0)) if self.plane is None else as_array(self.plane[1])
-        )
+        if self.plane is None:
+            arrays["normals"] = np.zeros((n, 0))
+        else:
+            arrays["normals"] = as_array(self.plane[1])
         names = (
             "beta",
             "gain",
@@ -525,11 +524,9 @@ class StepSettings(Portable):
         q = as_tensor(value, name, self.task.device if like is None else like.device)
         n = self.n_actuators
         check_shape(q, name, ("...", n or "n"), "one value per actuator")
-        return (
-            q
-            if like is None
-            else q.to(like.device, torch.promote_types(q.dtype, like.dtype))
-        )
+        if like is None:
+            return q
+        return q.to(like.device, torch.promote_types(q.dtype, like.dtype))
 
     def points(
         self,

@@ -105,11 +105,10 @@ def control_step(
         if posture is not None:
             most = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -most, most)
-    v = (
-        gain * e
-        if feed_forward is None
-        else torch.where(fine, feed_forward + gain * e, 0.0)
-    )
+    if feed_forward is None:
+        v = gain * e
+    else:
+        v = torch.where(fine, feed_forward + gain * e, 0.0)
     bounds = settings.step_bounds(q, seconds, before)
     if limits is None:
         step = limited_step(settings, J, v, posture, *bounds)
@@ -259,9 +258,10 @@ def _with_plane(
         return J, v
     stiff = IK_BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
     rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
-    aside = (
-        torch.zeros_like(rows[..., 0]) if posture is None else apply_rows(rows, posture)
-    )
+    if posture is None:
+        aside = torch.zeros_like(rows[..., 0])
+    else:
+        aside = apply_rows(rows, posture)
     return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
 
 

@@ -270,6 +270,6 @@ def _tally(status: np.ndarray | Tensor) -> str:
 def _errors(error: np.ndarray | Tensor) -> str:
     finite = as_array(error)[np.isfinite(as_array(error))]
     mean_and_max = "error mean {:.3g} m, max {:.3g} m".format
-    return (
-        mean_and_max(finite.mean(), finite.max()) if finite.size else "no error known"
-    )
+    if finite.size:
+        return mean_and_max(finite.mean(), finite.max())
+    return "no error known"

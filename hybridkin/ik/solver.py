@@ -253,11 +253,10 @@ class InverseKinematics:
             `ddq_max` it brakes first); outside the limits its known actuators return to them.
         """
         core = core_of(self.settings)
-        result = (
-            None
-            if core is None or dq is not None
-            else core.step(q, x_target, dx, x_measured)
-        )
+        if core is None or dq is not None:
+            result = None
+        else:
+            result = core.step(q, x_target, dx, x_measured)
         if result is None:
             return self._steps(core, q, x_target, dx, x_measured, dq)
         step = object.__new__(Step)  # its constructor takes longer than the step
@@ -297,7 +296,9 @@ class InverseKinematics:
         x, J = settings.evaluate(rows)
         known_tip = x if measured is None else measured
         e = task.difference(known_tip, target)
-        step = control_step(settings, rows, J, e, feed_forward, last=before, tip=known_tip)
+        step = control_step(
+            settings, rows, J, e, feed_forward, last=before, tip=known_tip
+        )
         parts = (
             step.dq,
             x,
@@ -377,11 +378,10 @@ class InverseKinematics:
         target = settings.points(x_target, "x_target")
         for message in settings.far_messages(target, "x_target"):
             warnings.warn(message, stacklevel=3)
-        q = (
-            settings.start(target)
-            if q0 is None
-            else settings.configurations(q0, "q0", target)
-        )
+        if q0 is None:
+            q = settings.start(target)
+        else:
+            q = settings.configurations(q0, "q0", target)
         target = target.to(q.dtype)
         lead = leading([(q, 1), (target, axes)])
         q = rows_of(q, lead)
@@ -389,11 +389,10 @@ class InverseKinematics:
         q = torch.where(
             torch.isfinite(q), q, torch.nan
         )  # limits must not make it finite
-        core = (
-            core_of(settings, search=True)
-            if as_numpy and q.dtype == torch.float64
-            else None
-        )
+        if as_numpy and q.dtype == torch.float64:
+            core = core_of(settings, search=True)
+        else:
+            core = None
         search = Search(settings, tolerance, max_iter)
         if core is not None:
             search = core.search(tolerance, max_iter)
@@ -544,9 +543,9 @@ class InverseKinematics:
             if score(tracks[-1]) == (len(target), len(target)):
                 break
         best = max(tracks, key=score)  # of equal tracks the first
-        return (
-            self._followed(best.q[0], *way, *loop, as_numpy, progress) if dry else best
-        )
+        if dry:
+            return self._followed(best.q[0], *way, *loop, as_numpy, progress)
+        return best
 
     def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""

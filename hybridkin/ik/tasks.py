@@ -130,11 +130,9 @@ class Task:
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies inside the domains of all models, shape (N,)."""
-        return (
-            self.domain_distance(q) <= 1.0
-            if len(q) > 0
-            else q.new_ones(0, dtype=torch.bool)
-        )
+        if len(q) > 0:
+            return self.domain_distance(q) <= 1.0
+        return q.new_ones(0, dtype=torch.bool)
 
 
 class PositionTask(Task):
@@ -340,11 +338,10 @@ class PointsTask(Task):
             )
         self.models = tuple(chain.with_tip(number(a, "at")) for a in at)
         n = len(at)
-        self.units = (
-            (1.0,) * n
-            if weights is None
-            else tuple(number(w, "weights") for w in weights)
-        )
+        if weights is None:
+            self.units = (1.0,) * n
+        else:
+            self.units = tuple(number(w, "weights") for w in weights)
         if (
             n == 0
             or len(self.units) != n

@@ -180,9 +180,10 @@ class Tracker(Portable):
         if core is not None and self._as_numpy and q.dtype == torch.float64:
             robot = Follower(core, self._memory)
         else:
-            reason = (
-                "`q0` is no float64 array of NumPy" if core else why_torch(settings)
-            )
+            if core:
+                reason = "`q0` is no float64 array of NumPy"
+            else:
+                reason = why_torch(settings)
             robot = _InTorch(settings, self._memory, self._as_numpy, reason)
         robot.start(q[None], dq[None])
         self._estimator = task.estimator

@@ -295,9 +295,12 @@ def from_csv(
         raise ValueError(
             f"`path` must be a CSV file of points, {path} is not text."
         ) from error
-    columns, need = (
-        (4, "t, x, y, z") if dt is None else (3, "x, y, z, because `dt` is given")
-    )
+    if dt is None:
+        columns = 4
+        need = "t, x, y, z"
+    else:
+        columns = 3
+        need = "x, y, z, because `dt` is given"
     named = bool(rows) and not re.match(
         r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE
     )
@@ -337,7 +340,9 @@ def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     direction = _checked(normal, "normal", _POINT, (3,))
     if not direction.any():
         raise ValueError("`normal` must not be zero; it is the normal of the plane.")
-    along = direction / np.abs(direction).max()  # squares neither overflow nor underflow
+    along = (
+        direction / np.abs(direction).max()
+    )  # squares neither overflow nor underflow
     along = along / np.linalg.norm(along)
     axis = np.eye(3)[0 if abs(along[0]) < 1.0 - 1e-9 else 1]
     across = axis - (axis @ along) * along

@@ -341,7 +341,8 @@ class ELMRegressor(FittedNetwork):
         shape, other_shape = (m.module_.output_weights.shape for m in (self, other))
         if shape != other_shape:
             raise ValueError(
-                f"`other` must have output_weights_ of shape {tuple(shape)}, got {tuple(other_shape)}; "
+                f"`other` must have output_weights_ of shape {tuple(shape)}, got "
+                f"{tuple(other_shape)}; "
                 f"fit both models with the same `direct_link` and the same columns of `y`."
             )
         return self._solve(merge(self._stats, other._stats), self.module_)

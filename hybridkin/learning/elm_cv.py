@@ -194,11 +194,10 @@ class ELMRegressorCV(FittedNetwork):
         if groups is not None:
             groups = labels(groups, len(X))
         # Listed splits are used as given, even if equal rows fall into different splits.
-        apart = (
-            np.arange(len(X))
-            if isinstance(self.cv, (Iterable, PredefinedSplit))
-            else groups
-        )
+        if isinstance(self.cv, (Iterable, PredefinedSplit)):
+            apart = np.arange(len(X))
+        else:
+            apart = groups
         first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
         X = X[first]
         y = y[first]
@@ -311,11 +310,10 @@ def _candidate(params, relevance, task):
     stats = gather(None, elm, X, targets, sample_weight, candidate.block_size)
     left_out = LeftOut(elm, stats, X, targets, weights, candidate.fit_intercept)
     largest = left_out.eigenvalues[-1] or 1.0
-    alphas = (
-        _AUTO_ALPHAS * largest
-        if isinstance(alphas, str)
-        else _positive(alphas, "alphas")
-    )
+    if isinstance(alphas, str):
+        alphas = _AUTO_ALPHAS * largest
+    else:
+        alphas = _positive(alphas, "alphas")
     total = np.zeros((len(alphas), targets.shape[1]))
     weight = 0.0
     for rows, errors in _errors(left_out, splits, alphas):
@@ -328,9 +326,9 @@ def _candidate(params, relevance, task):
 
 def _errors(left_out, splits, alphas):
     """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
-    return (
-        left_out.alone(alphas) if splits is None else left_out.together(splits, alphas)
-    )
+    if splits is None:
+        return left_out.alone(alphas)
+    return left_out.together(splits, alphas)
 
 
 def _left_out_errors(best, task):
@@ -413,10 +411,9 @@ def _positive(values, name, integer=False):
     kind = np.integer if integer else np.number
     fits = array.ndim == 1 and array.size and np.issubdtype(array.dtype, kind)
     if not fits or not (np.isfinite(array) & (array > 1.0 / LARGEST)).all():
-        need = (
-            "positive integers"
-            if integer
-            else f"positive numbers, over {1.0 / LARGEST:g}"
-        )
+        if integer:
+            need = "positive integers"
+        else:
+            need = f"positive numbers, over {1.0 / LARGEST:g}"
         raise ValueError(f"`{name}` must be one or more {need}, got {values!r}.")
     return array

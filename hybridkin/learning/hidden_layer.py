@@ -49,9 +49,10 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
     good = _is_finite(y, 1) or _is_finite(y, 2)
     checks = {"multi_output": True, "y_numeric": True}
     X, y = _validated(estimator, X, y, good=good, reset=reset, **checks)
-    weights = (
-        None if sample_weight is None else np.asarray(sample_weight, dtype=np.float64)
-    )
+    if sample_weight is None:
+        weights = None
+    else:
+        weights = np.asarray(sample_weight, dtype=np.float64)
     if weights is not None:
         good = (
             _is_finite(weights, 1) and len(weights) == len(X) and weights.min() >= 0.0

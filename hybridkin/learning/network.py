@@ -180,11 +180,10 @@ class ELM(LeverageModule):
         u = (q - self.input_center.to(q)) / self.input_scale.to(q)
         W = self.input_weights.to(q)
         b = self.input_bias.to(q)
-        a = (
-            nn.functional.linear(u, W, b)
-            if out is None
-            else torch.addmm(b, u, W.T, out=out)
-        )
+        if out is None:
+            a = nn.functional.linear(u, W, b)
+        else:
+            a = torch.addmm(b, u, W.T, out=out)
         return u, a, ACTIVATIONS[self.activation][0](a, out=out)
 
     def _write_features(self, q, out):

@@ -29,7 +29,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
 
 
-def error_module(regressor: Any, q: Tensor) -> ForwardModel:
+def error_module(regressor: object, q: Tensor) -> ForwardModel:
     """Return a fitted regressor as a forward model q (..., n) -> (..., m).
 
     Parameters
@@ -43,11 +43,10 @@ def error_module(regressor: Any, q: Tensor) -> ForwardModel:
     """
     if isinstance(getattr(regressor, "module_", None), nn.Module):
         return as_forward_model(regressor)
-    steps = (
-        [*regressor.named_steps.values()]
-        if isinstance(regressor, Pipeline)
-        else [regressor]
-    )
+    if isinstance(regressor, Pipeline):
+        steps = [*regressor.named_steps.values()]
+    else:
+        steps = [regressor]
     center = np.zeros(q.shape[1])
     scale = np.ones(q.shape[1])
     while len(steps) > 1 and (found := _affine(steps[0])) is not None:

@@ -60,7 +60,7 @@ class _Controller(Protocol):
     settings: Any
 
     def stored(self) -> Stored: ...
-    def tracker(self, q0: Any, *, memory: float | None = None) -> Any: ...
+    def tracker(self, q0: object, *, memory: float | None = None) -> Any: ...
 
 
 def export_c(
@@ -118,9 +118,10 @@ def export_c(
         )
     controller = model if isinstance(model, _Controller) else None
     # The model of a task: of several markers it is the one that is steered.
-    module = (
-        controller.settings.task.models[0] if controller else as_forward_model(model)
-    )
+    if controller:
+        module = controller.settings.task.models[0]
+    else:
+        module = as_forward_model(model)
     try:
         plan = Plan((controller or module).stored())
         if controller and plan.n_outputs > 3:

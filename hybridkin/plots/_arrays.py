@@ -21,7 +21,7 @@ def plain(value: Any, name: str = "array") -> NDArray:
 
 
 def shaped(
-    value: Any, name: str, need: Sequence[int | str], length: int | None = None
+    value: object, name: str, need: Sequence[int | str], length: int | None = None
 ) -> NDArray[np.float64]:
     """Return numbers of a checked shape as a new float array; infinite ones become NaN."""
     return arrays.shaped(plain(value, name), name, need, length)

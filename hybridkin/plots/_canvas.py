@@ -81,7 +81,8 @@ class Display:
     """Base class of all displays, which remember their last axes."""
 
     def _drawn(self, ax: Axes) -> Self:
-        self.ax_, self.figure_ = ax, ax.figure
+        self.ax_ = ax
+        self.figure_ = ax.figure
         return self
 
 
@@ -136,7 +137,8 @@ def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """
     colors = [model_color(name, "") for name in names]
     left = itertools.cycle([color for color in COLORS if color not in colors] or COLORS)
-    looks, counts = [], Counter[str]()
+    looks = []
+    counts = Counter[str]()
     for color in (color or next(left) for color in colors):
         first = next((style for _, of, style in _MODELS if of == color), "-")
         style = STYLES[(STYLES.index(first) + counts[color]) % len(STYLES)]
@@ -174,7 +176,8 @@ def label_space(ax: Any, unit: str) -> None:
     """Label the axes of space and scale them equally, none too short, on white panes."""
     ax.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
     low, high = np.array([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]).T
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    middle = 0.5 * (low + high)
+    half = 0.5 * (high - low)
     half = half.clip(min=0.25 * half.max())
     ax.set(
         **{

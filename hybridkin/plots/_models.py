@@ -24,7 +24,7 @@ _REACHED = 1e-6  # largest distance of a drawn tip from its place [m]
 class Predictor(Protocol):
     """A fitted estimator."""
 
-    def predict(self, X: Any, /) -> Any: ...
+    def predict(self, X: object, /) -> Any: ...
 
 
 Model: TypeAlias = Predictor | torch.nn.Module

@@ -48,7 +48,8 @@ class Stage:
     """Axes that show one frame of a scene after another."""
 
     def __init__(self, scene: Scene, ax: Any, error_ax: Axes | None = None) -> None:
-        self.scene, self.title_ax = scene, ax if error_ax is None else error_ax
+        self.scene = scene
+        self.title_ax = ax if error_ax is None else error_ax
         for name, low, high in zip("xyz", scene.low, scene.high, strict=True):
             ax.set(**{f"{name}lim": (low, high)})
         label_space(ax, scene.unit)
@@ -77,7 +78,8 @@ class Stage:
 
     def show(self, k: int) -> None:
         """Move everything to frame k."""
-        scene, row = self.scene, self.scene.rows[k]
+        scene = self.scene
+        row = self.scene.rows[k]
         self.trail.set_data_3d(*scene.x[: row + 1].T)
         for artist, line in self.moving:
             artist.set_data_3d(*line.points[k].T)

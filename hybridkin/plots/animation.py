@@ -102,10 +102,8 @@ class TrackAnimation(Display):
         self.error = None if self.target is None else distance(self.x, self.target)
         self.error_name = "error"
         if expected is not None:
-            self.error, self.error_name = (
-                shaped(expected, "expected", "T", T),
-                "expected error",
-            )
+            self.error = shaped(expected, "expected", "T", T)
+            self.error_name = "expected error"
         self.t = times(t, T)
         shown = np.arange(T) if rows is None else shaped(rows, "rows", "K")
         K = len(shown)
@@ -119,7 +117,8 @@ class TrackAnimation(Display):
             raise ValueError(
                 f"`body` must hold {K} configurations, got {len(body.points)}."
             )
-        self.body, self.name = body, str(name)
+        self.body = body
+        self.name = str(name)
 
     @classmethod
     def from_estimator(
@@ -171,10 +170,8 @@ class TrackAnimation(Display):
         rows = _evenly(times(t, len(q)), len(q), n_frames)
         ends = None if tips is None else shaped(tips, "tips", "T3", len(q))[rows]
         body = BackboneDisplay.from_estimator(model, q[rows], tips=ends, names=names)
-        name, x = (
-            "tip (model)" if x is None else "tip (measured)",
-            tips if x is None else x,
-        )
+        name = "tip (model)" if x is None else "tip (measured)"
+        x = tips if x is None else x
         if x is None:
             finite = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
@@ -210,7 +207,8 @@ class TrackAnimation(Display):
         TrackAnimation
             Itself, drawn.
         """
-        space, K = space_or_new(ax), len(self.rows)
+        space = space_or_new(ax)
+        K = len(self.rows)
         Stage(self._scene(unit), space).show(whole(frame, "frame", -K, K - 1) % K)
         return self._drawn(space)
 
@@ -265,12 +263,14 @@ class TrackAnimation(Display):
             )
         if not 0.0 < speed < np.inf:
             raise ValueError(f"`speed` must be positive, got {speed!r}.")
-        scene, fps = self._scene(unit), speed * self.fps
+        scene = self._scene(unit)
+        fps = speed * self.fps
         if kind == ".html":
             text = page(scene, fps, view, progress)
             write_file(path, lambda staging: staging.write_text(text, encoding="utf-8"))
             return path
-        writer, figure = _writer(kind, fps), Figure(figsize=_SIZE, layout="constrained")
+        writer = _writer(kind, fps)
+        figure = Figure(figsize=_SIZE, layout="constrained")
         grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
         ax = figure.add_subplot(
             grid[:] if self.error is None else grid[0], projection="3d"
@@ -321,7 +321,8 @@ class TrackAnimation(Display):
         finite = everything[np.isfinite(everything).all(axis=1)]
         if len(finite) == 0:
             raise ValueError("`x` must hold at least one known tip; all rows are NaN.")
-        low, high = finite.min(axis=0), finite.max(axis=0)
+        low = finite.min(axis=0)
+        high = finite.max(axis=0)
         margin = 0.04 * float((high - low).max()) or 1e-3
         return low - margin, high + margin
 
@@ -331,15 +332,14 @@ class TrackAnimation(Display):
         when = f"step {row}" if self.t is None else f"t = {self.t[row]:.2f} s"
         if self.error is None:
             return when
-        error, places = (
-            scale_of(unit) * self.error[row],
-            decimals(scale_of(unit) * self.error),
-        )
+        error = scale_of(unit) * self.error[row]
+        places = decimals(scale_of(unit) * self.error)
         shown = f"{error:.{places}f} {unit}" if np.isfinite(error) else "not known"
         return f"{when}, {self.error_name} {shown}"
 
     def _scene(self, unit: str) -> Scene:
-        scale, (low, high) = scale_of(unit), self.limits()
+        scale = scale_of(unit)
+        (low, high) = self.limits()
         steps, when = steps_of(self.t, len(self.x))
         return Scene(
             unit=unit,

@@ -83,7 +83,7 @@ class LearningCurveDisplay(Display):
         *,
         groups: ArrayLike | None = None,
         sizes: Iterable[int] | None = None,
-        cv: Any = 5,
+        cv: object = 5,
         random_state: int | np.random.RandomState | None = None,
     ) -> Self:
         """Return the curves of models fitted to more and more rows of a log.
@@ -177,12 +177,15 @@ class LearningCurveDisplay(Display):
         LearningCurveDisplay
             Itself, drawn.
         """
-        scale, ax, looks = scale_of(unit), axes_or_new(ax), looks_of(self.errors)
+        scale = scale_of(unit)
+        ax = axes_or_new(ax)
+        looks = looks_of(self.errors)
         for i, (name, errors) in enumerate(self.errors.items()):
             style = (looks[i]["color"], MARKERS[i % 8] + looks[i]["linestyle"])
             color, form = (styles or {}).get(name, style)
             finite = np.isfinite(errors).any(axis=1)
-            sizes, values = self.sizes[finite], scale * errors[finite]
+            sizes = self.sizes[finite]
+            values = scale * errors[finite]
             ax.plot(
                 sizes,
                 np.nanmean(values, axis=1),
@@ -192,7 +195,8 @@ class LearningCurveDisplay(Display):
                 label=name,
             )
             if values.shape[1] > 1:
-                low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
+                low = np.nanmin(values, axis=1)
+                high = np.nanmax(values, axis=1)
                 ax.fill_between(
                     sizes, low, high, color=color, alpha=0.15, linewidth=0.0
                 )

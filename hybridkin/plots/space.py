@@ -212,9 +212,10 @@ class BackboneDisplay(Display):
         self.actuators = tuple(
             shaped(path, "actuators", "KP3", K) for path in actuators
         )
-        self.segments = (
-            (0,) * len(self.actuators) if segments is None else tuple(segments)
-        )
+        if segments is None:
+            self.segments = (0,) * len(self.actuators)
+        else:
+            self.segments = tuple(segments)
         n = len(self.actuators)
         if len(self.segments) != n:
             raise ValueError(f"`segments` must hold {n} numbers, one per actuator.")
@@ -225,12 +226,14 @@ class BackboneDisplay(Display):
             )
         self.disks = None if disks is None else shaped(disks, "disks", "KDC3", K)
         self.frames = None if frames is None else shaped(frames, "frames", "KF44", K)
-        self.tips = (
-            self.points[:, -1] if tips is None else shaped(tips, "tips", "K3", K)
-        )
-        self.predicted = (
-            None if predicted is None else shaped(predicted, "predicted", "K3", K)
-        )
+        if tips is None:
+            self.tips = self.points[:, -1]
+        else:
+            self.tips = shaped(tips, "tips", "K3", K)
+        if predicted is None:
+            self.predicted = None
+        else:
+            self.predicted = shaped(predicted, "predicted", "K3", K)
         self.rigid = rigid
 
     @classmethod

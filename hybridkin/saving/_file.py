@@ -30,7 +30,8 @@ from hybridkin._core.stored import Stored
 
 FORMAT = "hybridkin-model"
 VERSION = 3
-_HEADER, _CHECKSUM = "hybridkin", "sha256"
+_HEADER = "hybridkin"
+_CHECKSUM = "sha256"
 _UNREADABLE = (
     SafetensorError,
     AttributeError,

@@ -91,7 +91,8 @@ def save_model(
     header: dict[str, Any] = {"versions": versions, "created": created}
     results: dict[str, Any] = {}
     if isinstance(model, HybridForwardModel):
-        stored, results = stored_hybrid(model), training_of(model)
+        stored = stored_hybrid(model)
+        results = training_of(model)
         header["units"] = _units(model.mechanical_model_, model.output)
         header["domain"] = _domain(model)
     elif isinstance(model, Model):

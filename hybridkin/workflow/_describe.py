@@ -129,9 +129,10 @@ def _write_geometry(report: Report, geometry: dict[str, Any] | None) -> None:
     report.text(f"Mechanical model: {geometry['kind']}{''.join(parts)}.")
     rows = []
     for k, entry in enumerate(geometry.get("segments", [])):
-        length = (
-            "extensible" if entry["length"] is None else f"{1e3 * entry['length']:.2f}"
-        )
+        if entry["length"] is None:
+            length = "extensible"
+        else:
+            length = f"{1e3 * entry['length']:.2f}"
         cells = [
             f"{k + 1}",
             f"{1e3 * entry['radius']:.3f}",
@@ -199,11 +200,10 @@ def _write_limits(
 def _write_training(report: Report, training: dict[str, Any]) -> None:
     """Add the training notes in the file; a model that was saved by hand may have few."""
     if "log" in training:
-        thinned = (
-            ""
-            if training["n_whole"] == training["rows"]
-            else f" of {training['n_whole']}"
-        )
+        if training["n_whole"] == training["rows"]:
+            thinned = ""
+        else:
+            thinned = f" of {training['n_whole']}"
         report.text(
             f"Fitted to {training['log']}: {training['rows']}{thinned} rows, "
             f"{training['n_motions']} motions. Model: {training['saved']}, {training['chosen']}. "

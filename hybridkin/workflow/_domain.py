@@ -176,19 +176,17 @@ class Domain:
     def tendons(self) -> ArcChain | None:
         """The chain if all its actuators are tendons, else None."""
         chain = self.loaded.chain
-        return (
-            chain if isinstance(chain, ArcChain) and not any(chain.extensible) else None
-        )
+        if isinstance(chain, ArcChain) and not any(chain.extensible):
+            return chain
+        return None
 
     @property
     def rest(self) -> NDArray:
         """The command (n,) at which no tendon is pulled; for other robots zero."""
         chain = self.tendons
-        return (
-            np.zeros(self.loaded.n_actuators)
-            if chain is None
-            else as_array(chain.rest.detach())
-        )
+        if chain is None:
+            return np.zeros(self.loaded.n_actuators)
+        return as_array(chain.rest.detach())
 
     @cached_property
     def sample(self) -> tuple[NDArray, NDArray]:

@@ -61,7 +61,9 @@ def write_comparison(
     report: Report, errors: dict[str, NDArray], fold: NDArray, log: MeasuredLog
 ) -> None:
     """Add the errors on held-out motions: table, figures, and the motions of largest error."""
-    n, n_whole, n_folds = len(log.q), report.record["n_whole"], int(fold.max()) + 1
+    n = len(log.q)
+    n_whole = report.record["n_whole"]
+    n_folds = int(fold.max()) + 1
     thinned = "" if n_whole == n else f" (of {n_whole}, evenly thinned)"
     report.text(
         "## Errors on held-out motions",
@@ -102,7 +104,8 @@ def write_comparison(
         for i in np.argsort(means[:, -1])[::-1][:5]
     ]
     report.table(["motion", "rows", *present], rows)
-    saved, chosen = report.record["saved"], report.record["chosen"]
+    saved = report.record["saved"]
+    chosen = report.record["chosen"]
     by_fold = "; ".join(
         choices.get(saved, "-") for choices in report.record["choices_by_fold"]
     )
@@ -228,14 +231,13 @@ def _in_words(entry: dict[str, Any]) -> list[str]:
         )
     candidates = entry["candidates"]
     # A single candidate is named even if another one has less error: a gain must be clear.
-    names = (
-        {*candidates} - {"blend"} if len(entry["weights"]) > 1 else {*entry["weights"]}
-    )
+    if len(entry["weights"]) > 1:
+        names = {*candidates} - {"blend"}
+    else:
+        names = {*entry["weights"]}
     least, alone = min((candidates[name], name) for name in names)
-    best, without = (
-        f"{1e3 * least:.2f} mm",
-        f"{1e3 * candidates['mechanical']:.2f} mm without one.",
-    )
+    best = f"{1e3 * least:.2f} mm"
+    without = f"{1e3 * candidates['mechanical']:.2f} mm without one."
     text = f"Auto chose the error model {alone}: {best} on held-out motions, {without}"
     if alone == "mechanical":
         text = f"Auto chose no error model: {best} on held-out motions; none is clearly better."

@@ -49,7 +49,8 @@ def better_place(domain: Domain, path: Trajectory, tol: float) -> str:
     center = in_millimetres(0.5 * (moved.x.min(axis=0) + moved.x.max(axis=0)))
     if share_inside == 1.0:
         return f"move its centre to {center}"
-    return f"make it smaller (--scale); with its centre at {center}, {100 * share_inside:.0f} % is inside"
+    percent = f"{100 * share_inside:.0f} % is inside"
+    return f"make it smaller (--scale); with its centre at {center}, {percent}"
 
 
 def solver(domain: Domain) -> InverseKinematics:

@@ -21,7 +21,8 @@ def check_reach(
     domain: Domain, path: Trajectory, tol: float, force: bool, progress: Progress
 ) -> None:
     """Raise if a path is in another unit or, unless `force` is set, leaves the robot's reach."""
-    limits, (commands, tips) = domain.limits, domain.sample
+    limits = domain.limits
+    (commands, tips) = domain.sample
     far, reach = (float(np.linalg.norm(x, axis=1).max()) for x in (path.x, tips))
     if far > _OTHER_UNIT * reach:
         raise ValueError(
@@ -30,7 +31,8 @@ def check_reach(
         )
     if force:
         return
-    ik, rows = solver(domain), some_rows(path)
+    ik = solver(domain)
+    rows = some_rows(path)
 
     def missed_by(scale: float, rows: NDArray) -> NDArray:
         progress("checking the reach", 0, 1)

@@ -48,7 +48,8 @@ def export_model(
     paths : list of Path
         The written files.
     """
-    report, model = Report("C code"), loaded.module
+    report = Report("C code")
+    model = loaded.module
     report.record.update(n_actuators=loaded.n_actuators, dtype=dtype, dt=dt)
     report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
     if dt is not None:

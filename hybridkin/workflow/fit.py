@@ -157,10 +157,15 @@ class _Rows(NamedTuple):
 
     def calibrated(self) -> tuple[Chain | None, CalibrationResult | None, list[str]]:
         """Return the chain before its calibration, the result, and its warnings."""
-        geometry, chain, names = self.geometry, self.robot.chain, self.robot.calibrate
-        start, messages = None, []
+        geometry = self.geometry
+        chain = self.robot.chain
+        names = self.robot.calibrate
+        start = None
+        messages = []
         if geometry is not None:
-            chain, names, start = geometry.chain, geometry.parameters, geometry.start
+            chain = geometry.chain
+            names = geometry.parameters
+            start = geometry.start
             messages = [*geometry.messages]
         if chain is None or not names:
             return chain, None, messages
@@ -262,12 +267,14 @@ def compare_by_group(
     parts = folds(log.q, log.motions, settings.n_folds)
     rows = _Rows(log.q, log.x, log.motions, robot, settings)
     if settings.play == "detect":
-        chain = (
-            None if robot.chain is None else rows.with_geometry_chosen().mechanical()
-        )
+        if robot.chain is None:
+            chain = None
+        else:
+            chain = rows.with_geometry_chosen().mechanical()
         rows = rows.with_play_detected(log, chain)
     jobs = (delayed(_one_fold)(rows.of(train), rows.of(test)) for train, test in parts)
-    fold, distance = np.empty(len(log.q), dtype=int), np.empty(len(log.q))
+    fold = np.empty(len(log.q), dtype=int)
+    distance = np.empty(len(log.q))
     comparison = Comparison({}, {}, fold, distance, [])
     most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
     most = min(effective_n_jobs(n_jobs or 1), len(parts), most)
@@ -538,9 +545,8 @@ def _chosen(model: HybridForwardModel) -> str:
 
 def _held_out(model: HybridForwardModel, module: ForwardModel, test: _Rows) -> NDArray:
     """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
-    q = (
-        test.q
-        if model.play_ is None
-        else model.play_.apply_by_group(test.q, test.groups)
-    )
+    if model.play_ is None:
+        q = test.q
+    else:
+        q = model.play_.apply_by_group(test.q, test.groups)
     return distances(evaluate(module, np.array(q, dtype=float))[0], test.x)

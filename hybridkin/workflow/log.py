@@ -28,9 +28,10 @@ class LogError(ValueError):
 
     def __init__(self, report: LogReport) -> None:
         first = report.errors[0]
-        further = (
-            f" ({len(report.errors) - 1} more above)" if len(report.errors) > 1 else ""
-        )
+        if len(report.errors) > 1:
+            further = f" ({len(report.errors) - 1} more above)"
+        else:
+            further = ""
         super().__init__(
             f"the log did not pass its check: {first.message} {first.advice}{further}"
         )
@@ -184,7 +185,9 @@ def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
 def _with_motions(
     log: Log, report: LogReport, excluded: tuple[str, ...] = ()
 ) -> MeasuredLog:
-    named, n, columns = log.groups is not None, len(log.q), dict(vars(log))
+    named = log.groups is not None
+    n = len(log.q)
+    columns = dict(vars(log))
     if not named:
         columns["groups"] = np.arange(n) * _BLOCKS // n
     return MeasuredLog(**columns, report=report, named=named, excluded=excluded)

@@ -27,7 +27,8 @@ from hybridkin.workflow._promise import Promise
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
 
-_MODEL, _ROBOT = "model.safetensors", "robot.toml"
+_MODEL = "model.safetensors"
+_ROBOT = "robot.toml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +63,10 @@ class LoadedModel:
     @property
     def chain(self) -> Chain | None:
         """The mechanical model if it is a chain, else None."""
-        mechanical = (
-            self.model if self.hybrid is None else self.hybrid.mechanical_model_
-        )
+        if self.hybrid is None:
+            mechanical = self.model
+        else:
+            mechanical = self.hybrid.mechanical_model_
         return mechanical if isinstance(mechanical, Chain) else None
 
     @property
@@ -75,11 +77,9 @@ class LoadedModel:
     @property
     def n_actuators(self) -> int:
         """Size of q."""
-        return (
-            self.module.n_actuators
-            if self.hybrid is None
-            else self.hybrid.n_features_in_
-        )
+        if self.hybrid is None:
+            return self.module.n_actuators
+        return self.hybrid.n_features_in_
 
     @property
     def trained_range(self) -> robots.Limits | None:
@@ -173,10 +173,8 @@ class LoadedModel:
             "per_distance": 0.0,
             "p95": held_out["p95"] / held_out["mean"],
         }
-        promise, far = (
-            Promise(**self._training.get("promise", constant)),
-            np.zeros(len(q)),
-        )
+        promise = Promise(**self._training.get("promise", constant))
+        far = np.zeros(len(q))
         tested = None if self.hybrid is None else self.hybrid.module_.tested
         if self.hybrid is not None and tested is not None:
             far = distances(tested, q + as_array(self.hybrid.module_.shift_of_zeros))
@@ -226,7 +224,8 @@ def play_widths(model: HybridForwardModel) -> list[float] | None:
     """Return the backlash of every actuator [m], None without."""
     if model.play_ is None:
         return None
-    chain, width = model.mechanical_model_, model.play_.width
+    chain = model.mechanical_model_
+    width = model.play_.width
     if isinstance(chain, ArcChain) and not chain.in_metres:
         width = width * as_array(chain.gains.detach().abs())
     return np.ravel(width).tolist()
@@ -275,7 +274,8 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
                 f"`model` {path} is a folder without {_MODEL}; name the file."
             )
         path = path / _MODEL
-    file, beside = path, path.with_name(_ROBOT)
+    file = path
+    beside = path.with_name(_ROBOT)
     model = load_model(file)
     if robot is None and path.name == _MODEL and beside.is_file():
         robot = beside

@@ -78,25 +78,28 @@ def next_rows(
     check_out(out, "next", ["next.csv"], force=force)
     n = whole(n, "n")
     limits = path_limits(loaded, within_fit=False) if limits is None else limits
-    domain, log = Domain(loaded, limits), loaded.log_format()
-    candidates, target, where = domain.postures(_POOL), None, "within the limits"
+    domain = Domain(loaded, limits)
+    log = loaded.log_format()
+    candidates = domain.postures(_POOL)
+    target = None
+    where = "within the limits"
     if path is not None:
         target = best_track(domain, path, _TOL, progress).q
         candidates = np.concatenate([target, candidates])
         far = distance(loaded.tips(target), path.x).max()
         where = f"along the path, which the model reaches to within {1e3 * far:.3g} mm"
-    measured_q = (
-        None if measured is None else loaded.effective(measured.q, measured.motions)
-    )
+    if measured is None:
+        measured_q = None
+    else:
+        measured_q = loaded.effective(measured.q, measured.motions)
     progress("choosing configurations", 0, 1)
     rows, errors = choose_rows(
         loaded.model, candidates, n, measured=measured_q, target=target
     )
-    sent = (
-        candidates[rows]
-        if loaded.play is None
-        else loaded.play.command(candidates[rows])[0]
-    )
+    if loaded.play is None:
+        sent = candidates[rows]
+    else:
+        sent = loaded.play.command(candidates[rows])[0]
     report = Report(f"{loaded.name}: {n} configurations to measure next")
     n_measured = 0 if measured_q is None else len(measured_q)
     report.record.update(

@@ -47,7 +47,8 @@ def read_path(
     ValueError
         If the file has no times and `dt` is not given, or is not a table of numbers.
     """
-    file, dt = as_path(path), None if dt is None else number(dt, "dt")
+    file = as_path(path)
+    dt = None if dt is None else number(dt, "dt")
     if not file.is_file():
         raise FileNotFoundError(
             f"`path` must be a CSV file of points, there is none at {file}."

@@ -325,7 +325,7 @@ def quiet(label: str, done: int, total: int) -> None:
     """Ignore progress."""
 
 
-def json_text(record: Any) -> str:
+def json_text(record: object) -> str:
     """Return a record as JSON; numbers that are not finite become null.
 
     Parameters

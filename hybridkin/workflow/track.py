@@ -143,11 +143,10 @@ def track_path(
         outside = better_place(domain, path, tol)
     _write_summary(report, loaded.plane_in_words(), outside)
     _add_path(report, loaded, track)
-    shown = (
-        {"command": sent}
-        if loaded.play is None
-        else {"command": sent, "actuator": whole.q}
-    )
+    if loaded.play is None:
+        shown = {"command": sent}
+    else:
+        shown = {"command": sent, "actuator": whole.q}
     _add_commands(report, domain, whole.t, shown, n_lead)
     statuses = [*[LEAD_IN] * n_lead, *names]
     report.file("track.csv", partial(_write_track, whole, shown, statuses, log_format))
@@ -289,10 +288,12 @@ def animate_track(
             "mechanical model."
         )
     log = read_track(path, loaded.log_format())
-    out, q = Path(out), loaded.effective(log.q)
+    out = Path(out)
+    q = loaded.effective(log.q)
     if log.groups is not None:  # the way to the path is no part of it
         on_path = log.groups != LEAD_IN
-        log, q = log.rows(on_path), q[on_path]
+        log = log.rows(on_path)
+        q = q[on_path]
     target = log.x if tuple(log.x_names) == TARGET else None
     film = TrackAnimation.from_estimator(
         loaded.chain,
