@@ -47,9 +47,8 @@ def simulated_log(n_motions=60, n_rows=25, seed=0):
         rng.random((n_motions, 1, 3, 1)) < 0.6
     )
     way = np.sin(np.linspace(0.0, np.pi, n_rows))[None, :, None, None]
-    bends = way * bends + rng.normal(
-        0.0, 0.01, (n_motions, n_rows, 3, 2)
-    )  # out and back
+    # Out and back.
+    bends = way * bends + rng.normal(0.0, 0.01, (n_motions, n_rows, 3, 2))
     towards = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=-1)
     pull = np.einsum("mrsc,sac->mrsa", np.cumsum(bends, axis=2), towards)
     q = -RADII[:, None] * pull - 0.0003

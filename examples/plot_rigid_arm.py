@@ -49,12 +49,10 @@ URDF = """
 # The log: 150 configurations. The base of the true arm is 2 cm away from the nominal one, its tool
 # is not in the URDF, and shoulder and elbow sag by up to two degrees under the weight.
 
-MASSES = torch.tensor(
-    [0.0, 0.0, 1.4, 0.0, 0.9, 0.6], dtype=torch.float64
-)  # at each joint [kg]
-COMPLIANCE = torch.tensor(
-    [0.0, 0.002, 0.003, 0.0, 0.002, 0.0], dtype=torch.float64
-)  # [rad/Nm]
+# at each joint [kg]
+MASSES = torch.tensor([0.0, 0.0, 1.4, 0.0, 0.9, 0.6], dtype=torch.float64)
+# [rad/Nm]
+COMPLIANCE = torch.tensor([0.0, 0.002, 0.003, 0.0, 0.002, 0.0], dtype=torch.float64)
 
 nominal = RigidChain.from_urdf(URDF, "flange")
 base = np.eye(4)

@@ -25,10 +25,11 @@ PAPER = {
     "data-driven, linear": 9.8,
     "data-driven, ELM": 3.4,
 }
+# Test error [cm]
 PAPER |= {
     "hybrid on nominal, linear": 1.8,
     "hybrid on nominal, ELM": 1.3,
-}  # test error [cm]
+}
 
 names = [f"{row['model']}, {row['learner']}".removesuffix(", -") for row in table]
 for name, row in zip(names, table, strict=True):

@@ -338,9 +338,8 @@ class TrunkPlant:
             state = self._follow(state, target, held, budget)
             force, gap = state[n:], target - self._forces(state)[1]
             saturated = held & (np.abs(force) > limit)
-            released = ~held & (
-                force * gap < 0
-            )  # a push if too long, or a pull if too short
+            # a push if too long, or a pull if too short.
+            released = ~held & (force * gap < 0)
             if not (saturated | released).any():
                 return state, held
             held = (held & ~saturated) | released

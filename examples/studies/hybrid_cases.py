@@ -56,9 +56,8 @@ class Case(NamedTuple):
     name: str
     draw: int
     chain: Any
-    frame: tuple[
-        str, ...
-    ]  # calibrated even in the nominal model: where the frame is unknown
+    # Calibrated even in the nominal model: where the frame is unknown.
+    frame: tuple[str, ...]
     calibrate: tuple[str, ...] | str  # of all models but auto, which chooses for itself
     q: NDArray
     x: NDArray

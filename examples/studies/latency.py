@@ -34,11 +34,12 @@ from hybridkin.plots import new_figure
 from hybridkin.workflow.report import Report
 
 LOOP = Path(__file__).parents[1] / "c" / "loop.c"
+# of the circle [m]; of a turn [ticks]; [ns]
 RADIUS, TURN, PERIOD = (
     0.01,
     2000,
     1_000_000,
-)  # of the circle [m]; of a turn [ticks]; [ns]
+)
 BINS = 100  # ten per decade, from 1 ns
 
 

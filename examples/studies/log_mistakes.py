@@ -464,9 +464,8 @@ MISTAKES: dict[str, tuple[Mistake, tuple[str, ...]]] = {
 class Outcome:
     """What was said of a log, and the mean test error [m] of what was fitted to it."""
 
-    kinds: tuple[
-        str, ...
-    ]  # of the findings, errors first; "calibration" of a fit's warning
+    # of the findings, errors first; "calibration" of a fit's warning.
+    kinds: tuple[str, ...]
     advice: str
     error: float | None
 

@@ -62,6 +62,7 @@ _STILL = 0.02  # of the rms of the direction with the largest motion
 _NEAR = (
     0.025  # largest distance of a path from a measured tip, relative to their extent
 )
+# of the path, relative to the extent of the tips.
 _SIZES = (
     0.5,
     0.4,
@@ -70,7 +71,7 @@ _SIZES = (
     0.2,
     0.15,
     0.1,
-)  # of the path, relative to the extent of the tips
+)
 _CENTRES, _NORMALS = 40, 12  # that are tried
 _DURATION, _DT = 20.0, 0.1  # of a path [s]
 _NOISE = 5e-4  # of measured tips along each axis, as in the logs [m]
@@ -580,9 +581,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             f"{n_done} of {len(seeds)} robots, {time.monotonic() - began:.0f} s",
             flush=True,
         )
-        written = tracks_report(entries).write(
-            given.out
-        )  # what there is, if it is interrupted
+        # What there is, if it is interrupted.
+        written = tracks_report(entries).write(given.out)
     print(*written, sep="\n")
 
 

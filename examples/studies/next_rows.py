@@ -264,9 +264,8 @@ def _entry(
         random_state=case.draw,
     )
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", UserWarning
-        )  # few rows; tendons that contradict each other
+        # Few rows; tendons that contradict each other.
+        warnings.simplefilter("ignore", UserWarning)
         model.fit(q, x, groups=groups)
         errors = np.linalg.norm(model.predict(test[0]) - test[1], axis=1)
     known = {

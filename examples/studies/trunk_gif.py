@@ -101,9 +101,8 @@ if __name__ == "__main__":
         (0.0, 0.0, 0.70), (0.50, 0.25), duration=DURATION, dt=PERIOD
     )
     pictures = frames(path)
-    palette = pictures[-1].quantize(
-        N_COLORS
-    )  # one of all, or the colours would flicker
+    # One of all, or the colours would flicker.
+    palette = pictures[-1].quantize(N_COLORS)
     first, *others = [
         p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures
     ]

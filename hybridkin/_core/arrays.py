@@ -211,9 +211,8 @@ def leading(pairs: Sequence[tuple[Tensor, int]]) -> tuple[int, ...]:
     """Return the common batch shape of tensors, each with its number of trailing axes."""
     shapes = [tuple(a.shape[: a.ndim - trailing]) for a, trailing in pairs]
     try:
-        return np.broadcast_shapes(
-            *shapes
-        )  # torch's version takes half a second to import
+        # Torch's version takes half a second to import.
+        return np.broadcast_shapes(*shapes)
     except ValueError as error:
         need = "configurations (`q`) and targets (`x_target`) must agree in their batch shapes"
         raise ValueError(f"{need}, got {shapes}.") from error

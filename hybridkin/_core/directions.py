@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 _EXCITED = 0.01  # of the largest spread
-_ROUNDING = (
-    4.0 * np.finfo(np.float64).eps
-)  # of the largest value: a range below it is none
+# of the largest value: a range below it is none.
+_ROUNDING = 4.0 * np.finfo(np.float64).eps
 _POINT = 1e-6  # of the largest value: the range of rows of a single configuration
 _COUNTS = 1e-4  # of a step: numbers this close to multiples of a step are whole counts
 _AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished from it
@@ -86,9 +85,8 @@ def few_terms(directions: NDArray) -> NDArray:
         solution = linprog(
             cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)
         ).x
-        a = (
-            held if solution is None else solution[:K]
-        )  # if it fails, the nearest vector
+        # if it fails, the nearest vector.
+        a = held if solution is None else solution[:K]
         return a / np.linalg.norm(a)
 
     columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]

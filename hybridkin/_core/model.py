@@ -88,9 +88,8 @@ class PortableModule(Portable, nn.Module):
     A class that sets `layout` can be saved to files and compiled.
     """
 
-    layout: ClassVar[Layout] = Layout(
-        "", {}
-    )  # no kind: it could only be stored as code
+    # no kind: it could only be stored as code.
+    layout: ClassVar[Layout] = Layout("", {})
 
     def stored(self) -> Stored:
         """Return the description of the module: kind, settings, arrays and parts.

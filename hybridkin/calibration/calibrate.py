@@ -362,9 +362,8 @@ def _result(
     pieces = (problem.parts(part) for part in (std, std < _IDENTIFIED * prior_std))
     for part, error, identified in zip(problem.parameters, *pieces, strict=True):
         value = part.value(geometry[part.entry])
-        error = np.asarray(
-            part.std_errors(error, value.numpy())
-        )  # for one gain a plain number
+        # For one gain a plain number.
+        error = np.asarray(part.std_errors(error, value.numpy()))
         values[part.name] = value if torch_given else value.numpy()
         std_errors[part.name] = torch.from_numpy(error) if torch_given else error
         identifiable[part.name] = np.asarray(part.flags(identified))

@@ -34,12 +34,13 @@ _CLEARLY = 0.7
 _WORSE = (
     1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
 )
+# Also from few rows.
 _USUAL = (
     "nothing",
     "base",
     "radii + base",
     "radii + base + gain",
-)  # also from few rows
+)
 _EQUAL = 0.007  # of the score: within it the smaller set is taken
 _ALIKE = 0.01  # of the error: within it the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal

@@ -155,9 +155,8 @@ def fit_play(
                 tips = result.chain(
                     torch.from_numpy(y[test]).to(result.chain.base)
                 ).numpy()
-            squares.append(
-                np.nansum((tips - x[test]) ** 2) / len(test)
-            )  # NaN: missing markers
+            # NaN: missing markers.
+            squares.append(np.nansum((tips - x[test]) ** 2) / len(test))
         return np.sqrt(squares)
 
     def root_mean_square(errors: NDArray) -> float:

@@ -229,9 +229,8 @@ def _mjcf_joints(model: Any, body: int) -> list[Joint]:
 
 
 def _mjcf_pose(position: NDArray, quaternion: NDArray) -> NDArray:
-    return matrix_of(
-        Rotation.from_quat(np.roll(quaternion, -1)), position
-    )  # w comes first
+    # w comes first.
+    return matrix_of(Rotation.from_quat(np.roll(quaternion, -1)), position)
 
 
 def matrix_of(turn: Rotation | None = None, position: ArrayLike = 0.0) -> NDArray:
@@ -262,8 +261,7 @@ def chain_path(chain: Chain) -> list[Joint]:
         else:
             joint_name = joint.name
         axis = joint.axis.detach().cpu().double().numpy()
-        limits = (
-            joint.limits if any(joint.limits or ()) else None
-        )  # two zeros mean none
+        # Two zeros mean none.
+        limits = joint.limits if any(joint.limits or ()) else None
         path.append(Joint(origin, joint.joint_type, axis, joint_name, limits))
     return path

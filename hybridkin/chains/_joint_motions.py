@@ -246,9 +246,8 @@ class JointChain(Chain):
             *q.shape[:-1], 6, self.n_actuators
         )
         turned = (self.tip.to(q)[:, :3].T @ frame.flatten(1)).unflatten(1, (3, -1))
-        local = torch.cat([turned, tip[None]]).permute(
-            2, 1, 0
-        )  # (N, 3, 4): axes and tip
+        # (N, 3, 4): axes and tip.
+        local = torch.cat([turned, tip[None]]).permute(2, 1, 0)
         last = identity(4, q)[3].expand(len(local), 1, 4)
         pose = (self.base.to(q) @ torch.cat([local, last], 1)).reshape(
             *q.shape[:-1], 4, 4
@@ -358,9 +357,8 @@ class JointChain(Chain):
         columns = torch.linalg.cross(axes, tip - points, dim=1)
         if "prismatic" in self.kinds:
             slides = self.slides.to(z.device)[:, None, None]
-            columns = torch.where(
-                slides, axes + (tip - tip), columns
-            )  # NaN in a row of NaN
+            # NaN in a row of NaN.
+            columns = torch.where(slides, axes + (tip - tip), columns)
         return tip, columns, axes, frame
 
     def _in_measuring_frame(self, columns: Tensor, q: Tensor) -> Tensor:

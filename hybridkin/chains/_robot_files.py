@@ -211,9 +211,8 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     if "rotation" in stages[1:]:
         raise ValueError('`stage` "rotation" is only allowed in the first [[segment]].')
     arguments |= {"stage": "rotation"} if stages[0] == "rotation" else {}
-    any_radius = next(
-        filter(None, arguments["radii"]), 1.0
-    )  # for stages it has no effect
+    # For stages it has no effect.
+    any_radius = next(filter(None, arguments["radii"]), 1.0)
     arguments["radii"] = [radius or any_radius for radius in arguments["radii"]]
     if elastic:
         return ElasticTendonChain(**arguments)

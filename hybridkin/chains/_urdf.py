@@ -219,9 +219,8 @@ def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
             raise ValueError(
                 f"joint {followed[0]!r} must mimic via at most {_MOST} other joints."
             )
-        driver = by_name.get(name) or defaultdict(
-            _Tag, joint=_Tag(type=kind)
-        )  # not in the file
+        # Not in the file.
+        driver = by_name.get(name) or defaultdict(_Tag, joint=_Tag(type=kind))
     driven_by = driver["joint"].get("type", "")
     if not {kind, driven_by} <= {*_ONE_AXIS, "fixed"}:
         kinds = (*_ONE_AXIS, "fixed", *_FREE)
@@ -309,7 +308,6 @@ def _origin_tag(placed: NDArray) -> bytes:
     pitch = math.atan2(-c[0], cosine * a[0] + sine * b[0])
     roll = math.atan2(sine * a[2] - cosine * b[2], cosine * b[1] - sine * a[1])
     rows = position, (roll, pitch, yaw)
-    xyz, rpy = (
-        " ".join(repr(float(number) + 0.0) for number in row) for row in rows
-    )  # no -0.0
+    # no -0.0.
+    xyz, rpy = (" ".join(repr(float(number) + 0.0) for number in row) for row in rows)
     return f'<origin xyz="{xyz}" rpy="{rpy}"'.encode()

@@ -146,10 +146,11 @@ class ElasticTendonChain(ArcChain):
         STRUCTURE,
         write_plan=_write_plan,
     )
+    # The table is checked against the geometry.
     _structure = (
         *ArcChain._structure,
         "_table",
-    )  # the table is checked against the geometry
+    )
 
     def __init__(
         self,

@@ -84,9 +84,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         print(text, flush=True)
     except OSError as error:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # for the flush at exit
+        # For the flush at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(
             error, BrokenPipeError
         ):  # `head`, for example, has what it wants

@@ -39,6 +39,7 @@ _GOOD = 0.55  # missed motion of another reading
 _ENOUGH = 0.85  # explained share of the variance
 _TWIST = 120.0  # [deg] least rotation of a base about its axis
 _TILT = 45.0  # [deg] largest tilt of a base
+# Factors on all bends that are tried.
 _BENDS = (
     0.25,
     0.4,
@@ -48,7 +49,8 @@ _BENDS = (
     2.0,
     2.5,
     4.0,
-)  # factors on all bends that are tried
+)
+# Offsets, in standard deviations.
 _SHIFTS = (
     -2.0,
     -1.0,
@@ -58,7 +60,7 @@ _SHIFTS = (
     0.5,
     1.0,
     2.0,
-)  # offsets, in standard deviations
+)
 _SHIFTED = 0.87  # relative missed motion; for clean logs, simulated and real, it was above 0.89
 _SIMPLE = 1.1  # an earlier change in the list is chosen if it is nearly as good
 _ADVICE = {

@@ -29,6 +29,7 @@ from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
 
 _DELIMITERS = (",", ";", "\t")
+# a missing name of a motion, as text.
 _UNNAMED = (
     "",
     "nan",
@@ -36,11 +37,12 @@ _UNNAMED = (
     "NaT",
     "None",
     "<NA>",
-)  # a missing name of a motion, as text
+)
+# Columns of a file; characters of a motion's name.
 _MOST_COLUMNS, _LONGEST = (
     10_000,
     256,
-)  # columns of a file; characters of a motion's name
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

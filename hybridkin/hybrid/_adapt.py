@@ -25,9 +25,8 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import evaluate
 
 PARAMETERS = ("base", "actuator_zeros")
-_SCALES = 10.0 ** np.arange(
-    -3.0, 0.6, 0.5
-)  # prior standard deviations, in natural units
+# Prior standard deviations, in natural units.
+_SCALES = 10.0 ** np.arange(-3.0, 0.6, 0.5)
 _COMMON = 0.5  # share of the variance of a row that its whole group shares
 _ROUNDS, _CHOOSING = 30, 6  # Gauss-Newton rounds; the first ones also choose the scales
 _SETTLED = 1e-9

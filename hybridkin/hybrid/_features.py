@@ -222,9 +222,8 @@ class PoseFeatures(Features):
         C = len(weights)
         at_base, *forces = weights.split([3, *(len(part) for part in vectors)], dim=1)
         value = at_base @ lever
-        pulls = [
-            at_base[:, :, None]
-        ]  # forces on the end, from the frames before a segment
+        # Forces on the end, from the frames before a segment.
+        pulls = [at_base[:, :, None]]
         turns = []  # moments, from the frames after a segment
         for force, part in zip(forces, vectors, strict=True):
             value = value + force @ part

@@ -31,10 +31,11 @@ _ROWS = 128  # number of rows that represent the training rows
 _BLOCK = 4096  # training rows whose distances are computed at once
 _TESTED = 0.98  # share of these rows whose distances from other groups count as tested
 _STEP = 0.2  # least tested distance, and the domain without data; the range of an actuator is 2
+# Domain off the plane of a log: in this unit, and in its rms there.
 _OFF, _AS_LOGGED = (
     0.02,
     3.0,
-)  # domain off the plane of a log: in this unit, and in its rms there
+)
 
 
 class Guard(PortableModule):
@@ -64,9 +65,8 @@ class Guard(PortableModule):
     def forward(self, q: Tensor) -> Tensor:
         """Return g(q), shape (..., 1)."""
         excess = (self.domain_distance(q) / self.FULL - 1.0).clamp(min=0.0)
-        return (1.0 / (1.0 + excess**3)).nan_to_num()[
-            ..., None
-        ]  # 0 where the distance overflows
+        # 0 where the distance overflows.
+        return (1.0 / (1.0 + excess**3)).nan_to_num()[..., None]
 
     def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return g(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
@@ -363,9 +363,8 @@ class GroupDistance(PortableModule):
         # Each added row is the farthest from the rows before.
         picked = [y.square().sum(1).argmax()]
         gap = y.new_full((len(y),), torch.inf)
-        step = torch.empty_like(
-            y
-        )  # reused: allocating it each time costs more than the sums
+        # Reused: allocating it each time costs more than the sums.
+        step = torch.empty_like(y)
         while True:
             torch.sub(y, y[picked[-1]], out=step)
             gap = torch.minimum(gap, step.square_().sum(1))

@@ -11,11 +11,12 @@ from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
+# Their errors are those of held-out rows.
 _HELD_OUT = (
     ReadoutFit,
     ELMRegressor,
     ELMRegressorCV,
-)  # their errors are those of held-out rows
+)
 
 
 def fitted_rows(model: Any) -> dict[str, object]:

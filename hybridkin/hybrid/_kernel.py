@@ -20,6 +20,7 @@ _FOLDS = 5
 _FOLDS_OF_FEW = 10
 _FEW = 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
+# Divided by the mean variance of the inputs.
 _GAMMAS = (
     0.003,
     0.01,
@@ -27,7 +28,7 @@ _GAMMAS = (
     0.1,
     0.3,
     1.0,
-)  # divided by the mean variance of the inputs
+)
 
 
 def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:

@@ -203,9 +203,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X = check_inputs(self, X)
         q = self._effective(X, groups).astype(np.float64)
         if warn and isinstance(chain := self.mechanical_model_, Chain):
-            rows = torch.from_numpy(
-                q
-            )  # finite; negative lengths are extrapolation, no error
+            # Finite; negative lengths are extrapolation, no error.
+            rows = torch.from_numpy(q)
             for message in (
                 *chain.unit_messages(rows, "X"),
                 chain.contradiction(rows, "X"),

@@ -26,15 +26,15 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import Program, program_of
 
 _LARGEST = 1000  # most weights; of more features only the strongest directions are kept
+# Steps; the first ones and every tenth factorise.
 _ROUNDS, _FACTORS, _REFRESH = (
     200,
     4,
     10,
-)  # steps; the first ones and every tenth factorise
+)
 _SETTLED = 1e-9  # relative to the gradient without a correction
-_RATIOS = torch.from_numpy(
-    np.logspace(-2, 4, 25)
-)  # noise ratios, over the mean of dx/dq squared
+# Noise ratios, over the mean of dx/dq squared.
+_RATIOS = torch.from_numpy(np.logspace(-2, 4, 25))
 
 
 class ReadoutFit(NamedTuple):
@@ -102,10 +102,11 @@ def _tips(model: ForwardModel) -> _Tips:
         "offsets": offsets,
         "radii": np.ones(m),
     }
+    # q are the arcs.
     derived = {
         "arc_matrix": np.eye(3 * m),
         "arc_offset": np.zeros(3 * m),
-    }  # q are the arcs
+    }
     place = {"tip_at": float(m), "markers": [[float(m), *model.markers[-1][1:]]]}
     plan = Plan(Stored("constant_curvature", place, arrays, derived=derived))
     program = Program(plan)

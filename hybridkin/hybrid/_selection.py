@@ -33,10 +33,11 @@ _PICKS = 10  # picks of a blend; each is a weight of 0.1
 _EQUAL = 1e-8  # scores this close are equal: readouts end at 1e-9 of their gradient
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their number
+# With fewer, penalties that were chosen on all rows suit them.
 _FEW_MOTIONS, _FEW_ROWS = (
     40,
     100,
-)  # with fewer, penalties that were chosen on all rows suit them
+)
 _ANEW = 5  # folds without which penalties are then chosen once more
 
 
@@ -195,9 +196,8 @@ class _HeldOut(NamedTuple):
         total = np.zeros_like(y)
         for k in range(1, _PICKS + 1):
             means = [weights @ distance((total + x) / k, y) for x in predicted]
-            best = int(
-                np.argmax(means <= (1.0 + _EQUAL) * np.min(means))
-            )  # the first of equals
+            # The first of equals.
+            best = int(np.argmax(means <= (1.0 + _EQUAL) * np.min(means)))
             picks[best] += 1
             total += predicted[best]
         return picks / _PICKS

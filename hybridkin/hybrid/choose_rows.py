@@ -26,15 +26,17 @@ _OTHER = 0.0165
 _SHIFT = 0.033
 _TURN = 0.1
 _NOISE = 0.0055
+# Parameters: above the first, features are reduced; hard limit.
 _LARGEST, _MOST = (
     1000,
     5000,
-)  # parameters: above the first, features are reduced; hard limit
+)
 _BLOCK = 1000  # rows whose design matrix is in memory at once
+# Rows that represent a motion; they count as so many independent rows.
 _ROWS, _WORTH = (
     8,
     2.0,
-)  # rows that represent a motion; they count as so many independent rows
+)
 
 
 def choose_rows(

@@ -440,9 +440,8 @@ class HybridForwardModel(HybridPredictor):
         check_finite(X=X, y=y)
         X, y, weights = check_rows(self, X, y, weights, reset)
         y = np.where(missing, np.nan, y)
-        X = (
-            X if X.flags.writeable else X.copy()
-        )  # torch warns of columns of a data frame
+        # Torch warns of columns of a data frame.
+        X = X if X.flags.writeable else X.copy()
         groups = None if groups is None else labels(groups, len(X))
         return Rows(X, y, cast("NDArray | None", weights), groups)
 

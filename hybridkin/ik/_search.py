@@ -30,11 +30,12 @@ _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
 _OUTSIDE = -1.0
 _DONE = -2.0
 _RETURNS = 30  # attempts to return rows that ended outside the tip limits
+# Where further starts are split; only rows still open use the next part.
 _PARTS = [
     4,
     8,
     16,
-]  # where further starts are split; only rows still open use the next part
+]
 _ROWS = 256  # rows searched again at once
 _FINE = 0.01  # factor on tol when configurations are compared
 _SAME = 0.01  # of the ranges: closer configurations count as the same

@@ -386,9 +386,8 @@ class InverseKinematics:
         lead = leading([(q, 1), (target, axes)])
         q = rows_of(q, lead)
         target = rows_of(target, lead, axes)
-        q = torch.where(
-            torch.isfinite(q), q, torch.nan
-        )  # limits must not make it finite
+        # Limits must not make it finite.
+        q = torch.where(torch.isfinite(q), q, torch.nan)
         if as_numpy and q.dtype == torch.float64:
             core = core_of(settings, search=True)
         else:

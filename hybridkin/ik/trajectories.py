@@ -340,9 +340,8 @@ def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     direction = _checked(normal, "normal", _POINT, (3,))
     if not direction.any():
         raise ValueError("`normal` must not be zero; it is the normal of the plane.")
-    along = (
-        direction / np.abs(direction).max()
-    )  # squares neither overflow nor underflow
+    # Squares neither overflow nor underflow.
+    along = direction / np.abs(direction).max()
     along = along / np.linalg.norm(along)
     axis = np.eye(3)[0 if abs(along[0]) < 1.0 - 1e-9 else 1]
     across = axis - (axis @ along) * along

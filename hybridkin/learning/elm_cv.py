@@ -26,15 +26,15 @@ from hybridkin.learning._ridge import gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
 from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
 
-_AUTO_ALPHAS = np.logspace(
-    -11, 2, 40
-)  # times the largest eigenvalue of the features' Gram matrix
+# Times the largest eigenvalue of the features' Gram matrix.
+_AUTO_ALPHAS = np.logspace(-11, 2, 40)
+# Factors on the best weight scale, tried with new input scales.
 _ZOOM = (
     0.5,
     1.0,
     2.0,
     4.0,
-)  # factors on the best weight scale, tried with new input scales
+)
 _WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
 _LEAST_RELEVANCE = 0.01
 _ROWS_OF_JACOBIANS = 10_000
@@ -396,10 +396,11 @@ def _splits(cv, groups, n_rows, place):
             )
         out = np.ones(n_rows + 1, dtype=bool)
         tested = np.zeros(n_rows + 1, dtype=bool)
+        # The last: rows of weight 0.
         out[place[train]], tested[place[test]] = (
             False,
             True,
-        )  # the last: rows of weight 0
+        )
         splits.append(
             (np.flatnonzero((out | tested)[:-1]), np.flatnonzero(tested[:-1]))
         )

@@ -11,9 +11,8 @@ from hybridkin._core.kernel_numbers import HK_GROUP
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Layout
 
-_BLOCK = (
-    2**17
-)  # numbers in the hidden layer of a block of rows: 1 MB, which fits the cache
+# Numbers in the hidden layer of a block of rows: 1 MB, which fits the cache.
+_BLOCK = 2**17
 
 # name -> sigma(a), and sigma'(a) from a and s = sigma(a)
 ACTIVATIONS = {

@@ -61,9 +61,8 @@ def error_module(regressor: object, q: Tensor) -> ForwardModel:
                 coef / scale, readout.intercept_ - coef / scale @ center
             )
         if len(steps) == 2 and isinstance(steps[0], PolynomialFeatures):
-            powers = np.pad(
-                steps[0].powers_, ((1, 0), (0, 0))
-            )  # the intercept is a monomial
+            # The intercept is a monomial.
+            powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))
             constant = np.broadcast_to(readout.intercept_, len(coef))
             return PolynomialModule(
                 powers, np.vstack([constant, coef.T]), center, scale

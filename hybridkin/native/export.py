@@ -26,10 +26,11 @@ from hybridkin._core.version import __version__
 
 _FOLDER = Path(__file__).parent
 _REAL = {"float64": "double", "float32": "float"}
+# of the test, relative to the largest numbers.
 _TOLERANCE = {
     "float64": 1e-8,
     "float32": 2e-3,
-}  # of the test, relative to the largest numbers
+}
 # Buffers with the middle and the half width of the training rows of a learned part.
 _RANGES = (
     ("input_center", "input_scale"),

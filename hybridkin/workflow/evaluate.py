@@ -71,9 +71,8 @@ def evaluate_log(
     measured.check(force)
     if loaded.play is not None:
         measured.check_order("A model with backlash (play)")
-    motion = (
-        measured.motions if measured.named else np.zeros(len(log.q))
-    )  # else one motion
+    # Else one motion.
+    motion = measured.motions if measured.named else np.zeros(len(log.q))
     predicted = loaded.predict(log.q, motion)
     markers = distances(predicted, log.x)
     columns = {"error": np.nanmean(markers, axis=1)}

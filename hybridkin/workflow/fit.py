@@ -63,10 +63,11 @@ _DATA_QUADRATIC = "data-driven, quadratic"
 _DATA_ELM = "data-driven, ELM"
 _HYBRID_ELM = "hybrid, ELM"
 _FILES = ("model.safetensors", "robot.toml", "held_out.png", "error_histogram.png")
+# With and without auto; fewer are not worth a start.
 _ROWS_PER_PROCESS = {
     True: 150,
     False: 1500,
-}  # with and without auto; fewer are not worth a start
+}
 
 
 @dataclass(frozen=True)

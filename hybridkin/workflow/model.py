@@ -133,9 +133,8 @@ class LoadedModel:
         None if the model does not hold its rows.
         """
         if self.hybrid is None:
-            return (
-                None if self.header else np.zeros(len(q), dtype=bool)
-            )  # nominal: no fit
+            # Nominal: no fit.
+            return None if self.header else np.zeros(len(q), dtype=bool)
         fitted = np.isin(row_digests(q, x), self.hybrid._fitted_rows)
         _, motion = np.unique(motions, return_inverse=True)
         return (

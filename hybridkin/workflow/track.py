@@ -375,9 +375,8 @@ def _text(values: NDArray) -> NDArray:
 def _add_path(report: Report, loaded: LoadedModel, track: Track) -> None:
     figure, axes = new_figure(11.0, 4.6, 1, 3)
     display = TrackingDisplay.from_tracks({f"solver on {loaded.kind}": track})
-    i, j = sorted(
-        np.argsort(np.ptp(track.target, axis=0))[1:]
-    )  # the plane of the largest moves
+    # The plane of the largest moves.
+    i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])
     display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
     display.plot_time(axes[1], unit="mm")
     errors = loaded.expected_errors(track.q)
