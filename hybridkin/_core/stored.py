@@ -229,13 +229,13 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
     """Return an estimator with the given parameters; unknown ones are ignored."""
     defaults = cls().get_params(deep=False)
-    settings = {
-        name: tuple(value)
-        if isinstance(defaults[name], tuple) and type(value) is list
-        else value
-        for name, value in params.items()
-        if name in defaults
-    }
+    settings = {}
+    for name, value in params.items():
+        if name not in defaults:
+            continue
+        if isinstance(defaults[name], tuple) and type(value) is list:
+            value = tuple(value)
+        settings[name] = value
     return cls(**settings)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -48,7 +49,7 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
         guesses.append(Guess(aligned(chain, rows)))
     if isinstance(chain, ArcChain) and {"angles", "turns"} & {*names}:
         step = max(1, len(rows.q) // _ROWS)
-        few = Rows(*(part[::step] for part in rows))
+        few = rows.take(slice(None, None, step))
         guesses += _searched(chain, few, free_base, "radii" in names)
     elif free_base and isinstance(chain, ArcChain):
         counts = chain.actuators_per_segment
@@ -85,9 +86,7 @@ def _searched(
             score = math.inf
             for _ in range(_SWEEPS):
                 for k in range(n_segments):
-                    for option in [
-                        (flip, turn) for flip in (hand, not hand) for turn in _TURNS
-                    ]:
+                    for option in product((hand, not hand), _TURNS):
                         tried = [*choice[:k], option, *choice[k + 1 :]]
                         rms = _chosen(chain, tried, scale, rows, free_base)[1]
                         if rms < score * (1.0 - 1e-9):
@@ -100,9 +99,8 @@ def _searched(
     ranked = sorted(best.values(), key=lambda pair: pair[0])
     hopeful = [guess for score, guess in ranked if score < _HOPELESS * ranked[0][0]]
     for mirrored in (False, True):
-        yield from [guess for guess in hopeful if any(guess.mirrored) == mirrored][
-            :_KEPT
-        ]
+        alike = [guess for guess in hopeful if any(guess.mirrored) == mirrored]
+        yield from alike[:_KEPT]
 
 
 def _chosen(

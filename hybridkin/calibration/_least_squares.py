@@ -55,6 +55,10 @@ class Rows(NamedTuple):
     x: Tensor
     weight: Tensor
 
+    def take(self, rows: NDArray | slice) -> Rows:
+        """Return some of the rows."""
+        return Rows(self.q[rows], self.x[rows], self.weight[rows])
+
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Which markers were measured, (N, K)."""

@@ -390,10 +390,8 @@ def _result(
 def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     squares = 0.0
     for train, test in folds(groups, groups):
-        fit = solve(
-            best.problem, Rows(*(part[train] for part in rows)), best.theta, loss
-        )
-        held_out = Rows(*(part[test] for part in rows))
+        fit = solve(best.problem, rows.take(train), best.theta, loss)
+        held_out = rows.take(test)
         squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weights.sum())
     return float(np.sqrt(squares / float(rows.weights.sum())))
 

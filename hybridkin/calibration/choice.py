@@ -379,10 +379,9 @@ def _errors(
     """Return the errors of a set; splits are (1, ...) of held-out rows, (0, ...) of outer rows."""
     totals = np.zeros((2, 2))  # of io and cv: weighted distances, and weights
     for kind, train, test in splits:
-        chain, training, new = (
-            rung.chain,
-            *(Rows(*(part[i] for part in rows)) for i in (train, test)),
-        )
+        chain = rung.chain
+        training = rows.take(train)
+        new = rows.take(test)
         if start is not None:
             chain = solve(
                 start.problem, training, start.theta, loss, roughly=True

@@ -529,9 +529,7 @@ class ArcChain(MarkedChain):
         chain = chain.with_geometry(angles=torch.from_numpy(angles))
         tip_at = stored.value("tip_at", float)
         places = stored.list_of(list, "markers")
-        if [type(number) for place in places for number in place] != len(places) * [
-            float
-        ] * 4:
+        if any([type(number) for number in place] != 4 * [float] for place in places):
             raise ValueError(
                 f"`markers` must hold lists of four numbers, got {places!r:.60}"
             )

@@ -419,10 +419,13 @@ def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
     unit = table.get("unit", "m")
     log = robot.log
     plain = robot.chain is not None and robot.chain.in_metres
-    need = "m" if log is None else unit if plain else "log"
-    if values and unit != need:
+    if log is None:
+        need = "m"
+        why = "without [log]"
+    else:
+        need = unit if plain else "log"
         why = "without [[segment]]" if robot.chain is None else "with gains"
-        why = "without [log]" if log is None else why
+    if values and unit != need:
         raise ValueError(f'`unit` in [limits] must be "{need}" {why}, got "{unit}".')
     limits = Limits(
         **{key: each(values, key, "[limits]", robot.n_actuators) for key in values}

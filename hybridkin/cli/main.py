@@ -136,12 +136,11 @@ def _interruptible() -> Iterator[None]:
 def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:
     """Return the files of --out, each with its number and time on the disk."""
     out = vars(arguments).get("out") or Path(os.devnull)
-    files = [
-        file
-        for file in (out.glob("[!.]*") if out.is_dir() else [out])
-        if file.is_file()
-    ]
-    return {file: (file.stat().st_ino, file.stat().st_mtime_ns) for file in files}
+    stamps = {}
+    for file in out.glob("[!.]*") if out.is_dir() else [out]:
+        if file.is_file():
+            stamps[file] = (file.stat().st_ino, file.stat().st_mtime_ns)
+    return stamps
 
 
 def _next(arguments: argparse.Namespace, stages: Stages) -> _Outcome:

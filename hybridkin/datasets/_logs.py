@@ -262,6 +262,11 @@ def load_log(
                 f"millimetres, give {name}_unit='mm'.",
                 stacklevel=2,
             )
+    units = {"q": "rad", "x": "m"}
+    if q_unit in METRES:
+        units["q"] = "m"
+    elif q_unit == "1":
+        units["q"] = "1"
     return Log(
         columns[0] * factor,
         columns[1] * METRES[x_unit],
@@ -272,10 +277,7 @@ def load_log(
         q_names=q,
         x_names=x,
         q_sign=q_sign,
-        units={
-            "q": "m" if q_unit in METRES else "1" if q_unit == "1" else "rad",
-            "x": "m",
-        },
+        units=units,
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )

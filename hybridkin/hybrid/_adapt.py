@@ -228,21 +228,22 @@ def _likeliest_scales(
     The rows are A theta = target with unit variance. A standard deviation of zero means no change.
     The misfit is the variance that no change explains, relative to that of the fit.
     """
-    base, zeros = (name in parameters for name in PARAMETERS)
     scales = _SCALES.tolist()
-    bases = [(0.0, 0.0), *(product(scales, scales) if base else ())]
-    tried = np.array(
-        [(*pair, own) for pair in bases for own in [0.0, *(scales if zeros else ())]]
-    )
+    bases = [(0.0, 0.0)]
+    if "base" in parameters:
+        bases += product(scales, scales)
+    shifts = [0.0]
+    if "actuator_zeros" in parameters:
+        shifts += scales
+    tried = np.array([(*pair, shift) for pair, shift in product(bases, shifts)])
     std = np.repeat(tried, (3, 3, A.shape[1] - 6), axis=1)
     moments = std * (A.T @ target)
     systems = std[:, :, None] * (A.T @ A) * std[:, None]
     evidence = np.empty((len(MISFITS), len(std)))
     for k, misfit in enumerate(MISFITS):
         inner = systems / misfit + np.eye(A.shape[1])
-        explained = (moments * np.linalg.solve(inner, moments[..., None])[..., 0]).sum(
-            1
-        ) / misfit
+        solved = np.linalg.solve(inner, moments[..., None])[..., 0]
+        explained = (moments * solved).sum(1) / misfit
         left = (target @ target - explained) / misfit + len(A) * np.log(misfit)
         evidence[k] = -0.5 * (left + np.linalg.slogdet(inner)[1])
     evidence -= SWITCH * (tried[:, 1:] > 0.0).sum(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from itertools import product
 from math import inf, log10
 from typing import Any
 
@@ -243,30 +244,29 @@ def choose(
         for pair in pairs:
             if pair not in scores:
                 scores[pair] = score(_penalties(pair))
-        good = [p for p in scores if scores[p] <= (1.0 + _EQUAL) * min(scores.values())]
-        return max(
-            good, key=lambda p: (p.count(inf), sum(k for k in p if k < inf), -scores[p])
-        )
+        limit = (1.0 + _EQUAL) * min(scores.values())
+        return max((pair for pair in scores if scores[pair] <= limit), key=preference)
 
-    at = (inf, inf)
+    def preference(pair: Pair) -> tuple[int, float, float]:
+        return pair.count(inf), sum(k for k in pair if k < inf), -scores[pair]
+
     if start is None:
-        at = best_of((a, b) for a in _GRID for b in _GRID)
+        at = best_of(product(_GRID, _GRID))
     else:
-        at = best_of([at, (_half_decades(start[0]), _half_decades(start[1]))])
+        at = best_of([(inf, inf), (_half_decades(start[0]), _half_decades(start[1]))])
     for step in (2.0, 1.0):
         previous = None
         while at != previous:
-            near = [
-                [
-                    k
-                    for k in (own + step, own, own - step)
-                    if k == inf or low <= k <= _HIGH
-                ]
-                for own, low in zip(at, _LOW, strict=True)
-            ]
             previous = at
-            at = best_of((a, b) for a in near[0] for b in near[1])
+            linear = _near(at[0], step, _LOW[0])
+            at = best_of(product(linear, _near(at[1], step, _LOW[1])))
     return _penalties(at), {_penalties(pair): value for pair, value in scores.items()}
+
+
+def _near(half_decades: float, step: float, low: float) -> list[float]:
+    """Return a penalty and its neighbours that are within the limits, or infinite."""
+    neighbours = (half_decades + step, half_decades, half_decades - step)
+    return [k for k in neighbours if k == inf or low <= k <= _HIGH]
 
 
 def _half_decades(penalty: float) -> float:

@@ -98,7 +98,9 @@ def _validated(estimator, X, *y, good=True, **checks):
     checks |= {"dtype": DTYPES, "order": "C", "skip_check_array": good}
     with np.errstate(invalid="ignore"):  # a sum of both infinities
         validated = validate_data(estimator, X, *y, **checks)
-    return [*map(np.asarray, (X, *y) if good else validated if y else [validated])]
+    if good:
+        return [np.asarray(X), *map(np.asarray, y)]
+    return [*map(np.asarray, validated if y else [validated])]
 
 
 def draw_layer(params, X, sample_weight):

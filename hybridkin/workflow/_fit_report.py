@@ -93,16 +93,15 @@ def write_comparison(
     )
     _add_figures(report, errors, (present[0], present[-1]))
     motions, counts = np.unique(log.motions, return_counts=True)
-    means = np.array(
-        [[errors[n][log.motions == m].mean() for n in present] for m in motions]
-    )
+    of_present = np.column_stack([errors[name] for name in present])
+    means = np.array([of_present[log.motions == m].mean(axis=0) for m in motions])
     report.text(
         f"Mean errors in mm of the five motions with the largest errors of {present[-1]}:"
     )
-    rows = [
-        [str(motions[i]), str(counts[i]), *(f"{1e3 * mean:.1f}" for mean in means[i])]
-        for i in np.argsort(means[:, -1])[::-1][:5]
-    ]
+    rows = []
+    for i in np.argsort(means[:, -1])[::-1][:5]:
+        in_mm = [f"{1e3 * mean:.1f}" for mean in means[i]]
+        rows.append([str(motions[i]), str(counts[i]), *in_mm])
     report.table(["motion", "rows", *present], rows)
     saved = report.record["saved"]
     chosen = report.record["chosen"]

@@ -155,9 +155,9 @@ def read_log(
         raise ValueError("`exclude` needs `groups`, the column that names the motions.")
     if log.groups is not None:
         motions = [str(name).removesuffix(suffix) for name in log.groups]
-        included = np.array(
-            [not any(fnmatch.fnmatch(m, p) for p in exclude) for m in motions]
-        )
+        included = np.ones(len(motions), dtype=bool)
+        for pattern in exclude:
+            included &= [not fnmatch.fnmatch(name, pattern) for name in motions]
         if not included.any():
             raise ValueError(
                 f"`exclude` must leave at least 2 motions, but leaves none of {len({*motions})}; "
