@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn.base import clone
-from sklearn.kernel_ridge import KernelRidge
 
-from hybridkin import ELMRegressorCV, HybridForwardModel, PlayOperator
+from hybridkin import PlayOperator
 from hybridkin._core.model import FunctionModel
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._error_models import NoCorrection
 from hybridkin.hybrid._fit import Spec
-from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
 from hybridkin.hybrid._play import choose_play
 from hybridkin.hybrid._radius import Radius, _quantile
 from hybridkin.hybrid._rows import Rows
@@ -100,44 +97,6 @@ def test_a_blend_without_a_sure_gain_is_left_alone():
     assert results["chosen"] == "mechanical"
 
 
-@pytest.mark.parametrize("groups", [None, np.arange(60) // 6])
-def test_the_kernel_has_the_least_held_out_distance_among_its_neighbours(groups):
-    rng = np.random.default_rng(0)
-    X = rng.uniform(0.1, 0.4, (60, 2))
-    y = np.sin(20.0 * X) + 0.05 * rng.standard_normal((60, 2))
-    weights = rng.uniform(0.5, 2.0, 60)
-    spread = X.var(axis=0).mean()
-
-    def score(gamma, alpha):
-        total = 0.0
-        for train, test in folds_of(X, groups):
-            model = KernelRidge(kernel="rbf", gamma=gamma / spread, alpha=alpha)
-            model.fit(X[train], y[train], sample_weight=weights[train])
-            total += weights[test] @ np.linalg.norm(model.predict(X[test]) - y[test], axis=1)
-        return total
-
-    found = tuned_kernel(X, y, weights, groups)
-    i = int(np.argmin(np.abs(np.array(_GAMMAS) - found.gamma * spread)))
-    j = _ALPHAS.index(found.alpha)
-    assert found.gamma == pytest.approx(_GAMMAS[i] / spread)
-    best = score(_GAMMAS[i], _ALPHAS[j])
-    near = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
-    for k, m in near:
-        if k in range(len(_GAMMAS)) and m in range(len(_ALPHAS)):
-            assert best <= score(_GAMMAS[k], _ALPHAS[m]) * (1.0 + 1e-9)
-
-
-def test_folds_of_rows_are_drawn_and_those_of_groups_are_whole():
-    X, groups = np.zeros((200, 2)), np.arange(200) // 8
-    assert len(folds_of(X, None)) == 5
-    assert len(folds_of(X[:199], None)) == 10
-    for _, test in folds_of(X, None):
-        assert (np.diff(np.sort(test)) > 1).any()  # not one piece of the log
-    of_test = [np.unique(groups[test]) for _, test in folds_of(X, groups)]
-    assert_array_equal(np.sort(np.concatenate(of_test)), np.arange(25))
-    assert any((np.diff(names) > 1).any() for names in of_test)
-
-
 def test_the_quantile_of_groups_and_its_least_number():
     """Of single rows the rank ceil((n + 1) coverage); infinite where that exceeds n."""
     values, groups = np.arange(1.0, 20.0), np.arange(19)
@@ -173,26 +132,6 @@ def test_a_drift_is_emptied_and_learns_anew():
     rest = new.learned(q, 1e-4 * rng.standard_normal((50, 3)), np.ones(50), 1.0)
     assert rest.likeliest_alpha(1e-4) == np.inf
     assert_array_equal(rest.correction(np.inf)(torch.from_numpy(q)).numpy(), 0.0)
-
-
-def test_the_kernel_does_not_depend_on_the_unit_of_q():
-    rng = np.random.default_rng(0)
-    X = rng.uniform(0.1, 0.4, (40, 2))
-    y, ones = np.sin(20.0 * X), np.ones(40)
-    metres, millimetres = tuned_kernel(X, y, ones, None), tuned_kernel(1e3 * X, y, ones, None)
-    assert millimetres.gamma == pytest.approx(1e-6 * metres.gamma)
-    assert millimetres.alpha == metres.alpha
-
-
-def test_a_search_of_ones_own_gets_the_groups():
-    rng = np.random.default_rng(0)
-    X, groups = rng.uniform(0.1, 0.4, (60, 2)), np.arange(60) // 12
-    y = np.sin(20.0 * X) + 0.1 * rng.standard_normal((5, 2))[groups]
-    search = ELMRegressorCV(20, max_hidden=20, random_state=0)
-    hybrid = HybridForwardModel(None, search, random_state=0).fit(X, y, groups=groups)
-    alone, rows = (clone(search).fit(X, y, groups=g) for g in (groups, None))
-    assert_array_equal(hybrid.error_model_.left_out_errors_, alone.left_out_errors_)
-    assert np.abs(alone.left_out_errors_ - rows.left_out_errors_).max() > 0.01
 
 
 @pytest.mark.slow
