@@ -24,6 +24,7 @@ _LIKELY = 0.5  # least share of the mean squared error that a likely cause expla
 _OFF = 0.01  # least distance from the plane of the log, as a share of the range of the commands
 _ROUNDS = 3  # of the fit of backlash
 _NARROW = 1e-3  # least width of backlash, as a share of the range
+_SHORT = 0.5  # range of a short path, as a share of that of the log
 _DIFFERENT = 0.1  # of the range: commands of a log that differ from those of the track
 _COLUMNS = ("rows", "promised", "promised_p95", "mean", "p95", "max")
 
@@ -70,7 +71,8 @@ def verify_track(
         Its ``record`` holds "parts" of the path, the first of which is the whole, with "promised"
         and "promised_p95", mean, p95 and max [m]; "kept", whether the mean is at most 1.5 times the
         promised one (None without a promise); "causes", the share of the mean squared error that
-        each cause explains; and "cause", the largest above 0.5 if the promise is not kept, or None.
+        each cause explains; "cause", the largest above 0.5 if the promise is not kept, or None; and
+        "range", the largest range of an actuator relative to the log (None without a log).
     paths : list of Path
         The written files.
 
@@ -114,6 +116,7 @@ def verify_track(
         command="verify", model=str(loaded.path), track=str(track), log=log.source
     )
     report.record.update(parts=parts, kept=is_kept, causes=causes, cause=cause)
+    report.record.update(range=_share_of_range(loaded, q))
     _write(report)
     return report, [] if out is None else report.write(out)
 
@@ -150,6 +153,16 @@ def _parts(loaded: LoadedModel, q: NDArray) -> dict[str, NDArray]:
     for k in range(4):
         parts[f"quarter {k + 1}"] = quarter == k
     return {name: rows for name, rows in parts.items() if rows.any()}
+
+
+def _share_of_range(loaded: LoadedModel, q: NDArray) -> float | None:
+    """Return the largest range of an actuator, as a share of its range in the log."""
+    if loaded.hybrid is None:
+        return None
+    low, high = loaded.hybrid.training_range_
+    widths = high - low
+    moved = widths > 0.0
+    return float((np.ptp(q, axis=0)[moved] / widths[moved]).max(initial=0.0))
 
 
 def _entry(
@@ -253,3 +266,10 @@ def _write(report: Report) -> None:
         report.text("None of these explains the error; check load, friction and delay.")
     else:
         report.text(f"Likely cause: {cause}. To do: {_REMEDIES[cause]}.")
+        share_of_range = report.record["range"]
+        if cause == "moved base" and share_of_range and share_of_range < _SHORT:
+            report.text(
+                f"The path covers {100 * share_of_range:.0f} % of the range of the log; on so "
+                "short a path an error of the model looks the same. Repeat a motion of the log "
+                "to tell them apart."
+            )

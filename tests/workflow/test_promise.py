@@ -1,14 +1,16 @@
 """What tracks promise: errors that grow with the distance from the log, and where paths lie."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, workflow
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, IKStatus, workflow
 from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.ik import trajectories
 from hybridkin.workflow._domain import Domain
-from hybridkin.workflow._places import better_place, placed
+from hybridkin.workflow._places import better_place, placed, solver
 from hybridkin.workflow._promise import Promise
 
 rng = np.random.default_rng(0)
@@ -65,3 +67,34 @@ def test_a_path_that_is_too_large_is_to_be_made_smaller(domain):
     wide = trajectories.figure_eight(tips.mean(axis=0), [3.0, 2.0], dt=0.1)
     assert placed(domain, wide, 1e-4)[1] < 0.5
     assert better_place(domain, wide, 1e-4).startswith("make it smaller (--scale)")
+
+
+def test_a_path_is_placed_where_its_promise_is_least(domain):
+    training = {
+        "saved": "h",
+        "held_out": {"h": {"mean": 2e-3, "p95": 5e-3}},
+        "promise": {"at_rows": 1e-3, "per_distance": 5e-3, "p95": 2.0},
+    }
+    loaded = replace(domain.loaded, header={"training": training})
+    model = HybridForwardModel(loaded.chain, "linear")
+    q = domain.sample[0][:200]
+    x = loaded.chain(torch.from_numpy(q)).numpy() + 1e-3 * q[:, :3]
+    model.fit(q, x, groups=np.arange(200) // 10)
+    loaded = replace(loaded, model=model)
+    promising = Domain(loaded, workflow.path_limits(loaded))
+    tips = promising.sample[1]
+    path = trajectories.figure_eight(tips.mean(axis=0), [0.01, 0.01], dt=0.1)
+    moved, share = placed(promising, path, 1e-4)
+    assert share == 1.0
+
+    def promise(shift):
+        solution = solver(promising).solve(path.x + shift, restarts=0)
+        if not (solution.status == IKStatus.CONVERGED).all():
+            return np.inf
+        return loaded.promised_errors(solution.q)["mean"].mean()
+
+    least = promise(moved.x[0] - path.x[0])
+    elsewhere = np.array([promise(tip - tips.mean(axis=0)) for tip in tips[::25]])
+    assert np.isfinite(elsewhere).sum() > 5
+    assert least < 0.8 * np.median(elsewhere[np.isfinite(elsewhere)])
+    assert least < 1.1 * elsewhere.min()

@@ -126,6 +126,17 @@ def test_the_cause_of_a_fault_is_found(verified, fault, cause, remedy):
     assert remedy in report.plain()
 
 
+def test_a_moved_base_on_a_short_path_is_said_to_be_uncertain(verified):
+    q = loops(0.1 * SIZE)
+    report = verified(*on_a_moved_base(q))
+    assert report.record["cause"] == "moved base"
+    assert report.record["range"] < 0.2
+    assert "on so short a path" in report.plain()
+    report = verified(*on_a_moved_base(loops(0.6 * SIZE)))
+    assert report.record["range"] > 0.5
+    assert "on so short a path" not in report.plain()
+
+
 def test_an_error_of_no_known_cause_is_not_explained(verified):
     q = loops(0.6 * SIZE)
     far = 3e-3 * np.random.default_rng(2).standard_normal((len(q), 3))
