@@ -132,7 +132,7 @@ def test_a_moved_base_on_a_short_path_is_said_to_be_uncertain(verified):
     assert report.record["cause"] == "moved base"
     assert report.record["range"] < 0.2
     assert "on so short a path" in " ".join(report.plain().split())
-    report = verified(*on_a_moved_base(loops(0.6 * SIZE)))
+    report = verified(*on_a_moved_base(loops(SIZE)))
     assert report.record["range"] > 0.5
     assert "on so short a path" not in " ".join(report.plain().split())
 
