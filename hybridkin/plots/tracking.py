@@ -200,14 +200,14 @@ class TrackingDisplay(Display):
             ax.plot(steps, error, label=self._summary(name, scale, unit), **look)
         ax.set(xlabel=when, ylabel=f"tip error [{unit}]")
         ax.set_xlim((steps[0], steps[-1]) if len(steps) > 1 else None)
+        levels = dict(expected or {})
         least = []
-        for (label, level), style in zip(
-            (expected or {}).items(), STYLES * 2, strict=False
-        ):
+        for (label, level), style in zip(levels.items(), STYLES * 2, strict=False):
             level = np.broadcast_to(scale * plain(level, "expected"), len(steps))
-            if np.isfinite(level).any():
-                least.append(float(np.nanmin(level)))
-                label = f"{label}: {least[-1]:.3g} {unit}"
+            finite = level[np.isfinite(level)]
+            if finite.size:
+                least.append(finite.min())
+                label = f"{label}: {finite.mean():.3g} {unit}"
             ax.plot(steps, level, color="black", linestyle=style, label=label)
         if least:
             ax.set_yscale("log")

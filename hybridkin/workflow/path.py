@@ -18,7 +18,13 @@ from hybridkin.workflow._places import placed
 from hybridkin.workflow.model import LoadedModel
 
 _TOL = 1e-4  # of a point that lies in the domain [m]
-_SHAPES = ("figure-eight", "spiral", "line")
+_EXAMPLE = ("40", "20", "0")  # sizes
+# shapes, with the meaning of their sizes
+_SHAPES = {
+    "figure-eight": ("width", "height"),
+    "spiral": ("first radius", "last radius"),
+    "line": ("x", "y", "z"),
+}
 
 
 def read_path(
@@ -146,11 +152,14 @@ def shape_path(
     ValueError
         If the number of sizes does not fit the shape.
     """
-    n_sizes = 3 if one_of(shape, "shape", _SHAPES) == "line" else 2
+    sizes = _SHAPES[one_of(shape, "shape", _SHAPES)]
     extent = real_array(size, "size").tolist()
-    if np.shape(extent) != (n_sizes,):
-        need = f"--size must be {n_sizes} numbers for a {shape}"
-        raise ValueError(f"`size` does not fit: {need}, got {size!r:.80}.")
+    if np.shape(extent) != (len(sizes),):
+        example = ",".join(_EXAMPLE[: len(sizes)])
+        raise ValueError(
+            f"`size` does not fit: --size must be {len(sizes)} numbers for a {shape} "
+            f"({', '.join(sizes)}), such as --size {example} --unit mm, got {size!r:.80}."
+        )
     domain = Domain(loaded, limits)
     tips = domain.sample[1]
     middle = tips.mean(axis=0) if center is None else real_array(center, "center")
