@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,9 +15,6 @@ from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, check_shape
-
-if TYPE_CHECKING:
-    from hybridkin._core.plan import Plan
 
 _Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
@@ -38,8 +35,8 @@ class Layout(NamedTuple):
     derived : tuple of str
         Buffers computed from the others. Kernels use them; files do not contain them.
     write_plan : callable, optional
-        Writes the node of a description of this kind into a plan, and returns its place. None: the
-        class has no kernel.
+        Called with a plan and a description of this kind: writes its node into the plan and returns
+        the place. None: the class has no kernel.
     """
 
     kind: str
@@ -47,7 +44,7 @@ class Layout(NamedTuple):
     settings: Mapping[str, type] = MappingProxyType({})
     parts: tuple[str, ...] = ()
     derived: tuple[str, ...] = ()
-    write_plan: WritePlan | None = None
+    write_plan: Callable[..., int] | None = None
 
 
 @dataclass(frozen=True)
@@ -193,7 +190,6 @@ class Stored:
         return self.parts[name]
 
 
-WritePlan = Callable[["Plan", Stored], int]
 KINDS_OF_MODELS: dict[str, Any] = {}
 """The classes with a layout, by its kind."""
 
