@@ -18,7 +18,15 @@ TEXT = "\n".join(
 ELSEWHERE = {
     # what saving, calibration and serial coupling call of a chain or a hybrid
     *("coordinates", "from_coordinates", "from_coordinates_and_jacobian", "from_stored", "stored"),
-    *("far_messages", "unit_messages", "frames_and_moves", "up_to_tip", "tips", "extra_repr"),
+    *(
+        "far_messages",
+        "unit_messages",
+        "plausible_rows",
+        "frames_and_moves",
+        "up_to_tip",
+        "tips",
+        "extra_repr",
+    ),
     "with_geometry",
     # files: hostile ones are an examination of their own
     *("from_urdf", "from_mjcf", "to_urdf", "load_armlab", "load_asl_trunk", "load_ftdcr"),

@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import identity, whole
+from hybridkin._core.arrays import as_array, identity, whole
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Restore, Stored
 from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
@@ -37,6 +38,7 @@ ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 """Parameters of `calibrate` that change a part of an entry of the geometry, and that entry."""
 
 Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
+_LONGEST = 10.0  # largest plausible length of an extensible segment [m]
 STRUCTURE = {
     "actuators_per_segment": list,
     "tip_at": float,
@@ -368,11 +370,22 @@ class ArcChain(MarkedChain):
             ),
             q,
         )
-        pull = LONGEST_PULL * self.reach.detach()
-        beyond = metres > factor * torch.where(self.absolute, 10.0, pull).to(q)
+        beyond = metres > factor * self._largest_metres.to(q)
         beyond[..., : self.stage is not None] = False  # an angle
         message = millimetres_message(name, metres[beyond], 0.0)
         return [] if message is None else [message]
+
+    @property
+    def _largest_metres(self) -> Tensor:
+        """Largest plausible length or change of length (n,) [m]."""
+        pull = LONGEST_PULL * self.reach.detach()
+        return torch.where(self.absolute, _LONGEST, pull)
+
+    def plausible_rows(self) -> PlausibleRows:
+        """Return bounds of rows that need no warning about their units."""
+        weights = torch.diag(self.gains.detach() / self._largest_metres)
+        first = int(self.stage is not None)  # the angle of a stage has no bound
+        return PlausibleRows(as_array(self.rest), as_array(weights[first:]))
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return arcs (3 S, N) of rows (N, n) and d arcs / dq, (3 S, n) or (3 S, n, N).

@@ -12,6 +12,7 @@ from hybridkin._core.arrays import check_shape, countable
 from hybridkin._core.blocks import check_tensor, check_vectors
 from hybridkin._core.html import numbers
 from hybridkin._core.model import PoseModel
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.units import span_message
 
 if TYPE_CHECKING:
@@ -179,6 +180,10 @@ class Chain(PoseModel):
             )
         self._check_rows(rows, name)
         return self.unit_messages(rows, name)
+
+    def plausible_rows(self) -> PlausibleRows | None:
+        """Return bounds of rows that need no warning about units or contradictions, if known."""
+        return None
 
     def _why_shape(self) -> str:
         """Return why q must have its shape, for messages."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import Numbers, Transform, identity
+from hybridkin._core.arrays import Numbers, Transform, as_array, identity
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains._arcs import free_arcs, levers, reading_matrix, turned_by_first
 from hybridkin.chains._checks import bend_counts, filled, float_dtype
@@ -213,10 +215,7 @@ class ConstantCurvatureChain(ArcChain):
         tensor([0.0000, 0.0030], dtype=torch.float64)
         """
         rows = self.metres(self._rows(q))
-        residual = (
-            rows - rows @ (self._readings() @ (self.arc_matrix / self.gains)).to(q).T
-        )
-        return self._by_segment(residual, q)
+        return self._by_segment(rows - rows @ self._explained_by_arcs().to(q).T, q)
 
     def contradictory(self, q: Tensor) -> Tensor:
         """Return whether the actuator lengths of each segment contradict each other.
@@ -287,6 +286,26 @@ class ConstantCurvatureChain(ArcChain):
             f"{row}, segment {segment + 1}, {1e3 * float(residual[row, segment]):.3g} mm rms. "
             "ElasticTendonChain models tendons that can only pull."
         )
+
+    def plausible_rows(self) -> PlausibleRows:
+        """Return bounds of rows that need no warning about units or contradictions.
+
+        Tendons do not contradict each other if no residual of `consistency` is noticed.
+        """
+        rows = super().plausible_rows()
+        if all(self.extensible):
+            return rows
+        counts = self.actuators_per_segment
+        fixed_length = ~np.repeat(self.extensible, counts)
+        noticed = as_array(_NOTICED * self.radii).repeat(counts)
+        explained = as_array(self._explained_by_arcs())
+        residuals = (np.eye(len(explained)) - explained) * as_array(self.gains)
+        of_tendons = (residuals / noticed[:, None])[fixed_length]
+        return replace(rows, weights=np.concatenate([rows.weights, of_tendons]))
+
+    def _explained_by_arcs(self) -> Tensor:
+        """Return the matrix (n, n) from readings to those of the fitted arcs [-]."""
+        return self._readings() @ (self.arc_matrix / self.gains)
 
     @property
     def limits(self) -> dict[str, Any]:

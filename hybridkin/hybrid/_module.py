@@ -13,7 +13,9 @@ from typing_extensions import Self
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Layout, Stored
+from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule
 
@@ -261,6 +263,13 @@ class Hybrid(ForwardModel):
     def without_learned(self) -> Hybrid:
         """Return the mechanical model alone, as a hybrid."""
         raise NotImplementedError
+
+    @cached_property
+    def plausible_rows(self) -> PlausibleRows | None:
+        """Bounds of rows that the mechanical model does not warn about, if known."""
+        if isinstance(self.mechanical, Chain):
+            return self.mechanical.plausible_rows()
+        return None
 
     def rows(self) -> Hybrid:
         """Return the module whose outputs are the columns of measured y; for tips this module."""

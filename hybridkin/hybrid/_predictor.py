@@ -183,6 +183,19 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if message is not None:
             warnings.warn(message, stacklevel=3)
 
+    def _doubts(self, q: NDArray) -> list[str]:
+        """Return warnings about units and contradictions of finite rows q (N, n).
+
+        Negative lengths are extrapolation, no error.
+        """
+        chain = self.mechanical_model_
+        plausible = self.module_.plausible_rows
+        if not isinstance(chain, Chain) or (plausible and plausible.hold(q)):
+            return []
+        rows = torch.from_numpy(q)
+        messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
+        return [message for message in messages if message is not None]
+
     def _effective(self, X: NDArray, groups: ArrayLike | None) -> NDArray:
         """Return the motion of the actuators: with backlash, not the commands X themselves."""
         if self.play_ is None or not len(X):
@@ -199,24 +212,20 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         warn: bool = True,
     ) -> list[NDArray]:
         """Return the results of a function of the module for the rows of X, in the dtype of X."""
-        check_is_fitted(self, "module_")
+        if "module_" not in vars(self):
+            check_is_fitted(self, "module_")
         X = check_inputs(self, X)
         q = self._effective(X, groups).astype(np.float64)
-        if warn and isinstance(chain := self.mechanical_model_, Chain):
-            # Finite; negative lengths are extrapolation, no error.
-            rows = torch.from_numpy(q)
-            for message in (
-                *chain.unit_messages(rows, "X"),
-                chain.contradiction(rows, "X"),
-            ):
-                if message is not None:
-                    warnings.warn(message, stacklevel=3)
-        arrays = function(self.module_.rows(), q)
-        with np.errstate(over="ignore"):  # too large for float32
-            arrays = [
-                a if a.dtype == bool else a.astype(X.dtype, copy=False) for a in arrays
-            ]
-        return [a[:, 0] if self._single_output and a.ndim > 1 else a for a in arrays]
+        if warn:
+            for message in self._doubts(q):
+                warnings.warn(message, stacklevel=3)
+        arrays = [*function(self.module_.rows(), q)]
+        if any(a.dtype not in (X.dtype, bool) for a in arrays):
+            with np.errstate(over="ignore"):  # too large for float32
+                arrays = [a if a.dtype == bool else a.astype(X.dtype) for a in arrays]
+        if self._single_output:
+            arrays = [a[:, 0] if a.ndim > 1 else a for a in arrays]
+        return arrays
 
 
 def _method(name: str) -> Callable[[Hybrid, NDArray], Sequence[NDArray]]:

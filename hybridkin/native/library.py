@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.kernel_numbers import ACTIVATIONS, HK_GROUP, checksum
@@ -209,18 +209,19 @@ class Program:
         """
         lead = q.shape[:-1]
         n, m = self._sizes
-        if q.shape == (n,):
-            a = np.empty(m + m * n + 1)
+        if q.size == n == q.shape[-1]:  # one row: one array for all results
+            results = np.empty(m + m * n + 1)
             size = m + m * n
-            at = _address(a) or 0
+            at = _address(results) or 0
             row = np.asarray(q, np.float64).tobytes()
             places = (
                 at + 8 * m if jacobian else None,
                 at + 8 * size if distance else None,
             )
             self._evaluate(self._call.place, row, 1, at, *places)
-            J = a[m:size].reshape(m, n) if jacobian else None
-            return a[:m], J, a[size, ...] if distance else None
+            J = results[m:size].reshape(*lead, m, n) if jacobian else None
+            d = results[size:].reshape(lead) if distance else None
+            return results[:m].reshape(*lead, m), J, d
         x = np.empty((*lead, m))
         J = np.empty((*lead, m, n)) if jacobian else None
         d = np.empty(lead) if distance else None
@@ -389,23 +390,48 @@ def program_of(model: ForwardModel) -> Program | None:
 
 def evaluate(
     model: ForwardModel,
-    q: NDArray,
+    q: ArrayLike,
     value: bool = True,
     jacobian: bool = False,
     distance: bool = False,
 ) -> tuple[NDArray, ...]:
-    """Return the requested ones of x (..., m), dx/dq (..., m, n) and domain distance (...).
+    """Return the requested results of a model for NumPy rows, by the compiled core if it can.
 
-    The compiled core computes them if it can, else torch. `q` must be writable float64.
+    Parameters
+    ----------
+    model : ForwardModel
+        A chain, or the ``module_`` of a fitted hybrid.
+    q : array-like of shape (..., n)
+        Actuator vectors [m or rad].
+    value : bool, default=True
+        Whether to compute x; with `jacobian` it always is.
+    jacobian : bool, default=False
+        Whether to compute dx/dq.
+    distance : bool, default=False
+        Whether to compute the domain distance; 1 is the edge of the domain.
+
+    Returns
+    -------
+    tuple of ndarray
+        Those that are asked for of x (..., m) [m], dx/dq (..., m, n) and the distance (...).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin import ConstantCurvatureChain, native
+    >>> chain = ConstantCurvatureChain([0.1])
+    >>> x, J = native.evaluate(chain, np.full((2, 3), 0.2), jacobian=True)
+    >>> x.shape, J.shape
+    ((2, 3), (2, 3, 3))
     """
+    q = np.asarray(q, np.float64)
     program = program_of(model)
     if program is not None and not (value or jacobian):
         return (program.domain(q)[0],)
     if program is not None:
-        return tuple(
-            a for a in program.evaluate(q, jacobian, distance) if a is not None
-        )
-    rows = torch.from_numpy(q)
+        results = program.evaluate(q, jacobian, distance)
+        return tuple([part for part in results if part is not None])
+    rows = torch.from_numpy(np.require(q, requirements="W"))
     results = ()
     with torch.no_grad():
         if jacobian:

@@ -1,0 +1,32 @@
+"""A quick test that rows need no warning about their units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class PlausibleRows:
+    """Linear bounds of rows that no check of a chain warns about: ``|W (q - rest)| <= 1``.
+
+    Rows outside may still be right. The chain itself then checks them, which takes longer.
+
+    Attributes
+    ----------
+    rest : ndarray of shape (n,)
+        The q at which no actuator is displaced.
+    weights : ndarray of shape (K, n)
+        The matrix W.
+    """
+
+    rest: NDArray
+    weights: NDArray
+
+    def hold(self, q: NDArray) -> bool:
+        """Return whether all rows of q (N, n) lie within the bounds."""
+        with np.errstate(all="ignore"):  # numbers too large for float64 are outside
+            largest = np.abs((q - self.rest) @ self.weights.T).max(initial=0.0)
+        return bool(largest <= 1.0)
