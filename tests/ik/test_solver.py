@@ -347,8 +347,8 @@ def test_posture_after_convergence_is_the_nearest_solution(rng, A):
 
 @pytest.mark.slow
 def test_further_starts_reach_what_a_warm_start_misses(rng):
-    target = CHAIN(uniform(rng, 0.1, 0.4, 100, 9))
-    starts = uniform(rng, 0.1, 0.4, 100, 9)
+    target = CHAIN(uniform(rng, 0.1, 0.4, 300, 9))
+    starts = uniform(rng, 0.1, 0.4, 300, 9)
     once = bha().solve(target, starts, restarts=0)
     again = bha().solve(target, starts)
     assert again.converged.all()
