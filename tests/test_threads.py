@@ -11,7 +11,7 @@ import torch
 from saved_models import trunk, trunk_log
 
 from hybridkin import ELMRegressor, ELMRegressorCV, HybridForwardModel
-from hybridkin._core.turns import TURNS, one_thread
+from hybridkin._core.turns import TURNS
 
 Q, X, GROUPS = trunk_log()
 ELM = ELMRegressor(4, random_state=0)
@@ -63,44 +63,6 @@ def test_threads_change_filters_in_turn(changes, model):
     model.fit(Q, X, groups=GROUPS)
     assert changes
     assert all(changes)
-
-
-def test_limits_of_overlapping_calls_end_with_them(monkeypatch):
-    inside, go_on, now = threading.Event(), threading.Event(), [2]
-
-    class Limits:
-        """As those of threadpoolctl: of the process, and what was found is put back."""
-
-        def __init__(self, limits):
-            self.found, now[0] = now[0], limits
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *error):
-            now[0] = self.found
-
-    monkeypatch.setattr("hybridkin._core.turns.threadpool_limits", Limits)
-
-    @one_thread()
-    def first():
-        inside.set()
-        go_on.wait(LONG)
-
-    @one_thread()
-    def second():
-        assert go_on.is_set()  # it has waited
-
-    threads = [threading.Thread(target=work, daemon=True) for work in (first, second)]
-    threads[0].start()
-    assert inside.wait(LONG)
-    threads[1].start()
-    threads[1].join(0.05)
-    assert threads[1].is_alive()
-    assert now == [1]
-    go_on.set()
-    [thread.join(LONG) for thread in threads]
-    assert now == [2]
 
 
 @pytest.mark.slow

@@ -5,16 +5,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, RigidChain, calibrate, datasets
 from hybridkin._core.rotations import rotation
-from hybridkin.calibration._least_squares import LOSSES, Rows, row_loss
-from hybridkin.calibration._parameters import Problem, parameter_names
-from hybridkin.calibration._search import search
-from hybridkin.calibration.calibrate import fit_geometry, refitted
+from hybridkin.calibration._least_squares import LOSSES
+from hybridkin.calibration.calibrate import fit_geometry
 
 # The plain chain makes most tips itself here: tendons pulled at random mean no slack.
 pytestmark = pytest.mark.filterwarnings("ignore:.* pull the tendons of a segment together")
@@ -196,22 +193,6 @@ def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
         assert "does not move the tips" in sentence
 
 
-@pytest.mark.slow
-def test_segments_beyond_the_tip_are_not_identified(rng):
-    q = tendons(rng)
-    truth = tendon_robot(base=planted_base(), offsets=[0.01, 0.02, 0.0]).with_tip(1.5)
-    start = nominal_tendon_robot().with_tip(1.5)
-    result = calibrate(start, q, truth(q), ("radii", "lengths", "offsets", "base"))
-    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
-    assert_close(result.chain.radii[:2], truth.radii[:2], rtol=0, atol=1e-9)
-    assert_close(result.chain.lengths[:2], truth.lengths[:2], rtol=0, atol=1e-9)
-    assert_close(result.chain.offsets[0], truth.offsets[0], rtol=0, atol=1e-9)
-    assert_close(result.chain.base, truth.base, rtol=0, atol=1e-9)
-    unseen = {"radii[2]", "lengths[2]", "offsets[1]", "offsets[2]"}
-    assert {sentence.split(" ")[0] for sentence in result.unidentified} == unseen
-    assert float(result.chain.radii[2]) == pytest.approx(0.0045, rel=1e-9)
-
-
 KINDS = [
     (lengths, routing, n, tip)
     for lengths in (None, [0.06, 0.05])
@@ -248,23 +229,6 @@ def test_derivatives_by_the_geometry(kind, rng):
         expected = torch.func.jacfwd(lambda v, n=name: chain.with_geometry(**{n: v})(q))(value)
         J = chain.geometry_jacobian(q, tangents)
         assert_close(J, expected.flatten(2), rtol=1e-9, atol=1e-11, msg=name)
-
-
-@pytest.mark.parametrize("aliases", [False, True])
-def test_derivatives_of_the_geometry_by_the_free_parameters(aliases, rng):
-    chain, q = any_robot([0.06, 0.05], "base", 3, 2.0, rng)
-    skipped = ("angles", "offsets") if aliases else ("turns", "tool")
-    names = tuple(name for name in parameter_names(chain) if name not in skipped)
-    problem = Problem.of(chain, names, {}, dict.fromkeys(names, 0.5))
-    theta = 0.3 * gauss(rng, len(problem.labels))
-    tangents = problem.tangents(theta)
-    for name, value in problem.moved(theta).geometry().items():
-        J = torch.func.jacfwd(lambda t, name=name: problem.moved(t).geometry()[name])(theta)
-        assert_close(tangents[name], J.movedim(-1, 0), rtol=1e-9, atol=1e-12, msg=name)
-        assert value.shape == tangents[name].shape[1:]
-    # Both together, which is what the search uses.
-    J = torch.func.jacfwd(lambda t: problem.moved(t)(q))(theta)
-    assert_close(problem.moved(theta).geometry_jacobian(q, tangents), J, rtol=1e-8, atol=1e-11)
 
 
 CLOCKWISE = [(0,), (1,), (0, 1), (2,), (0, 2), (0, 1, 2)]
@@ -372,17 +336,6 @@ def test_prior_keeps_what_the_data_do_not_identify(rng):
     assert "radii[2] +1 % does not move the tips: leave radii[2] out" in repr(result)
 
 
-def test_without_a_prior_unidentified_directions_are_still_reported(rng):
-    q = chambers(rng, 60)
-    q[:, 6:] = 0.25
-    x = ConstantCurvatureChain(RADII)(q)
-    x = x + 0.001 * torch.randn(60, 3, generator=rng, dtype=torch.float64)
-    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
-    result = calibrate(nominal, q, x, ("radii",), prior=float("inf"))
-    assert result.identifiable["radii"].tolist() == [True, True, False]
-    assert (result.chain.radii[:2] - torch.tensor(RADII[:2])).abs().max() < 0.005
-
-
 def test_robust_loss_forgets_outliers(rng):
     q = chambers(rng)
     truth = ConstantCurvatureChain(RADII)
@@ -430,40 +383,6 @@ def test_turning_the_frame_leaves_the_fit_as_it_is(loss, rng):
     assert_close(other.chain.radii, plain.chain.radii, rtol=1e-8, atol=0)
     assert_close(other.chain.base, turn @ plain.chain.base, rtol=0, atol=1e-8)
     assert_close(other.std_errors["radii"], plain.std_errors["radii"], rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_the_loss_is_that_of_the_distance(loss):
-    rng = np.random.default_rng(0)
-    e = rng.normal(size=(20, 3)) * np.geomspace(1e-4, 1e2, 20)[:, None]
-    weight, prior = rng.uniform(0.5, 3.0, 20), np.array([0.3, 4.0])
-    z = np.append((weight[:, None] * e**2).ravel(), prior)
-    total, slope, _ = row_loss(z, weight, loss)
-    turn = Rotation.from_rotvec([0.4, 1.0, -2.0]).as_matrix()
-    turned = np.append((weight[:, None] * (e @ turn.T) ** 2).ravel(), prior)
-    bounded = 3.0 * weight @ LOSSES[loss]((e**2).sum(1) / 3.0)[0] + prior.sum()
-    for found in (total.sum(), row_loss(turned, weight, loss)[0].sum()):
-        assert found == pytest.approx(bounded, rel=1e-12)
-    for i in (0, 28, 57, 60):
-        step = 1e-6 * z[i] * (np.arange(62) == i)
-        pair = [
-            row_loss(at, weight, loss)[0][3 * (i // 3) : 3 * (i // 3) + 3].sum()
-            for at in (z + step, z - step)
-        ]
-        assert slope[i] == pytest.approx((pair[0] - pair[1]) / (2.0 * step[i]), rel=1e-4)
-
-
-@pytest.mark.parametrize("name", [name for name in LOSSES if name != "linear"])
-def test_losses_are_those_of_scipy(name):
-    z = np.array([1e-3, 0.5, 1.0, 3.0, 1e4])
-    for at, value, rate, bend in zip(z, *LOSSES[name](z), strict=True):
-        found = least_squares(lambda t, a=at: np.sqrt([a]) + 0.0 * t, [0.0], loss=name, max_nfev=1)
-        assert 2.0 * found.cost == pytest.approx(value, rel=1e-3)
-        step = 1e-4 * at
-        ahead, behind = LOSSES[name](at + step), LOSSES[name](at - step)
-        if at != 1.0:  # where huber bends
-            assert rate == pytest.approx((ahead[0] - behind[0]) / (2 * step), rel=1e-6)
-            assert bend == pytest.approx((ahead[1] - behind[1]) / (2 * step), rel=1e-3, abs=1e-3)
 
 
 def test_bounds_hold(rng):
@@ -556,34 +475,6 @@ def test_sentences_describe_unidentified_directions_and_their_effect(case, rng):
     assert expected in named
 
 
-@pytest.mark.slow
-def test_singular_values_and_standard_errors_agree(rng):
-    q = chambers(rng)
-    x = trunk()(q) + 0.005 * gauss(rng, 100, 3)
-    names = ("radii", "turns", "tool")
-    result = calibrate(trunk([0.09] * 3), q, x, names, prior={"radii": 0.2, "turns": 0.7})
-    flat = np.concatenate([np.ravel(result.std_errors[name]) for name in names])
-    units = np.concatenate([result.values["radii"], np.ones(3), [float(trunk([0.09] * 3).reach)]])
-    prior = np.repeat([0.2, 0.7, 0.5], [3, 3, 1])
-    np.testing.assert_allclose(flat, prior * units / result.narrowing, rtol=1e-9)
-    # The trace of the covariance in units of the prior, by parameters and by directions.
-    by_directions = (1.0 / (result.singular_values**2 + 1.0)).sum()
-    assert (result.narrowing**-2).sum() == pytest.approx(by_directions, rel=1e-9)
-    known = np.concatenate([np.ravel(result.identifiable[name]) for name in names])
-    assert (known == (result.narrowing > 10)).all()
-
-
-def test_lists_and_frames_of_pandas_do_as_well(rng):
-    """In full precision, and frames, whose arrays are read-only, without a word."""
-    chain, q = ConstantCurvatureChain(RADII), chambers(rng)
-    x = chain(q).detach().numpy()
-    start = ConstantCurvatureChain([0.09, 0.09, 0.09])
-    q = q.numpy()
-    for kind in (np.ndarray.tolist, pytest.importorskip("pandas").DataFrame):
-        result = calibrate(start, kind(q), kind(x), ("radii",), prior=math.inf)
-        np.testing.assert_allclose(result.values["radii"], RADII, rtol=1e-8)
-
-
 def test_tips_in_millimetres_are_noticed(rng):
     chain, q = nominal_tendon_robot(), tendons(rng)
     with torch.no_grad():
@@ -592,18 +483,6 @@ def test_tips_in_millimetres_are_noticed(rng):
         calibrate(chain, q, 1000 * x, ("base",))
     far = x + torch.tensor([40.0, 0.0, 0.0], dtype=torch.float64)  # a far frame is none
     assert calibrate(chain, q, far, ("base",), prior=math.inf).rmse < 1e-6
-
-
-def test_numpy_in_numpy_out_and_groups(rng):
-    q = chambers(rng)
-    x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(100, 3, generator=rng).double()
-    groups = np.arange(100) // 10
-    result = calibrate(ConstantCurvatureChain(RADII), q.numpy(), x.numpy(), groups=groups)
-    assert isinstance(result.values["radii"], np.ndarray)
-    assert isinstance(result.std_errors["base"], np.ndarray)
-    assert result.correlations.shape == (9, 9) == (len(result.names),) * 2
-    np.testing.assert_allclose(np.diag(result.correlations), 1.0, rtol=1e-12)
-    assert result.rmse < result.cv_rmse < 1.5 * result.rmse
 
 
 @pytest.mark.parametrize(
@@ -639,14 +518,6 @@ def test_bad_input_says_what_is_needed(change, message):
         calibrate(ConstantCurvatureChain(RADII), **arguments)
 
 
-def test_an_arm_has_no_radii(rng):
-    q = uniform(rng, 10, 6)
-    with pytest.raises(
-        ValueError, match=r"different entries of \['base', 'joint_zeros', 'tool', 'links'\]"
-    ):
-        calibrate(arm(), q, arm()(q), ("radii",))
-
-
 def distances(chain, data):
     with torch.no_grad():
         return np.linalg.norm(chain(torch.from_numpy(data.q)).numpy() - data.x, axis=1)
@@ -656,37 +527,11 @@ NAIVE = ("radii", "lengths", "angles", "base", "tool")
 
 
 @pytest.mark.slow
-def test_real_robot_of_three_cables_from_a_naive_start(data_home):
-    data = datasets.load_armlab(data_home)
-    start = ConstantCurvatureChain([0.01], lengths=[0.1])
-    with pytest.warns(UserWarning, match=r"lengths\[0\] is at its lower bound"):
-        result = calibrate(start, data.q[::10], data.x[::10], NAIVE, loss="soft_l1")
-    assert distances(result.chain, data).mean() <= 0.0025
-    steps = difference(result.chain.angles.diff(), torch.tensor(-THIRD).double())
-    assert steps.abs().max() < 0.1  # its cables run clockwise
-    assert any("lengths[0]" in sentence and "tool" in sentence for sentence in result.unidentified)
-
-
-@pytest.mark.slow
 def test_real_nine_tendon_robot_from_a_naive_start(data_home):
     data = datasets.load_ftdcr(data_home)
     start = ConstantCurvatureChain([0.0045] * 3, lengths=[0.06, 0.0625, 0.064], routing="base")
     result = calibrate(start, data.q[::3], data.x[::3], NAIVE, loss="soft_l1")
     assert distances(result.chain, data).mean() <= 0.009
-
-
-def test_real_nine_tendon_robot(data_home):
-    data = datasets.load_ftdcr(data_home)
-    turns = (-3.03, -2.52, -2.01)
-    chain = ConstantCurvatureChain(
-        [0.0045] * 3,
-        lengths=[0.060, 0.0625, 0.064],
-        routing="base",
-        angles=[[turn + 2 * math.pi / 3 * i for i in range(3)] for turn in turns],
-    )
-    kept = np.array(["tendon" not in group for group in data.groups])
-    result = calibrate(chain, data.q[kept], data.x[kept], ("radii", "base", "tool"))
-    assert distances(result.chain, data)[kept].mean() < 0.006
 
 
 def test_tendons_that_contradict_each_other_warn_once(rng):
@@ -709,17 +554,6 @@ def test_tendons_that_contradict_each_other_warn_once(rng):
         result, messages = fit_geometry(truth, balanced, truth(balanced), ("radii",))
     assert messages == [str(caught[0].message)]
     assert_close(result.values["radii"], truth.radii, rtol=1e-9, atol=0)
-
-
-def test_a_fit_from_a_start_gives_the_chain_alone(rng):
-    truth, nominal = trunk(base=planted_base()), trunk([0.09] * 3)
-    q, names = chambers(rng, 60), ("radii", "base")
-    x, weights = truth(q) + 1e-4 * gauss(rng, 60, 3), 1.0 + torch.arange(60) % 3
-    stds = dict.fromkeys(names, 0.5)
-    start = search(nominal, Rows(q, x, weights), names, "linear", {}, stds)
-    chain = refitted(start, q, x, weights)
-    result, _ = fit_geometry(nominal, q, x, names, sample_weight=weights, start=start)
-    assert_close(chain.geometry(), result.chain.geometry(), rtol=1e-12, atol=1e-13)
 
 
 def test_only_chains_can_be_calibrated(rng):

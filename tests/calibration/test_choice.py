@@ -5,11 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_array_equal
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel, RigidChain
-from hybridkin.calibration.choice import Errors, _best, choose_geometry
-from hybridkin.calibration.measured import inner_and_outer
+from hybridkin.calibration.choice import choose_geometry
 
 NOISE = 5e-4
 
@@ -123,19 +121,6 @@ def test_without_learning_the_held_out_error_decides():
     assert set(model.calibration_.values) == set(choice.parameters)
 
 
-def test_lists_and_other_models_stay_as_given():
-    q, nominal = chambers(60), ConstantCurvatureChain([0.05])
-    x = measured(ConstantCurvatureChain([0.06]), q)
-    choice = choose_geometry(nominal, q, x, parameters=("radii",))
-    assert (choice.parameters, choice.errors, choice.chain) == (("radii",), {}, nominal)
-    by_default = HybridForwardModel(nominal, "linear").fit(q, x)
-    assert by_default.calibration_ is None
-    listed = HybridForwardModel(nominal, "linear", calibrate=["radii"]).fit(q, x)
-    assert set(listed.calibration_.values) == {"radii"}
-    data_alone = HybridForwardModel(torch.nn.Linear(3, 3).double(), "drop", calibrate="auto")
-    assert data_alone.fit(q, x).calibration_ is None
-
-
 @pytest.mark.slow
 def test_rigid_robots_choose_their_base():
     origins = np.tile(np.eye(4), (2, 1, 1))
@@ -144,31 +129,3 @@ def test_rigid_robots_choose_their_base():
     q = np.random.default_rng(0).uniform(-1, 1, (60, 2))
     moved = arm.with_geometry(base=moved_base())
     assert choose_geometry(arm, q, measured(moved, q)).name == "base"
-
-
-def test_which_set_is_taken():
-    every, nan = np.ones(3, dtype=bool), math.nan
-    pair = np.ones(2, dtype=bool)
-    assert _best(np.array([[2.0, 1.0], [1.9, 1.3], [1.9, 1.3]]), every, every) == 0
-    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.9, 0.8]]), every, every) == 1
-    assert _best(np.array([[2.0, 1.0], [1.7, 5.0], [1.7, 6.0]]), every, every) == 1
-    assert _best(np.array([[3.0, nan], [2.0, nan], [1.0, nan]]), every, every) == 2
-    few = np.array([True, True, False])
-    assert _best(np.array([[3.0, nan], [2.0, nan], [1.5, nan]]), few, every) == 1
-    assert _best(np.array([[3.0, nan], [2.0, nan], [1.3, nan]]), few, every) == 2
-    assert _best(np.array([[3.0, nan], [2.0, nan]]), ~pair, pair) == 1
-    # Where the inner rows are too few for the last set, its `io` follows from the one before.
-    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.8, 9.0]]), every, every) == 1
-    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.8, 9.0]]), every, few) == 2
-    assert _best(np.array([[2.0, 1.0], [1.9, 0.8], [1.95, 9.0]]), every, few) == 1
-    assert Errors(2.0).known() == {"cv": 2.0}
-
-
-def test_split_into_inner_and_outer_rows():
-    rng = np.random.default_rng(0)
-    X = np.column_stack([rng.uniform(-1, 1, 200), 10 * rng.uniform(-1, 1, 200), np.ones(200)])
-    inner, outer = inner_and_outer(X)
-    assert (len(inner), len(outer)) == (80, 70)
-    far = np.linalg.norm((X - X.mean(0))[:, :2] / X[:, :2].std(0), axis=1)
-    assert far[inner].max() < far[outer].min()
-    assert_array_equal(inner_and_outer(X * [3.0, 0.1, 7.0])[0], inner)  # units do not matter

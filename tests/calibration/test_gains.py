@@ -10,11 +10,8 @@ from torch.testing import assert_close
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
-    HybridForwardModel,
     calibrate,
-    fit_play,
 )
-from hybridkin.calibration._parameters import Problem
 from hybridkin.calibration.calibrate import fit_geometry
 from hybridkin.calibration.choice import choose_geometry
 
@@ -135,33 +132,6 @@ def test_the_unit_of_q_changes_no_calibration(elastic):
     assert_close(ours.std_errors["radii"], theirs.std_errors["radii"], rtol=1e-6, atol=0)
 
 
-def test_natural_size_of_zeros():
-    problem = Problem.of(tendon_robot(2e-5), ("actuator_zeros",), {}, {"actuator_zeros": 1.0})
-    np.testing.assert_allclose(problem.parameters[0].units, np.full(6, 0.007 / 2e-5))
-
-
-@pytest.mark.slow
-def test_default_widths_of_play_are_in_the_unit_of_q():
-    q, x = measured(tendon_robot(), 5)
-    fit = fit_play(tendon_robot(), q, x, np.arange(60) // 20, parameters=("radii",))
-    mean = np.abs(TRUE).mean()
-    assert_close(fit.widths, np.array([0.0, 0.05, 0.1, 0.2, 0.4]) * 1e-3 / mean)
-
-
-@pytest.mark.parametrize("gains", [2e-5, TRUE])
-@pytest.mark.parametrize("elastic", [False, True])
-def test_one_gain_from_rows_as_tensors(gains, elastic):
-    """Its standard error is a tensor (), as the gain is."""
-    make = ElasticTendonChain.from_chain if elastic else lambda chain: chain
-    truth, start = make(tendon_robot(gains)), make(tendon_robot(1.1 * torch.tensor(gains)))
-    q, x = measured(truth, 6, n=20)
-    result = calibrate(start, torch.from_numpy(q), torch.from_numpy(x), ["gain"])
-    assert result.std_errors["gain"].shape == result.values["gain"].shape == ()
-    assert abs(result.values["gain"] - truth.gains[0]) < 4 * result.std_errors["gain"]
-    hybrid = HybridForwardModel(start, "drop", calibrate=("gain",)).fit(q, x)
-    assert_close(hybrid.calibration_.values["gain"], result.values["gain"])
-
-
 def test_auto_calibrates_the_gain_beside_the_radii():
     """A gain off by 27 % is not hidden in radii that count as identified."""
     q, x = measured(tendon_robot(), 0)
@@ -174,8 +144,3 @@ def test_auto_calibrates_the_gain_beside_the_radii():
     ratio = result.values["gain"] / result.values["radii"][0]
     assert abs(ratio / (TRUE[0] / RADII[0]) - 1) < 0.01
     assert "The data identify gain / radii[0]" in result.unidentified[0]
-
-
-def test_few_rows_calibrate_the_gain_with_the_radii():
-    q, x = measured(tendon_robot(), 0, n=12)
-    assert choose_geometry(tendon_robot(1.27 * TRUE), q, x).name == "radii + base + gain"

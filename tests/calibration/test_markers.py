@@ -66,15 +66,6 @@ def test_equal_markers_give_what_one_gives():
     np.testing.assert_allclose(ratio, 3**0.5, rtol=0.01)
 
 
-def test_a_marker_that_lacks_a_coordinate_is_missing_as_a_whole():
-    q, x = log(30)
-    x[3, 4] = np.nan
-    expected = x.copy()
-    expected[3, 3:6] = np.nan
-    found = [calibrate(NOMINAL, q, each, ("radii",)).values["radii"] for each in (x, expected)]
-    np.testing.assert_array_equal(*found)
-
-
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -87,10 +78,3 @@ def test_rows_without_any_marker_raise(change, match):
     q, x = log(30)
     with pytest.raises(ValueError, match=match):
         calibrate(NOMINAL, q, change(x), ("radii",))
-
-
-def test_of_one_marker_nothing_may_be_missing():
-    q, x = log(30)
-    x[4, 7] = np.nan
-    with pytest.raises(ValueError, match="NaN or infinity in 1 of 30 rows"):
-        calibrate(NOMINAL.tip_model, q, x[:, 6:], ("radii",))

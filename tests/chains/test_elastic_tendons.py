@@ -1,13 +1,9 @@
 import copy
 import math
-import pickle
 
-import joblib
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
@@ -132,17 +128,6 @@ def test_every_way_to_find_the_taut_tendons_agrees(module, limit, monkeypatch, r
     assert_close(J, chain.jacobian(q), rtol=0, atol=1e-12 * float(J.abs().max()))
 
 
-@pytest.mark.parametrize("name", ["through", "soft", "pre-tensioned", "uneven"])
-def test_rows_that_are_not_finite_spoil_no_others(name, rng):
-    chain, n = ROBOTS[name], ROBOTS[name].n_actuators
-    q = random_q(rng, 100, n)
-    spoilt = q.clone()
-    spoilt[::7, 0], spoilt[1::7, 1] = torch.nan, torch.inf
-    sound = spoilt.isfinite().all(-1)
-    assert torch.equal(chain.tensions(spoilt)[sound], chain.tensions(q)[sound])
-    assert torch.isnan(chain(spoilt)[::7]).all()
-
-
 def test_one_tendon_pulled_by_hand():
     radius, bending, axial, pull = 0.005, 2e-6, 4.0, 0.003
     chain = ElasticTendonChain([radius], [0.1], bending_stiffness=bending, axial_stiffness=axial)
@@ -235,22 +220,6 @@ def test_change_of_units(rng):
     in_mm = chain.with_geometry(**{name: unit * geometry[name] for name, unit in units.items()})
     assert_close(in_mm(1e3 * q), 1e3 * chain(q), rtol=1e-12, atol=1e-11)
     assert_close(in_mm.tensions(1e3 * q), 1e3 * chain.tensions(q), rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-@each_robot
-def test_jacobian_against_central_differences(chain, rng):
-    q, step = random_q(rng, 100, chain.n_actuators), 1e-6
-    moves = step * torch.eye(chain.n_actuators, dtype=torch.float64)
-    beside = [chain.slack(q[:, None] + sign * moves) for sign in (2, 1, -1, -2)]
-    smooth = torch.stack(beside).eq(chain.slack(q)[:, None]).flatten(2).all(-1).all(0)
-    q = q[smooth]
-    assert len(q) > 30
-    J, at = chain.jacobian(q), q[:, None]
-    near = (chain(at + moves) - chain(at - moves)) / (2 * step)
-    far = (chain(at + 2 * moves) - chain(at - 2 * moves)) / (4 * step)
-    expected = ((4 * near - far) / 3).mT
-    assert_close(J, expected, rtol=0, atol=1e-7 * float(J.abs().max()))
 
 
 @each_robot
@@ -381,48 +350,6 @@ def test_what_is_kept_follows_the_geometry(rng):
     assert_close(zeros.grad, 2 * slope.sum((0, 1)), rtol=1e-10, atol=1e-10)
 
 
-def test_blocks_of_rows_are_as_one(rng):
-    chain, q = robot(), random_q(rng, 9000)
-    x, J = chain.forward_and_jacobian(q)
-    assert_close((chain(q), x), 2 * (chain._forward(q)[0],), rtol=0, atol=1e-14)
-    assert_close(J, chain._forward_and_jacobian(q)[1], rtol=0, atol=1e-14)
-    one = torch.ones((), dtype=torch.float64)
-    slope = torch.func.jacfwd(lambda scale: chain(scale * q).sum(0))(one)
-    assert_close(slope, (J @ q[..., None]).sum((0, 2)), rtol=1e-10, atol=1e-10)
-
-
-@settings(max_examples=20, deadline=None)
-@given(lead=st.lists(st.integers(0, 3), max_size=3), single=st.booleans())
-def test_any_batch_shape(lead, single):
-    dtype = torch.float32 if single else torch.float64
-    q, chain = torch.full((*lead, 9), -1e-3, dtype=dtype), ROBOTS["through"]
-    for value, shape in (
-        (chain(q), (3,)),
-        (chain.jacobian(q), (3, 9)),
-        (chain.pose_jacobian(q), (6, 9)),
-        (chain.tensions(q), (9,)),
-        (chain.poses(q), (4, 4, 4)),
-        (chain.backbone(q, 5), (16, 3)),
-        (chain.geometry_jacobian(q, {"lengths": torch.eye(3)}), (3, 3)),
-    ):
-        assert value.shape == (*lead, *shape)
-        assert value.dtype == dtype
-    assert chain.slack(q).shape == q.shape
-    assert chain.slack(q).dtype == torch.bool
-
-
-@each_robot
-def test_batch_equals_loop_and_nan_stays_in_its_row(chain, rng):
-    q = random_q(rng, 6, chain.n_actuators)
-    assert_close(chain(q), torch.stack([chain(row) for row in q]), rtol=0, atol=1e-14)
-    spoilt = q.clone()
-    spoilt[2, 4], spoilt[3, 1] = torch.nan, torch.inf
-    x = chain(spoilt)
-    assert torch.isnan(x[2]).all()
-    kept = [0, 1, 4, 5]
-    assert_close(x[kept], chain(q)[kept], rtol=0, atol=1e-14)
-
-
 @each_robot
 def test_single_precision(chain, rng):
     widths = (0.0, 1e-9, 1e-5, 1e-3, 5e-3, 0.05)
@@ -449,16 +376,6 @@ def test_absurd_displacements_end(rng):
             assert torch.isfinite(x).all()
 
 
-@each_robot
-def test_pickle_copy_and_hash(chain, rng):
-    q, fresh = random_q(rng, 3, chain.n_actuators), copy.deepcopy(chain)
-    x = chain(q)
-    assert joblib.hash(fresh) == joblib.hash(chain)
-    for twin in (pickle.loads(pickle.dumps(chain)), copy.deepcopy(chain)):
-        assert_close(twin(q), x, rtol=0, atol=0)
-    assert set(chain.state_dict()) == set(chain.geometry())
-
-
 @pytest.mark.slow
 def test_another_tip(rng):
     whole, q = robot(), random_q(rng, 4)
@@ -477,17 +394,6 @@ def test_another_tip(rng):
         assert_close(slope, expected, rtol=0, atol=1e-11 * float(slope.abs().max()))
     assert repr(whole) == "ElasticTendonChain(3 segments, 9 actuators, routing 'base')"
     assert "tip at 0.3" in repr(whole.with_tip(0.3))
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@each_robot
-def test_on_a_cuda_device(chain, rng):
-    q = random_q(rng, 5000, chain.n_actuators)
-    expected = chain.forward_and_jacobian(q)
-    for there in (chain, copy.deepcopy(chain).cuda()):
-        x, J = there.forward_and_jacobian(q.cuda())
-        assert x.is_cuda
-        assert_close((x.cpu(), J.cpu()), expected, rtol=1e-9, atol=1e-11)
 
 
 def logged(truth, rng, n=300):

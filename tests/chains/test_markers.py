@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, load_model, save_model
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain
 from hybridkin._core import plan
 from hybridkin.chains.chain import Chain
 from hybridkin.native.library import evaluate, program_of
@@ -97,14 +97,6 @@ def test_the_compiled_core_has_one_marker(chain, k):
 def test_several_markers_have_no_kernel(chain):
     with pytest.raises(plan.NoKernel, match="several markers"):
         plan.Plan(chain.with_markers(MARKERS).stored())
-
-
-def test_several_markers_are_saved(chain, tmp_path):
-    marked = chain.with_markers(MARKERS)
-    save_model(marked, tmp_path / "chain.safetensors")
-    again = load_model(tmp_path / "chain.safetensors")
-    assert again.markers == marked.markers
-    assert "markers at 0.5, 2, 1.7, 3" in repr(again)
 
 
 def test_other_chains_keep_the_markers():

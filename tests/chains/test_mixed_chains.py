@@ -11,11 +11,8 @@ from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
     HybridForwardModel,
-    InverseKinematics,
     calibrate,
     datasets,
-    load_model,
-    save_model,
 )
 from hybridkin.chains.chain import Chain
 
@@ -201,18 +198,6 @@ def test_geometry_jacobian_is_that_of_forward_mode(robot):
     )
 
 
-@each_robot
-def test_saved_and_loaded(robot, tmp_path, rng):
-    angles = robot.chain.angles
-    bent = angles + 1e-3 * torch.arange(len(angles)).double()  # calibrated: not quite in a plane
-    for chain in (robot.chain, robot.chain.with_geometry(angles=bent).with_tip(0.5)):
-        save_model(chain, tmp_path / "chain.safetensors")
-        again = load_model(tmp_path / "chain.safetensors")
-        q = 0.2 + 0.01 * torch.randn(5, chain.n_actuators, generator=rng, dtype=torch.float64)
-        assert_close(again(q), chain(q), rtol=0, atol=0)
-        assert repr(again) == repr(chain)
-
-
 def planted(robot, seed, n=150, noise=3e-4, bent=0.0):
     """Return noisy rows (q, x) of a robot whose radii are up to 10 % off, and the robot."""
     rng, chain = np.random.default_rng(seed), robot.chain
@@ -257,23 +242,6 @@ def test_hybrids_learn_what_the_chain_leaves(name, coupling):
     J, step = model.jacobian(q[240:241])[0], 1e-6 * np.eye(q.shape[1])
     right = (model.predict(q[240] + step) - model.predict(q[240] - step)).T / 2e-6
     assert_close(J, right, rtol=0, atol=1e-6 * np.abs(J).max())
-
-
-@pytest.mark.parametrize("name", ["insertion", "rotation and insertion"])
-def test_inverse_kinematics_keeps_lengths_positive_and_turns_freely(name):
-    robot = ROBOTS[name]
-    free = robot.free(np.random.default_rng(3), 20)
-    q = torch.stack([robot.actuators(c) for c in free])
-    ik = InverseKinematics(robot.chain)
-    least = [0.0 if own else -np.inf for own in robot.chain.absolute]
-    assert ik.settings.q_min.tolist() == least
-    found = ik.solve(robot.chain(q), q0=q + 0.02 * torch.sin(torch.arange(q.numel()).view_as(q)))
-    assert found.converged.all()
-    assert_close(robot.chain(found.q), robot.chain(q), rtol=0, atol=1e-4)
-    with pytest.raises(ValueError, match="positive actuator lengths"):
-        robot.chain.check_actuators(-q.abs())
-    (message,) = robot.chain.check_actuators(1e3 * q.abs())
-    assert "looks like millimetres" in message
 
 
 @pytest.mark.parametrize(

@@ -120,26 +120,6 @@ def test_motions_start_afresh_wherever_their_rows_lie(rng):
     close(play.apply_by_group(q.numpy(), groups), y)
 
 
-def test_type_and_dtype_are_kept_and_gradients_flow():
-    play = PlayOperator(0.2)
-    q = torch.tensor([[0.0], [1.0], [0.95]], requires_grad=True)
-    y, state = play.apply(q)
-    assert y.dtype == state.effective.dtype == torch.float32
-    assert_close(torch.autograd.grad(y.sum(), q)[0].ravel(), torch.tensor([1.0, 2.0, 0.0]))
-    y, state = play.apply(np.zeros((2, 1), np.float32))
-    assert isinstance(state.command, np.ndarray)
-    assert y.dtype == state.command.dtype == np.float32
-    assert play.apply([[0], [1]])[0].dtype == np.float64
-
-
-def test_no_rows_leave_the_state_alone():
-    play = PlayOperator(0.2)
-    _, state = play.apply(np.ones((3, 2)))
-    y, after = play.apply(np.ones((0, 2)), state)
-    assert y.shape == (0, 2)
-    close(np.stack(after), np.stack(state))
-
-
 @pytest.mark.parametrize("width", [-1.0, np.nan, np.inf, [[0.1]], [0.1, -0.1]])
 def test_width_must_be_a_play(width):
     with pytest.raises(ValueError, match="`width` must be"):

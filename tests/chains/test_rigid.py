@@ -1,14 +1,9 @@
-import copy
 import math
-import pickle
 import re
 
-import joblib
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
@@ -228,19 +223,6 @@ def test_part_of_an_mjcf_from_a_file(tmp_path, rng):
     assert RigidChain.from_mjcf(path, "pin", root_link="ball").names == ("pin",)
 
 
-@pytest.mark.parametrize("rows", [3, 200], ids=["few rows", "many rows"])
-def test_derivatives(rows, rng):
-    chain, q = arm(tool=[0.1, 0.02, 0.2], base=random_pose(rng)), random_q(rng, rows)
-    x, J = chain.forward_and_jacobian(q)
-    x_reverse, J_reverse = reverse_jacobian(chain.forward, q)
-    assert_close(x, x_reverse, rtol=0, atol=4e-15)
-    assert_close(J, J_reverse, rtol=0, atol=4e-15)
-    assert_close(chain.pose_jacobian(q)[:, :3], J, rtol=0, atol=0)
-    assert_close(torch.func.vmap(torch.func.jacrev(chain))(q), J, rtol=0, atol=4e-15)
-    vmapped = torch.func.vmap(chain.forward_and_jacobian)(q)
-    assert_close(vmapped, (x, J), rtol=0, atol=4e-15)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [2, 65], ids=["few rows", "many rows"])
 def test_gradcheck(rows, rng):
@@ -289,38 +271,6 @@ def test_poses_and_backbone_agree(rng):
     assert chain.backbone(q).shape == (4, 10, 3)
 
 
-@settings(max_examples=30, deadline=None)
-@given(lead=st.lists(st.integers(0, 9), max_size=3), single=st.booleans())
-def test_any_batch_shape(lead, single):
-    q = torch.full((*lead, 2), 0.5, dtype=torch.float32 if single else torch.float64)
-    chain = planar()
-    shapes = {
-        (3,): chain(q),
-        (3, 2): chain.jacobian(q),
-        (6, 2): chain.pose_jacobian(q),
-        (3, 4, 4): chain.poses(q),
-        (10, 3): chain.backbone(q, 3),
-    }
-    for shape, value in shapes.items():
-        assert value.shape == (*lead, *shape)
-        assert value.dtype == q.dtype
-
-
-def test_batch_equals_loop_across_blocks_and_nan_stays_in_its_row(rng):
-    chain, q = arm(), random_q(rng, 5000)
-    before = q.clone()
-    x, J = chain.forward_and_jacobian(q)
-    some = [0, 1, 2500, 4095, 4096, 4999]
-    for row in some:
-        assert_close(chain.forward_and_jacobian(q[row]), (x[row], J[row]), rtol=0, atol=4e-15)
-    assert_close(q, before, rtol=0, atol=0)
-    q[3, 4] = torch.nan
-    spoilt, J_spoilt = chain.forward_and_jacobian(q)
-    assert torch.isnan(spoilt[3]).all()
-    assert_close(spoilt[some], x[some], rtol=0, atol=0)
-    assert_close(J_spoilt[some], J[some], rtol=0, atol=0)
-
-
 def test_float32_keeps_its_dtype_and_accuracy(rng):
     q = random_q(rng, 100).float()
     x, J = arm().forward_and_jacobian(q)
@@ -328,14 +278,6 @@ def test_float32_keeps_its_dtype_and_accuracy(rng):
     reference, J_reference = arm().forward_and_jacobian(q.double())
     assert_close(x.double(), reference, rtol=0, atol=1e-6)
     assert_close(J.double(), J_reference, rtol=0, atol=2e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rows", [3, 200], ids=["few rows", "many rows"])
-def test_compiled(rows, rng):
-    chain, q = arm(), random_q(rng, rows)
-    compiled = torch.compile(chain.forward_and_jacobian, backend="eager", fullgraph=True)
-    assert_close(compiled(q), chain.forward_and_jacobian(q), rtol=0, atol=1e-15)
 
 
 def test_base_and_tool_move_what_they_should(rng):
@@ -384,33 +326,12 @@ def test_with_geometry_is_differentiable_and_leaves_the_arm(rng):
         chain.with_geometry(tool=tool[:2])
 
 
-def test_pickle_copy_and_hash(rng):
-    chain, q = arm(), random_q(rng, 3)
-    for twin in (pickle.loads(pickle.dumps(chain)), copy.deepcopy(chain), arm()):
-        assert_close(twin(q), chain(q), rtol=0, atol=0)
-        assert joblib.hash(twin) == joblib.hash(chain)
-    assert joblib.hash(arm(tool=[0.0, 0.0, 0.1])) != joblib.hash(chain)
-    assert chain.float().carriers.dtype == torch.float32
-    assert_close(chain(q), arm()(q), rtol=0, atol=1e-6)
-
-
 def test_pytorch_kinematics_rotations_become_orthonormal():
     kinematics = pytest.importorskip("pytorch_kinematics")
     serial = kinematics.build_serial_chain_from_urdf(URDF.encode(), "flange")
     rotation = RigidChain.from_chain(serial).origins[:, :3, :3]
     eye = torch.eye(3, dtype=torch.float64).expand_as(rotation)
     assert_close(rotation.mT @ rotation, eye, rtol=0, atol=2e-15)
-
-
-def test_inverse_kinematics_reaches_what_can_be_reached(rng):
-    chain = arm(tool=[0.0, 0.0, 0.1])
-    low = torch.tensor([-2.8, -2.0, 0.0, -2.0, -2.8, -2.0, -2.8, -2.0], dtype=torch.float64)
-    high = torch.where(chain.slides, 0.4, -low)
-    targets = chain(low + (high - low) * torch.rand(50, 8, generator=rng, dtype=torch.float64))
-    ik = InverseKinematics(chain, q_min=low, q_max=high)
-    found = ik.solve(targets, tol=1e-6, max_iter=100, restarts=5)
-    assert_close(chain(found.q), targets, rtol=0, atol=1e-4)
-    assert ((found.q >= low) & (found.q <= high)).all()
 
 
 def sagging(q):
@@ -435,17 +356,6 @@ def test_a_hybrid_learns_the_sag_of_an_arm_and_is_inverted(rng):
     ik = InverseKinematics(model, q_min=-1.0, q_max=1.0)
     found = ik.solve(targets, max_iter=100, restarts=5)
     assert_close(model.module_(found.q), targets, rtol=0, atol=1e-4)
-
-
-def test_calibration_finds_the_base(rng):
-    q, base = random_q(rng, 60), torch.eye(4, dtype=torch.float64)
-    base[:3, :3] = torch.linalg.matrix_exp(
-        torch.tensor([[0.0, -0.2, 0.1], [0.2, 0.0, 0.3], [-0.1, -0.3, 0.0]], dtype=torch.float64)
-    )
-    base[:3, 3] = torch.tensor([0.05, -0.1, 0.2])
-    result = calibrate(arm(), q, arm(base=base)(q), ("base",))
-    assert_close(result.values["base"], base, rtol=0, atol=1e-8)
-    assert_close(result.chain(q), arm(base=base)(q), rtol=0, atol=1e-8)
 
 
 LINKS = '<robot name="r"><link name="a"/><link name="b"/>{}</robot>'

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -225,28 +224,6 @@ def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
     assert "radius covering 90 % of the tips" in printed
 
 
-def test_npz_and_parquet_are_read_as_csv_is(log, robot, tmp_path, capsys):
-    pd = pytest.importorskip("pandas")
-    pytest.importorskip("pyarrow")
-    table = rows()
-    names = HEADER.split(",")
-    pd.DataFrame(dict(zip(names, table.T, strict=True))).to_parquet(tmp_path / "log.parquet")
-    arrays = {"tendons": table[:, 1:7], "tip": table[:, 7:10], "motion": table[:, 10]}
-    np.savez(tmp_path / "log.npz", time=table[:, 0], **arrays)
-    ranges = []
-    for name, extra in (
-        ("log.csv", []),
-        ("log.parquet", []),
-        ("log.npz", ["--q", "tendons", "--x", "tip"]),
-    ):
-        code, record = document(capsys, "describe", tmp_path / name, "--robot", robot, *extra)
-        assert code == 0
-        ranges.append(record["q_range"])
-        assert record["n_motions"] == 10
-    np.testing.assert_allclose(ranges[1], ranges[0], atol=1e-8)
-    np.testing.assert_allclose(ranges[2], ranges[0], atol=1e-8)
-
-
 def test_options_stand_over_the_log_table(log, robot, tmp_path, capsys):
     table = rows()
     table[:, 1:7] *= -0.1  # cm, shortening negative
@@ -308,24 +285,6 @@ def test_spoilt_logs_stop_the_fit_with_advice(robot, tmp_path, capsys, spoil, fo
     assert code == 1
     assert not record["ok"]
     assert any(re.search(found, finding["message"]) for finding in record["findings"])
-
-
-@pytest.mark.parametrize(
-    ("spoil", "option", "left"), [(frozen, "--drop-frozen", 220), (with_nan, "--drop-invalid", 237)]
-)
-def test_spoilt_rows_can_be_left_out(robot, tmp_path, capsys, spoil, option, left):
-    table, _ = spoil(rows())
-    log = write(tmp_path / "log.csv", table)
-    code, record = document(capsys, "describe", log, "--robot", robot, option)
-    assert code == 0
-    assert record["ok"]
-    kept = workflow.read_log(
-        log,
-        robots.read_description(robot).log,
-        drop_frozen=spoil is frozen,
-        drop_invalid=spoil is with_nan,
-    )
-    assert len(kept.q) == left
 
 
 @pytest.mark.parametrize(
@@ -416,16 +375,6 @@ def test_an_interrupt_that_an_import_turns_into_an_error(log, robot, tmp_path, c
     assert errors.split("\n\n")[-1] == "hybridkin: interrupted; nothing was written\n"
     assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
     assert code == 130
-
-
-@pytest.mark.slow
-def test_an_error_of_the_program_keeps_its_traceback(log, robot, tmp_path, monkeypatch):
-    def broken(*_, **__):
-        raise AssertionError
-
-    monkeypatch.setattr(workflow, "fit_log", broken)
-    with pytest.raises(AssertionError):
-        main(["fit", str(log), "--robot", str(robot), "--out", str(tmp_path / "m")])
 
 
 # evaluate, track, animate, describe
@@ -631,18 +580,6 @@ def test_track_leads_in_from_where_the_robot_stands(fitted, tmp_path, capsys):
     assert run(capsys, *arguments, "--from=1,2")[0] == 2
 
 
-@pytest.mark.slow
-def test_start_of_chambers_is_the_middle_of_their_range(tmp_path):
-    chain = hybridkin.robots.bionic_handling_assistant()
-    loaded = workflow.LoadedModel("trunk", Path("trunk.toml"), chain)
-    limits = workflow.path_limits(loaded, 0.1, 0.4)
-    path = hybridkin.trajectories.line([0.0, 0, 0.75], [0.05, 0, 0.75], duration=1.0, dt=0.25)
-    report, _ = workflow.track_path(loaded, path, tmp_path / "t", limits=limits)
-    np.testing.assert_allclose(report.record["lead_in"]["start"], 0.25)
-    with pytest.raises(ValueError, match='`start` must be "rest", "path" or numbers'):
-        workflow.track_path(loaded, path, "t", limits=limits, start="home")
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -694,15 +631,6 @@ def test_animate_a_track(fitted, tmp_path, capsys, kind):
     assert sorted(p.name for p in tmp_path.iterdir()) == [out.name, "track"]
 
 
-def test_animate_knows_its_formats(fitted, tmp_path, capsys):
-    code, _, errors = run(
-        capsys, "animate", fitted / "model", fitted / "log.csv", "--out", tmp_path / "film.avi"
-    )
-    assert code == 2
-    assert "must end in" in errors
-    assert [*tmp_path.iterdir()] == []
-
-
 def test_describe_tells_what_a_model_is(fitted, capsys):
     code, record = document(capsys, "describe", fitted / "model")
     assert code == 0
@@ -739,16 +667,6 @@ def test_describe_of_a_description_and_of_what_is_none(fitted, tmp_path, capsys)
     code, _, errors = run(capsys, "describe", other)
     assert code == 2
     assert "not a model" in errors
-
-
-def test_a_model_of_another_robot_is_refused(fitted, tmp_path, capsys):
-    other = tmp_path / "other.toml"
-    other.write_text("[[segment]]\nradius = 0.005\nlength = 0.1\n")
-    code, _, errors = run(
-        capsys, "evaluate", fitted / "model", fitted / "log.csv", "--robot", other
-    )
-    assert code == 2
-    assert "has 3 actuators" in errors
 
 
 # play, and domains of odd shape
@@ -880,21 +798,6 @@ def test_first_track_of_a_kernel_model_stays_where_the_model_is_at_home(tmp_path
     np.testing.assert_allclose(record["limits"]["q_max"], high)
 
 
-@pytest.mark.slow
-def test_track_of_a_calibrated_model_without_a_learned_part(tmp_path, capsys):
-    table = rows()
-    chain = hybridkin.ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
-    model = hybridkin.HybridForwardModel(chain, "drop", calibrate=("radii",))
-    model.fit(-1e-3 * table[:, 1:7], 1e-3 * table[:, 7:10])
-    save_model(model, tmp_path / "drop.safetensors")
-    shape = ["--shape", "figure-eight", "--size", "10,5", "--unit", "mm", "--dt", "1"]
-    code, record = document(
-        capsys, "track", tmp_path / "drop.safetensors", *shape, "--out", tmp_path / "t"
-    )
-    assert code == 0
-    assert record["reached"] == record["n"]
-
-
 # the command line itself
 
 
@@ -952,22 +855,6 @@ def test_a_reader_that_stops_early_is_no_error(fitted):
     assert process.returncode == 0
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
-def test_a_full_disk_for_the_result_is_an_error_in_one_line(fitted):
-    command = [sys.executable, "-m", "hybridkin", "describe", fitted / "robot.toml"]
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
-    assert done.returncode == 2
-    assert re.fullmatch(r"hybridkin: error: .*No space left on device\n", done.stderr)
-
-
-def test_groups_of_the_description_can_be_left_out(log, robot, capsys):
-    code, record = document(capsys, "describe", log, "--robot", robot, "--groups", "none")
-    assert code == 0
-    assert record["n_motions"] in (None, 0)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -1002,20 +889,6 @@ def test_help_comes_at_once_and_json_is_alone_on_stdout(fitted):
 
 
 # the recordings of real robots, rows thinned for speed
-
-
-@pytest.mark.slow
-def test_fit_of_ftdcr_with_nothing_but_a_robot_description(data_home, tmp_path, capsys):
-    log, out = data_home / "ftdcr_v4" / "train.csv", tmp_path / "m"
-    arguments = [log, "--robot", "examples/robots/ftdcr_v4.toml", "--out", out]
-    code, record = document(capsys, "fit", *arguments, *FIT, "--max-rows", "410", "--no-auto")
-    assert code == 0
-    assert (record["n"], record["n_whole"], record["n_motions"]) == (405, 1620, 66)
-    assert {f["kind"] for f in record["log_check"]["findings"]} == {"time"}
-    held_out = {name: entry["mean"] for name, entry in record["held_out"].items()}
-    assert held_out["hybrid, ELM"] < held_out["mechanical, calibrated"]
-    assert held_out["mechanical, calibrated"] < held_out["mechanical, nominal"]
-    assert (out / "model.safetensors").is_file()
 
 
 @pytest.mark.slow

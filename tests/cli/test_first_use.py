@@ -93,13 +93,6 @@ def test_init_of_motors(tmp_path, capsys, options, metres):
     assert robot.log.q_unit == options[1]
 
 
-def test_sizes_of_motors_may_differ_by_segment(tmp_path, capsys):
-    options = ["--q-unit", "ticks", "--spool-radius", "6,3", "--counts-per-turn", "100"]
-    run(capsys, "init", tmp_path / "r.toml", *MOTORS, *options)
-    gains = robots.from_toml(tmp_path / "r.toml").gains.numpy()
-    assert gains == pytest.approx(np.repeat([6e-5, 3e-5], 3) * 2 * np.pi)
-
-
 def test_every_key_of_the_file_has_a_comment(tmp_path, capsys):
     run(capsys, "init", tmp_path / "r.toml", *TENDONS, "--q-sign", "1")
     lines = (tmp_path / "r.toml").read_text().splitlines()
@@ -165,14 +158,6 @@ def test_init_without_what_it_needs_writes_nothing(tmp_path, capsys, options, me
     assert code == 2
     assert message in err
     assert not [*tmp_path.iterdir()]
-
-
-def test_init_names_columns_that_it_does_not_find(tmp_path, capsys):
-    (tmp_path / "log.csv").write_text("left,right,up,x,y,z\n1,2,3,4,5,6\n")
-    options = [*TENDONS, "--q-sign", "1", "--segments", "1", "--log", tmp_path / "log.csv"]
-    code, _, err = run(capsys, "init", tmp_path / "robot.toml", *options)
-    assert code == 2
-    assert "needs --q where" in err
 
 
 def test_init_replaces_a_file_only_by_force(tmp_path, capsys):

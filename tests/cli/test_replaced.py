@@ -8,7 +8,6 @@ import torch
 
 from hybridkin import robots
 from hybridkin.cli.main import main
-from hybridkin.workflow.report import check_out
 
 ROBOT = """calibrate = []
 [[segment]]
@@ -91,21 +90,6 @@ def test_fit_keeps_the_description_of_another_robot(home, capsys):
     assert main(["fit", *COMMANDS["fit"], "--out", "arm"]) == 2
     assert "arm has robot.toml, not written by `hybridkin fit`" in capsys.readouterr().err
     assert content(out) == {"robot.toml": b"mine"}
-
-
-def test_a_folder_with_other_files_is_used(home):
-    (home / "log.txt").write_text("mine")
-    assert main(["next", *COMMANDS["next"], "--out", "."]) == 0
-    assert (home / "log.txt").read_text() == "mine"
-    assert (home / "next.csv").is_file()
-
-
-@pytest.mark.parametrize("text", ["", "[1, 2]", '{"command": 3}', "[" * 100_000, "\xff"])
-def test_a_report_of_another_program_is_not_replaced(tmp_path, text):
-    (tmp_path / "report.json").write_text(text, encoding="latin-1")
-    with pytest.raises(FileExistsError, match=r"has report\.json, not written by `hybridkin next`"):
-        check_out(tmp_path, "next", ["next.csv"], force=False)
-    check_out(tmp_path, "next", ["next.csv"], force=True)
 
 
 @pytest.mark.slow

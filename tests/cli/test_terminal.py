@@ -48,13 +48,6 @@ def test_a_long_stage_says_how_much_time_is_left(clock, capsys):
     ]
 
 
-def test_a_stage_that_fails_gets_no_time(clock, capsys):
-    stages = Stages()
-    stages("tracking", 1, 4)
-    stages.close()
-    assert capsys.readouterr().err == "hybridkin: tracking ...\n"
-
-
 def test_quiet_leaves_warnings_and_what_is_important(clock, capsys):
     stages = Stages(quiet=True)
     stages("tracking", 0, 4)
@@ -93,11 +86,6 @@ def report():
     report = Report("A table")
     report.table(["tip error [mm]", "mean"], [["hybrid, auto", "1.50"], ["[/nominal]", "22.75"]])
     return report
-
-
-def test_tables_are_plain_in_a_pipe(report, capsys):
-    aligned = "  tip error [mm]   mean\n  hybrid, auto     1.50\n  [/nominal]      22.75"
-    assert shown(report) == f"A table\n\n{aligned}"
 
 
 def test_tables_are_ruled_on_a_terminal_and_colours_can_be_off(report, monkeypatch):

@@ -3,8 +3,7 @@ import pytest
 import torch
 from numpy.testing import assert_array_equal
 
-from hybridkin._core.arrays import check_shape, labels, leading, number, shaped, table
-from hybridkin._core.blocks import in_blocks
+from hybridkin._core.arrays import check_shape, labels, leading, shaped, table
 
 
 def test_shapes_of_lengths_letters_and_leading_axes():
@@ -27,13 +26,6 @@ def test_shapes_of_lengths_letters_and_leading_axes():
     assert_array_equal(shaped([[1, 2]], "x", "T2", 1), [[1.0, 2.0]])
     with pytest.raises(ValueError, match=r"`t` must have shape \(3,\), got \(2,\)"):
         shaped([0.0, 1.0], "t", "T", 3)
-
-
-def test_one_number_is_one():
-    assert number(np.float32(0.5), "at") == 0.5
-    assert type(number(torch.tensor(2), "at")) is float
-    with pytest.raises(ValueError, match=r"`at` must be one number, got \[1.0\]"):
-        number([1.0], "at")
 
 
 def test_labels_of_any_kind():
@@ -63,12 +55,3 @@ def test_tables_keep_what_scikit_learn_asks_for():
     assert table(None, "sample_weight") is None
     assert table(2.0, "sample_weight") == 2.0
     assert_array_equal(table([[1, 2]], "X"), [[1.0, 2.0]])
-
-
-@pytest.mark.parametrize("lead", [(), (7,), (2, 3), (0,), (2, 0)])
-def test_blocks_are_the_whole(lead):
-    q = torch.arange(float(np.prod(lead) * 3)).reshape(*lead, 3)
-    square, outer = in_blocks(lambda rows: (rows**2, rows[:, :, None] * rows[:, None]), q, 2)
-    assert_array_equal(square, q**2)
-    assert_array_equal(outer, q[..., :, None] * q[..., None, :])
-    assert square.is_contiguous()

@@ -36,23 +36,6 @@ def test_a_class_with_a_layout_registers_its_writer(constant):
     assert plan.data[plan.begin(plan.root) :][:3].tolist() == [0.0, 1.0, 2.0]
 
 
-def test_classes_without_a_writer_have_no_kernel(constant):
-    class Other(PortableModule):
-        layout = Layout("other", {})
-
-    with pytest.raises(NoKernel, match="'other' has no kernel"):
-        Plan(Stored(Other.layout.kind))
-
-
-def test_equal_nodes_share_one_place(constant):
-    def write(plan):
-        places = {plan.node_of(constant), plan.node_of(constant)}
-        assert len(places) == 1
-        return places.pop()
-
-    assert Plan(write).digest == Plan(constant).digest
-
-
 def test_sizes_are_limited():
     for what, most in MOST.items():
         with pytest.raises(NoKernel, match=f"{most + 1} {what}: the kernels support at most"):

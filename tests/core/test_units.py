@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from hybridkin._core.units import METRES, UNITS, degrees_message, motion_message, span_message
+from hybridkin._core.units import METRES, UNITS, motion_message
 
 
 def tips(span, n=5):
@@ -32,12 +32,3 @@ def test_tips_that_lie_further_apart_than_the_model_moves(span, moved, noticed):
     assert (message is not None) == noticed
     if noticed:
         assert message.startswith(f"`x` spans {span:.4g} m, but the robot is only 0.25 m long")
-
-
-def test_spans_and_angles():
-    assert span_message("x", tips(2.5), 0.25) is None
-    assert span_message("x", tips(2.51).flip(1), 0.25) is not None
-    assert degrees_message("q", torch.tensor([12.56])) is None
-    assert "radians" in (degrees_message("q", torch.tensor([0.0, 13.0])) or "")
-    assert degrees_message("q", torch.tensor([13.0]), factor=2.0) is None
-    assert degrees_message("q", torch.zeros(0)) is None

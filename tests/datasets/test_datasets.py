@@ -1,5 +1,4 @@
 import json
-import shutil
 import sys
 
 import numpy as np
@@ -9,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
 from hybridkin import ConstantCurvatureChain
-from hybridkin.chains.robots import bionic_handling_assistant
 from hybridkin.datasets import (
     Log,
     check_log,
@@ -39,12 +37,6 @@ def test_shipped_data_say_what_they_are():
     assert "Reinhart" in data.citation
 
 
-def test_shipped_data_return_X_y():
-    q, x = load_trunk(return_X_y=True)
-    assert_array_equal(q, load_trunk().q)
-    assert_array_equal(x, load_trunk().x)
-
-
 def test_shipped_data_break_constant_curvature_as_the_papers_trunk_does():
     q, x = map(torch.as_tensor, load_trunk(return_X_y=True))
 
@@ -66,17 +58,6 @@ def test_paper_split():
     assert np.bincount(data.part[train]).tolist() == [500, 500, 500, 400]
     assert_array_equal(paper_split(data.part, 0)[1], test)
     assert (paper_split(data, random_state=1)[1] != test).any()
-
-
-@pytest.mark.parametrize("n_test", [0, 501])
-def test_paper_split_needs_enough_random_rows(n_test):
-    with pytest.raises(ValueError, match="`n_test` must be 1 to 500"):
-        paper_split(load_trunk(), n_test=n_test)
-
-
-def test_paper_split_needs_parts():
-    with pytest.raises(ValueError, match="has no parts"):
-        paper_split(type("Data", (), {"part": None})())
 
 
 # CSV logs
@@ -121,16 +102,6 @@ def test_csv_angles_and_unitless(log):
     data = load_log(path, **COLUMNS, q_unit="1")
     assert_allclose(data.q, [[90, 180, -90]])
     assert data.units["q"] == "1"
-
-
-def test_counts_stay_counts(log):
-    path = log(HEADER + "0,r,90,180,-90,1,2,3\n")
-    data = load_log(path, **COLUMNS, q_unit="1", q_sign=-1)
-    assert_allclose(data.q, [[-90, -180, 90]])
-    assert (data.units["q"], data.file_units["q"]) == ("1", "1")
-    assert "q from -180 to 90," in str(check_log(data))
-    angles = check_log(load_log(path, **COLUMNS, q_unit="deg"))
-    assert "q from -90 to 180 deg" in str(angles)
 
 
 def test_csv_with_byte_order_mark_semicolons_blanks_and_empty_lines(log):
@@ -179,17 +150,6 @@ def test_csv_invalid_rows_are_counted_or_dropped(log):
 def test_csv_errors(log, text, arguments, message):
     with pytest.raises(ValueError, match=message):
         load_log(log(text), **{**COLUMNS, **arguments})
-
-
-def test_csv_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="there is none at"):
-        load_log(tmp_path / "absent.csv", **COLUMNS)
-
-
-@pytest.mark.parametrize("row", ["0,r,1,1,1,100,200,300\n", "0,r,1,1,1,0,0,0\n0,r,1,1,1,9,0,0\n"])
-def test_csv_millimetres_in_a_metre_field_warn(log, row):
-    with pytest.warns(UserWarning, match="x_unit='mm'"):
-        load_log(log(HEADER + row), **COLUMNS, q_unit="mm")
 
 
 def test_logs_of_every_format_hold_the_same(tmp_path):
@@ -315,13 +275,6 @@ def test_one_frozen_coordinate_and_a_frozen_actuator():
     assert finding.rows.tolist() == [*range(70, 85)]
 
 
-def test_actuators_that_rest_by_command_are_not_frozen():
-    log = tendon_log()
-    log["q"][60:120, 3:] = 0.0
-    log["q"][180:240, :3] = 0.0
-    assert not any(kind == "frozen actuator" for kind, _ in found(log))
-
-
 def test_invalid_rows():
     log = tendon_log()
     log["x"][[3, 4, 90], 2] = np.nan
@@ -405,18 +358,6 @@ def test_units_that_cannot_be(q, x, units, advice):
         assert wanted in finding.advice
 
 
-def test_units_that_are_no_lengths():
-    log = tendon_log()
-    turns = {**log, "units": {"q": "rad", "x": "m"}, "file_units": {"q": "deg", "x": "mm"}}
-    (finding,) = check_log(Log(**turns), chain=CHAIN).errors
-    assert "the actuators of the robot are lengths, but q is in deg" in finding.message
-    assert "`spool_radius`" in finding.advice
-    assert check_log(Log(**turns)).ok
-    steps = {**log, "q": 1e3 * log["q"], "file_units": {"q": "mm", "x": "m"}}
-    (finding,) = check_log(Log(**steps), chain=CHAIN).errors
-    assert "`gain` (of pressures or steps: metres per unit)" in finding.advice
-
-
 def test_logs_in_counts_are_checked_in_metres():
     gains = np.array([2e-5, -3e-5, 2.5e-5, 1e-5, 4e-5, 2e-5])
     zeros = torch.full((6,), 512.0, dtype=torch.float64)
@@ -434,17 +375,6 @@ def test_logs_in_counts_are_checked_in_metres():
     found, wanted = findings(-1.0)
     assert found == wanted
     assert any("sign of q flipped" in message for message in found)
-
-
-@pytest.mark.parametrize("unit", ["mm", "cm"])
-def test_units_of_chambers(unit):
-    data, scale = load_trunk(), {"mm": 1e3, "cm": 1e2}[unit]
-    log = {"q": scale * data.q, "x": scale * data.x}
-    report = check_log(Log(**log), chain=bionic_handling_assistant())
-    for name, finding in zip("qx", report.errors, strict=True):
-        assert f'{name}_unit = "{unit}"' in finding.advice
-    changes = check_log(Log(data.q - 0.25, data.x), chain=bionic_handling_assistant())
-    assert "give `length`" in changes.errors[0].advice
 
 
 def test_a_wrong_sign_is_told():
@@ -469,13 +399,6 @@ def test_clockwise_numbering_is_told(base_is_free):
     finding = found(log, chain=CHAIN, base_is_free=base_is_free)["numbering", "warning"]
     assert "clockwise = true" in finding.advice
     assert check_log(Log(**tendon_log()), chain=CHAIN, base_is_free=base_is_free).ok
-
-
-def test_a_model_that_explains_nothing_is_told():
-    log = tendon_log()
-    log["q"] = np.random.default_rng(1).permutation(log["q"])
-    finding = found(log, chain=CHAIN)["geometry", "warning"]
-    assert "columns are q and x, their order" in finding.advice
 
 
 def test_check_says_what_it_needs():
@@ -550,12 +473,6 @@ def test_asl_trunk(data_home):
     assert_array_equal(data.x, data.disks[:, 2])
     assert set(data.groups) <= set(range(len(data.run_names)))
     assert data.units["q"] == "1"
-
-
-def test_data_home_comes_from_the_environment(data_home, monkeypatch, tmp_path):
-    shutil.copytree(data_home / "asl_trunk_static", tmp_path / "asl_trunk_static")
-    monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
-    assert len(load_asl_trunk().q) == 2170
 
 
 def test_a_log_shows_a_summary():

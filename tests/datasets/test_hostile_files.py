@@ -54,16 +54,6 @@ def test_an_npz_that_expands_without_measure(tmp_path, monkeypatch):
         load_log(path, Q, X)
 
 
-def test_an_array_of_many_columns_and_one_of_complex_numbers(tmp_path):
-    path = tmp_path / "log.npz"
-    np.savez(path, q=np.zeros((2, 10_001)), x=np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="must have at most 10000 columns, got 10001"):
-        load_log(path, "q", "x")
-    np.savez(path, q=np.full((2, 3), 1j), x=np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="must hold numbers, got complex128"):
-        load_log(path, "q", "x")
-
-
 def test_a_parquet_of_one_value_repeated(tmp_path, monkeypatch):
     monkeypatch.setattr(_npz, "_MOST", 10**6)
     pd = pytest.importorskip("pandas")
@@ -82,13 +72,6 @@ def test_a_wide_header_over_short_rows_costs_what_the_file_holds(tmp_path):
     path.write_text(wide.replace("\n", 2_000 * ",c" + "\n") + "0,0,0\n")
     with pytest.raises(ValueError, match="must have at most 10000 columns, got 11007"):
         load_log(path, Q, X)
-
-
-def test_names_of_motions_have_an_end(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text(HEADER + "0,0,0,0,0,0," + "a" * 300 + "\n")
-    with pytest.raises(ValueError, match="`groups` must name motions in at most 256 characters"):
-        load_log(path, Q, X, "motion")
 
 
 def test_messages_have_an_end(tmp_path):

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from hybridkin.chains.robots import LogFormat
 from hybridkin.datasets import load_log
-from hybridkin.datasets._log_report import LogReport
-from hybridkin.workflow import read_log
 
 N = 6
 NAMES = {"q": ["a", "b", "c"], "x": ["X", "Y", "Z"]}
@@ -69,12 +66,6 @@ def test_a_time_zone_does_not_change_the_time(tmp_path):
     assert local.time[0] == dates[0].timestamp()
 
 
-def test_fractions_of_a_second_are_kept(tmp_path):
-    ticks = np.array([0, 1, 10, 100, 1000, 10_000]).astype("m8[us]")
-    log = load_log(npz(tmp_path, t=np.datetime64("2024-01-01") + ticks), **NAMES, time="t")
-    assert_allclose(log.time - FIRST, 1e-6 * ticks.astype(float), atol=2.5e-7)
-
-
 def test_a_missing_date_is_a_missing_value(tmp_path):
     dates = np.datetime64("2024-01-01") + np.arange(N).astype("m8[s]")
     dates[2] = "NaT"
@@ -93,11 +84,6 @@ def test_dates_are_no_actuators_and_no_tips(tmp_path, name, kind):
             load_log(write(tmp_path, **{name: dates}), **NAMES)
 
 
-def test_months_have_no_seconds(tmp_path):
-    with pytest.raises(ValueError, match=r"'t' .* must hold numbers, got timedelta64\[M\]"):
-        load_log(npz(tmp_path, t=np.arange(N).astype("m8[M]")), **NAMES, time="t")
-
-
 # a column has one use
 
 
@@ -113,12 +99,6 @@ def test_a_column_is_used_once(tmp_path, use):
     for path in (text(tmp_path, HEADER, *ROWS), npz(tmp_path)):
         with pytest.raises(ValueError, match="must name a column once"):
             load_log(path, **{**NAMES, **use})
-
-
-def test_a_column_of_an_array_is_used_once(tmp_path):
-    np.savez(tmp_path / "log.npz", q=np.zeros((N, 3)), x=np.ones((N, 3)))
-    with pytest.raises(ValueError, match="must name a column once"):
-        load_log(tmp_path / "log.npz", ["q", "q[0]"], ["x"])
 
 
 def test_a_motion_may_be_named_by_an_actuator(tmp_path):
@@ -142,39 +122,6 @@ def test_rows_without_a_motion_are_named(tmp_path, missing):
     assert len(load_log(path, **NAMES).q) == 8  # motions do not matter if they are not read
 
 
-@pytest.mark.parametrize(
-    "motions",
-    [
-        np.array([1, 1, np.nan, np.nan, 2, 2]),
-        np.array(["u", "u", "", " ", "v", "v"]),
-        np.array(["2024-01-01", "2024-01-02", "", "", "2024-01-03", "2024-01-03"], "M8[D]"),
-    ],
-)
-def test_rows_of_arrays_without_a_motion_are_named(tmp_path, motions):
-    with pytest.raises(ValueError, match=r"2 of 6 rows .* \(rows 2-3\)"):
-        load_log(npz(tmp_path, m=motions), **NAMES, groups="m")
-
-
-@pytest.mark.parametrize("kind", ["object", "category", "Int64"])
-def test_rows_of_data_frames_without_a_motion_are_named(tmp_path, kind):
-    pd = pytest.importorskip("pandas")
-    values = [1, 1, None, None, 2, 2] if kind == "Int64" else ["u", "u", None, None, "v", "v"]
-    with pytest.raises(ValueError, match=r"2 of 6 rows .* \(rows 2-3\)"):
-        load_log(parquet(tmp_path, m=pd.Series(values, dtype=kind)), **NAMES, groups="m")
-
-
-def test_the_check_of_a_log_names_rows_without_a_motion(tmp_path):
-    path = text(tmp_path, HEADER, *(row.replace("u", "") for row in ROWS))
-    reports: list[LogReport] = []
-    for drop in (False, True):
-        log = read_log(path, LogFormat(**NAMES, groups="m"), drop_invalid=drop)
-        assert log.groups.tolist() == ["v"] * 4
-        reports.append(log.report)
-    first, second = ([f for f in report.findings if f.kind == "invalid"] for report in reports)
-    assert [finding.severity for finding in (*first, *second)] == ["error", "warning"]
-    assert "lines 2-5" in first[0].message
-
-
 # quotes
 
 
@@ -189,18 +136,6 @@ def test_a_quote_that_hides_rows_is_noticed(tmp_path, at, end, cell):
     path = text(tmp_path, HEADER, *(",".join(row) + "\n" for row in rows))
     with pytest.raises(ValueError, match=rf"quote .* in line {at + 2} .* up to line \d|\d+ cells"):
         load_log(path, ["b", "c"], NAMES["x"])
-
-
-def test_a_quote_in_the_header_is_noticed(tmp_path):
-    path = text(tmp_path, HEADER.replace("m", '"m'), *ROWS)
-    with pytest.raises(ValueError, match=r"in line 1 .* hides rows up to line 9"):
-        load_log(path, **NAMES)
-
-
-def test_a_quote_that_hides_a_long_file_is_noticed(tmp_path):
-    path = text(tmp_path, HEADER, ROWS[0].replace("u", '"u'), *(1000 * ROWS))
-    with pytest.raises(ValueError, match=r"does not close a quote .*field limit"):
-        load_log(path, **NAMES)
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])

@@ -1,7 +1,6 @@
 """A model that follows its robot to another day: moved base, shifted zeros, nothing else."""
 
 import copy
-import warnings
 
 import numpy as np
 import pytest
@@ -12,22 +11,17 @@ from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
-    ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
     InverseKinematics,
     RigidChain,
     datasets,
     jacobian,
-    load_model,
     native,
     robots,
-    save_model,
 )
 from hybridkin._core.rotations import rotation, rotation_vector
-from hybridkin.hybrid._adapt import _whitened
 from hybridkin.hybrid._adapted import AdaptedModel
-from hybridkin.hybrid._module import HybridModule
 
 SHIFT = 0.006 * np.array([1.0, -0.5, 0.8, -1.2, 0.3, 0.9, -1.0, 0.6, -0.7])
 TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.03, -0.05, 0.02])
@@ -93,43 +87,25 @@ def test_many_rows_find_the_change_itself(trunk):
     assert_allclose(model.predict(q - SHIFT), x, rtol=0, atol=1e-3)
 
 
-class Unicycle(torch.nn.Module):
-    """A model without a geometry, tips in space of two actuators."""
-
-    def forward(self, q):
-        a, b = q.unbind(-1)
-        return torch.stack([a.sin(), b.cos(), 0.3 * a * b], -1)
-
-
 def fits():
     """Return models by name, each with rows to fit."""
     data, rng, make = datasets.load_trunk(), np.random.default_rng(0), HybridForwardModel
     q, x = data.q[:250], data.x[:250]
     trunk, few = robots.bionic_handling_assistant(), ELMRegressor(30, random_state=0)
-    elastic = ElasticTendonChain([0.005, 0.005], [0.1, 0.1])
     origins = np.tile(np.eye(4), (3, 1, 1))
     origins[1:, 0, 3] = 0.3
     arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0], [1, 0, 1]], tool=[0.2, 0, 0.1])
-    pulls, turns, ways = (rng.uniform(-a, a, (150, n)) for a, n in ((0.004, 6), (0.6, 3), (1, 2)))
+    turns = rng.uniform(-0.6, 0.6, (150, 3))
     with torch.no_grad():
         T = trunk.pose(torch.from_numpy(q))
-        pulled, turned, gone = (
-            f(torch.from_numpy(rows)).numpy() + 0.05 * rows[:, :1] ** 2
-            for f, rows in ((elastic, pulls), (arm, turns), (Unicycle(), ways))
-        )
+        turned = arm(torch.from_numpy(turns)).numpy() + 0.05 * turns[:, :1] ** 2
     poses = np.hstack([x, rotation_vector(T[:, :3, :3]).numpy()])
     serial = make(trunk, "quadratic", coupling="serial", calibrate="default")
     return {
-        "elm": (make(trunk, few), q, x),
         "serial": (serial, q, x),
-        "box": (make(trunk, few, guard="box"), q, x),
-        "no guard": (make(trunk, "pose", guard=None), q, x),
-        "drop": (make(trunk, "drop"), q, x),
         "play": (make(trunk, few, play=0.001), q, x),
         "pose": (make(trunk, few, output="pose"), q, poses),
-        "elastic": (make(elastic, few), pulls, pulled),
         "rigid": (make(arm, few), turns, turned),
-        "function": (make(Unicycle(), few), ways, gone),
         "data alone": (make(None, ELMRegressor(100, alpha=1e-6, random_state=0)), q, x),
     }
 
@@ -138,14 +114,12 @@ def fits():
 def case(request):
     """Return a fit, and rows of its robot after a change that it can express exactly."""
     model, q, x = fits()[request.param]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # pulls that contradict each other
-        model.fit(q, x)
-        shift = 0.1 * np.ptp(q, axis=0) * np.linspace(-1, 1, q.shape[1])
-        return model, q - shift, moved(model.predict(q)), q
+    model.fit(q, x)
+    shift = 0.1 * np.ptp(q, axis=0) * np.linspace(-1, 1, q.shape[1])
+    return model, q - shift, moved(model.predict(q)), q
 
 
-def test_any_model_is_adapted_saved_and_fitted_again(case, tmp_path):
+def test_any_model_is_adapted_and_adapted_back(case):
     fitted, q, x, then = case
     off, before = error(fitted, q, x), fitted.predict(q)
     model = copy.deepcopy(fitted).adapt(q, x)
@@ -155,12 +129,6 @@ def test_any_model_is_adapted_saved_and_fitted_again(case, tmp_path):
     assert_allclose(again.predict(q), model.predict(q), rtol=0, atol=1e-12)
     back = copy.deepcopy(model).adapt(then, fitted.predict(then))
     assert_allclose(back.predict(q), before, rtol=0, atol=1e-9)
-    if not isinstance(model.mechanical_model, Unicycle):
-        save_model(model, tmp_path / "model.safetensors")
-        loaded = load_model(tmp_path / "model.safetensors")
-        assert_allclose(loaded.predict(q), model.predict(q), rtol=0, atol=1e-12)
-        assert_allclose(loaded.predict_mechanical(q), model.predict_mechanical(q), atol=1e-12)
-        assert_allclose(loaded.adapt(q, x).predict(q), again.predict(q), rtol=0, atol=1e-9)
 
 
 def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
@@ -234,13 +202,6 @@ def test_a_large_turn_of_the_base_is_found(trunk):
     assert error(model, q_new, fitted.predict(q_new) @ turn.T) < 5e-3
 
 
-def test_the_errors_of_the_rows_of_a_group_have_a_common_part():
-    groups = np.array(["b", "a", "b", "b", "c"])
-    common = 0.5 * (groups[:, None] == groups) + 0.5 * np.eye(5)
-    whitening = _whitened(np.eye(5), groups)
-    assert_allclose(whitening.T @ whitening, np.linalg.inv(common), rtol=0, atol=1e-14)
-
-
 def test_the_rows_of_one_motion_count_as_fewer(trunk):
     fitted, _, (q, x) = trunk
     q, x = q[:30], x[:30] + np.array([0.004, 0.0, 0.0])
@@ -248,13 +209,6 @@ def test_the_rows_of_one_motion_count_as_fewer(trunk):
     one = copy.deepcopy(fitted).adapt(q, x, groups=np.zeros(30))
     assert isinstance(free.module_, AdaptedModel)
     assert not isinstance(one.module_, AdaptedModel)
-
-
-def test_what_is_no_change_of_base_or_zeros_is_said(trunk):
-    fitted, _, (q, x) = trunk
-    other = x + 0.1 * np.sin(40.0 * q[:, :3])
-    with pytest.warns(UserWarning, match="has changed in a way"):
-        copy.deepcopy(fitted).adapt(q, other)
 
 
 @pytest.mark.parametrize("wrong", ["base", [], ["tool"], ["base", "radii"]])
@@ -318,19 +272,6 @@ def test_rows_too_large_for_the_model_are_refused():
     assert np.isfinite(model.partial_fit(q[:1], x[:1] + 0.01, alpha=5e-324).predict(q)).all()
 
 
-def test_an_adapted_model_takes_single_rows_and_batches():
-    chain = robots.bionic_handling_assistant()
-    motion = torch.eye(4).double()
-    motion[:3, :3] = rotation(torch.tensor([0.1, -0.2, 0.3]).double())[0]
-    motion[:3, 3] = torch.tensor([0.01, 0.02, -0.03])
-    shift = torch.full((9,), 0.001).double()
-    model = AdaptedModel(HybridModule(chain, [], shift[:0]), shift, motion)
-    q = torch.linspace(0.2, 0.3, 2 * 6 * 9).double().reshape(2, 6, 9)
-    expected = chain(q + shift) @ motion[:3, :3].mT + motion[:3, 3]
-    assert_close(model(q), expected)
-    assert_close(model(q[1, 2]), expected[1, 2])
-
-
 def test_the_warning_of_another_change_names_the_line_of_the_caller():
     q = np.random.default_rng(0).uniform(0.2, 0.3, (30, 9))
     model = HybridForwardModel(robots.bionic_handling_assistant(), "drop")
@@ -340,16 +281,3 @@ def test_the_warning_of_another_change_names_the_line_of_the_caller():
     with pytest.warns(UserWarning, match="has changed in a way") as caught:
         model.adapt(q, x + 0.1 * np.sin(40.0 * q[:, :3]), parameters=["base"])
     assert caught[0].filename == __file__
-
-
-@pytest.mark.parametrize("gains", [1.0, -2e-5])
-def test_zeros_of_chains_with_gains_move_in_the_unit_of_q(gains):
-    plain = ConstantCurvatureChain([0.005], lengths=[0.1], gains=gains, actuator_zeros=3e-4)
-    for chain in (plain, ElasticTendonChain.from_chain(plain)):
-        q = np.random.default_rng(0).uniform(-0.003, 0.003, (30, 3)) / gains
-        shift = torch.tensor([2e-4, -1e-4, 3e-4], dtype=torch.float64) / gains
-        module = HybridModule(chain, [], shift[:0])
-        changed = AdaptedModel(module, shift, torch.eye(4, dtype=torch.float64))
-        rows = torch.from_numpy(q)
-        assert_close(changed.mechanical(rows), chain(rows + shift), rtol=0, atol=1e-12)
-        assert_close(changed(rows), chain(rows + shift), rtol=0, atol=1e-12)

@@ -5,8 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel, jacobian
-from hybridkin.hybrid._features import Features, Projected, QuadraticFeatures, Readout
+from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel
 
 
 @pytest.mark.parametrize("coupling", ["parallel", "serial"])
@@ -54,18 +53,3 @@ def test_columns_of_unlike_ranges_that_move_together(input_scaling):
     assert len(still) == 2
     J = model.jacobian(q)
     assert np.abs(J @ still.T).max() < 1e-9 * np.abs(J).max()
-
-
-@pytest.mark.parametrize("kind", [Features, QuadraticFeatures])
-def test_a_model_of_a_part_of_q(kind):
-    rng = np.random.default_rng(3)
-    q = torch.from_numpy(rng.uniform(-1.0, 1.0, (20, 3)) * [1.0, 5.0, 0.2] + 2.0)
-    features = kind.of_range(q)
-    weights = torch.from_numpy(rng.normal(size=(2, features(q).shape[1])))
-    M, offset = torch.from_numpy(rng.normal(size=(3, 3))), torch.from_numpy(rng.normal(size=3))
-    model = Projected(Readout(features, weights), M, offset)
-    expected = features(q @ M + offset) @ weights.mT
-    assert_close(model(q), expected, rtol=0.0, atol=1e-12)
-    value, J = model.forward_and_jacobian(q)
-    assert_close(value, expected, rtol=0.0, atol=1e-12)
-    assert_close(J, jacobian(model.forward, q), rtol=0.0, atol=1e-11)

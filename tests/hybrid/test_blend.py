@@ -62,12 +62,6 @@ def test_all_is_the_mean_of_the_parts(blend, parts, q):
     assert not trusted.all()
 
 
-def test_jacobian_against_differences(blend, q):
-    h, J = 1e-6, blend.jacobian(q)
-    ahead = [(blend(q + h * e) - blend(q - h * e)) / (2 * h) for e in torch.eye(9).double()]
-    assert_close(torch.stack(ahead, -1), J, rtol=0.0, atol=1e-6)
-
-
 def test_drift_is_added_once_and_leaves_the_parts_alone(blend, parts, q):
     slope = torch.full((3, 9), 0.1, dtype=torch.float64)
     drift = AffineModule(slope, torch.full((3,), 0.01, dtype=torch.float64))
@@ -81,15 +75,6 @@ def test_drift_is_added_once_and_leaves_the_parts_alone(blend, parts, q):
     assert_close(torch.stack(ahead, -1), J, rtol=0.0, atol=1e-6)
 
 
-def test_single_precision_and_inversion(blend, q):
-    x, J = blend.forward_and_jacobian(q.float())
-    assert x.dtype == J.dtype == torch.float32
-    assert_close(x, blend(q).float(), rtol=0.0, atol=1e-5)
-    ik = InverseKinematics(blend, q_min=0.1, q_max=0.4, q_pref=0.25)
-    target = blend(q[:5]).numpy()
-    assert np.abs(ik.solve(target).x - target).max() < 1e-4
-
-
 @pytest.mark.slow
 def test_a_blend_of_a_hybrid_with_itself_is_the_hybrid():
     data, rng = datasets.load_trunk(), np.random.default_rng(0)
@@ -97,7 +82,7 @@ def test_a_blend_of_a_hybrid_with_itself_is_the_hybrid():
     for settings in ({}, {"error_model": "quadratic", "coupling": "serial"}):
         model = HybridForwardModel(chain, random_state=0, **settings).fit(data.q, data.x).module_
         twice = blended([model, model], torch.tensor([0.5, 0.5], dtype=torch.float64))
-        q = torch.from_numpy(rng.uniform(0.1, 0.4, (400, 9)))
+        q = torch.from_numpy(rng.uniform(0.1, 0.4, (100, 9)))
         assert_close(twice.domain_distance(q), model.domain_distance(q), rtol=0.0, atol=0.0)
         assert (twice.in_domain(q) == model.in_domain(q)).all()
         assert_close(twice.forward_and_jacobian(q), model.forward_and_jacobian(q))

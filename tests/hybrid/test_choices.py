@@ -9,33 +9,29 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import multivariate_normal
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.linear_model import Ridge
-from sklearn.model_selection import GroupKFold
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, load_model, save_model
-from hybridkin.hybrid import _radius, _selection
+from hybridkin.hybrid import _radius
 from hybridkin.hybrid._adapt import _Problem
 from hybridkin.hybrid._drift import MISFITS, SWITCH, Drift
 from hybridkin.hybrid._error_models import (
     _LEAST,
-    KernelModel,
-    NamedFeatures,
     NoCorrection,
     RegressorModel,
     Residuals,
 )
 from hybridkin.hybrid._features import Features
-from hybridkin.hybrid._fit import Spec, fit_hybrid
-from hybridkin.hybrid._kernel import _ALPHAS, _GAMMAS, folds_of, tuned_kernel
-from hybridkin.hybrid._linearised import choose
+from hybridkin.hybrid._fit import Spec
+from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._pose import WithPose
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
 from hybridkin.hybrid._readout_fit import fit_readout
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._selection import _chosen, _HeldOut, select
-from hybridkin.hybrid._settings import check_settings
+from hybridkin.hybrid._selection import _chosen, _HeldOut
 
 CHAIN = ConstantCurvatureChain([0.05])
+N, M = 40, 10  # held-out and outer rows
+NAMES = ["mechanical", "left", "right"]
 
 
 def log(n, seed=0, noise=1e-4):
@@ -49,34 +45,6 @@ def log(n, seed=0, noise=1e-4):
 # Kernel
 
 
-def kernel_scores(X, y, weights):
-    """Return the sum of held-out distances of every width and penalty, by solved systems."""
-    squares = ((X[:, None] - X) ** 2).sum(-1) / X.var(axis=0).mean()
-    scores = np.zeros((len(_GAMMAS), len(_ALPHAS)))
-    for i, gamma in enumerate(_GAMMAS):
-        K = np.exp(-gamma * squares)
-        for train, test in folds_of(X, None):
-            for j, alpha in enumerate(_ALPHAS):
-                system = K[np.ix_(train, train)] + alpha * np.diag(1.0 / weights[train])
-                found = K[np.ix_(test, train)] @ np.linalg.solve(system, y[train])
-                scores[i, j] += weights[test] @ np.linalg.norm(found - y[test], axis=1)
-    return scores
-
-
-@pytest.mark.parametrize("frequency", [0.1, 0.5, 1.0, 1.5, 2.0, 2.5])
-def test_the_kernel_is_better_than_all_its_neighbours(frequency):
-    rng = np.random.default_rng(0)
-    X = rng.uniform(-3.0, 3.0, (30, 1))
-    y = np.sin(frequency * X + [0.0, 1.0]) + 0.02 * rng.standard_normal((30, 2))
-    weights = rng.integers(1, 4, 30).astype(float)
-    found, scores = tuned_kernel(X, y, weights, None), kernel_scores(X, y, weights)
-    i = int(np.argmin(np.abs(np.log(np.array(_GAMMAS) / (found.gamma * X.var())))))
-    j = _ALPHAS.index(found.alpha)
-    assert found.gamma == pytest.approx(_GAMMAS[i] / X.var())
-    near = scores[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
-    assert scores[i, j] <= near.min() * (1.0 + 1e-9)
-
-
 def test_the_kernel_does_not_depend_on_the_unit_of_its_inputs():
     q, x = log(40)
     ones = np.ones(40)
@@ -85,99 +53,86 @@ def test_the_kernel_does_not_depend_on_the_unit_of_its_inputs():
     assert scaled.gamma == pytest.approx(plain.gamma / 1024.0**2)
 
 
-def test_folds_of_groups_are_drawn():
-    X, groups = np.zeros((60, 2)), np.repeat(np.arange(12), 5)
-    expected = GroupKFold(10, shuffle=True, random_state=0).split(X, groups=groups)
-    for pair, (train, test) in zip(folds_of(X, groups), expected, strict=True):
-        assert_array_equal(pair[0], train)
-        assert_array_equal(pair[1], test)
-
-
 # Blend
 
 
-def held_out(errors, n, groups=None, counts=None):
-    """Return predictions off by errors (K, N + M, 3); every fourth of N rows is an outer one."""
+def held_out(errors, counts=None, groups=None):
+    """Return predictions that are off by errors (K, N + M, 3), of tips at random."""
     rng = np.random.default_rng(0)
-    y, outer = rng.standard_normal((n, 3)), np.arange(0, n, 4)
-    rows = Rows(np.zeros((n, 2)), y, counts, groups)
+    y = rng.standard_normal((N, 3))
+    rows = Rows(np.zeros((N, 2)), y, counts, groups)
+    outer = np.arange(0, N, N // M)
     predicted = np.concatenate([y, y[outer]]) + errors
-    return _HeldOut.of(predicted, rows, np.arange(n) % 5, outer), rows
+    return _HeldOut.of(predicted, rows, np.arange(N) % 5, outer), rows
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_blend_adds_ten_times_the_candidate_that_lowers_its_score_most(seed):
-    rng = np.random.default_rng(seed)
-    sizes = rng.uniform(0.5, 1.5, (4, 1, 1))
-    counts = rng.uniform(0.5, 2.0, 40)
-    found, rows = held_out(sizes * rng.standard_normal((4, 50, 3)), 40, counts=counts)
-    weights = np.concatenate([counts, counts[::4]])
-    far = np.linalg.norm(found.predicted - found.y, axis=2)
-    weights[:40] *= 0.9 / (counts @ far[0, :40])
-    weights[40:] *= 0.1 / (counts[::4] @ far[0, 40:])
-    picked = []
-    for _ in range(10):
-        scores = []
-        for k in range(4):
-            mean = np.mean([found.predicted[i] for i in (*picked, k)], axis=0)
-            scores.append(float(weights @ np.linalg.norm(mean - found.y, axis=1)))
-        picked.append(int(np.argmin(scores)))
-    expected = np.bincount(picked, minlength=4) / 10.0
-    assert 1 < (expected > 0.0).sum()
-    assert_allclose(found.shares(np.ones(50, dtype=bool)), expected, atol=1e-15)
-    assert_allclose(found.weights, weights)
-    assert rows.groups is None
+def random_errors(*sizes):
+    rng = np.random.default_rng(1)
+    return np.array(sizes)[:, None, None] * rng.standard_normal((len(sizes), N + M, 3))
+
+
+def test_shares_are_tenths_and_the_first_of_equals_is_taken():
+    every = np.ones(N + M, dtype=bool)
+    noise = random_errors(1.0)[0]
+    found, _ = held_out(np.stack([noise, 0.1 * noise, 0.1 * noise]))
+    assert_array_equal(found.shares(every), [0.0, 1.0, 0.0])
+    found, _ = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]))
+    assert_array_equal(found.shares(every), [0.0, 0.5, 0.5])  # their errors cancel
+    found, _ = held_out(np.stack([noise, 0.25 * noise, -0.5 * noise]))
+    shares = found.shares(every)
+    assert_allclose(shares.sum(), 1.0)
+    assert_allclose(shares, [0.0, 0.7, 0.3])  # 2/3 and 1/3
+    only = np.arange(N + M) < 7  # of some rows
+    errors = np.stack([noise, 0.1 * noise, 0.1 * noise])
+    errors[1, 7:] *= 100.0
+    assert_array_equal(held_out(errors)[0].shares(only), [0.0, 1.0, 0.0])
+    assert_array_equal(held_out(errors)[0].shares(~only), [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("groups", [None, np.arange(N) // 4])
+def test_a_blend_is_taken_where_it_gains(groups):
+    noise = random_errors(1.0)[0]
+    found, rows = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]), groups=groups)
+    shares, results = _chosen(NAMES, found, rows)
+    assert_array_equal(shares, [0.0, 0.5, 0.5])
+    assert results["chosen"] == "blend"
+    assert results["candidate"] == [*NAMES, "blend"]
+    assert results["weights"] == {"mechanical": 0.0, "left": 0.5, "right": 0.5}
+    off = np.linalg.norm(found.predicted - found.y, axis=2)
+    assert_allclose(results["mean_distance"], [*off[:, :N].mean(1), 0.0], atol=1e-15)
+    assert_allclose(results["io_distance"], [*off[:, N:].mean(1), 0.0], atol=1e-15)
+    assert_array_equal(results["rank"][[0, -1]], [4, 1])
+    assert results["expected_distance"] == results["mean_distance"][-1]
+    by_fold = [off[0, :N][np.arange(N) % 5 == k].mean() for k in range(5)]
+    assert_allclose(results["fold_distance"][0], by_fold)
+    assert_allclose(results["std_distance"][0], np.std(by_fold, ddof=1))
+
+
+def test_a_blend_without_a_sure_gain_is_left_alone():
+    errors = random_errors(1.0, 1.0, 1.0)
+    errors[0] *= 0.8
+    found, rows = held_out(errors)
+    shares, results = _chosen(NAMES, found, rows)
+    gains = results["fold_distance"][0] - results["fold_distance"][-1]
+    sure = gains.mean() > gains.std(ddof=1) / np.sqrt(5)
+    assert (shares[0] == 1.0) == (not sure)
+    errors[1:] *= 5.0
+    shares, results = _chosen(NAMES, *held_out(errors))
+    assert_array_equal(shares, [1.0, 0.0, 0.0])
+    assert results["expected_distance"] == results["mean_distance"][0]
+    assert results["chosen"] == "mechanical"
 
 
 def test_a_gain_in_one_motion_alone_is_not_sure():
     """Every fold has rows of the one motion that gains: only motions show that others do not."""
-    n, groups = 40, np.arange(40) // 10
+    groups = np.arange(40) // 10
     errors = np.random.default_rng(0).standard_normal((2, 50, 3))
     errors[1] = (
         errors[0] * np.where(np.concatenate([groups, groups[::4]]) == 0, 0.01, 1.05)[:, None]
     )
     names = ["mechanical", "learned"]
-    assert _chosen(names, *held_out(errors, n))[1]["chosen"] == "learned"
-    assert _chosen(names, *held_out(errors, n, groups))[1]["chosen"] == "mechanical"
-
-
-def few_candidates(_):
-    return {
-        "mechanical": NoCorrection(),
-        "parallel linear": NamedFeatures("linear", "parallel"),
-        "parallel kernel": KernelModel(),
-    }
-
-
-def test_the_kernel_is_tried_on_logs_that_are_not_large(monkeypatch):
-    monkeypatch.setattr(_selection, "_candidates", few_candidates)
-    rows = Rows(*log(30))
-    candidates = [*few_candidates(None), "blend"]
-    monkeypatch.setattr(_selection, "_MOST", 31)
-    assert select(Spec(CHAIN), rows)[1]["candidate"] == candidates
-    monkeypatch.setattr(_selection, "_MOST", 29)
-    candidates.remove("parallel kernel")
-    assert select(Spec(CHAIN), rows)[1]["candidate"] == candidates
-
-
-@pytest.mark.parametrize("groups", [None, np.arange(30) // 2])
-def test_penalties_are_settled_by_folds_of_motions(groups, monkeypatch):
-    """On all rows, folds of motions are held out; without motions, single rows."""
-    seen = []
-
-    def fit(spec, rows):
-        seen.append(rows.groups)
-        return fit_hybrid(spec, rows)
-
-    monkeypatch.setattr(_selection, "_candidates", few_candidates)
-    monkeypatch.setattr(_selection, "fit_hybrid", fit)
-    rows = Rows(*log(30), groups=groups)
-    select(Spec(CHAIN), rows)
-    of_all_rows = [labels for labels in seen if labels is not None and len(labels) == len(rows.X)]
-    assert len(of_all_rows) == (0 if groups is None else 3)  # once for each candidate
-    for labels in of_all_rows:
-        for k, (_, test) in enumerate(folds_of(rows.X, groups)):
-            assert_array_equal(labels[test], k)
+    assert _chosen(names, *held_out(errors))[1]["chosen"] == "learned"
+    assert _chosen(names, *held_out(errors, groups=groups))[1]["chosen"] == "mechanical"
 
 
 def test_the_radius_chooses_the_error_model_without_the_held_out_rows(monkeypatch):
@@ -218,39 +173,6 @@ def test_a_regressor_that_takes_groups_gets_them(groups):
         assert model.error_model_.groups_ is None
     else:
         assert_array_equal(model.error_model_.groups_, groups)
-
-
-def test_several_markers_have_an_error_model_each_or_none():
-    chain = CHAIN.with_markers([(0, 0.5), (0, 1.0)])
-    q, _ = log(30)
-    x = chain(torch.from_numpy(q)).numpy() + 0.001
-    assert HybridForwardModel(chain, "drop").fit(q, x).error_model_ is None
-    found = HybridForwardModel(chain, "linear").fit(q, x).error_model_
-    assert len(found) == 2
-    assert found[0].rmse < 1e-6
-
-
-def test_residuals_of_rows_left_out_are_computed_unless_they_are_not_wanted():
-    spec = Spec(CHAIN, NamedFeatures("linear", "parallel", (1.0, 1.0)))
-    rows = Rows(*log(30))
-    assert np.isfinite(fit_hybrid(spec, rows).error.result.residual).all()
-    spec = dataclasses.replace(spec, left_out=False)
-    assert np.isnan(fit_hybrid(spec, rows).error.result.residual).all()
-
-
-@pytest.mark.parametrize(
-    ("settings", "kind", "message"),
-    [
-        ({"calibrate": "radii"}, ValueError, "`calibrate` must be a sequence of names"),
-        ({"calibrate": 3}, ValueError, "`calibrate` must be a sequence of names"),
-        ({"error_model": Ridge()}, TypeError, "inside the robot"),
-        ({"error_model": "kernel"}, TypeError, "inside the robot"),
-    ],
-)
-def test_settings_that_do_not_fit(settings, kind, message):
-    with pytest.raises(kind, match=message):
-        check_settings(HybridForwardModel(CHAIN, coupling="serial", **settings))
-    check_settings(HybridForwardModel(CHAIN, coupling="serial", calibrate="auto"))
 
 
 def test_a_radius_that_cannot_be_is_refused(tmp_path):
@@ -355,18 +277,6 @@ def test_the_derivative_of_a_pose_by_a_change_of_the_robot():
         move = 1e-5 * np.eye(9)[k]
         high, low = (problem.linearised(theta + sign * move)[0] for sign in (1.0, -1.0))
         assert_allclose(A[..., k], (low - high) / 2e-5, rtol=0, atol=1e-8)
-
-
-def test_a_choice_of_penalties_starts_where_it_is_asked_to():
-    start, tried = (10.0**1.5, 10.0**-2.5), []
-
-    def score(pair):
-        tried.append(pair)
-        return 1.0 + (np.log10(pair[0]) - 1.5) ** 2 + (np.log10(pair[1]) + 2.5) ** 2
-
-    assert choose(score, start)[0] == pytest.approx(start)
-    assert tried[0] == (inf, inf)
-    assert tried[1] == pytest.approx(start)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -13,8 +13,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
-from sklearn.pipeline import Pipeline, make_pipeline
-from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, PolynomialFeatures
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 from sklearn.utils.estimator_checks import parametrize_with_checks
 from torch.testing import assert_close
 
@@ -241,14 +241,6 @@ def test_numbers_too_large_for_a_model_leave_the_other_rows_alone(log, size):
         assert weights[1] < 1e-12
 
 
-def test_pipeline_in_other_units(log):
-    q, x, _ = log
-    metres = FunctionTransformer(lambda q: q / 1000.0)
-    pipeline = Pipeline([("metres", metres), ("model", HybridForwardModel(bha(), random_state=0))])
-    expected = HybridForwardModel(bha(), random_state=0).fit(q, x).predict(q)
-    assert_allclose(pipeline.fit(1000 * q, x).predict(1000 * q), expected, rtol=0, atol=1e-9)
-
-
 def test_clone_pickle_and_hash(log):
     q, x, _ = log
     model = HybridForwardModel(bha(), ELMRegressor(random_state=0)).fit(q, x)
@@ -360,22 +352,6 @@ def test_slack_is_better_known_than_learned(slack_log):
     assert errors[1] < 0.001
 
 
-@pytest.mark.slow
-def test_elastic_chain_as_the_mechanical_model(slack_log):
-    q, x, _ = slack_log
-    model = HybridForwardModel(elastic(), calibrate="default", random_state=0).fit(q, x)
-    assert set(model.calibration_.values) == set(elastic().default_parameters)
-    named = HybridForwardModel(elastic(), "drop", calibrate=("base", "angles")).fit(q, x)
-    assert set(named.calibration_.values) == {"base", "angles"}
-    assert model.in_domain(q).all()
-    assert not model.in_domain(40 * q).all()
-    points = np.concatenate([q[:3], 1.6 * q[:3]])  # inside the domain and beyond
-    J = model.jacobian(points)
-    moves = 1e-7 * np.eye(6)
-    columns = [(model.predict(points + m) - model.predict(points - m)) / 2e-7 for m in moves]
-    assert_allclose(np.stack(columns, -1), J, rtol=0, atol=1e-5 * np.abs(J).max())
-
-
 def test_the_plain_chain_tells_of_slack_once_per_call(slack_log):
     q, x, _ = slack_log
     chain = ConstantCurvatureChain([0.005] * 2, lengths=[0.1, 0.1], routing="base")
@@ -456,52 +432,6 @@ def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
     assert_close(module.jacobian(at), reverse, rtol=1e-6, atol=1e-6 * float(reverse.abs().max()))
 
 
-@pytest.mark.parametrize("kind", ["leverage", "box"])
-@pytest.mark.parametrize(
-    "error_model",
-    [
-        ELMRegressor(random_state=0),
-        ELMRegressor(alpha=1e-4, direct_link=True, activation="tanh", random_state=0),
-        LinearRegression(),
-    ],
-    ids=["elm", "linked", "linear"],
-)
-def test_weight_and_its_derivative(kind, error_model):
-    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
-    model = HybridForwardModel(chain, error_model, guard=kind).fit(data.q, data.x)
-    guard = model.module_.corrections[0].guard
-    rng = np.random.default_rng(0)
-    away = rng.uniform(-0.2, 0.2, (40, 9)) * np.linspace(0, 1, 40)[:, None]
-    q = torch.from_numpy(data.q[:40] + away)
-    weight, slope = guard.weight_and_jacobian(q)
-    assert_close(weight, guard(q))
-    assert ((weight > 0.01) & (weight < 0.99)).any()
-    assert_close(slope, torch.func.vmap(torch.func.jacrev(guard))(q), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("settings", "groups", "message"),
-    [
-        ({"calibrate": True}, None, "`calibrate` must be a sequence of names.*got True"),
-        ({"calibrate": "radii"}, None, "`calibrate` must be a sequence of names.*got 'radii'"),
-        ({}, np.zeros(3), r"`groups` must have shape \(20,\), got \(3,\); one entry for each row"),
-    ],
-)
-def test_settings_and_groups_are_checked(settings, groups, message):
-    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
-    chain = robots.bionic_handling_assistant()
-    with pytest.raises(ValueError, match=message):
-        HybridForwardModel(chain, "linear", **settings).fit(q, q[:, :3], groups=groups)
-
-
-def test_tips_in_millimetres_are_noticed_without_a_calibration():
-    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
-    chain = robots.bionic_handling_assistant()
-    x = 1e3 * chain(torch.from_numpy(q)).numpy()
-    with pytest.warns(UserWarning, match="`y` spans .* works in metres"):
-        HybridForwardModel(chain, "linear").fit(q, x)
-
-
 def test_rows_that_cannot_be_written_to_are_read_without_a_word():
     q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
     q.flags.writeable = False
@@ -530,20 +460,6 @@ def test_a_log_of_balanced_tendons_is_not_left_by_common_pulls(error_model):
     track = ik.track(figure_eight((0.0, 0.0, 0.195), (0.03, 0.02), duration=5.0, dt=0.02))
     assert (track.status == IKStatus.CONVERGED).all()
     assert np.abs(track.q.reshape(-1, 2, 3).mean(axis=2)).max() < 1e-8
-
-
-@pytest.mark.parametrize(
-    ("name", "allowed"),
-    [
-        ("coupling", r"\('parallel', 'serial'\)"),
-        ("guard", r"\(.*'leverage'.*\)"),
-        ("output", r"\('position', 'pose'\)"),
-    ],
-)
-def test_a_word_that_is_no_choice_raises_with_the_choices(name, allowed):
-    model = HybridForwardModel(robots.bionic_handling_assistant(), **{name: "other"})
-    with pytest.raises(ValueError, match=f"^`{name}` must be one of {allowed}, got 'other'"):
-        model.fit(np.full((3, 9), 0.25), np.zeros((3, 3)))
 
 
 def test_warnings_of_units_name_the_line_of_the_caller():

@@ -95,10 +95,6 @@ def test_group_distance_of_repeated_motions_is_a_tenth_of_the_range():
     assert (found.domain_distance(q) == 0.0).all()
 
 
-def test_group_distance_of_one_group_is_none():
-    assert GroupDistance.fit(rows(9), np.zeros(9)) is None
-
-
 def test_group_distance_ignores_directions_without_data():
     """Balanced tendons: their common pull is no part of the distance."""
     bend = rows(40, 2)
@@ -219,9 +215,3 @@ def test_poses_keep_to_the_tested_distance():
     share = model.in_domain(new).mean()
     model.module_.learned.tested = None
     assert 0.0 < share < 0.7 * model.in_domain(new).mean()
-
-
-def test_at_most_128_rows_represent_the_log():
-    q = torch.linspace(-1.0, 1.0, 300).double()[:, None]
-    distance = GroupDistance.fit(q, np.arange(300) // 30)
-    assert len(distance.rows) == len(distance.rows.unique()) == 128

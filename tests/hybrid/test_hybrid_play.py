@@ -13,9 +13,8 @@ from hybridkin import (
     fit_play,
     robots,
 )
-from hybridkin.hybrid import _play
 from hybridkin.hybrid._fit import Spec
-from hybridkin.hybrid._play import choose_play, play_of
+from hybridkin.hybrid._play import choose_play
 from hybridkin.hybrid._rows import Rows
 
 WIDTH = 0.02
@@ -119,7 +118,7 @@ def play_found(q, x, groups):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.0, 0.05, 0.28, 0.37, 0.56, 1.3])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.37, 1.3])
 def test_any_width_up_to_the_range_is_found(share):
     q, x, groups, width = log_with(share)
     assert play_found(q, x, groups) == pytest.approx(width, rel=0.05, abs=1e-12)
@@ -170,9 +169,9 @@ def test_measurements_go_on_where_the_last_ones_ended(log):
 
 
 @pytest.mark.slow
-def test_with_auto_and_a_radius(log):
+def test_with_a_radius(log):
     train, test = split(log)
-    model = HybridForwardModel(CHAIN, "auto", play="auto", coverage=0.85, random_state=0)
+    model = HybridForwardModel(CHAIN, "quadratic", play="auto", coverage=0.85)
     model.fit(*train[:2], groups=train[2])
     q, x, groups = test
     predicted, radius = model.predict(q, return_radius=True, groups=groups)
@@ -210,74 +209,3 @@ def test_clear_errors(log):
     message = r"`groups` must have shape \(480,\), got \(3,\); one entry for each row of the log"
     with pytest.raises(ValueError, match=message):
         model.predict(q, groups=groups[:3])
-
-
-class Affine:
-    """Least squares of affine functions; fits faster than the network it replaces."""
-
-    def __init__(self, *args, **options):
-        pass
-
-    def fit(self, X, y, weights, groups):
-        phi, self.left_out_errors_ = np.column_stack([np.ones(len(X)), X]), np.empty_like(y)
-        for name in np.unique(groups):
-            test = groups == name
-            coef = np.linalg.lstsq(phi[~test], y[~test], rcond=None)[0]
-            self.left_out_errors_[test] = y[test] - phi[test] @ coef
-        return self
-
-
-@pytest.fixture
-def affine(monkeypatch):
-    monkeypatch.setattr(_play, "ELMRegressorCV", Affine)
-
-
-def swinging(n_rows=80):
-    """Return commands of one motion of one actuator, whose swing grows."""
-    time = np.linspace(0.0, 6.0 * np.pi, n_rows)
-    return (0.1 * np.sin(time) * np.linspace(0.4, 1.0, n_rows))[:, None]
-
-
-def tip_of(effective, noise, rng):
-    return effective * np.array([1.0, -0.5, 0.2]) + noise * rng.standard_normal((len(effective), 3))
-
-
-@pytest.mark.parametrize("one_group", [True, False])
-def test_the_width_lies_between_the_tried_ones(affine, rng_of_play, one_group):
-    """Twice a tried width is the next one; between them the width is searched for."""
-    q = swinging()
-    groups = np.zeros(len(q)) if one_group else None
-    for share in (0.14, 0.28):
-        width = share * np.ptp(q)
-        x = tip_of(PlayOperator(width).apply(q)[0], 1e-6, rng_of_play)
-        found = choose_play(Spec(None), Rows(q, x, None, groups))
-        assert found.width == pytest.approx(width, rel=0.02)
-
-
-def test_a_tip_that_follows_the_commands_has_no_play(affine, rng_of_play):
-    q = swinging()
-    x = tip_of(q, 1e-5, rng_of_play)
-    assert choose_play(Spec(None), Rows(q, x)) is None
-
-
-def test_noise_alone_is_play_in_at_most_half_of_the_logs(affine, rng_of_play):
-    """By chance some width is best, but its gain is within the standard error."""
-    q = swinging(40)
-    logs = [rng_of_play.standard_normal((40, 3)) for _ in range(6)]
-    found = [choose_play(Spec(None), Rows(q, x)) is not None for x in logs]
-    assert sum(found) <= 3
-
-
-def test_commands_without_effect_are_play_of_the_whole_range(affine, rng_of_play):
-    """Only where a motion starts has an effect, so the log gives no upper limit of the play."""
-    starts = np.linspace(0.0, 0.1, 6)
-    q = (starts[:, None] + 0.1 * np.sin(np.linspace(0.0, 6.0, 20))).reshape(-1, 1)
-    x = tip_of(np.repeat(starts, 20)[:, None], 1e-6, rng_of_play)
-    found, messages = play_of("auto", Spec(None), Rows(q, x, None, np.repeat(range(6), 20)))
-    assert found.width == pytest.approx(np.ptp(q))
-    assert "no upper limit" in messages[0]
-
-
-@pytest.fixture
-def rng_of_play():
-    return np.random.default_rng(0)

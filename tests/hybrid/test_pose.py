@@ -9,8 +9,7 @@ import torch
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
-from sklearn.ensemble import RandomForestRegressor
-from sklearn.linear_model import LinearRegression, Ridge
+from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
@@ -18,12 +17,10 @@ from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
-    ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
     InverseKinematics,
-    RigidChain,
     load_model,
     robots,
     save_model,
@@ -321,25 +318,6 @@ def test_pose_jacobian_is_the_derivative(log, kind):
     assert_close(J, torch.cat([by_reverse[:, :, 3], angular], dim=1), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", range(5))
-def test_position_part_is_that_of_the_pose(log, kind):
-    module, q = [*models(log)][kind].fit(*log).module_, cases(log)
-    x, J = module.forward_and_jacobian(q)
-    assert_close(x, module.pose(q)[:, :3, 3], rtol=0, atol=1e-14)
-    assert_close(J, module.pose_jacobian(q)[:, :3], rtol=0, atol=1e-12)
-    assert_close(module.jacobian(q), J)
-
-
-def test_estimator_and_module_agree(fitted, log):
-    q = torch.from_numpy(log[0][:30])
-    y, J = fitted.predict_and_jacobian(q.numpy())
-    assert y.shape == (30, 6)
-    assert J.shape == (30, 6, 9)
-    assert_allclose(fitted.predict(q.numpy()), y, rtol=0, atol=0)
-    assert_allclose(fitted.jacobian(q.numpy()), fitted.module_.pose_jacobian(q).numpy(), atol=1e-15)
-    assert fitted.in_domain(q.numpy()).shape == fitted.error_weight(q.numpy()).shape == (30,)
-
-
 def test_shapes_lead_and_rows_stand_alone(fitted):
     module = fitted.module_
     q = torch.from_numpy(actuators(12, spread=0.15)).reshape(3, 4, 9)
@@ -397,29 +375,6 @@ def test_a_point_on_the_backbone_can_be_steered():
     assert_close(model.module_.pose_jacobian(rows)[..., :3, :], J, rtol=0, atol=1e-12)
 
 
-def arm():
-    origins = np.tile(np.eye(4), (3, 1, 1))
-    origins[1:, 0, 3] = 0.3
-    return RigidChain(origins, [[0, 0, 1], [0, 1, 0], [1, 0, 0]], tool=[0.2, 0, 0])
-
-
-def tendons():
-    return ElasticTendonChain([0.01, 0.01], [0.1, 0.1])
-
-
-@pytest.mark.parametrize(("chain", "spread"), [(arm(), 0.8), (tendons(), 0.002)])
-def test_all_kinds_of_chains(chain, spread):
-    q = spread * np.random.default_rng(0).uniform(-1, 1, (200, chain.n_actuators))
-    T = end(chain, q)
-    way = 0.1 / spread * np.array([0.2, 0.1, -0.1]) * q[:, :1]
-    turn = 0.2 / spread * q[:, :3]
-    y = rows_of(moved(T, way, turn))
-    model = HybridForwardModel(chain, Ridge(1e-12), output="pose", guard="box").fit(q, y)
-    found = model.predict(q)
-    assert millimetres(found, y).max() < 1e-3
-    assert degrees(found, y).max() < 1e-3
-
-
 class Turntable(PoseModel):
     """A mechanical model of a user's own, without a reach."""
 
@@ -446,18 +401,6 @@ def test_a_mechanical_model_of_ones_own():
 
 
 # ---------------------------------------------------------------- in use
-
-
-def test_inverse_kinematics_of_the_position(fitted):
-    ik = InverseKinematics(fitted, q_min=0.1, q_max=0.4)
-    target = fitted.module_(torch.from_numpy(actuators(10, seed=11, spread=0.03)))
-    solution = ik.solve(target, tol=1e-8)
-    assert solution.converged.all()
-    assert_close(fitted.module_(solution.q), target, rtol=0, atol=1e-8)
-    tracker = ik.tracker(np.full(9, 0.25))
-    for _ in range(40):
-        tracker.step(target[0].numpy())
-    assert tracker.error < 1e-4
 
 
 def test_inverse_kinematics_of_the_pose(fitted):
@@ -495,26 +438,6 @@ def test_a_change_of_the_robot_is_followed(log):
     )
 
 
-@pytest.mark.parametrize(
-    "error_model", ["drop", LinearRegression(), ELMRegressor(random_state=0)], ids=str
-)
-@pytest.mark.parametrize("changed", [False, True])
-def test_models_come_back_from_disk(log, tmp_path, error_model, changed):
-    q, y = log
-    model = pose_model(error_model, calibrate=("base",)).fit(q, y)
-    if changed:
-        model.partial_fit(q[:30], y[:30] + 0.01)
-    save_model(model, tmp_path / "pose.safetensors")
-    found = load_model(tmp_path / "pose.safetensors")
-    new = actuators(40, seed=15, spread=0.15)
-    assert found.output == "pose"
-    assert_allclose(found.predict(new), model.predict(new), rtol=0, atol=1e-12)
-    assert_allclose(found.jacobian(new), model.jacobian(new), rtol=0, atol=1e-9)
-    found.partial_fit(q[:5], y[:5])
-    model.partial_fit(q[:5], y[:5])
-    assert_allclose(found.predict(new), model.predict(new), rtol=0, atol=1e-12)
-
-
 def test_files_of_another_output_are_damaged(log, tmp_path):
     q, y = log
     positions = HybridForwardModel(bha(), LinearRegression()).fit(q, y[:, :3])
@@ -539,14 +462,6 @@ def test_scikit_learn_tools(log):
     weights = np.r_[np.ones(150), np.zeros(150)]
     half = clone(model).fit(q, y, sample_weight=weights)
     assert_allclose(half.predict(q), clone(model).fit(q[:150], y[:150]).predict(q), atol=1e-9)
-
-
-def test_any_regressor_with_six_outputs(log):
-    q, y = log
-    model = pose_model(RandomForestRegressor(20, random_state=0)).fit(q, y)
-    assert (
-        degrees(model.predict(q), y).mean() < 0.5 * degrees(model.predict_mechanical(q), y).mean()
-    )
 
 
 class TipOnly(torch.nn.Module):
@@ -578,9 +493,3 @@ def test_rows_must_hold_six_numbers(log, columns, names):
     y = np.resize(y, (len(q), columns)) if columns > 6 else y[:, :columns]
     with pytest.raises(ValueError, match=r"`y` must have shape \(N, 6\).*output='position'"):
         pose_model(calibrate=names).fit(q, y)
-
-
-def test_a_single_column_is_no_pose(log):
-    q, y = log
-    with pytest.raises(ValueError, match=r"`y` must have shape \(N, 6\)"):
-        pose_model().fit(q, y[:, 0])

@@ -1,6 +1,3 @@
-import copy
-import pickle
-
 import pytest
 import torch
 from torch.testing import assert_close
@@ -127,36 +124,6 @@ def test_slope(robot, rng):
 
 
 @pytest.mark.slow
-@every_robot
-def test_derivatives_by_autograd(robot, rng):
-    chain, q = rows_of(robot, rng, 3)
-    features = features_of(chain, q)
-    weights = uniform(rng, 2, features(q).shape[1]).requires_grad_()
-    q = q[1:].requires_grad_()
-    options = dict(eps=1e-8, atol=1e-3, rtol=1e-3)
-    assert torch.autograd.gradcheck(features, q, **options)
-    assert torch.autograd.gradcheck(features.readout, (q, weights), **options)
-
-
-@every_robot
-def test_batches_equal_loops(robot, rng):
-    chain, q = rows_of(robot, rng, 12)
-    features = features_of(chain, q)
-    weights = uniform(rng, 4, features(q).shape[1])
-    value, slope = features.readout(q, weights)
-    many = q.unflatten(0, (3, 4))
-    assert_close(features(many), features(q).unflatten(0, (3, 4)))
-    for part, whole in zip(features.readout(many, weights), (value, slope), strict=True):
-        assert_close(part, whole.unflatten(0, (3, 4)))
-    assert_close(features(q[7]), features(q)[7])
-    for part, whole in zip(features.readout(q[7], weights), (value, slope), strict=True):
-        assert_close(part, whole[7])
-    long = q.repeat(500, 1)
-    assert_close(features.readout(long, weights)[1], slope.repeat(500, 1, 1))
-    assert_close(features(long), features(q).repeat(500, 1))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["trunk", "cables", "elastic tendons"])
 def test_planted_correction_is_found(robot, rng):
     chain, q = rows_of(robot, rng, 700)
@@ -191,49 +158,3 @@ def test_size_of_the_robot_changes_nothing(rng):
     small = ConstantCurvatureChain([0.03, 0.02], offsets=0.01)
     large = ConstantCurvatureChain([0.3, 0.2], offsets=0.1)
     assert_close(features_of(small, q)(q), features_of(large, 10 * q)(10 * q))
-
-
-@every_robot
-def test_single_precision(robot, rng):
-    chain, q = rows_of(robot, rng, 30)
-    features = features_of(chain, q)
-    weights = uniform(rng, 4, features(q).shape[1])
-    value, slope = features.readout(q, weights)
-    single = copy.deepcopy(features).float()
-    assert features.center.dtype == torch.float64
-    for kind in (features, single):
-        assert kind(q.float()).dtype == torch.float32
-        assert_close(kind(q.float()).double(), features(q), atol=1e-4, rtol=0)
-        value_single, slope_single = kind.readout(q.float(), weights.float())
-        assert value_single.dtype == slope_single.dtype == torch.float32
-        assert_close(value_single.double(), value, atol=1e-3, rtol=0)
-        if robot != "elastic tendons":  # which may lie beside a kink
-            assert_close(slope_single.double(), slope, atol=3e-4 * slope.abs().max(), rtol=0)
-
-
-@every_robot
-def test_a_bad_row_stays_alone(robot, rng):
-    chain, q = rows_of(robot, rng, 9)
-    features = features_of(chain, q)
-    weights = uniform(rng, 3, features(q).shape[1])
-    broken = q.clone()
-    broken[4, 1] = float("nan")
-    others = torch.arange(9) != 4
-    assert_close(features(broken)[others], features(q)[others])
-    assert features(broken)[4].isnan().any()
-    good, new = features.readout(q, weights), features.readout(broken, weights)
-    for part, part_new in zip(good, new, strict=True):
-        assert_close(part_new[others], part[others])
-    assert new[0][4].isnan().all()
-
-
-def test_copies_and_states(rng):
-    chain, q = rows_of("trunk", rng, 20)
-    features = features_of(chain, q)
-    blank = copy.deepcopy(features)
-    for buffer in blank.buffers():
-        buffer.zero_()
-    assert_close(chain(q), ROBOTS["trunk"]()[0](q))
-    blank.load_state_dict(features.state_dict())
-    assert_close(blank(q), features(q), atol=0, rtol=0)
-    assert_close(pickle.loads(pickle.dumps(features))(q), features(q), atol=0, rtol=0)

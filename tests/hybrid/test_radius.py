@@ -127,32 +127,12 @@ def test_every_group_has_the_same_mass():
     assert _quantile(values, groups, ones, 0.76) == np.inf
 
 
-def test_weights_are_repetitions():
-    values = np.array([3.0, 1.0, 2.0, 5.0, 4.0])
-    groups, counts = np.array([0, 1, 0, 1, 1]), np.array([2, 1, 3, 1, 4])
-    for coverage in (0.1, 0.3, 0.5, 0.6, 0.9):
-        repeated = [np.repeat(part, counts) for part in (values, groups)]
-        one_by_one = _quantile(*repeated, np.ones(counts.sum()), coverage)
-        assert _quantile(values, groups, counts.astype(float), coverage) == one_by_one
-
-
 def test_one_dimensional_targets_and_no_mechanical_model():
     q, x, _ = motions(0, 10)
     model = HybridForwardModel(None, coverage=0.9, random_state=0).fit(q, x[:, 0])
     tips, radius = model.predict(q, return_radius=True)
     assert tips.shape == radius.shape == (len(q),)
     assert np.mean(np.abs(tips - x[:, 0]) < radius) > 0.85
-
-
-def test_it_is_saved(tmp_path):
-    q, x, motion = motions(0, 20)
-    model = HybridForwardModel(robots.bionic_handling_assistant(), coverage=0.8, random_state=0)
-    model.fit(q, x, groups=motion)
-    save_model(model, tmp_path / "model.safetensors")
-    back = load_model(tmp_path / "model.safetensors")
-    assert back.radius_ == model.radius_
-    assert back.coverage == 0.8
-    assert_allclose(back.predict(q, True)[1], model.predict(q, True)[1])
 
 
 def test_an_infinite_radius_is_saved_and_described(tmp_path):
@@ -163,14 +143,6 @@ def test_an_infinite_radius_is_saved_and_described(tmp_path):
     assert "radius covering 90 % of the tips: not known" in report.plain()
     assert "at least 9" in " ".join(report.plain().split())
     assert json.loads(json_text(report.record))["radius"]["inside"] is None
-
-
-def test_a_damaged_radius_is_refused(tmp_path):
-    model, _, _ = few(9, 0.9)
-    model.radius_ = model.radius_._replace(inside=np.nan)
-    save_model(model, tmp_path / "model.safetensors")
-    with pytest.raises(ValueError, match="`radius` must hold"):
-        load_model(tmp_path / "model.safetensors")
 
 
 @pytest.mark.slow

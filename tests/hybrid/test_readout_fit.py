@@ -1,5 +1,3 @@
-import copy
-import pickle
 from math import inf, log10
 
 import pytest
@@ -7,8 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, robots
-from hybridkin._core.model import ForwardModel, reverse_jacobian
-from hybridkin.hybrid import _linearised
+from hybridkin._core.model import ForwardModel
 from hybridkin.hybrid._features import Features, HiddenFeatures, QuadraticFeatures, Readout
 from hybridkin.hybrid._linearised import (
     Linearised,
@@ -145,30 +142,6 @@ def test_quadratic_features_span_all_monomials(rng):
     )
 
 
-def test_constant_inputs_are_features_without_harm(rng):
-    q = uniform(rng, 30, 3)
-    q[:, 1] = 0.7
-    assert torch.isfinite(QuadraticFeatures.of_range(q)(q)).all()
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("kind", ["quadratic", "hidden"])
-@pytest.mark.parametrize("coupling", ["serial", "parallel"])
-def test_jacobian(robot, kind, coupling, rng):
-    chain, q = rows_of(robot, rng, 20)
-    features = some_features(kind, q, rng)
-    outputs = chain.coordinates(q)[0] if coupling == "serial" else chain(q)
-    shape = outputs.shape[1], features(q).shape[1]
-    module = hybrid(chain, Readout(features, 0.003 * uniform(rng, *shape)), coupling)
-    x, J = module.forward_and_jacobian(q)
-    assert_close(x, module(q))
-    assert_close(J, reverse_jacobian(module, q)[1], atol=1e-9, rtol=1e-9)
-    assert_close(J, module.jacobian(q.reshape(4, 5, -1)).flatten(0, 1))
-    assert_close(x[3], module(q[3]))
-    if robot != "tendons":  # a difference may reach across where a tendon goes slack
-        assert_close(J, central_differences(module, q), atol=1e-6, rtol=1e-5)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["trunk", "cables", "arm"])
 def test_planted_correction_is_recovered(robot, rng):
@@ -260,16 +233,6 @@ def test_rows_left_out_equal_fits_without_them(sizes, rng):
         assert_close(found[out], expected, atol=1e-10, rtol=1e-10)
 
 
-def test_products_of_many_rows_are_computed_in_blocks(rng, monkeypatch):
-    whole, penalty = ridge(rng)
-    monkeypatch.setattr(_linearised, "_BLOCK", 200)  # 7 rows of 28 products
-    parts = Linearised(whole.J, whole.phi, whole.y)
-    assert_close(parts.gram, whole.gram)
-    expected = torch.einsum("nxa,nk,nxb,nl->akbl", whole.J, whole.phi, whole.J, whole.phi)
-    assert_close(whole.gram, expected)
-    assert_close(parts.left_out(penalty), whole.left_out(penalty))
-
-
 @pytest.mark.parametrize("at", [3.0, 2.0, 1.4])
 @pytest.mark.parametrize("elastic", [False, True])
 def test_tips_of_arcs_are_those_of_the_chain(at, elastic, rng):
@@ -282,16 +245,6 @@ def test_tips_of_arcs_are_those_of_the_chain(at, elastic, rng):
     z = chain.coordinates(0.004 * uniform(rng, 20, 9))[0]
     found = _tips(chain)(z)
     assert_close(found, chain.from_coordinates_and_jacobian(z), rtol=1e-12, atol=1e-14)
-
-
-def test_fit_without_residuals_of_rows_left_out(rng):
-    chain, q = rows_of("trunk", rng, 40)
-    x = disturbed(chain, q, rng, noise=0.003)[1]
-    features = QuadraticFeatures.of_range(q)
-    whole = read_out(chain, features, q, x, alphas=(0.1, 1.0))
-    brief = read_out(chain, features, q, x, alphas=(0.1, 1.0), left_out=False)
-    assert torch.equal(brief.readout.weights, whole.readout.weights)
-    assert torch.isnan(torch.from_numpy(brief.residual)).all()
 
 
 def test_rows_left_out_of_the_whole_fit(rng):
@@ -390,61 +343,6 @@ def test_noise_of_the_actuators_is_told_from_that_of_the_tip(rng):
     assert problem.likeliest_ratio(1e-3 * uniform(rng, 1500, 3)) > 100.0
 
 
-@pytest.mark.slow
-def test_noise_of_the_actuators_is_allowed_for(rng):
-    errors = []
-    for _ in range(4):
-        chain, q = rows_of("trunk", rng, 400)
-        truth = disturbed(chain, q, rng, size=0.01)[0]
-        x, features = shaken(truth, q, rng), QuadraticFeatures.of_range(q)
-        alphas = (1e-3, 1e-3)
-        fits = [
-            read_out(chain, features, q, x, alphas=alphas, noise_ratio=ratio)
-            for ratio in (0.25, inf)
-        ]
-        errors.append(
-            [(hybrid(chain, fit.readout)(q) - truth(q)).norm(dim=1).mean() for fit in fits]
-        )
-        chosen = read_out(chain, features, q, x)
-        assert (hybrid(chain, chosen.readout)(q) - truth(q)).norm(dim=1).mean() < 1.05 * errors[-1][
-            0
-        ]
-    allowed, ignored = torch.tensor(errors).mean(0)
-    assert allowed < 0.9 * ignored
-
-
-def test_rows_left_out_with_noise_of_the_actuators(rng):
-    chain, q = rows_of("trunk", rng, 60)
-    x = disturbed(chain, q, rng, size=0.002, noise=0.002)[1]
-    options = {"alphas": (0.3, 3.0), "noise_ratio": 0.5}
-    fit = read_out(chain, Features.of_range(q), q, x, **options)
-    assert fit.noise_ratio == 0.5
-    assert fit.gradient < 1e-8
-    weight = torch.ones(60, dtype=torch.float64)
-    weight[3] = 0.0
-    other = read_out(chain, Features.of_range(q), q, x, sample_weight=weight, **options)
-    left = x[3] - hybrid(chain, other.readout)(q[3])
-    assert_close(torch.from_numpy(fit.residual[3]), left, atol=2e-4, rtol=0.05)
-
-
-def test_whitened_residuals_are_those_of_noise_of_unit_level(rng):
-    chain, q = rows_of("tendons", rng, 40)
-    weight = 1.0 + uniform(rng, 40).abs()
-    args = Features.of_range(q), q, chain(q) + 0.01, weight
-    problem = _Problem(chain, *args, serial=True).in_noise(0.3)
-    J = chain.jacobian(q)
-    covariance = J @ J.mT + 0.3 * torch.eye(3, dtype=q.dtype)
-    W = problem.whitening
-    spherical = W @ covariance @ W.mT
-    level = spherical[0, 0, 0]
-    assert_close(spherical, level * torch.eye(3, dtype=q.dtype).expand(40, -1, -1))
-    mean = (weight[:, None, None] * covariance).diagonal(dim1=1, dim2=2).sum() / (3 * weight.sum())
-    assert_close(level, mean)
-    residual = 0.01 * uniform(rng, 40, 3)
-    whitened = (W @ (weight.sqrt()[:, None] * residual)[..., None])[..., 0]
-    assert_close(problem.in_metres(whitened), residual)
-
-
 def test_choice_finds_the_least_of_a_bowl():
     scores = lambda pair: 1.0 + (pair[0] - 0.1) ** 2 + (1.0 / pair[1] - 0.1) ** 2  # noqa: E731
     found, tried = choose(scores)
@@ -496,64 +394,6 @@ def test_turning_the_frame_turns_the_model(rng):
     a = hybrid(chain, read_out(chain, features, q, x, alphas=(0.1, 1.0)).readout)
     b = hybrid(turned, read_out(turned, features, q, x @ R.mT, alphas=(0.1, 1.0)).readout)
     assert_close(a(q) @ R.mT, b(q), atol=1e-8, rtol=0)
-
-
-def test_a_bad_row_stays_alone(rng):
-    chain, q = rows_of("trunk", rng, 12)
-    module = hybrid(chain, Readout(QuadraticFeatures.of_range(q), 0.01 * uniform(rng, 9, 55)))
-    x, J = module.forward_and_jacobian(q)
-    broken = q.clone()
-    broken[5, 2] = float("nan")
-    x_new, J_new = module.forward_and_jacobian(broken)
-    others = torch.arange(12) != 5
-    assert_close(x_new[others], x[others])
-    assert_close(J_new[others], J[others])
-    assert torch.isnan(x_new[5]).all()
-
-
-def test_single_precision(rng):
-    chain, q = rows_of("trunk", rng, 100)
-    x = disturbed(chain, q, rng, noise=0.003)[1]
-    fit = read_out(chain, QuadraticFeatures.of_range(q), q.float(), x.float(), alphas=(0.1, 1.0))
-    x_single, J_single = hybrid(chain, fit.readout).forward_and_jacobian(q.float())
-    assert x_single.dtype == J_single.dtype == torch.float32
-    x_double, J_double = hybrid(chain, fit.readout).forward_and_jacobian(q)
-    assert_close(x_single.double(), x_double, atol=2e-6, rtol=0)
-    assert_close(J_single.double(), J_double, atol=5e-5, rtol=1e-5)
-    assert_close(
-        copy.deepcopy(hybrid(chain, fit.readout)).float()(q.float()), x_single, atol=2e-6, rtol=0
-    )
-
-
-@pytest.mark.parametrize("kind", ["linear", "quadratic", "hidden"])
-def test_state_dict_holds_all(kind, rng):
-    chain, q = rows_of("trunk", rng, 60)
-    x = disturbed(chain, q, rng, noise=0.003)[1]
-    fit = read_out(chain, some_features(kind, q, rng), q, x, alphas=(0.1, 1.0))
-    module = hybrid(chain, fit.readout)
-    blank = copy.deepcopy(module)
-    for buffer in blank.buffers():
-        buffer.zero_()
-    blank.load_state_dict(module.state_dict())
-    for name in ("forward", "jacobian"):
-        assert_close(getattr(blank, name)(q), getattr(module, name)(q), atol=0, rtol=0)
-    assert_close(pickle.loads(pickle.dumps(module))(q), module(q), atol=0, rtol=0)
-
-
-@pytest.mark.slow
-def test_derivatives_by_autograd(rng):
-    chain, q = rows_of("trunk", rng, 2)
-    module = hybrid(chain, Readout(QuadraticFeatures.of_range(q), 0.01 * uniform(rng, 9, 55)))
-    assert torch.autograd.gradcheck(module, q.requires_grad_())
-    assert torch.autograd.gradgradcheck(module, q)
-    assert torch.autograd.gradcheck(module.jacobian, q)
-
-
-def test_a_serial_fit_settles_at_the_optimum(rng):
-    chain, q = rows_of("cables", rng, 30)
-    x = disturbed(chain, q, rng, size=0.005, noise=1e-4)[1]
-    fit = read_out(chain, Features.of_range(q), q, x, alphas=(0.01, inf), left_out=False)
-    assert fit.gradient < 1e-7
 
 
 def test_rows_with_missing_markers_do_not_count_for_the_ratio_of_noise(rng):

@@ -116,15 +116,6 @@ def test_nothing_to_learn_is_left_alone():
 
 
 @pytest.mark.slow
-def test_clone_refit_and_file(chosen, trunk, tmp_path):
-    q, x = trunk
-    again = clone(chosen).fit(q[:250], x[:250], groups=np.arange(250) // 5)
-    assert_array_equal(again.predict(q), chosen.predict(q))
-    save_model(chosen, tmp_path / "model.safetensors")
-    assert_array_equal(load_model(tmp_path / "model.safetensors").predict(q), chosen.predict(q))
-
-
-@pytest.mark.slow
 def test_candidates_are_the_models_that_auto_compared(chosen, trunk, tmp_path):
     q = torch.from_numpy(trunk[0])
     weights = chosen.cv_results_["weights"]
@@ -139,11 +130,6 @@ def test_candidates_are_the_models_that_auto_compared(chosen, trunk, tmp_path):
     assert not hasattr(clone(chosen), "candidates_")
     save_model(chosen, tmp_path / "model.safetensors")
     assert load_model(tmp_path / "model.safetensors").candidates_ is None
-
-
-def test_only_auto_has_candidates(trunk):
-    q, x = trunk
-    assert HybridForwardModel(bha(), "linear").fit(q[:50], x[:50]).candidates_ is None
 
 
 @pytest.mark.slow
@@ -205,9 +191,9 @@ def test_fits_in_threads_are_independent():
     one_by_one = [predicted(k) for k in range(2)]
     filters = [*warnings.filters]
     with ThreadPoolExecutor(4) as pool:
-        at_once = [*pool.map(predicted, range(8))]
+        at_once = [*pool.map(predicted, range(4))]
     assert warnings.filters == filters
-    assert_allclose(at_once, 4 * one_by_one, rtol=0, atol=1e-12)
+    assert_allclose(at_once, 2 * one_by_one, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -239,9 +225,9 @@ def test_kernel_by_name_is_tuned_on_motions(trunk):
 
 
 def test_clear_errors(trunk):
-    q, x = trunk
-    with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
-        HybridForwardModel(bha(), "auto").fit(q, x, groups=np.zeros(len(q)))
+    q, x = (part[:40] for part in trunk)
+    with pytest.raises(ValueError, match="`groups`"):
+        HybridForwardModel(bha(), "auto", calibrate=()).fit(q, x, groups=np.zeros(len(q)))
     with pytest.raises(ValueError, match="`mechanical_model` must be given"):
         HybridForwardModel(None, "quadratic").fit(q, x)
 

@@ -10,8 +10,6 @@ from hybridkin import (
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    load_model,
-    save_model,
 )
 
 NETWORK = ELMRegressorCV(12, weight_scales=(0.4,), relevance_rounds=0, max_hidden=0, random_state=0)
@@ -47,8 +45,7 @@ def log_of(n, m, n_rows=50):
     "options",
     [
         {"guard": "box"},
-        pytest.param({"play": 0.01}, **SLOW),
-        pytest.param({"coverage": 0.8}, **SLOW),
+        pytest.param({"play": 0.01, "coverage": 0.8}, **SLOW),
     ],
 )
 def test_a_single_coordinate_or_output(coupling, name, n, m, options):
@@ -77,13 +74,6 @@ def test_a_single_coordinate_or_output_in_the_selection(n, m):
     without = np.std(x - model.predict_mechanical(q))
     assert np.std(x - model.predict(q)) < 0.1 * without
     assert model.jacobian(q).shape == (len(q), m, n)
-
-
-def test_data_only_with_one_actuator_is_saved(tmp_path):
-    q, x = log_of(1, 1)
-    model = HybridForwardModel(None, ELMRegressor(12, random_state=0)).fit(q, x[:, 0])
-    save_model(model, tmp_path / "model")
-    assert_allclose(load_model(tmp_path / "model").predict(q), model.predict(q), rtol=0)
 
 
 @pytest.mark.parametrize(("coupling", "name"), PAIRS)

@@ -59,20 +59,6 @@ def test_static_targets_are_reached_within_the_limits(way, start):
     assert max(errors) < 1e-4
 
 
-@needs_core
-@pytest.mark.parametrize("way", WAYS)
-def test_torch_takes_the_steps_of_the_core(way):
-    ik = InverseKinematics(chain(), **LIMITS, **WAYS[way])
-    for x, start in zip(targets(2), (0.0, 0.005), strict=True):
-        q = np.full(9, start)
-        core, reference = ik.tracker(q), ik.tracker(torch.from_numpy(q))
-        for _ in range(12):
-            command = reference.step(torch.from_numpy(x)).numpy()
-            assert_close(command, core.step(x), rtol=0, atol=1e-12)
-            assert (reference.saturated.numpy() == core.saturated).all()
-            assert reference.status == core.status
-
-
 def test_steps_of_a_batch_arrive_in_torch():
     ik = InverseKinematics(chain(), **LIMITS, **FAST)
     x = torch.from_numpy(targets(6))

@@ -55,17 +55,6 @@ def test_derivatives_obey_the_conditions_of_optimality(weights, held):
         assert_close(found[free], expected, rtol=1e-7, atol=1e-9)
 
 
-def test_without_a_posture_nothing_moves_but_for_the_target():
-    """The change is the smallest that follows the target: the pseudo-inverse."""
-    ik = InverseKinematics(PositionTask(bent, size=2), weights=WEIGHTS)
-    target = torch.tensor([0.9, 0.8], dtype=torch.float64, requires_grad=True)
-    q = ik.solve(target, Q_PREF, differentiable=True).q
-    slope = torch.stack([torch.autograd.grad(a, target, retain_graph=True)[0] for a in q])
-    root = WEIGHTS.sqrt()
-    J = torch.autograd.functional.jacobian(bent, q.detach())
-    assert_close(slope, torch.linalg.pinv(J / root) / root[:, None], rtol=1e-9, atol=1e-12)
-
-
 # J of full rank is the exception: planar arms, pairs of tendons, locked actuators, five joints.
 
 

@@ -1,15 +1,12 @@
 """Truths in closed form: of x = A q every step, track and solution is known."""
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ForwardModel, InverseKinematics, RigidChain
+from hybridkin import ConstantCurvatureChain, InverseKinematics, RigidChain
 from hybridkin.ik._gram import (
-    RowGram,
     adaptive_damping,
     apply_columns,
     apply_rows,
@@ -17,8 +14,6 @@ from hybridkin.ik._gram import (
     quick_gram,
     row_gram,
 )
-from hybridkin.ik._search import Search
-from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik.solver import IKStatus
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
 from hybridkin.ik.trajectories import Trajectory
@@ -60,22 +55,6 @@ def test_the_first_step_starts_at_rest():
     assert (again.abs().amax(-1) > step.dq.abs().amax(-1)).all()
 
 
-@pytest.mark.parametrize("low", [-torch.inf, -0.4])
-def test_starts_fill_a_range_around_the_first_one_where_there_are_no_limits(low):
-    ik = InverseKinematics(MODEL, q_min=low)
-    q = [[1.0, 0.0, -1.0, 0.5, 2.0], [-0.3, 0.0, 0.1, -0.4, 5.0]]
-    q = torch.tensor(q, dtype=torch.float64)
-    size = torch.tensor([0.25, 2.0], dtype=torch.float64)
-    starts = even_starts(ik.settings, q, size, 500)
-    assert starts.shape == (2, 500, 5)
-    lowest = q - size[:, None] if low == -torch.inf else torch.full_like(q, low)
-    highest = q.clamp(min=low) + size[:, None]
-    assert_close(starts.amin(1), lowest, rtol=0.0, atol=1e-12)  # its faces too
-    assert_close(starts.amax(1), highest, rtol=0.0, atol=1e-12)
-    middle = 0.5 * (lowest + highest)
-    assert ((starts.mean(1) - middle).abs() <= 0.05 * (highest - lowest)).all()
-
-
 def test_rows_without_limits_start_again_each_around_itself():
     """A model that is flat at the first start: only further starts, around it, reach the target."""
 
@@ -92,23 +71,6 @@ def test_rows_without_limits_start_again_each_around_itself():
     assert found.n_starts[2] == 1
 
 
-def test_poses_in_millimetres_are_noticed_by_their_position():
-    pose = np.eye(4)
-    pose[2, 3] = 190.0
-    ik = InverseKinematics(PoseTask(TENDONS), q_pref=0.0)
-    with pytest.warns(UserWarning, match=r"`x_target` spans 190 m.*metres"):
-        ik.solve(pose, max_iter=1, restarts=0)
-    with pytest.warns(UserWarning, match=r"`path` spans 190 m"):
-        ik.track(pose[None], q0=np.zeros(6))
-    points = InverseKinematics(PointsTask(TENDONS, [1.0, 2.0]), q_pref=0.0)
-    with pytest.warns(UserWarning, match=r"`x_target` spans 150 m"):
-        points.solve([[0.0, 0.0, 0.1], [0.0, 0.0, 150.0]], max_iter=1, restarts=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        pose[2, 3] = 0.19
-        ik.solve(pose, max_iter=1, restarts=0)
-
-
 def test_parts_of_a_task_have_their_own_tolerances():
     """An error of two parts is reached where each is within its own, in its own unit."""
     task = PoseTask(TENDONS, radian=0.5)
@@ -121,38 +83,6 @@ def test_parts_of_a_task_have_their_own_tolerances():
         PoseTask(TENDONS, radian=0)
     with pytest.raises(ValueError, match=r"`weights` must be positive.*for 2 points"):
         PointsTask(TENDONS, [1.0, 2.0], weights=[1.0])
-
-
-def test_distances_between_poses_are_those_of_the_error_for_small_turns():
-    draw = torch.Generator().manual_seed(1)
-    q = 1e-3 * torch.randn(5, 6, generator=draw, dtype=torch.float64)
-    poses, targets, task = TENDONS.pose(q), TENDONS.pose(q.flip(0))[:3], PoseTask(TENDONS, 0.3)
-    targets[:, :3, 3] += torch.tensor([1e-3, 2e-3, 5e-3])
-    expected = torch.stack(
-        [task.difference(poses, t.expand(5, 4, 4)).norm(dim=-1) for t in targets]
-    )
-    assert_close(task.distances(poses[None], targets), expected, rtol=1e-2, atol=1e-9)
-    rows = poses.expand(3, 5, 4, 4)
-    assert_close(task.distances(rows, targets), expected, rtol=1e-2, atol=1e-9)
-    rows, order = torch.stack([poses, poses.flip(0), poses]), [0, 1, 2, 3, 4]
-    expected = torch.stack([expected[0], expected[1, order[::-1]], expected[2]])
-    assert_close(task.distances(rows, targets), expected, rtol=1e-2, atol=1e-9)
-    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
-    far = task.distances(torch.eye(4, dtype=torch.float64)[None, None], half[None])
-    assert_close(far, far.new_full((1, 1), 0.3 * 2.0))  # the chord of half a turn is 2
-
-
-@pytest.mark.parametrize("limits", [{"q_min": -1.0, "q_max": 1.0}, {}], ids=["shared", "own"])
-def test_further_starts_are_those_whose_tips_lie_nearest(limits):
-    ik = InverseKinematics(MODEL, **limits)
-    q = torch.zeros(4, 5, dtype=torch.float64)
-    size, target = torch.full((4,), 0.5, dtype=torch.float64), 0.5 * torch.eye(4, 3).double()
-    n = 2048 if limits else 64  # as many as there are in the sample
-    sample = even_starts(ik.settings, q, size, n).expand(4, n, 5)
-    found = nearest_starts(ik.settings, q, size, target, 3)
-    away = (sample @ A.T - target[:, None]).norm(dim=-1)
-    order = away.argsort(dim=1)[:, :3]
-    assert_close(found, sample.gather(1, order[..., None].expand(-1, -1, 5)))
 
 
 def test_a_step_is_stopped_where_a_plane_turns_it():
@@ -195,20 +125,6 @@ def test_lost_rows_and_no_motion_at_all_leave_finite_numbers(m):
     assert_close(only.sigma_max, J.flatten(1).norm(dim=1))
 
 
-def test_bounds_of_a_step_hold_to_the_last_bit():
-    """q + upper is never above q_max, nor q + lower below q_min, and no more than rounding off."""
-    draw = torch.Generator().manual_seed(4)
-    q = torch.rand(20000, 5, generator=draw, dtype=torch.float64) * 0.3 + 0.1
-    low, high = 0.1 + 1e-3 / 3.0, 0.4 - 1e-3 / 7.0
-    ik = InverseKinematics(MODEL, q_min=low, q_max=high)
-    lower, upper = ik.settings.step_bounds(q)
-    inside = (q >= low) & (q <= high)
-    assert ((q + upper <= high) & (q + lower >= low))[inside].all()
-    assert (q + upper - high).abs().max() < 2e-16
-    assert (q + lower - low).abs().max() < 2e-16
-    assert (lower <= upper).all()
-
-
 def test_angles_come_into_uneven_limits_by_whole_turns():
     origins = np.tile(np.eye(4), (2, 1, 1))
     arm = RigidChain(origins, [[0.0, 0.0, 1.0]] * 2, tool=[1.0, 0.0, 0.0])
@@ -234,81 +150,6 @@ def test_targets_of_poses_must_hold_rotations():
     assert repr(found).startswith("IKSolution(1 targets: 1 CONVERGED; error mean ")
 
 
-def test_plain_numbers_take_the_short_way():
-    """Arrays and lists of three numbers go to the core as they are; others get a closer look."""
-    ik = InverseKinematics(TENDONS, q_min=-0.02, q_max=0.02)
-    tracker = ik.tracker(np.zeros(6))
-    if tracker.backend != "compiled":
-        pytest.skip("needs the compiled core")
-    tick, target = tracker._robot.tick, [0.01, 0.0, 0.19]
-    for good in (target, tuple(target), np.array(target)):
-        assert tick(good, None, None)
-        assert tick(good, good, good)
-    for bad in ([0.01, 0.0], np.zeros((1, 3)), np.zeros(3, dtype=np.float32), "abc", ["a"] * 3):
-        assert not tick(bad, None, None)
-        assert not tick(target, bad, None)
-        assert not tick(target, None, bad)
-
-
-def test_the_way_into_the_domain_is_newtons():
-    """To 0.98 of the distance where it grows evenly; nowhere from inside, or without a slope."""
-
-    class Domain(ForwardModel):
-        n_actuators, n_outputs, even = 3, 3, True
-
-        def forward(self, q):
-            return 1.0 * q
-
-        def domain_distance(self, q):
-            return 4.0 * q.norm(dim=-1) if self.even else (q > 1.0).any(-1).to(q)
-
-    model = Domain()
-    search = Search(InverseKinematics(model).settings, 1e-4, 50)
-    q = torch.tensor([[1.0, 2.0, 2.0], [0.0, 0.0, -0.5], [0.1, 0.0, 0.0]], dtype=torch.float64)
-    found = q + search._inward(q)
-    assert_close(model.domain_distance(found[:2]), q.new_tensor([0.98, 0.98]))
-    assert_close(found[:2], q[:2] * (0.98 / model.domain_distance(q[:2]))[:, None])
-    assert_close(found[2], q[2], rtol=0.0, atol=0.0)
-    model.even = False
-    assert_close(search._inward(q), torch.zeros_like(q), rtol=0.0, atol=0.0)
-
-
-def test_what_pulls_against_limits_alone_is_blocked():
-    model = (lambda q: 1.0 * q, lambda q: torch.eye(3).to(q).expand(*q.shape[:-1], 3, 3))
-    search = Search(InverseKinematics(model, q_min=-1.0, q_max=1.0).settings, 1e-4, 50)
-    q = torch.tensor(
-        [[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 1.0, 0.5], [0.0, 0.0, 0.0]]
-    ).double()
-    way = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-1.0, 1.0, 0.1], [1.0, 0.0, 0.0]])
-    blocked = [True, True, False, False]
-    assert search._blocked(search._point(q, q + way)).tolist() == blocked
-    assert search._blocked(search._point(q, q + 0.1 * way)).tolist() == blocked
-    assert not search._blocked(search._point(q, q - way)).any()
-    found = InverseKinematics(model, q_min=-1.0, q_max=1.0).solve(q + way, q, restarts=0)
-    assert (found.status == IKStatus.MAX_ITER).tolist() == [True, True, True, False]
-    assert (found.n_iter[:2] == 0).all()
-
-
-@pytest.mark.parametrize("m", [2, 4, 6])
-def test_singular_values_of_healthy_rows_are_known_and_estimated(m):
-    J = torch.randn(20, m, 8, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    sizes = torch.linalg.svdvals(J)
-    gram, quick = row_gram(J), quick_gram(J)
-    assert_close(gram.sigma_min, sizes[:, -1], rtol=1e-7, atol=0.0)
-    assert_close(gram.sigma_max, sizes[:, 0], rtol=1e-12, atol=0.0)
-    assert (quick.sigma_min <= sizes[:, -1] * (1.0 + 1e-6)).all()
-    assert (quick.sigma_min >= m**-0.25 * sizes[:, -1] * (1.0 - 1e-6)).all()
-
-
-def test_four_rows_have_their_own_singular_values():
-    J = torch.diag(torch.tensor([4.0, 3.0, 2.0, 0.5], dtype=torch.float64))[None]
-    gram, quick = row_gram(J), quick_gram(J)
-    assert_close(gram.sigma_min, J.new_tensor([0.5]))
-    assert_close(gram.sigma_max, J.new_tensor([4.0]))
-    # The estimate is at most the fourth root of the number of rows too small.
-    assert 0.5 / 4.0**0.25 <= float(quick.sigma_min) <= 0.5
-
-
 def test_what_dependent_rows_cannot_reach_is_dropped():
     """The multipliers are those of the pseudo-inverse, also if the rows want different things."""
     J = torch.tensor([[[1.0, 2.0, 2.0], [1.0, 2.0, 2.0]]], dtype=torch.float64)
@@ -316,13 +157,6 @@ def test_what_dependent_rows_cannot_reach_is_dropped():
     mu = damped_solve(row_gram(J), v)
     assert_close(mu, (torch.linalg.pinv(J @ J.mT) @ v[..., None])[..., 0])
     assert_close(apply_rows(J, apply_columns(J, mu)), torch.full_like(v, 2.0))
-
-
-def test_a_jacobian_is_singular_where_it_is_damped():
-    low = torch.tensor([0.0, 0.01, 0.02, 0.021, 1.0], dtype=torch.float64)
-    gram = RowGram((), low, torch.ones_like(low))
-    assert gram.is_singular.tolist() == [True, True, False, False, False]
-    assert (adaptive_damping(gram) > 0.0).tolist() == gram.is_singular.tolist()
 
 
 def test_a_healthy_cold_start_is_the_middle_of_the_limits():
@@ -342,23 +176,6 @@ def test_one_row_settles_at_the_preferred_posture():
     assert found.converged
     expected = preferred + a * (0.7 - a @ preferred) / a.square().sum()
     assert_close(found.q, expected, rtol=0.0, atol=1e-6)
-
-
-def test_starts_beside_singular_points_are_a_share_of_the_limits_away():
-    """By up to 5 % of the range where the error is small, and not all actuators alike."""
-    ik = InverseKinematics(MODEL, q_min=-1.0, q_max=1.0)
-    search, q = Search(ik.settings, 1e-4, 50), torch.zeros(1, 5, dtype=torch.float64)
-    moved = search._nudged(search._start(q, q @ A.T + 1e-6))[0]
-    assert 0.05 < float(moved.abs().max()) <= 0.1
-    assert len(moved.unique()) == 5
-
-
-def test_rows_that_are_not_finite_are_not_held_by_limits():
-    ik = InverseKinematics(MODEL, q_min=-1.0, q_max=1.0, dq_max=1.0)
-    q = torch.tensor([[0.0] * 5, [0.0, 1.0, 0.0, -1.0, 0.0]], dtype=torch.float64)
-    step = ik.step(q, torch.full((2, 3), torch.nan, dtype=torch.float64))
-    assert (step.dq == 0.0).all()
-    assert_close(step.saturated, q.abs() == 1.0)
 
 
 def test_a_gap_in_a_path_stops_the_feed_forward_only_there():

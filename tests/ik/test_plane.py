@@ -66,17 +66,6 @@ def test_ticks_arrive_in_the_plane_at_the_limits_too(model, targets, options):
     assert off_plane(model, tracker.q) < COUNT
 
 
-@pytest.mark.parametrize("options", [{}, {"weights": [1.0, 2, 3, 4, 5, 6]}])
-def test_the_core_steps_as_torch_does(model, targets, options):
-    ik = solver(model, **options)
-    start = balanced(1)[0] + 50 * COUNT
-    compiled, in_torch = ik.tracker(start), ik.tracker(torch.from_numpy(start))
-    outside = targets + 0.02 * np.random.default_rng(2).standard_normal(targets.shape)
-    for target in outside[:8].repeat(10, axis=0):
-        expected = in_torch.step(torch.from_numpy(target)).numpy()
-        assert np.abs(compiled.step(target) - expected).max() < 1e-11
-
-
 def test_solutions_lie_in_the_plane(model, targets):
     ik = solver(model)
     found = ik.solve(targets, q0=balanced(1)[0] + 50 * COUNT)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hybridkin import InverseKinematics, robots
-from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
+from hybridkin.ik.results import IKSolution, IKStatus, Track
 
 TRUNK = robots.bionic_handling_assistant()
 
@@ -25,22 +25,6 @@ def test_figures_of_a_track_leave_out_what_is_not_known():
     assert repr(track) == text
     empty = a_track(np.empty((0, 2)), [])
     assert repr(empty) == "Track(0 targets; no error known; largest step 0)"
-
-
-@pytest.mark.parametrize("target", [[0.1, 0.0, 0.7], [[0.1, 0.0, 0.7]] * 2])
-def test_a_step_has_its_fields_and_no_others(target):
-    ik = InverseKinematics(TRUNK, q_min=0.1, q_max=0.26, dq_max=2.0)
-    q, target = np.full((*np.shape(target)[:-1], 9), 0.25), np.array(target)
-    step = ik.step(q, target)
-    held = int(step.saturated.sum())
-    np.testing.assert_array_equal(step.saturated, (q + step.dq >= 0.26) | (step.dq <= -0.02))
-    assert held > 0
-    distance = np.linalg.norm(TRUNK_TIP - target, axis=-1)
-    figures = f"error mean {distance.mean():.3g} m, max {distance.max():.3g} m"
-    assert repr(step) == f"Step(dq of shape {q.shape}, {held} saturated, {figures})"
-    with pytest.raises(AttributeError, match="velocity"):
-        _ = step.velocity
-    assert isinstance(step, Step)
 
 
 TRUNK_TIP = TRUNK(TRUNK.base.new_full((9,), 0.25)).numpy()

@@ -121,23 +121,6 @@ def test_a_joint_turns_on_beyond_its_limit(kind, task):
             assert_close(torch.cos(q - goal), torch.ones(2).double(), rtol=0.0, atol=1e-5)
 
 
-def test_starts_outside_the_limits_come_in_by_whole_turns():
-    arm = RigidChain(
-        np.tile(np.eye(4), (3, 1, 1)),
-        np.eye(3),
-        kinds=["revolute", "prismatic", "revolute"],
-    )
-    ik = InverseKinematics(arm, q_min=[-3.2, -1.0, -1.0], q_max=[3.2, 1.0, 1.0])
-    inside = ik.settings.inside(
-        torch.tensor([[4.0, 8.0, 4.0], [-16.0, 0.5, -0.5]], dtype=torch.float64)
-    )
-    whole = 2.0 * math.pi
-    expected = [[4.0 - whole, 1.0, 1.0], [-16.0 + 3.0 * whole, 0.5, -0.5]]
-    assert_close(inside, torch.tensor(expected, dtype=torch.float64))
-    off = InverseKinematics(arm, q_min=-3.2, q_max=3.2, limits="off")
-    assert torch.isinf(off.settings.periods).all()
-
-
 def test_reached_parts_stay_reached_to_the_end(rng):
     """A last step may lower the whole error and raise that of the position above its tolerance."""
     arm = planar(0.3, 0.2, 0.1)

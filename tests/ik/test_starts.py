@@ -4,7 +4,6 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain
-from hybridkin.ik._starts import _even_shares
 from hybridkin.ik.solver import IKStatus, InverseKinematics
 
 TRUNK = ConstantCurvatureChain([0.100, 0.093, 0.079])
@@ -106,20 +105,3 @@ def test_further_starts_lie_around_the_first_one_where_there_are_no_limits(rng):
     assert solution.converged.double().mean() > 0.85 > 0.75 > once.converged.double().mean()
     assert solution.q.min() >= -0.02
     assert solution.q.max() < 0.2
-
-
-@pytest.mark.parametrize("n", [1, 3, 9, 24])
-def test_the_sample_fills_the_box_its_faces_and_corners(n):
-    shares = _even_shares(n, 2048, torch.device("cpu"))
-    assert shares.shape == (2048, n)
-    assert (shares[0] == 0.5).all()
-    assert ((shares >= 0.0) & (shares <= 1.0)).all()
-    assert_close(shares.mean(0), torch.full((n,), 0.5).double(), rtol=0.0, atol=0.02)
-    at_limit = (shares == 0.0) | (shares == 1.0)
-    assert 0.2 < at_limit.double().mean() < 0.6
-    assert len(shares.unique(dim=0)) > (0.5 * 2048 if n > 1 else 500)
-    if n > 1:
-        correlation = torch.corrcoef(shares.T) - torch.eye(n).double()
-        assert correlation.abs().max() < 0.2
-    if n == 3:
-        assert len(shares[at_limit.all(1)].unique(dim=0)) == 8  # every corner

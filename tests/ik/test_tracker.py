@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from hybridkin import (
-    ConstantCurvatureChain,
     ELMRegressor,
     HybridForwardModel,
     InverseKinematics,
@@ -147,24 +146,6 @@ def test_any_task_is_followed(draw):
 
 
 # ---------------------------------------------------------------- streams
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dq_max", [None, 0.05, 0.01])
-@pytest.mark.parametrize("guard", ["leverage", None])
-def test_a_streamed_lap_is_the_loop_over_steps(hybrids, guard, dq_max):
-    ik = InverseKinematics(hybrids[guard], q_min=0.17, q_max=0.32, dq_max=dq_max)
-    path = figure_eight(DATA.x.mean(0), (0.12, 0.06), duration=2.0).x
-    q = ik.solve(path[0]).q
-    tracker, held = ik.tracker(q), 0
-    for here, ahead in pairwise(path):
-        step = ik.step(q, here, (ahead - here) / ik.settings.dt)
-        new = tracker.step(here, (ahead - here) / ik.settings.dt)
-        np.testing.assert_array_equal(new, q + step.dq)
-        np.testing.assert_array_equal(tracker.saturated, step.saturated)
-        assert ((new >= 0.17) & (new <= 0.32)).all()
-        q, held = new, held + int(step.saturated.any())
-    assert {None: held == 0, 0.05: 10 < held < 100, 0.01: held > 150}[dq_max], held
 
 
 def closed_path(n):
@@ -359,18 +340,6 @@ def test_bad_input_says_what_is_needed():
         InverseKinematics(lambda q: q[..., :2]).tracker(np.zeros(4))
     with pytest.raises(ValueError, match=r"shape \(4,\)"):
         InverseKinematics(Linear(np.ones((3, 4))), q_min=np.zeros(4)).tracker(np.zeros(5))
-
-
-@pytest.mark.slow
-def test_many_segments_and_more_actuators(draw):
-    """Nothing depends on nine actuators or three segments."""
-    chain = ConstantCurvatureChain([0.1, 0.09, 0.08, 0.07, 0.06], n_actuators=4)
-    ik = InverseKinematics(chain, q_min=0.1, q_max=0.4, dq_max=0.5)
-    tracker = ik.tracker(0.25 + 0.02 * draw.standard_normal(20))
-    for _ in range(20):
-        target = tracker.x + 0.05 * draw.standard_normal(3)
-        expected = tracker.q + ik.step(tracker.q, target).dq
-        np.testing.assert_array_equal(tracker.step(target), expected)
 
 
 @pytest.mark.parametrize("as_array", [np.array, torch.tensor])

@@ -2,18 +2,11 @@
 
 import copy
 import pickle
-import subprocess
-import sys
-import warnings
 
 import joblib
 import numpy as np
-import pandas as pd
-import polars as pl
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import LinAlgWarning
 from sklearn.base import clone
@@ -23,7 +16,6 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from torch.testing import assert_close
 
 from hybridkin import ELMRegressor
-from hybridkin.learning.network import ELM
 
 BOUNDS = np.array([[0.1] * 9, [0.3] * 9])
 VARIANTS = [
@@ -152,15 +144,6 @@ def test_units_of_the_data_do_not_matter(unit):
     assert_allclose(other.jacobian(unit * X) * unit, 3 * base.jacobian(X), rtol=1e-7, atol=1e-7)
 
 
-def test_narrow_range_far_from_zero_keeps_its_digits():
-    X, Y = trunk()
-    # 2^-20 and 2^10: the shift and the shrinking are exact up to the grid of the sum.
-    near = np.round((X - 0.2) * 2**20) * 2.0**-20
-    far = near * 2.0**-20 + 1024
-    far_model, near_model = elm().fit(far, Y), elm().fit(near, Y)
-    assert_allclose(far_model.predict(far), near_model.predict(near), rtol=1e-6)
-
-
 # Statistics: add, merge, weigh
 
 
@@ -218,24 +201,6 @@ def test_sample_weight_is_repetition(fit_intercept, input_scaling):
     assert weighted.n_samples_seen_ == w.sum()
 
 
-def test_fit_forgets_partial_fit_and_partial_fit_remembers_fit():
-    X, Y = trunk()
-    model = elm(input_scaling=BOUNDS).partial_fit(X[:50], Y[:50]).fit(X[50:], Y[50:])
-    fresh = elm(input_scaling=BOUNDS).fit(X[50:], Y[50:])
-    assert joblib.hash(model) == joblib.hash(fresh)
-    assert_same_model(model.partial_fit(X[:50], Y[:50]), elm(input_scaling=BOUNDS).fit(X, Y))
-    # The features of the rows already summed are not those of another activation.
-    tanh = clone(model).fit(X[50:], Y[50:]).set_params(activation="tanh")
-    assert_same_model(tanh.partial_fit(X[:50], Y[:50]), model)
-    assert pickle.loads(pickle.dumps(tanh)).module_.activation == "logistic"
-
-
-def test_alpha_can_change_between_calls():
-    X, Y = trunk()
-    model = elm(alpha=10.0, input_scaling=BOUNDS).fit(X[:200], Y[:200]).set_params(alpha=0.1)
-    assert_same_model(model.partial_fit(X[200:], Y[200:]), elm(input_scaling=BOUNDS).fit(X, Y))
-
-
 @pytest.mark.parametrize("fit_intercept", [False, True])
 def test_every_output_may_have_its_own_alpha(fit_intercept):
     X, Y = trunk()
@@ -250,19 +215,6 @@ def test_every_output_may_have_its_own_alpha(fit_intercept):
     for wrong in ([0.1, 0.2], [0.1, 0.2, -1.0], [0.1, 0.2, np.nan], [[0.1, 0.2, 0.3]]):
         with pytest.raises(ValueError, match="`alpha` must be a number >= 0, or 3 of them"):
             elm(alpha=wrong).fit(X, Y)
-
-
-@pytest.mark.parametrize("block_size", [1, 7, 299, 10**6])
-def test_block_size_does_not_matter(block_size):
-    X, Y = trunk()
-    blocks, whole = elm(block_size=block_size).fit(X, Y), elm().fit(X, Y)
-    assert_same_model(blocks, whole)
-    readout = ("output_weights", "tangent", "leverage_factor")
-    taken = {name: whole.module_.get_buffer(name) for name in readout}
-    blocks.module_.load_state_dict(taken, strict=False)
-    assert_allclose(blocks.jacobian(X), whole.jacobian(X), rtol=1e-12, atol=1e-13)
-    assert_allclose(blocks.predict(X), whole.predict(X), rtol=1e-12)
-    assert_allclose(blocks.leverage(X), whole.leverage(X), rtol=1e-11)
 
 
 # Derivatives
@@ -328,18 +280,6 @@ def test_module_batches_dtypes_and_transforms():
         module(torch.zeros(9, dtype=torch.int64))
 
 
-def test_state_dict_is_the_whole_module():
-    X, Y = trunk()
-    a, b = elm(activation="tanh").fit(X, Y).module_, elm(activation="tanh").fit(X, 2 * Y).module_
-    q = torch.tensor(X)
-    rebuilt = ELM(a.activation, **a.state_dict())
-    assert_close(rebuilt.forward_and_jacobian(q), a.forward_and_jacobian(q), rtol=0, atol=0)
-    assert_close(rebuilt.leverage(q), a.leverage(q), rtol=0, atol=0)
-    b.load_state_dict(a.state_dict())
-    assert_close(b.forward_and_jacobian(q), a.forward_and_jacobian(q), rtol=0, atol=0)
-    assert repr(a) == "ELM(9 -> 30 tanh -> 3)"
-
-
 # Uncertainty
 
 
@@ -383,14 +323,6 @@ def test_std_covers_new_measurements(fit_intercept):
     assert_allclose(np.mean(variances), 0.04, rtol=0.02)
 
 
-def test_leverage_grows_outside_the_data():
-    X, Y = trunk()
-    model = elm(100).fit(X, Y)
-    center, outward = X.mean(0), np.ones(9)
-    path = center + np.array([0.0, 0.1, 0.2, 0.4])[:, None] * outward
-    assert (np.diff(model.leverage(path)) > 0).all()
-
-
 # Hard data
 
 
@@ -429,30 +361,6 @@ def test_constant_and_repeated_columns(input_scaling):
         assert model.input_scale_[2] == 1
 
 
-@variants
-def test_one_row(params):
-    X, Y = trunk(1)
-    model = elm(**params).fit(X, Y)
-    phi = features(model, X)[0]
-    if model.fit_intercept:
-        assert_allclose(model.predict(X), Y, rtol=1e-13)
-        assert np.isnan(model.noise_variance_).all()
-    else:
-        share = phi @ phi / (phi @ phi + 0.1)
-        assert_allclose(model.predict(X), share * Y, rtol=1e-12)
-        assert_allclose(model.leverage(X), [share], rtol=1e-12)
-        assert_allclose(model.noise_variance_, (1 - share) * Y[0] ** 2, rtol=1e-9)
-
-
-def test_fewer_rows_than_neurons():
-    X, Y = trunk(15)
-    model = elm(200).fit(X, Y)
-    phi = features(model, X)
-    dual = phi.T @ np.linalg.solve(phi @ phi.T + 0.1 * np.eye(15), Y)
-    assert model.solver_ == "cholesky"
-    assert_allclose(model.output_weights_, dual, rtol=0, atol=1e-11 * np.abs(dual).max())
-
-
 @pytest.mark.parametrize("fit_intercept", [False, True])
 def test_alpha_zero(fit_intercept):
     X, Y = trunk(400)
@@ -476,21 +384,6 @@ def test_alpha_zero(fit_intercept):
     assert model.leverage(split) > 1e3
 
 
-def test_noise_of_a_singular_system_counts_its_rank():
-    """A penalty near rounding takes no degree of freedom."""
-    X, Y = trunk(60)
-    X[:, 1] = X[:, 0]
-    model = elm(3, alpha=1e-14, direct_link=True)
-    with pytest.warns(LinAlgWarning, match="singular"):
-        model.fit(X, Y)
-    assert model.solver_ == "eigh"
-    phi = features(model, X)
-    rank = np.linalg.matrix_rank(phi)
-    assert rank == phi.shape[1] - 1
-    rss = np.sum((Y - model.predict(X)) ** 2, axis=0)
-    assert_allclose(model.noise_variance_, rss / (60 - rank), rtol=1e-9)
-
-
 def test_a_column_too_small_to_be_squared_changes_nothing():
     X, Y = trunk(60)
     model = elm(3, alpha=0, input_scaling=None, direct_link=True)
@@ -501,32 +394,6 @@ def test_a_column_too_small_to_be_squared_changes_nothing():
         with pytest.warns(LinAlgWarning, match="singular"), np.errstate(divide="raise"):
             predictions.append(model.fit(X, Y).predict(X))
     assert_allclose(*predictions, rtol=1e-9)
-
-
-def test_features_of_different_units_are_not_singular():
-    X, Y = trunk()
-    X[:, 0] *= 1e-7
-    model = elm(5, alpha=0, input_scaling=None, direct_link=True).fit(X, Y)
-    assert model.solver_ == "cholesky"
-
-
-@pytest.mark.slow
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, 12), st.integers(1, 5), st.integers(0, 3), st.integers(1, 20), st.booleans())
-def test_shapes(n, d, m, n_hidden, single):
-    rng = np.random.default_rng(n)
-    dtype = np.float32 if single else np.float64
-    X, Y = rng.standard_normal((n, d)).astype(dtype), rng.standard_normal((n, m) if m else n)
-    model = ELMRegressor(n_hidden, random_state=0, direct_link=True, block_size=5).fit(X, Y)
-    y, J = model.predict_and_jacobian(X)
-    outputs = (m,) if m else ()
-    assert y.shape == (n, *outputs)
-    assert J.shape == (n, *outputs, d)
-    assert y.dtype == J.dtype == dtype
-    assert model.predict(X, return_std=True)[1].shape == y.shape
-    assert model.leverage(X).shape == (n,)
-    assert model.output_weights_.shape == (n_hidden + d, m or 1)
-    assert model.leverage(X).max() <= 1 + 1e-5
 
 
 # Manners
@@ -551,36 +418,6 @@ def test_pickle_clone_copy_and_hash():
     assert joblib.hash(fresh) == joblib.hash(elm(input_scaling=BOUNDS))
 
 
-@pytest.mark.slow
-def test_pickle_is_the_same_in_another_process():
-    code = (
-        "import sys, pickle, numpy as np; from hybridkin import ELMRegressor;"
-        "X = np.random.default_rng(0).uniform(size=(40, 4));"
-        "m = ELMRegressor(10, random_state=0).fit(X, X @ X.T[:, :2]);"
-        "sys.stdout.buffer.write(pickle.dumps(m))"
-    )
-    first, second = (
-        subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
-        for _ in range(2)
-    )
-    assert first == second
-    X = np.random.default_rng(0).uniform(size=(40, 4))
-    expected = ELMRegressor(10, random_state=0).fit(X, X @ X.T[:, :2])
-    assert_allclose(pickle.loads(first).predict(X), expected.predict(X), rtol=1e-12)
-
-
-def test_device():
-    X, Y = trunk()
-    model = elm(device=torch.device("cpu")).fit(X, Y)
-    assert_array_equal(model.predict(X), elm().fit(X, Y).predict(X))
-    model.device = "xla:7"  # as if it came from a machine that has one
-    moved = pickle.loads(pickle.dumps(model))
-    assert moved.device == "xla:7"
-    assert_array_equal(moved.predict(X), model.predict(X))
-    with pytest.raises(RuntimeError, match=r"`device` must name .*, got 'xla:7'; use device=None"):
-        moved.fit(X, Y)
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_equals_cpu():
     X, Y = trunk()
@@ -600,42 +437,6 @@ def test_seeds():
         ELMRegressor(30, random_state=rng).fit(X, Y).input_weights_,
         elm().fit(X, Y).input_weights_,
     )
-
-
-@pytest.mark.parametrize("frame", [pd.DataFrame, lambda X, columns: pl.DataFrame(X, columns)])
-def test_named_columns(frame):
-    X, Y = trunk()
-    names = [f"q{i}" for i in range(9)]
-    model = elm().fit(frame(X, columns=names) if frame is pd.DataFrame else frame(X, names), Y)
-    assert list(model.feature_names_in_) == names
-    with pytest.raises(ValueError, match="feature names"):
-        model.predict(pd.DataFrame(X[:, ::-1], columns=names[::-1]))
-    assert_array_equal(model.predict(pd.DataFrame(X, columns=names)), elm().fit(X, Y).predict(X))
-
-
-def test_read_only_memory_map(tmp_path):
-    X, Y = trunk()
-    joblib.dump((X, Y), tmp_path / "data")
-    X_map, Y_map = joblib.load(tmp_path / "data", mmap_mode="r")
-    model = elm().fit(X_map, Y_map)
-    assert_array_equal(model.predict(X_map), elm().fit(X, Y).predict(X))
-    joblib.dump(model, tmp_path / "model")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mapped = joblib.load(tmp_path / "model", mmap_mode="r")
-        assert_array_equal(mapped.predict(X_map), model.predict(X))
-        assert_same_model(mapped.partial_fit(X, Y), model.partial_fit(X, Y))
-
-
-def test_global_state_is_left_alone():
-    X, Y = trunk()
-    before = torch.get_num_threads(), torch.get_default_dtype(), torch.get_rng_state()
-    numpy_before = np.random.get_state()[1].copy()  # noqa: NPY002
-    elm().fit(X, Y).predict(X)
-    assert torch.is_grad_enabled()
-    assert (torch.get_num_threads(), torch.get_default_dtype()) == before[:2]
-    assert_close(torch.get_rng_state(), before[2])
-    assert_array_equal(np.random.get_state()[1], numpy_before)  # noqa: NPY002
 
 
 def test_clear_errors():

@@ -2,8 +2,6 @@
 
 import importlib.util
 import os
-import runpy
-import sys
 from pathlib import Path
 
 import joblib
@@ -18,15 +16,12 @@ from joblib.externals.loky import get_reusable_executor
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.model_selection import GridSearchCV, KFold, cross_val_score, cross_validate
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
+from sklearn.preprocessing import MinMaxScaler
 from sklearn.utils import estimator_html_repr
 
 from hybridkin import (
-    ConstantCurvatureChain,
     ELMRegressor,
     ELMRegressorCV,
-    HybridForwardModel,
-    InverseKinematics,
 )
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "plot_elm_dask.py"
@@ -122,16 +117,6 @@ def test_decay_is_a_weight_that_falls_with_age(fit_intercept):
     assert np.abs(forgetful.predict(X) - elm(**params).fit(X, y).predict(X)).max() > 1e-3
 
 
-def test_each_chunk_may_have_its_own_decay():
-    decays, forgetful = [1.0, 0.5, 1.0, 0.9, 0.2, 1.0], elm(input_scaling=BOUNDS)
-    for (X, y), decay in zip(stream(), decays, strict=True):
-        forgetful.partial_fit(X, y, decay=decay)
-    X, y, chunk = together(stream())
-    later = np.append(np.cumprod(decays[:0:-1])[::-1], 1.0)  # product of the decays that followed
-    whole = elm(input_scaling=BOUNDS).fit(X, y, sample_weight=later[chunk])
-    assert_same_predictions(forgetful, whole, X)
-
-
 @pytest.mark.parametrize("decay", [0, -1, 1.5, np.nan, np.inf])
 def test_a_wrong_decay_or_chunk_changes_nothing(decay):
     X, y = data()
@@ -215,33 +200,6 @@ def test_order_of_merges_does_not_matter():
     assert [joblib.hash(part) for part in parts] == hashes
 
 
-def test_dask_example_says_so_where_dask_is_missing(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    runpy.run_path(str(EXAMPLE), run_name="__main__")
-    assert "Skipped: this example needs dask" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_joblib_on_dask_gives_the_same_scores(scaled_out):
-    X, y = data()
-    here = cross_validate(WatchedELM(20, random_state=0), X, y, return_estimator=True)
-    chosen = GridSearchCV(elm(), SEARCH, cv=3).fit(X, y)
-    by_itself = elm_cv()
-    scores = cross_val_score(by_itself, X, y)
-    with joblib.parallel_config(backend="dask"):
-        there = cross_validate(WatchedELM(20, random_state=0), X, y, return_estimator=True)
-        searched = GridSearchCV(elm(), SEARCH, cv=3).fit(X, y)
-        assert_allclose(cross_val_score(by_itself, X, y), scores, rtol=1e-9)
-    assert {model.process_ for model in here["estimator"]} == {os.getpid()}
-    assert os.getpid() not in {model.process_ for model in there["estimator"]}
-    assert {model.threads_ for model in there["estimator"]} == {1}
-    assert_allclose(there["test_score"], here["test_score"], rtol=1e-9)
-    assert searched.best_params_ == chosen.best_params_
-    expected = chosen.cv_results_["mean_test_score"]
-    assert_allclose(searched.cv_results_["mean_test_score"], expected, rtol=1e-9)
-    assert_same_predictions(searched, chosen, X)
-
-
 # Processes and threads
 
 
@@ -264,28 +222,6 @@ def test_processes_share_the_cores(two_processes):
     assert_allclose(there["test_score"], here["test_score"], rtol=1e-9)
     for a, b in zip(there["estimator"], here["estimator"], strict=True):
         assert_same_predictions(a, b, X)
-
-
-@pytest.mark.slow
-def test_thread_counts_are_left_alone():
-    q = np.random.default_rng(0).uniform(0.1, 0.3, (60, 9))
-    chain = ConstantCurvatureChain([0.1, 0.093, 0.079])
-    x = chain(torch.from_numpy(q)).numpy() + 0.01 * np.sin(20 * q[:, :3])
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)  # neither what a library would set, nor what the tests run with
-    try:
-        with threadpoolctl.threadpool_limits(2):
-            counts = torch.get_num_threads(), threadpoolctl.threadpool_info()
-            model = elm(input_scaling=[[0.1] * 9, [0.3] * 9]).fit(q, x).partial_fit(q, x)
-            model.merge(elm(input_scaling=[[0.1] * 9, [0.3] * 9]).fit(q, x))
-            model.predict_and_jacobian(q)
-            ELMRegressorCV(20, random_state=0).fit(q, x).predict(q, return_std=True)
-            hybrid = HybridForwardModel(chain, elm(), calibrate=("radii",)).fit(q, x)
-            ik = InverseKinematics(hybrid, q_min=0.1, q_max=0.3, q_pref=0.2)
-            ik.solve(torch.from_numpy(x[0]))
-            assert (torch.get_num_threads(), threadpoolctl.threadpool_info()) == counts
-    finally:
-        torch.set_num_threads(before)
 
 
 # Frames, pipelines, pictures, metadata
@@ -315,19 +251,6 @@ def test_frames_through_a_search(library):
     assert_allclose(cross_val_score(choosing, X_frame, y_frame["x"]), scores, rtol=1e-9)
 
 
-@pytest.mark.parametrize("transform", ["pandas", "polars"])
-@pytest.mark.parametrize("last", [elm(), elm_cv()], ids=["elm", "cv"])
-def test_pipeline_that_hands_on_frames(transform, last):
-    X, y = data()
-    X_frame, _ = as_frames(pd, X, y)
-    plain = make_pipeline(MinMaxScaler(), PolynomialFeatures(2, include_bias=False), last)
-    expected = plain.fit(X, y).predict(X)
-    framed = sklearn.clone(plain).set_output(transform=transform).fit(X_frame, y)
-    assert list(framed[-1].feature_names_in_[:5]) == ["q0", "q1", "q2", "q3", "q0^2"]
-    assert_allclose(framed.predict(X_frame), expected, rtol=1e-9)
-    assert_allclose(framed.score(X_frame, y), plain.score(X, y), rtol=1e-9)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "estimator",
@@ -351,25 +274,3 @@ def test_html_repr(estimator):
         assert "text/html" in model._repr_mimebundle_()
         assert name in estimator_html_repr(make_pipeline(MinMaxScaler(), model))
     assert name in estimator_html_repr(GridSearchCV(fresh, {"random_state": [0, 1]}).fit(X, y))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("weighted", [(True, True), (True, False), (False, True)], ids=str)
-def test_weights_reach_the_folds(weighted):
-    X, y = data()
-    w = np.random.default_rng(3).uniform(0.1, 5.0, 200)
-    folds, expected, plain = KFold(3), [], []
-    for train, test in folds.split(X):
-        w_fit, w_score = (
-            w[rows] if on else None for rows, on in zip((train, test), weighted, strict=True)
-        )
-        expected.append(elm().fit(X[train], y[train], w_fit).score(X[test], y[test], w_score))
-        plain.append(elm().fit(X[train], y[train]).score(X[test], y[test]))
-    assert np.abs(np.subtract(expected, plain)).min() > 1e-5
-    with sklearn.config_context(enable_metadata_routing=True):
-        model = elm().set_fit_request(sample_weight=weighted[0])
-        model.set_score_request(sample_weight=weighted[1])
-        found = cross_validate(model, X, y, cv=folds, params={"sample_weight": w})
-        assert_allclose(found["test_score"], expected, rtol=1e-12)
-        with pytest.raises(sklearn.exceptions.UnsetMetadataPassedError):
-            cross_validate(elm(), X, y, cv=folds, params={"sample_weight": w})

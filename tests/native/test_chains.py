@@ -15,7 +15,6 @@ from hybridkin import (
     RigidChain,
 )
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin.hybrid._features import PoseFeatures, Readout
 from hybridkin.native.library import Program
 
 pytestmark = pytest.mark.needs_core
@@ -137,19 +136,6 @@ def test_pairs_and_insertions(lengths, routing):
         check(chain.with_tip(tip), q)
 
 
-def test_a_rotation_stage_is_left_to_torch():
-    chain = ConstantCurvatureChain([0.01] * 2, n_actuators=[1, 3], stage="rotation")
-    with pytest.raises(NoKernel, match="rotation stage"):
-        Plan(chain.stored())
-
-
-def test_a_quarter_circle():
-    chain = ConstantCurvatureChain([0.01], lengths=[0.1])
-    q = -0.01 * 0.5 * np.pi * np.array([1.0, -0.5, -0.5])
-    x = Program(Plan(chain.stored())).evaluate(q)[0]
-    assert np.abs(x - 0.2 / np.pi * np.array([1.0, 0.0, 1.0])).max() < 1e-16
-
-
 @pytest.mark.parametrize("bend", [0.0, 1e-9, 1.0, 3.1415, 3.1417, 3.6, 6.3, 12.6, 1e6])
 def test_bends_of_any_size(bend):
     """Around a half turn, where the polynomial ends, and at several turns."""
@@ -172,31 +158,6 @@ def test_elastic_tendons(counts, routing):
     check(chain, q, 1e-11)
     check(chain.with_tip(len(counts) - 0.6), q, 1e-11)
     check_nan_row(chain, q)
-
-
-@pytest.mark.parametrize("routing", ROUTINGS)
-def test_gains(routing):
-    rng = np.random.default_rng(5)
-    chain, q = elastic(rng, [3, 2, 4], routing)
-    gains = rng.choice([-1.0, 1.0], 9) * rng.uniform(0.2, 3.0, 9)
-    counted = chain.with_geometry(gains=torch.from_numpy(gains))
-    for tip in (3.0, 1.7):
-        x, J = check(counted.with_tip(tip), q / gains, 1e-11)
-        plain = Program(Plan(chain.with_tip(tip).stored())).evaluate(q, jacobian=True)
-        assert np.abs(x - plain[0]).max() < 1e-12
-        assert np.abs(J - plain[1] * gains).max() < 1e-11
-    arcs, q = trunk(rng, [3, 3, 3], routing=routing, gains=gains, actuator_zeros=rng.normal(size=9))
-    check(arcs, q / gains + arcs.actuator_zeros.numpy())
-
-
-def test_elastic_tendons_of_default_stiffness():
-    chain, rng = ElasticTendonChain([0.008] * 3, [0.1] * 3), np.random.default_rng(0)
-    x, _ = check(chain, rng.uniform(-0.03, 0.03, (1000, 9)), 1e-11)  # bends of several turns
-    assert np.isfinite(x).all()
-    check(chain, np.zeros((17, 9)), 1e-11)  # all are just about to pull
-    x, J = check(chain, np.full((17, 9), 0.01), 1e-11)  # all slack
-    assert_array_equal(x, np.tile([0.0, 0.0, chain.lengths.sum()], (17, 1)))
-    assert_array_equal(J, np.zeros((17, 3, 9)))
 
 
 def test_tendons_that_whole_steps_do_not_settle():
@@ -247,19 +208,6 @@ def test_coupled_joints_with_zeros(joints, n):
     twin = HybridForwardModel(arm, "quadratic", coupling="serial")
     x = in_torch(arm, q)[0] + 0.01 * np.sin(q[:, :1])
     check(twin.fit(q, x).module_, q, 1e-11)
-
-
-@pytest.mark.parametrize("counts", [[3], [3, 4, 3]])
-def test_readouts_of_pose_features(counts):
-    """The features see the whole robot, in the frame of its base."""
-    rng = np.random.default_rng(0)
-    plain, q = trunk(rng, counts, offsets=rng.uniform(0.0, 0.1, len(counts)), base=pose_of(rng))
-    soft, pulls = elastic(rng, counts, "base")
-    for chain, rows in ((plain, q), (soft, pulls)):
-        features = PoseFeatures.of_range(torch.from_numpy(rows), chain.with_tip(0.5))
-        size = features(torch.from_numpy(rows[:1])).shape[1]
-        weights = torch.from_numpy(rng.normal(size=(4, size)))
-        check(Readout(features, weights), rows, 1e-11)
 
 
 @settings(max_examples=20, deadline=None)

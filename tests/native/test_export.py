@@ -84,27 +84,6 @@ def test_without_limits_no_limit_is_kept_or_promised(tmp_path, dtype):
 
 @needs_cc
 @pytest.mark.slow
-def test_arms_of_prismatic_joints(tmp_path):
-    for kinds in (["prismatic", "revolute", "revolute"], ["prismatic"] * 3):
-        assert agrees(tmp_path, limited(arm(kinds=kinds), q_min=-1.0, q_max=1.0))
-
-
-@needs_cc
-@pytest.mark.slow
-def test_one_number_limits_all_actuators_of_a_data_only_hybrid(tmp_path):
-    assert agrees(tmp_path, limited(load_model(FOLDER / "data_only.safetensors")))
-
-
-@needs_cc
-@pytest.mark.slow
-def test_of_several_markers_the_steered_one_is_written(tmp_path):
-    marked = ConstantCurvatureChain([0.1, 0.09]).with_markers([(0, 1.0), (1, 1.0)])
-    assert agrees(tmp_path, limited(marked, q_min=0.15, q_max=0.35))
-    assert "enum { ROBOT_N = 6, ROBOT_OUTPUTS = 3 }" in (tmp_path / "robot.h").read_text()
-
-
-@needs_cc
-@pytest.mark.slow
 def test_a_soft_backbone_of_few_taut_tendons(tmp_path):
     rng = np.random.default_rng(2)
     radii, lengths = rng.uniform(0.004, 0.03, 3), rng.uniform(0.05, 0.15, 3)

@@ -1,7 +1,3 @@
-import copy
-import pickle
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 import torch
@@ -20,7 +16,6 @@ from hybridkin import (
     robots,
 )
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin.ik._compiled import core_of
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import PoseTask
 
@@ -36,7 +31,6 @@ CHAINS = {
     "tendons": (TENDONS, -0.02, 0.02),
     "elastic tendons": (ElasticTendonChain([0.02] * 2, [0.1] * 2), -0.02, 0.02),
 }
-STEP = ("dq", "x", "error", "sigma_min", "damping", "saturated")
 # The singular values are good to the root of the precision.
 ATOL = {"dq": 1e-9, "x": 1e-12, "error": 1e-12, "sigma_min": 1e-5, "damping": 1e-5}
 
@@ -85,27 +79,6 @@ def test_steps_are_those_of_torch(name):
         new = q[rows] + ours.dq[rows]
         assert ((new >= ends[0]) & (new <= ends[1])).all()
     assert held > 800
-
-
-def test_a_row_is_a_tick_is_a_row_of_a_batch():
-    draw = np.random.default_rng(1)
-    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, dq_max=5.0, ddq_max=100.0)
-    q, x = random_rows(draw, BHA, 0.1, 0.4, 40, {"q_min": 0.1})
-    dx, tip = draw.standard_normal((2, 40, 3))
-    for given in ((None, None), (dx, None), (None, tip), (dx, tip)):
-        batch = ik.step(q, x, given[0], x_measured=given[1])
-        for i in range(40):
-            row = [None if a is None else a[i] for a in given]
-            one = ik.step(q[i], x[i], row[0], x_measured=row[1])
-            for field in STEP:
-                np.testing.assert_array_equal(getattr(one, field), getattr(batch, field)[i])
-            if np.isfinite(q[i]).all():
-                tracker = ik.tracker(q[i])
-                new = tracker.step(list(x[i]), row[0], x_measured=row[1])
-                np.testing.assert_array_equal(new, q[i] + one.dq)
-                np.testing.assert_array_equal(tracker.saturated, one.saturated)
-                for field in ("x", "error", "sigma_min", "damping"):
-                    np.testing.assert_array_equal(getattr(tracker, field), getattr(one, field))
 
 
 @pytest.mark.parametrize("memory", [None, 0.05])
@@ -187,24 +160,6 @@ def test_what_has_no_kernel_runs_in_torch():
     assert single.backend == "torch: `q0` is no float64 array of NumPy"
 
 
-def test_why_a_tracker_runs_in_torch():
-    q, limits = np.full(9, 0.25), {"q_min": 0.1, "q_max": 0.4}
-    reasons = {
-        "a FunctionModel has no kernel": InverseKinematics(lambda q: BHA(q), **limits),
-        "only positions have a kernel of a step": InverseKinematics(
-            PoseTask(RigidChain([np.eye(4)], [[0, 0, 1]]))
-        ),
-        "a posture that is a function has no kernel": InverseKinematics(
-            BHA, q_pref=lambda q: q, **limits
-        ),
-    }
-    for reason, ik in reasons.items():
-        start = q[: ik.settings.n_actuators]
-        assert ik.tracker(start).backend == f"torch: {reason}"
-    tracker = InverseKinematics(BHA, **limits).tracker(torch.from_numpy(q))
-    assert tracker.backend == "torch: `q0` is no float64 array of NumPy"
-
-
 @pytest.mark.parametrize("error_model", [ELMRegressor(8, random_state=0), LinearRegression()])
 def test_a_model_of_data_alone_is_compiled_with_scalar_limits(error_model):
     draw = np.random.default_rng(0)
@@ -216,45 +171,6 @@ def test_a_model_of_data_alone_is_compiled_with_scalar_limits(error_model):
     assert tracker.backend == "compiled"
     vectors = InverseKinematics(model, q_min=np.full(9, 0.1), q_max=np.full(9, 0.4)).tracker(q[0])
     np.testing.assert_array_equal(tracker.step(x[1]), vectors.step(x[1]))
-
-
-def test_a_tracker_keeps_its_model_until_it_is_reset():
-    chain, q, x = copy.deepcopy(BHA), np.full(9, 0.25) + 0.01 * np.arange(9), [0.1, 0.0, 0.7]
-    ik = InverseKinematics(chain, q_min=0.1, q_max=0.4)
-    tracker, before = ik.tracker(q), ik.step(q, np.array(x))
-    chain.load_state_dict({k: 1.01 * v for k, v in chain.state_dict().items()}, strict=False)
-    after = ik.step(q, np.array(x))
-    assert np.abs(after.dq - before.dq).max() > 1e-5
-    np.testing.assert_array_equal(tracker.step(x), q + before.dq)
-    tracker.reset(q)
-    np.testing.assert_array_equal(tracker.step(x), q + after.dq)
-
-
-def test_copies_go_their_own_way():
-    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4)
-    tracker = ik.tracker(np.full(9, 0.25) + 0.01 * np.arange(9), memory=1.0)
-    tracker.step([0.1, 0.0, 0.7], x_measured=[0.11, 0.0, 0.7])
-    twins, nan = [copy.deepcopy(tracker), pickle.loads(pickle.dumps(tracker))], [np.nan] * 3
-    expected = [tracker.step([0.1, 0.0, 0.7], x_measured=nan) for _ in range(3)]
-    for twin in twins:
-        for q in expected:
-            np.testing.assert_array_equal(twin.step([0.1, 0.0, 0.7], x_measured=nan), q)
-
-
-def test_threads_do_not_change_results():
-    draw = np.random.default_rng(4)
-    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4)
-    q, few = draw.uniform(0.1, 0.4, (40_003, 9)), slice(39_990, None)
-    x = BHA(torch.from_numpy(q[::-1].copy())).numpy()
-    part, start = ik.step(q[few], x[few]).dq, torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        np.testing.assert_array_equal(ik.step(q, x).dq[few], part)
-    finally:
-        torch.set_num_threads(start)
-    with ThreadPoolExecutor(4) as pool:  # single rows at once, which share buffers in turn
-        rows = list(pool.map(lambda i: ik.step(q[i], x[i]).dq, range(39_990, 40_003)))
-    np.testing.assert_array_equal(rows, part)
 
 
 @pytest.mark.slow
@@ -299,28 +215,6 @@ KINDS = {
     "seven, one slides": ["revolute"] * 3 + ["prismatic"] + ["revolute"] * 3,
     "eight": ["revolute"] * 8,
 }
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_errors_and_jacobians_of_poses_are_those_of_torch(name):
-    draw = np.random.default_rng(7)
-    arm = arm_of(draw, KINDS[name])
-    task = PoseTask(arm, radian=0.3)
-    ik = InverseKinematics(task, q_min=-2.0, q_max=2.0)
-    q = torch.from_numpy(draw.uniform(-2.0, 2.0, (60, arm.n_actuators)))
-    target = arm.pose(q.flip(0))
-    half = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
-    target[:3, :3, :3] = half @ arm.pose(q[:3])[:, :3, :3]  # half a turn away
-    target[3] = arm.pose(q[3])
-    target[4, :3, :3] = arm.pose(q[4])[:3, :3] @ half[[1, 2, 0]][:, [1, 2, 0]]
-    found = core_of(ik.settings, search=True).find(0, q, target, 1e-4, 1)
-    x, J = task.evaluate(q)
-    e = task.difference(x, target)
-    torch.testing.assert_close(found.J, J, rtol=0.0, atol=1e-13)
-    torch.testing.assert_close(found.e[3:], e[3:], rtol=0.0, atol=1e-12)
-    torch.testing.assert_close(found.e[:3].norm(dim=1), e[:3].norm(dim=1), rtol=0.0, atol=1e-12)
-    assert found.e[:3, 3:].norm(dim=1).min() > 0.3 * 3.14159
-    assert core_of(ik.settings) is None
 
 
 @pytest.mark.slow
@@ -374,15 +268,6 @@ def test_what_is_infinite_or_overflows_holds_still(limits):
     dq = ik.step(q[0], x[0]).dq
     assert dq[3] < 0.0
     np.testing.assert_array_equal(np.delete(dq, 3), 0.0)
-
-
-def test_one_target_for_several_starts():
-    ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4)
-    q0 = np.array([np.full(9, 0.2), np.linspace(0.15, 0.35, 9), np.full(9, np.inf)])
-    for target in (np.array([0.05, 0.05, 0.75]), torch.tensor([0.05, 0.05, 0.75])):
-        solution = ik.solve(target, q0, restarts=2)
-        status = [IKStatus.CONVERGED, IKStatus.CONVERGED, IKStatus.INVALID_INPUT]
-        assert np.asarray(solution.status).tolist() == status
 
 
 @pytest.mark.parametrize("settings", [{}, {"dq_max": 0.5, "ddq_max": 5.0}, {"limits": "off"}])

@@ -7,9 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from saved_models import FOLDER
 from sklearn.linear_model import LinearRegression
 
-from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel, load_model
-from hybridkin._core.rotations import rotation
-from hybridkin.hybrid._adapted import AdaptedModel
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, load_model
 from hybridkin.hybrid._features import (
     Features,
     HiddenFeatures,
@@ -224,30 +222,6 @@ def test_corrections_that_are_too_long(coupling, longest):
     assert_as_in_torch(module, inputs(1.5, 19))
 
 
-def blend(weights, mechanical, drift):
-    """Four corrections in both couplings, two of whose guards share their leverage."""
-    tip = regressor("logistic"), regressor("kernel")
-    inner = regressor("quadratic", 6), regressor("pose", 6)
-    shared = guard("leverage", None)
-    wider = LeverageGuard(shared.model, 2.0 * shared.limit, shared.largest)
-    corrections = [
-        TipCorrection(tip[0], guard("own", tip[0])),
-        InnerCorrection(mechanical, inner[0], shared),
-        TipCorrection(tip[1], guard("box", tip[1])),
-        InnerCorrection(mechanical, inner[1], wider),
-    ]
-    return HybridModule(mechanical, corrections, torch.tensor(weights).double(), drift)
-
-
-@pytest.mark.parametrize("weights", [[0.2, 0.3, 0.1, 0.4], [0.0, 0.5, 0.0, 0.5]])
-@pytest.mark.parametrize("tip_at", [1.4, 2.0])
-def test_blends_are_those_of_torch(weights, tip_at):
-    for given in (None, drift()):
-        module = blend(weights, chain().with_tip(tip_at), given)
-        for spread in (0.3, 1.2, 20.0):
-            assert_as_in_torch(module, inputs(spread, 19), tol=2e-12)
-
-
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (3, 2), (6, 3), (9, 3), (17, 64), (64, 5)])
 @pytest.mark.parametrize("n_hidden", [1, 4, 12, 101])
 def test_networks_of_any_size(n, m, n_hidden):
@@ -259,32 +233,6 @@ def test_networks_of_any_size(n, m, n_hidden):
         assert_close_rows(found, expected)
     for found, expected in zip(program.evaluate(q[0], True), (x, J), strict=False):
         assert_close_rows(found, expected[0])
-
-
-@pytest.mark.parametrize("kind", TIP)
-def test_hybrids_without_mechanical_model(kind):
-    module = regressor(kind, 5)
-    corrections = [TipCorrection(module, guard("leverage", module))]
-    both = HybridModule(None, corrections, torch.ones(1).double(), drift(5))
-    assert_as_in_torch(both, inputs(1.2, 19), tol=2e-12)
-
-
-@pytest.mark.parametrize("coupling", ["parallel", "serial"])
-@pytest.mark.parametrize("trust", [None, "box", "leverage"])
-def test_a_robot_that_has_changed_is_that_of_torch(coupling, trust):
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[:3, :3] = rotation(torch.tensor([0.4, -0.8, 1.1], dtype=torch.float64))[0]
-    motion[:3, 3] = torch.tensor([0.3, -0.1, 0.2])
-    fitted = hybrid("quadratic", coupling, trust, drifting=True, weight=0.6)
-    module = AdaptedModel(fitted, torch.from_numpy(0.3 * HALF * draw(N)), motion)
-    for spread in (0.3, 1.2, 20.0):
-        assert_as_in_torch(module, inputs(spread, 19), tol=2e-12 if spread > 10 else 1e-13)
-
-
-def test_two_outputs_are_shifted_alone():
-    fitted = HybridModule(None, [TipCorrection(regressor("tanh", 2))], torch.ones(1).double())
-    module = AdaptedModel(fitted, torch.from_numpy(HALF), torch.eye(4).double())
-    assert_as_in_torch(module, inputs(1.2, 19))
 
 
 @pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
@@ -319,49 +267,6 @@ def log():
     q = 0.25 + 0.05 * rng.uniform(-1, 1, (60, 3))
     x = ConstantCurvatureChain([0.055])(torch.from_numpy(q)).numpy() + 0.01 * np.sin(20 * q)
     return q, x
-
-
-def test_estimators_predict_what_their_modules_do():
-    q, x = log()
-    model = HybridForwardModel(ConstantCurvatureChain([0.05]), ELMRegressor(20, random_state=0))
-    model.fit(q[:40], x[:40])
-    wide = 0.25 + 2.0 * (q - 0.25)
-    rows = torch.from_numpy(wide)
-    for estimator, module in ((model, model.module_), (model.error_model_, None)):
-        module = estimator.module_ if module is None else module
-        assert backend(module) == "compiled"
-        with torch.no_grad():
-            expected = [part.numpy() for part in module.forward_and_jacobian(rows)]
-        both = estimator.predict_and_jacobian(wide)
-        for found, right in zip(both, expected, strict=True):
-            assert_close_rows(found, right)
-        assert_array_equal(estimator.predict(wide), both[0])
-        assert_array_equal(estimator.jacobian(wide), both[1])
-        single = estimator.predict_and_jacobian(wide.astype(np.float32))
-        assert [part.dtype for part in single] == [np.float32, np.float32]
-    inside = model.module_.in_domain(rows).numpy()
-    assert 0 < inside.sum() < len(inside)
-    assert_array_equal(model.in_domain(wide), inside)
-    mechanical = model.mechanical_model_(rows).numpy()
-    assert_allclose(model.predict_mechanical(wide), mechanical, rtol=0, atol=1e-14)
-
-
-def test_later_measurements_and_fits_change_the_answer():
-    q, x = log()
-    model = HybridForwardModel(ConstantCurvatureChain([0.05]), LinearRegression()).fit(q, x)
-    network = ELMRegressor(10, random_state=0).fit(q, x)
-    for estimator in (model, network):
-        before = estimator.predict(q)
-        assert_array_equal(estimator.predict(q), before)
-        estimator.partial_fit(q[:30], x[:30] + 0.02)
-        after = estimator.predict(q)
-        assert np.abs(after - before).max() > 1e-3
-        with torch.no_grad():
-            expected = estimator.module_(torch.from_numpy(q)).numpy()
-        assert_allclose(after, expected, rtol=0, atol=1e-13)
-    with torch.no_grad():
-        network.module_.intercept.add_(1.0)
-    assert_allclose(network.predict(q), after + 1.0, rtol=0, atol=1e-12)
 
 
 def test_parts_without_kernel_leave_the_model_to_torch():

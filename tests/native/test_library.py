@@ -3,7 +3,6 @@ import multiprocessing
 import os
 import pickle
 import shutil
-import threading
 
 import joblib
 import numpy as np
@@ -64,16 +63,6 @@ def test_results_are_those_of_torch(lead):
 
 
 @pytest.mark.needs_core
-def test_any_array_is_read():
-    model, frozen = chain(), ROWS[:9].copy()
-    frozen.flags.writeable = False
-    for q in (frozen, frozen[0], ROWS[20:0:-3], np.asfortranarray(ROWS[:5]), ROWS[:4].astype("f4")):
-        agree(library.program_of(model).evaluate(q, jacobian=True)[:2], by_torch(model, q.copy()))
-    with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 6\), got \(4, 3\)"):
-        library.program_of(model).evaluate(ROWS[:4, :3])
-
-
-@pytest.mark.needs_core
 def test_models_that_carry_a_graph_are_computed():
     offsets = torch.tensor([0.01, 0.02], dtype=torch.float64, requires_grad=True)
     model = chain().with_geometry(offsets=offsets)
@@ -94,21 +83,6 @@ def test_the_number_of_threads_changes_nothing():
     for one, other in [(0, 1), (0, 2)]:
         assert all(np.array_equal(a, b) for a, b in zip(found[one], found[other], strict=True))
     agree(found[0][:2], by_torch(chain(), ROWS))
-
-
-@pytest.mark.needs_core
-def test_threads_can_share_a_model():
-    model, found = chain(), {}
-
-    def work(k):
-        for _ in range(50):
-            found[k] = library.program_of(model).evaluate(ROWS[k : k + 9], jacobian=True)[:2]
-
-    workers = [threading.Thread(target=work, args=(k,)) for k in range(8)]
-    [worker.start() for worker in workers]
-    [worker.join() for worker in workers]
-    for k in range(8):
-        agree(found[k], by_torch(model, ROWS[k : k + 9]))
 
 
 @pytest.mark.needs_core
@@ -143,14 +117,6 @@ def test_a_library_of_other_sources_is_refused(elsewhere):
     with open(elsewhere / "src" / "hk.c", "a") as source:
         source.write("\n")
     assert "was compiled from other sources" in backend(chain())
-
-
-@pytest.mark.needs_core
-def test_a_file_that_is_no_library_is_refused(elsewhere):
-    for path in (elsewhere / "lib").glob("*"):
-        path.unlink()
-        path.write_bytes(b"none")
-    assert backend(chain()).startswith("torch: the compiled library cannot be used (")
 
 
 @pytest.mark.needs_core
@@ -198,16 +164,6 @@ def test_a_program_is_no_part_of_its_model():
         twin.offsets = twin.offsets + 0.01
         agree(library.program_of(twin).evaluate(ROWS[:3], True)[:2], by_torch(twin, ROWS[:3]))
     assert library.program_of(model) is program
-
-
-@pytest.mark.needs_core
-def test_programs_travel():
-    program = library.program_of(chain())
-    sent = pickle.dumps(program)
-    assert len(sent) < 8 * len(program.plan.data) + 2000
-    there = pickle.loads(sent)
-    assert there.plan.digest == program.plan.digest
-    agree(there.evaluate(ROWS[:3], True)[:2], program.evaluate(ROWS[:3], True)[:2])
 
 
 def compute(model):

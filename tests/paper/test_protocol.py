@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hybridkin.datasets import load_trunk
@@ -27,16 +26,6 @@ def test_protocol_has_the_papers_counts_and_bounds():
 def test_protocol_is_seeded():
     assert_array_equal(paper_protocol(3)[0], paper_protocol(np.random.default_rng(3))[0])
     assert (paper_protocol(3)[0] != paper_protocol(4)[0]).all()
-
-
-def test_protocol_needs_whole_numbers():
-    with pytest.raises(ValueError, match=r"`n_segment` must be 0 to .*, a whole number"):
-        paper_protocol(n_segment=1.5)
-
-
-def test_the_seed_of_the_protocol_is_named():
-    with pytest.raises(ValueError, match="`random_state`"):
-        paper_protocol(np.nan)
 
 
 def test_shipped_data_are_the_protocol():

@@ -1,12 +1,10 @@
 """Data of the simulated trunk: what is drawn, settled, kept in a checkpoint and shipped."""
 
 import io
-import json
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from small_files import small_files
 
 from hybridkin.datasets import load_trunk
 from paper import NotSettledError, TrunkPlant, make_trunk, paper_protocol, trunk_data
@@ -38,15 +36,6 @@ def test_make_trunk_follows_the_plant():
     for q_target, q, x in zip(data.q_target, data.q, data.x, strict=True):
         assert_allclose(q, q_target, atol=1e-8)
         assert_allclose(x, plant(q_target), atol=1e-8)
-
-
-@pytest.mark.slow
-def test_make_trunk_noise_leaves_the_truth_alone():
-    clean = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0)
-    noisy = make_trunk(**SMALL, cable_noise=1e-3, mocap_noise=5e-4)
-    assert_array_equal(clean.q_target, noisy.q_target)
-    assert_allclose((noisy.q - clean.q).std(), 1e-3, rtol=0.3)
-    assert_allclose((noisy.x - clean.x).std(), 5e-4, rtol=0.4)
 
 
 @pytest.mark.slow
@@ -100,13 +89,6 @@ def test_a_checkpoint_of_another_run_is_not_taken(tmp_path, change):
     assert_array_equal(data.x, make_trunk(**{**arguments, **change}).x)
 
 
-def test_unseeded_runs_keep_their_seed():
-    data = make_trunk(n_segment=0, n_random=1)
-    again = make_trunk(n_segment=0, n_random=1, random_state=data.parameters["random_state"])
-    assert_allclose(again.x, data.x, rtol=0, atol=1e-12)
-    json.dumps(data.parameters)
-
-
 @pytest.fixture
 def stubborn(monkeypatch):
     """A plant that does not settle where the first chamber is long."""
@@ -134,19 +116,6 @@ def test_rows_that_do_not_settle_are_drawn_again(stubborn):
     assert_array_equal(data.q_target[kept], first_draw[kept])
 
 
-def test_given_rows_that_do_not_settle_are_left_out(stubborn):
-    q_target = np.full((4, 9), 0.24)
-    q_target[2] = 0.26
-    with pytest.warns(UserWarning, match="1 configurations did not settle and were left out"):
-        data = make_trunk(q_target, random_state=0)
-    assert data.row.tolist() == [0, 1, 3]
-    assert data.part is None
-    ((row, target, message),) = data.failed
-    assert row == 2
-    assert_array_equal(target, q_target[2])
-    assert "stubborn" in message
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -162,11 +131,6 @@ def test_make_trunk_bad_input(arguments, message):
         make_trunk(**arguments)
 
 
-def test_make_trunk_knows_the_parameters_of_the_plant():
-    with pytest.raises(TypeError, match="unexpected keyword argument 'stiffness'"):
-        make_trunk(stiffness=1.0)
-
-
 @pytest.mark.slow
 def test_a_damaged_checkpoint_is_made_again_and_runs_nothing(tmp_path):
     options = {"n_segment": 1, "n_random": 1, "random_state": 0, "return_X_y": True}
@@ -179,19 +143,3 @@ def test_a_damaged_checkpoint_is_made_again_and_runs_nothing(tmp_path):
     assert np.load(file).files == np.load(io.BytesIO(content)).files
     np.savez(file, q=objects)
     np.testing.assert_array_equal(make_trunk(**options, checkpoint=tmp_path)[1], whole[1])
-
-
-@pytest.mark.parametrize("value", ["a", ["a", "b"], 1j, {}])
-def test_commands_that_are_no_numbers_are_refused_by_name(value):
-    with pytest.raises((TypeError, ValueError), match="`q_target`"):
-        make_trunk(value)
-
-
-def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, monkeypatch):
-    result = np.zeros((20, 9)), np.zeros((20, 3)), np.zeros((20, 9)), []
-    monkeypatch.setattr(trunk_data, "_measure", lambda *_: result)
-    made = {"random_state": 0, "plant": {}}
-    with small_files(), pytest.raises(OSError, match="too large") as caught:
-        trunk_data._kept(tmp_path, np.arange(20), np.zeros((20, 9)), np.zeros(20), made)
-    assert caught.value.filename.startswith(str(tmp_path / "rows-"))
-    assert [*tmp_path.iterdir()] == []

@@ -48,27 +48,6 @@ def test_a_model_has_the_same_colour_in_every_figure(draw):
     assert draw(NAMES[::-2], axes[1]) == expected[::-2]  # whatever stands beside it
 
 
-def test_names_of_one_model_in_the_figures_share_its_colour():
-    same = {
-        "hybrid, ELM": ("hybrid on nominal", "parallel, quadratic", "figure eight, hybrid on x"),
-        "hybrid, serial": ("serial on calibrated", "serial, pose"),
-        "mechanical, calibrated": ("mechanical, as auto took it",),
-        "mechanical, nominal": ("nominal model", "spiral, mechanical, nominal"),
-        "data-driven, ELM": ("data alone, kernel ridge",),
-    }
-    for name, others in same.items():
-        assert {plots.model_color(other) for other in others} == {plots.model_color(name)}
-
-
-def test_lines_of_one_figure_differ():
-    names = ["hybrid, linear", "hybrid, ELM", "data-driven, linear", "a", "b", "c"]
-    _, ax = plots.new_figure(4, 3)
-    plots.TrackingDisplay(TRACK, {name: TRACK for name in names}).plot(ax)
-    looks = [(line.get_color(), line.get_linestyle()) for line in ax.lines[: len(names)]]
-    assert len({*looks}) == len(names)
-    assert looks[0][0] == looks[1][0]
-
-
 def track_errors(names, ax):
     display = plots.TrackingDisplay(TRACK, {name: TRACK + 0.01 for name in names})
     display.plot_error(ax, expected={"robot": 0.02})
@@ -84,15 +63,6 @@ def test_legends_do_not_cover_data(draw):
     assert not legend.overlaps(ax.xaxis.get_tightbbox())
     assert 0 <= legend.y0
     assert legend.y1 < ax.xaxis.get_tightbbox().y0
-
-
-@pytest.mark.parametrize("names", [None, ["a", "b"]])
-def test_the_legend_of_actuators_stands_beside_them(names):
-    figure, axes = plots.new_figure(6, 4, 2, 1)
-    paths = {name: np.arange(6.0).reshape(3, 2) for name in NAMES[:2]}
-    plots.ActuatorDisplay(paths, (1, 1), names=names).plot(axes)
-    figure.draw_without_rendering()
-    assert not axes[0].get_legend().get_window_extent().overlaps(axes[0].get_window_extent())
 
 
 def test_errors_behind_the_end_of_the_axis_are_numbers():
@@ -153,17 +123,6 @@ def test_a_serial_body_ends_where_the_model_puts_the_tip(bent_inside):
     film = plots.TrackAnimation.from_estimator(model, q[:5])
     (backbone,) = [line for line in film.lines() if line.label == "backbone"]
     np.testing.assert_allclose(backbone.points[:, -1], film.x, atol=1e-7)
-
-
-def test_a_serial_body_with_markers_ends_at_the_last_of_them(bent_inside):
-    chain, q, _ = bent_inside
-    chain = chain.with_markers([(0, 1.0), (1, 1.0)])
-    with torch.no_grad():
-        x = chain(torch.from_numpy(1.5 * q)).numpy()
-    model = HybridForwardModel(chain, "quadratic", coupling="serial", guard=None).fit(q, x)
-    assert model.module_.corrects_inside
-    body = plots.BackboneDisplay.from_estimator(model, q[:5])
-    np.testing.assert_allclose(body.points[:, -1], model.predict(q[:5])[:, 3:], atol=1e-7)
 
 
 def test_films_show_names_of_actuators_and_the_error_to_expect():

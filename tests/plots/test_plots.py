@@ -2,17 +2,14 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
-from matplotlib import animation
 from matplotlib.figure import Figure
 from PIL import Image
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.linear_model import Ridge
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -106,21 +103,6 @@ def test_rows_that_are_not_known_are_left_out_of_errors():
     np.testing.assert_allclose([*dots["mean"], *dots["maximum"]], [2.0, 3.0])
 
 
-def test_of_poses_the_position_is_compared(x):
-    poses = np.concatenate([x, np.zeros((50, 3))], axis=1)
-    turned = poses + np.array([0.03, 0.0, 0.04, 1.0, 2.0, 3.0])
-    display = plots.ErrorHistogramDisplay.from_predictions(poses, {"pose": turned, "tip": x})
-    np.testing.assert_allclose(display.errors["pose"], 0.05)
-    np.testing.assert_array_equal(display.errors["tip"], 0.0)
-
-
-def test_boxes_name_every_model(tmp_path):
-    figure, ax = plots.new_figure(6, 3)
-    plots.ErrorBoxDisplay({"a": [0.01, 0.02], "b": [0.03, 0.05]}).plot(ax)
-    assert {t.get_text() for t in ax.get_yticklabels()} == {"a", "b"}
-    assert drawn(figure, tmp_path)
-
-
 def test_tendons_on_stages_are_drawn_as_long_as_they_are():
     lengths = [None, None, 0.1, 0.12]
     chain = ConstantCurvatureChain(
@@ -171,16 +153,6 @@ def test_learning_curve_holds_out_and_adds_whole_motions(x):
     # Every motion is held out once, so that the errors with all rows average to that of all rows.
     expected = np.linalg.norm(x, axis=1).mean()
     np.testing.assert_allclose(display.errors["Watcher"].mean(axis=1), expected)
-
-
-def test_learning_curve_is_the_mean_distance_of_a_refitted_model(data):
-    q, x = data.q[:200], data.x[:200]
-    train, test = np.arange(150), np.arange(150, 200)
-    display = plots.LearningCurveDisplay.from_estimator(
-        {"ridge": Ridge(1e-3)}, q, x, sizes=[150], cv=[(train, test)]
-    )
-    expected = distances(Ridge(1e-3).fit(q[train], x[train]).predict(q[test]), x[test]).mean()
-    np.testing.assert_allclose(display.errors["ridge"], [[expected]], rtol=1e-9)
 
 
 def test_learning_curve_draws_mean_and_band(tmp_path):
@@ -486,35 +458,6 @@ def test_film_of_rows_that_are_not_known(tmp_path):
     assert None not in frames[0]["data"][0]["x"]
 
 
-@pytest.mark.slow
-def test_small_errors_are_distinguished(tmp_path):
-    """Micrometres of an error on a robot of a metre: rounded by its own size, not the robot's."""
-    chain, q = robots.bionic_handling_assistant(), np.tile(BENT, (5, 1))
-    target = plots.TrackAnimation.from_estimator(chain, q).x + [[0.0, 0.0, 1e-6]] * 5
-    target[:, 2] += 1e-6 * np.arange(5)
-    film = plots.TrackAnimation.from_estimator(chain, q, target=target)
-    assert [film.caption(k, "mm")[-9:] for k in (0, 4)] == ["0.0010 mm", "0.0050 mm"]
-    pytest.importorskip("plotly")
-    frames = frames_of(film.save(tmp_path / "a.html", unit="mm").read_text(encoding="utf-8"))
-    found = [frame["data"][-1]["y"][0] for frame in frames]
-    np.testing.assert_allclose(found, 1e-3 * np.arange(1, 6), atol=1e-6)
-
-
-def test_what_is_missing_is_named(film, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match=r"must end in one of .*got 'a\.avi'"):
-        film.save(tmp_path / "a.avi")
-    with pytest.raises(ValueError, match="`speed`"):
-        film.save(tmp_path / "a.gif", speed=0.0)
-    monkeypatch.setattr(animation.writers, "is_available", lambda name: False)
-    with pytest.raises(RuntimeError, match=r"install it .*or save as \.gif"):
-        film.save(tmp_path / "a.mp4")
-    monkeypatch.setitem(sys.modules, "plotly", None)
-    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
-    with pytest.raises(ImportError, match=r'pip install "hybridkin\[interactive\]"'):
-        film.save(tmp_path / "a.html")
-    assert [*tmp_path.iterdir()] == []
-
-
 def frames_of(html):
     text = html[html.rindex("Plotly.addFrames(") :]
     return json.JSONDecoder().raw_decode(text, text.index("["))[0]
@@ -625,97 +568,3 @@ def test_page_in_a_browser(film, track, tmp_path):
 
 
 # All of them
-
-
-@pytest.mark.parametrize(
-    ("make", "match"),
-    [
-        (lambda: plots.ErrorHistogramDisplay({}), "`errors` must be a mapping"),
-        (lambda: plots.ErrorHistogramDisplay({"a": [[1.0]]}), r"\(N,\).*\(1, 1\) for 'a'"),
-        (lambda: plots.ErrorBoxDisplay({"a": [np.nan]}), "with a number in them"),
-        (
-            lambda: plots.ErrorBoxDisplay.from_predictions(
-                np.zeros((4, 3)), {"a": np.zeros((5, 3))}
-            ),
-            "5, 3",
-        ),
-        (lambda: plots.LearningCurveDisplay([50, 25], {"a": [1, 2]}), "`sizes` must .* increase"),
-        (lambda: plots.LearningCurveDisplay([25, 50], {"a": [1, 2, 3]}), r"\(2,\) or"),
-        (lambda: plots.WorkspaceDisplay(np.zeros((4, 2)), np.zeros((4, 2))), r"\(N, 3\)"),
-        (
-            lambda: plots.WorkspaceDisplay(np.zeros((4, 3)), np.zeros((4, 3)), row=4),
-            "`row` must be -4 to 3",
-        ),
-        (lambda: plots.BackboneDisplay(np.zeros((4, 2))), r"\(K, P, 3\)"),
-        (lambda: plots.BackboneDisplay(np.zeros((4, 3)), tips=np.zeros((2, 3))), r"\(1, 3\)"),
-        (lambda: plots.TrackingDisplay(np.zeros((4, 3)), {"a": np.zeros((5, 3))}), r"\(4, 3\)"),
-        (lambda: plots.TrackingDisplay(np.zeros((2, 3)), {"a": np.zeros((2, 3))}, [1, 0]), "`t`"),
-        (lambda: plots.ActuatorDisplay({"a": np.zeros((5, 6))}, (3, 4)), r"\(T, 7\)"),
-        (lambda: plots.TrackAnimation(np.zeros((4, 3)), rows=[0, 4]), "4 rows"),
-        (
-            lambda: plots.TrackAnimation(
-                np.zeros((4, 3)), body=plots.BackboneDisplay(np.zeros((5, 3)))
-            ),
-            "4 configurations",
-        ),
-        (lambda: plots.TrackAnimation(np.full((4, 3), np.nan)).limits(), "all rows are NaN"),
-    ],
-)
-def test_wrong_arrays_are_named(make, match):
-    with pytest.raises(ValueError, match=match):
-        make()
-
-
-def test_wrong_choices_are_named(x, data):
-    _, ax = plots.new_figure(3, 3)
-    chain = robots.bionic_handling_assistant()
-    with pytest.raises(ValueError, match=r"`unit` must be one of \['m', 'cm', 'mm'\]"):
-        plots.ErrorHistogramDisplay({"a": [1.0]}).plot(ax, unit="inch")
-    with pytest.raises(ValueError, match="`plane`"):
-        plots.TrackingDisplay(x, {"a": x}).plot(ax, plane="xx")
-    with pytest.raises(ValueError, match="3 axes, got 1"):
-        plots.ActuatorDisplay({"a": x}, (1, 1, 1)).plot([ax])
-    with pytest.raises(TypeError, match="3-D axes"):
-        plots.BackboneDisplay(x).plot(ax)
-    with pytest.raises(TypeError, match="whose backbone can be drawn; got Ridge"):
-        plots.BackboneDisplay.from_estimator(Ridge().fit(data.q, data.x), data.q[0])
-    with pytest.raises(ValueError, match=r"`q` must have shape \(K, 9\)"):
-        plots.BackboneDisplay.from_estimator(chain, data.q[0, :6])
-    with pytest.raises(ValueError, match="at least 2 motions"):
-        plots.LearningCurveDisplay.from_estimator(
-            Ridge(), data.q[:20], data.x[:20], groups=np.zeros(20)
-        )
-    with pytest.raises(ValueError, match="1 to 16"):
-        plots.LearningCurveDisplay.from_estimator(Ridge(), data.q[:20], data.x[:20], sizes=[17])
-
-
-def test_inputs_are_copied(x):
-    display = plots.TrackingDisplay(x, {"a": x})
-    before = display.target.copy()
-    x += 1.0
-    np.testing.assert_array_equal(display.target, before)
-
-
-def test_own_axes_when_none_are_given(x):
-    displays = [
-        plots.ErrorHistogramDisplay({"a": [0.01, 0.02]}),
-        plots.BackboneDisplay(x),
-        plots.ActuatorDisplay({"a": x}, (3,)),
-    ]
-    for display in displays:
-        figure = display.plot().figure_
-        assert isinstance(figure, Figure)
-        assert plt.gcf() is figure
-        plt.close(figure)
-
-
-def test_a_workspace_without_a_known_error_is_drawn_empty():
-    figure, ax = plots.new_figure(3, 3, subplot_kw={"projection": "3d"})
-    nothing = np.full((2, 3), np.nan)
-    assert plots.WorkspaceDisplay(nothing, nothing).plot(ax).ax_ is ax
-    figure.canvas.draw()
-
-
-def test_actuators_of_other_lengths_are_refused():
-    with pytest.raises(ValueError, match=r"one shape \(T, 3\).*\(4, 3\) for 'b'"):
-        plots.ActuatorDisplay({"a": np.zeros((5, 3)), "b": np.zeros((4, 3))}, (3,))

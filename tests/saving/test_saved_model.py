@@ -4,7 +4,6 @@ import sys
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
@@ -21,18 +20,14 @@ from saved_models import (
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GroupKFold
-from torch.testing import assert_close
 
 import hybridkin
 from hybridkin import (
     ConstantCurvatureChain,
-    ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    RigidChain,
     load_model,
     robots,
     save_model,
@@ -89,75 +84,6 @@ def test_chain_comes_back(tmp_path, chain):
     }
 
 
-@pytest.mark.parametrize("chain", [arm(), arm(dtype=torch.float32), arm(q_min=None, q_max=None)])
-def test_rigid_arm_comes_back(tmp_path, chain):
-    save_model(chain, tmp_path / "arm.safetensors")
-    twin = load_model(tmp_path / "arm.safetensors")
-    assert (twin.kinds, twin.names) == (chain.kinds, chain.names)
-    # Axes and rotations are made orthonormal anew, which may change the last bit.
-    was, came = dict(chain.named_buffers()), dict(twin.named_buffers())
-    eps = torch.finfo(chain.base.dtype).eps
-    assert_close(came, was, rtol=0, atol=2 * eps)
-
-
-def test_hybrid_of_a_rigid_arm_comes_back(tmp_path, rng):
-    q = 2 * torch.rand(80, 3, generator=rng, dtype=torch.float64) - 1
-    x = arm()(q) - torch.cat([0.0 * q[:, :2], 0.01 * q[:, 1:2].cos()], 1)
-    model = HybridForwardModel(arm(), random_state=0).fit(q.numpy(), x.numpy())
-    save_model(model, tmp_path / "model")
-    twin = load_model(tmp_path / "model")
-    for was, came in zip(
-        model.predict_and_jacobian(q.numpy()), twin.predict_and_jacobian(q.numpy()), strict=True
-    ):
-        assert_allclose(came, was, rtol=1e-13, atol=1e-14)
-    assert isinstance(twin.mechanical_model, RigidChain)
-
-
-def test_hybrid_of_an_elastic_chain_comes_back(tmp_path):
-    rng = np.random.default_rng(0)
-    q = 0.003 * rng.uniform(-1, 1, (100, 7))
-    x = elastic_chain()(torch.from_numpy(q)).numpy() + 0.001 * np.sin(300 * q[:, :3])
-    names = ("base", "rest_bends")
-    model = HybridForwardModel(elastic_chain(), calibrate=names, random_state=0).fit(q, x)
-    save_model(model, tmp_path / "model")
-    twin = load_model(tmp_path / "model")
-    for points in (q, 3 * q):
-        for was, came in zip(
-            model.predict_and_jacobian(points), twin.predict_and_jacobian(points), strict=True
-        ):
-            assert_allclose(came, was, rtol=1e-12, atol=1e-13)
-    assert isinstance(twin.mechanical_model_, ElasticTendonChain)
-    assert twin.calibrate == names
-    assert model_header(tmp_path / "model")["parts"]["nominal"]["kind"] == "elastic_tendons"
-
-
-@pytest.mark.parametrize("guard", ["leverage", "box", None])
-@pytest.mark.parametrize(
-    "error_model", [None, "drop", LinearRegression(), KernelRidge(0.1, kernel="rbf", gamma=20.0)]
-)
-def test_hybrid_comes_back(tmp_path, log, error_model, guard):
-    q, x = log
-    model = HybridForwardModel(
-        robots.bionic_handling_assistant(),
-        error_model,
-        calibrate=("radii",),
-        guard=guard,
-        random_state=0,
-    ).fit(q, x)
-    path = tmp_path / "model.safetensors"
-    save_model(model, path)
-    twin = load_model(path)
-    far = 0.25 + 4 * (q - 0.25)
-    for points in (q, far):
-        for was, came in zip(
-            model.predict_and_jacobian(points), twin.predict_and_jacobian(points), strict=True
-        ):
-            # arrays come back in C order, which may change the last bit of a matrix product
-            assert_allclose(came, was, rtol=1e-13, atol=1e-14)
-    assert_array_equal(model.in_domain(far), twin.in_domain(far))
-    assert_allclose(twin.fit(q, x).predict(q).mean(), model.predict(q).mean(), rtol=1e-3)
-
-
 @pytest.mark.slow
 def test_a_hybrid_comes_back_in_another_process(tmp_path, fitted):
     model, q = fitted["parallel_elm"]
@@ -176,45 +102,6 @@ def test_a_loaded_network_can_learn_on(tmp_path, log):
     twin = load_model(tmp_path / "m")
     was = model.error_model_.partial_fit(q[100:], x[100:]).predict(q)
     assert_array_equal(twin.error_model_.partial_fit(q[100:], x[100:]).predict(q), was)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "elm",
-    [
-        ELMRegressor(20, [0.1, 1.0, 10.0], direct_link=True, random_state=0),
-        ELMRegressor(20, input_scaling=np.array([[0.1] * 9, [0.4] * 9]), random_state=0),
-        ELMRegressorCV(20, relevance_rounds=1, random_state=np.random.RandomState(0)),
-    ],
-    ids=["penalties", "bounds", "chosen"],
-)
-def test_network_comes_back_and_can_learn_on(tmp_path, log, elm):
-    q, x = log
-    frame = pd.DataFrame(q, columns=[f"c{i}" for i in range(9)])
-    elm.fit(frame[:100], x[:100])
-    save_model(elm, tmp_path / "elm.safetensors")
-    back = load_model(tmp_path / "elm.safetensors")
-    assert_array_equal(back.predict(frame), elm.predict(frame))
-    assert_array_equal(back.predict(frame, return_std=True)[1], elm.predict(frame, True)[1])
-    assert_array_equal(back.feature_names_in_, frame.columns)
-    chosen = getattr(elm, "best_estimator_", elm)
-    again = ELMRegressor(**chosen.get_params()).fit(q[:100], x[:100])
-    assert_allclose(
-        back.partial_fit(frame[100:], x[100:]).predict(frame),
-        again.partial_fit(q[100:], x[100:]).predict(q),
-        rtol=1e-10,
-    )
-
-
-def test_hybrid_with_a_chosen_network_comes_back(tmp_path, log):
-    q, x = log
-    chain = robots.bionic_handling_assistant()
-    model = HybridForwardModel(chain, ELMRegressorCV(20, relevance_rounds=0, random_state=0))
-    model.fit(q, x)
-    save_model(model, tmp_path / "model.safetensors")
-    back = load_model(tmp_path / "model.safetensors")
-    assert_array_equal(back.predict(q), model.predict(q))
-    assert isinstance(back.error_model_, ELMRegressor)
 
 
 def test_damaged_networks(tmp_path, log):
@@ -360,19 +247,6 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     assert model_header(path)["units"]["x"] == ["m", "m", "m", "rad", "rad", "rad"]
     with pytest.raises(TypeError, match="`training` must hold numbers"):
         save_model(arm(), path, training={"a": object()})
-
-
-def test_the_training_range_is_that_of_the_log(tmp_path):
-    """Also of an actuator that never moved, and of one whose half range is 1."""
-    q = np.random.default_rng(0).uniform(0.0, 2.0, (60, 3))
-    q[:2, 0] = 0.0, 2.0
-    q[:, 1] = 0.25
-    model = HybridForwardModel(None, ELMRegressor(4, random_state=0)).fit(q, q)
-    save_model(model, tmp_path / "model")
-    domain = model_header(tmp_path / "model")["domain"]
-    for found in (model.training_range_, load_model(tmp_path / "model").training_range_):
-        assert_array_equal(found, [q.min(0), q.max(0)])
-    assert_array_equal([domain["q_low"], domain["q_high"]], [q.min(0), q.max(0)])
 
 
 @pytest.mark.parametrize("kind", ["chain", "parallel_elm", "serial_pose", "elm"])

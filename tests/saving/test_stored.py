@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 from safetensors.numpy import load_file
 from saved_models import trunk_log
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -39,17 +39,6 @@ def test_modules_of_regressors_come_back(tmp_path, regressor):
     assert_close(came, was, rtol=1e-12, atol=1e-13)
 
 
-def test_a_description_describes_the_same_model(fitted):
-    module = fitted["parallel_elm"][0].module_
-    stored = module.stored()
-    assert stored.kind == "hybrid_module"
-    assert {*stored.parts} == {"mechanical", "corrections", "tested"}
-    (correction,) = stored.parts["corrections"].parts.values()
-    network = module.corrections[0].module
-    assert_array_equal(correction.parts["module"].arrays["input_weights"], network.input_weights)
-    assert_array_equal(stored.part("mechanical").array("radii"), module.mechanical.radii)
-
-
 @pytest.mark.parametrize("kind", ["parallel_elm", "serial_pose", "drift_and_radius", "blend"])
 def test_equal_arrays_are_written_once(tmp_path, kind, fitted):
     save_model(fitted[kind][0], tmp_path / "model")
@@ -69,19 +58,6 @@ def test_shared_parts_are_shared_again(tmp_path, fitted):
     assert correction.readout is serial.error_model_.readout
     assert correction.readout.features.chain is serial.mechanical_model_
     assert serial.mechanical_model is not serial.mechanical_model_
-
-
-def test_error_models_come_back_fitted(tmp_path, fitted):
-    for kind in ("parallel_elm", "parallel_kernel", "parallel_regression"):
-        model, q = fitted[kind]
-        save_model(model, tmp_path / "model")
-        error = load_model(tmp_path / "model").error_model_
-        assert type(error) is type(model.error_model_)
-        assert_allclose(error.predict(q), model.error_model_.predict(q), rtol=1e-12)
-    save_model(fitted["blend"][0], tmp_path / "model")
-    was, came = fitted["blend"][0].error_model_, load_model(tmp_path / "model").error_model_
-    assert came.weights == was.weights
-    assert [type(one) for one in came.error_models] == [type(one) for one in was.error_models]
 
 
 def test_models_of_code_say_so():

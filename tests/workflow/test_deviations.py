@@ -45,12 +45,6 @@ def test_a_right_description_has_no_deviations(turn):
     assert said(nominal, robot(turn), ["radii", "turns", "lengths", "base"]) == []
 
 
-def test_the_simulated_trunk_has_no_deviations():
-    nominal, data = robots.bionic_handling_assistant(), datasets.load_trunk()
-    result = calibrate(nominal, data.q[::4], data.x[::4], ["radii", "base"])
-    assert [*deviations(nominal, result)] == []
-
-
 def test_sizes_that_contradict_a_ruler_are_named_with_both_values():
     (sentence,) = said(robot(length=0.125), robot(), ["lengths", "base"])
     assert "lengths[0] from 125 to 100.1 mm" in sentence
@@ -58,14 +52,6 @@ def test_sizes_that_contradict_a_ruler_are_named_with_both_values():
     assert "`spool_radius`" in sentence
     (sentence,) = said(robot(gains=1.3e-3), robot(gains=1e-3), ["gain", "base"])
     assert "gain from 0.0013 to" in sentence
-
-
-def test_sizes_that_are_not_physical_are_said_once():
-    q, x = measured(robot())
-    nominal = robot(radii=0.5 * RADII)
-    with pytest.warns(UserWarning, match="unphysical"):
-        result = calibrate(nominal, q, x, ["radii", "base"])
-    assert [*deviations(nominal, result)] == []
 
 
 def test_a_ring_that_is_turned_against_the_other_is_named():

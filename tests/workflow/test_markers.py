@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hybridkin import ConstantCurvatureChain, robots
-from hybridkin.datasets import check_log, load_log
+from hybridkin.datasets import load_log
 from hybridkin.workflow import FitSettings, evaluate_log, fit_log, open_model, read_log
 
 ROBOT = """
@@ -46,11 +46,6 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_a_description_places_the_markers(folder):
-    robot = robots.read_description(folder / "robot.toml")
-    assert robot.chain.markers == ((1.0, 0.01, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
@@ -82,15 +77,6 @@ def test_rows_with_a_marker_stay_and_rows_without_any_are_dropped(folder, tmp_pa
         load_log(tmp_path / "log.csv", [*"abcdef"], columns, x_unit="mm")
     dropped = load_log(tmp_path / "log.csv", [*"abcdef"], columns, x_unit="mm", drop_invalid=True)
     assert dropped.invalid_lines.tolist() == [3]
-
-
-def test_the_tip_is_checked_where_it_was_measured(folder):
-    robot = robots.read_description(folder / "robot.toml")
-    log = read_log(folder / "log.csv", robot.log, chain=robot.chain)
-    report = check_log(log, chain=robot.chain)
-    assert report.ok
-    assert report.x_range.shape == (3, 2)
-    assert np.isfinite(report.x_range).all()
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, IKStatus, workflow
-from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.ik import trajectories
 from hybridkin.workflow._domain import Domain
 from hybridkin.workflow._places import better_place, placed, solver
@@ -24,19 +23,6 @@ def test_errors_that_grow_with_the_distance_are_found():
     assert promise.per_distance == pytest.approx(3e-3, rel=0.1)
     assert promise.p95 == pytest.approx(-np.log(0.05), rel=0.1)
     assert np.mean(errors < promise.p95 * promise.mean(far)) == pytest.approx(0.95, abs=0.01)
-
-
-def test_errors_that_do_not_grow_are_promised_as_they_are():
-    errors, far = rng.uniform(1e-3, 3e-3, 100), rng.uniform(0.0, 2.0, 100)
-    promise = Promise.of(errors, np.zeros(100))
-    assert promise.mean(far) == pytest.approx(errors.mean())
-
-
-def test_distances_are_zero_at_rows_of_the_log():
-    q, groups = rng.uniform(0.2, 0.3, (60, 6)), np.arange(60) // 10
-    assert held_out_distances(q, groups, q).min() == 0.0
-    assert held_out_distances(q, groups, q + 0.05).mean() > 0.5
-    assert not held_out_distances(q, np.zeros(60), q + 0.05).any()
 
 
 @pytest.fixture(scope="module")

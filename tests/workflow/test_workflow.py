@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
     HybridForwardModel,
     PlayOperator,
-    calibrate,
     datasets,
     load_model,
     robots,
@@ -24,10 +22,7 @@ from hybridkin import (
 )
 from hybridkin.cli.main import main
 from hybridkin.hybrid.estimator import fit_quietly
-from hybridkin.saving.saved_model import model_header
 from hybridkin.workflow._domain import Domain
-from hybridkin.workflow._fit_report import auto_entry
-from hybridkin.workflow.report import geometry_entries, statistics
 
 ROBOT = """
 calibrate = ["radii", "base"]
@@ -67,25 +62,6 @@ def log(tmp_path):
     header = "l1,l2,l3,l4,l5,l6,x,y,z,motion"
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
     return path, robot
-
-
-def test_entries_of_a_calibration_have_units_a_user_reads(rng):
-    q = 0.25 + 0.05 * (2 * torch.rand(100, 6, generator=rng, dtype=torch.float64) - 1)
-    base = np.eye(4)
-    base[:3] = [[0, -1, 0, 0.01], [1, 0, 0, 0.02], [0, 0, 1, 0.03]]
-    truth = ConstantCurvatureChain([0.1, 0.08], base=base, rest_bends=[[0.1, 0], [0, 0.2]])
-    start = ConstantCurvatureChain([0.09, 0.09])
-    result = calibrate(start, q, truth(q), ("radii", "rest_bends", "base"))
-    entries = {entry["name"]: entry for entry in geometry_entries(start, result)}
-    assert tuple(entries) == result.names
-    expected = {"radii[0]": (90, 100, "mm"), "rest_bends[1, y]": (0, np.degrees(0.2), "deg")}
-    expected |= {"base[rot z]": (0, 90, "deg"), "base[y]": (0, 20, "mm")}
-    for name, (before, value, unit) in expected.items():
-        entry = entries[name]
-        assert entry["unit"] == unit
-        assert [entry["start"], entry["value"]] == pytest.approx([before, value], abs=1e-6)
-        assert entry["identified"]
-        assert entry["narrowing"] > 10
 
 
 @pytest.mark.slow
@@ -137,17 +113,6 @@ def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
     text = " ".join(report.plain().split())
     assert "radius covering 80 % of the tips: " in text
     assert "in the domain and for motions as in the log. Rows without a radius" in text
-
-
-def test_standard_error_counts_motions_once():
-    rng = np.random.default_rng(0)
-    motions = np.repeat(np.arange(40), rng.integers(5, 30, 40))
-    logs = 1.0 + rng.standard_normal((400, 40))[:, motions]  # the rows of a motion are equal
-    found = [statistics(errors, motions)["std_error"] for errors in logs]
-    assert np.mean(found) == pytest.approx(logs.mean(axis=1).std(), rel=0.1)
-    by_row = statistics(logs[0], np.arange(len(motions)))["std_error"]
-    assert by_row == pytest.approx(logs[0].std(ddof=1) / np.sqrt(len(motions)))
-    assert "std_error" not in statistics(logs[0])
 
 
 @pytest.fixture
@@ -206,26 +171,6 @@ def test_fit_of_elastic_tendons(slack_log, tmp_path):
 
 
 @pytest.mark.slow
-def test_fit_of_the_plain_chain_warns_of_slack_once(slack_log, tmp_path):
-    path, _ = slack_log
-    robot = tmp_path / "plain.toml"
-    robot.write_text('calibrate = ["base"]\n' + SLACK_ROBOT)
-    with pytest.warns(UserWarning, match="of 120 rows of `q` pull the tendons") as caught:
-        fit(path, robot, tmp_path / "m", groups="motion")
-    assert len(caught) == 1
-    text = (tmp_path / "m" / "report.md").read_text()
-    assert text.count("pull the tendons") == 1
-    assert f"Warning: {caught[0].message}" in text
-
-
-@pytest.mark.slow
-def test_without_a_column_of_motions_the_log_is_cut_into_stretches(log, tmp_path):
-    path, robot = log
-    report, _ = fit(path, robot, tmp_path / "m")
-    assert report.record["n_motions"] == 10
-
-
-@pytest.mark.slow
 def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home):
     robot = robots.read_description("examples/robots/ftdcr_v4.toml")
     data = datasets.load_ftdcr(data_home)
@@ -235,64 +180,6 @@ def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home):
     mean = {name: values.mean() for name, values in errors.items()}
     assert mean["hybrid, ELM"] <= mean["mechanical, calibrated"] < mean["mechanical, nominal"]
     assert mean["hybrid, ELM"] < mean["data-driven, quadratic"]
-
-
-@pytest.mark.slow
-def test_auto_on_slack_tendons_takes_elastic_ones(slack_log, tmp_path):
-    path, data = slack_log
-    robot = tmp_path / "plain.toml"
-    robot.write_text('calibrate = ["radii"]\n' + SLACK_ROBOT)
-    far = r"the calibration moved radii\[0\] from 5 to"
-    with pytest.warns(UserWarning, match="pull the tendons"), pytest.warns(UserWarning, match=far):
-        report, _ = fit(path, robot, tmp_path / "m", groups="motion", auto=True)
-    assert report.record["saved"] == "hybrid, auto"
-    chosen = report.record["auto"]
-    assert chosen["taken"].startswith("elastic tendons: ")
-    errors = chosen["mechanical_models"]
-    assert errors[chosen["taken"]]["cv"] < 0.5 * errors["radii"]["cv"]
-    assert "on elastic tendons" in report.record["chosen"]
-    assert any(sentence.startswith("Of 2 sets of parameters") for sentence in chosen["words"])
-    text = (tmp_path / "m" / "report.md").read_text()
-    assert "## Calibration of the elastic tendons that auto chose" in text
-    names = [entry["name"] for entry in report.record["calibration_of_saved"]["entries"]]
-    assert "bending_stiffness[0]" in names
-    header = model_header(tmp_path / "m" / "model.safetensors")
-    assert header["training"]["rows"] == 120
-    assert header["training"]["held_out"].keys() == report.record["held_out"].keys()
-    assert workflow.open_model(tmp_path / "m").header == header
-    predicted = workflow.open_model(tmp_path / "m").predict(data["q"])
-    assert np.linalg.norm(predicted - data["x"], axis=1).mean() < 0.0005
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("weights", "sentence"),
-    [
-        ([1.0, 0.0, 0.0], "Auto chose no error model: 2.50 mm on held-out motions; none is"),
-        (
-            [0.0, 1.0, 0.0],
-            "Auto chose the error model linear: 2.45 mm on held-out motions, 2.50 mm",
-        ),
-        ([0.0, 0.5, 0.5], "2.30 mm on held-out motions, 2.40 mm with the best of them alone (ELM)"),
-    ],
-    ids=["nothing", "not the least", "blend"],
-)
-def test_words_about_auto_are_those_of_what_it_took(weights, sentence):
-    names = ["mechanical", "linear", "ELM"]
-    model = HybridForwardModel(None, "auto")
-    model.mechanical_model_ = model.play_ = None
-    model.cv_results_ = {
-        "candidate": [*names, "blend"],
-        "mean_distance": np.array([2.5e-3, 2.45e-3, 2.4e-3, 2.3e-3]),
-        "expected_distance": 2.6e-3,
-        "chosen": "blend" if 0.5 in weights else names[weights.index(1.0)],
-        "weights": dict(zip(names, weights, strict=True)),
-        "mechanical_model": {"nothing": {"cv": 2.5e-3}},
-    }
-    entry = auto_entry(model)
-    assert sentence in " ".join(entry["words"])
-    assert "Expected on new motions like these: 2.60 mm." in entry["words"]
-    assert entry["expected"] == 2.6e-3
 
 
 @pytest.fixture(scope="module")
@@ -357,24 +244,6 @@ def test_an_actuator_that_never_moved_is_held_where_it_was():
     assert model.module_.in_domain(torch.from_numpy(Domain(loaded, limits).sample[0])).all()
 
 
-def test_the_domain_of_few_lines_is_found_from_its_rows():
-    """Single actuators from the shortest: the middle of the range is far from all motions."""
-    q = np.full((9, 20, 3), 0.16)
-    q[np.arange(9), :, np.arange(9) % 3] += np.linspace(0.0, 0.1, 20)
-    q, groups = q.reshape(-1, 3), np.arange(180) // 20
-    chain = ConstantCurvatureChain([0.05])
-    x = chain(torch.from_numpy(q)).numpy() + 0.01 * q
-    model = HybridForwardModel(chain, LinearRegression()).fit(q, x, groups=groups)
-    loaded = workflow.LoadedModel("lines", Path("lines"), model)
-    domain = Domain(loaded, workflow.path_limits(loaded))
-    assert not model.in_domain(0.5 * (q.min(0) + q.max(0))[None])
-    assert model.in_domain(domain.preferred[None])
-    commands = domain.sample[0]
-    assert model.in_domain(commands).all()
-    # How far the walks come on other lines depends on the preferred row: rounding decides which.
-    assert (np.ptp(commands, axis=0) > 0.03).all()
-
-
 @pytest.mark.slow
 def test_a_fit_to_a_thinned_log_knows_all_of_its_rows(log, tmp_path):
     path, robot = log
@@ -390,32 +259,6 @@ def test_a_fit_to_a_thinned_log_knows_all_of_its_rows(log, tmp_path):
     assert not nominal.was_fitted(measured.q, measured.x, measured.motions).any()
     report, _ = workflow.evaluate_log(nominal, measured)
     assert report.record["fitted_rows"] == 0
-
-
-def test_a_model_that_does_not_know_its_rows_says_so(log, tmp_path):
-    path, robot = log
-    description = robots.read_description(robot)
-    save_model(description.chain, tmp_path / "chain.safetensors")
-    loaded = workflow.open_model(tmp_path / "chain.safetensors", robot)
-    report, _ = workflow.evaluate_log(loaded, workflow.read_log(path, description.log))
-    assert report.record["fitted_rows"] is None
-    assert "does not say which rows it was fitted to" in report.plain()
-
-
-def test_limits_intersect_where_both_are_known():
-    one = robots.Limits(q_min=np.array([-1.0, 0.0]), q_max=np.array([2.0, 3.0]))
-    rates = {"dq_max": np.array([0.5, 0.5]), "ddq_max": np.array([2.0, 3.0])}
-    other = robots.Limits(q_max=np.array([1.0, 4.0]), **rates)
-    both = one.intersect(other)
-    assert both.q_min.tolist() == [-1.0, 0.0]
-    assert both.q_max.tolist() == [1.0, 3.0]
-    assert both.dq_max.tolist() == [0.5, 0.5]
-    narrow = both.narrowed(0.25)
-    assert narrow.q_min.tolist() == [-0.75, 0.25]
-    assert narrow.q_max.tolist() == [0.75, 2.75]
-    assert narrow.dq_max.tolist() == [0.5, 0.5]
-    assert narrow.ddq_max.tolist() == [2.0, 3.0]
-    assert narrow.scaled(-2.0).ddq_max.tolist() == [4.0, 6.0]
 
 
 def test_given_limits_replace_those_of_the_description():
@@ -525,18 +368,6 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path):
     way = trajectories.line(x, (x[0] + 0.005, x[1], x[2]), duration=1.0, dt=0.5)
     tracked, _ = workflow.track_path(loaded, way, tmp_path / "t", tol=1e-3)
     assert tracked.record["reached"] == 3
-
-
-def test_a_report_prints_what_it_writes():
-    report = workflow.Report("A title")
-    report.text("## Part", "Some **bold** words.", "- " + "word " * 30)
-    report.table(["name", "a"], [["x", "1"], ["longer", "22"]])
-    assert "**bold**" in report.markdown()
-    assert "| longer | 22 |" in report.markdown()
-    printed = report.plain()
-    assert printed.startswith("A title\n\nPart\n\nSome bold words.\n\n- word")
-    assert printed.endswith("  name     a\n  x        1\n  longer  22")
-    assert max(map(len, printed.splitlines())) <= 98
 
 
 def test_a_log_that_does_not_pass_its_check_stops_the_fit(log, tmp_path):
