@@ -115,7 +115,8 @@ class Stored:
         if key not in self.settings:
             raise ValueError(f"`{key}` of {self.kind!r} is missing")
         value = self.settings[key]
-        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+        if not isinstance(kinds, tuple):
+            kinds = (kinds,)
         if type(value) is int and float in kinds and int not in kinds:
             value = float(value)
         if (None if value is None else type(value)) not in kinds:

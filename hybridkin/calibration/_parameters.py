@@ -92,7 +92,8 @@ class Entries(_Named):
     def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
         """Return the limits of the free directions, by default the physical ones."""
         origin = self.start.numpy().ravel()[self.shown]
-        origin = np.abs(origin) if self.log else origin
+        if self.log:
+            origin = np.abs(origin)
         low, high = self.physical if bound is None else bound
         if bound is None:  # the start itself is always allowed
             low = np.minimum(low, origin)

@@ -82,7 +82,8 @@ def _best(
     image = None
     for fit, guess in zip(fits[1:], guesses[1:], strict=True):
         if not any(guess.mirrored):
-            best = fit if fit.rmse < _EQUAL * best.rmse else best
+            if fit.rmse < _EQUAL * best.rmse:
+                best = fit
         elif image is None or fit.rmse < image.rmse:
             image = fit
     if (

@@ -220,7 +220,8 @@ def choose_geometry(
 
     def choice(k: int) -> GeometryChoice:
         name, chosen, names = rungs[k]
-        chosen = nominal if chosen is chain else chosen
+        if chosen is chain:
+            chosen = nominal
         return GeometryChoice(chosen, names, starts[k], name, errors, tied)
 
     rivals = tuple(choice(k) for k in near if k != best and rungs[k].parameters)

@@ -209,7 +209,8 @@ def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
     limits = {}
     ends = {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
     for (name, end), value in zip(ends.items(), given, strict=True):
-        value = np.full(n, end) if value is None else value
+        if value is None:
+            value = np.full(n, end)
         limits[name] = numeric(value, name, need="n", length=n, finite=False)
     low, high, speed = limits.values()
     if not ((low <= high) & (speed > 0.0)).all():

@@ -361,7 +361,8 @@ class ArcChain(MarkedChain):
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return a warning if lengths exceed 10 m, or length changes 4 backbone lengths."""
-        name = name if self.in_metres else f"{name}` times `gains"
+        if not self.in_metres:
+            name = f"{name}` times `gains"
         # Also test q itself, without zeros: `q` may hold speeds, or limits that are absent.
         gains = self.gains.to(q)
         (metres,) = in_blocks(

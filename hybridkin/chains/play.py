@@ -142,7 +142,8 @@ class PlayOperator:
         """
         rows = real_array(q, "q")
         check_shape(rows, "q", ("N", "n"))
-        q = q if isinstance(q, Tensor) else rows
+        if not isinstance(q, Tensor):
+            q = rows
         groups = labels(groups, len(q))
         order = np.argsort(groups, kind="stable")  # a motion's rows keep their order
         starts = np.flatnonzero(groups[order][1:] != groups[order][:-1]) + 1

@@ -373,7 +373,8 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
             f"`calibrate` must name different entries of {geometry_names}, or be "
             f'"auto" or "default", got {names}.'
         )
-    names = names if isinstance(names, str) else tuple(names)
+    if not isinstance(names, str):
+        names = tuple(names)
     robot = RobotDescription(tables.get("name", stem), chain, names, log)
     return replace(robot, limits=_limits(tables.get("limits", {}), robot))
 

@@ -88,7 +88,8 @@ def check_log(
     several = log.x.shape[1] > 3
     if several:
         log = replace(log, x=log.x[:, -3:], x_names=log.x_names[-3:])
-        chain = None if chain is None else chain.tip_model
+        if chain is not None:
+            chain = chain.tip_model
     columns = np.column_stack([log.q, log.x]).astype(float)
     valid = np.asarray(countable(columns).all(axis=1))
     complete = valid | (several & countable(log.q).all(axis=1))
@@ -222,7 +223,8 @@ def _frozen(rows: _Rows) -> Iterator[LogFinding]:
                 "leave these rows out with --drop-frozen, or delete them from the log."
             )
             yield rows.finding("frozen tip", message, advice, frozen, severity)
-        tips = np.union1d(tips, frozen) if what == "the tip" else tips
+        if what == "the tip":
+            tips = np.union1d(tips, frozen)
     moved = np.linalg.norm(np.ptp(x, axis=0))
     for name, column in rows.columns("q"):
         still = np.diff(column) == 0

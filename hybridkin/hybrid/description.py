@@ -167,7 +167,8 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
     """Return the results of the training of a fitted hybrid as JSON values, errors in metres."""
     results: dict[str, Any] = {}
     error = model.error_model_
-    error = error.error_models[0] if isinstance(error, Blend) else error
+    if isinstance(error, Blend):
+        error = error.error_models[0]
     results["rows"] = len(model._fitted_rows)
     if isinstance(error, ReadoutFit):
         results["left_out_rmse"] = error.rmse

@@ -441,8 +441,10 @@ class HybridForwardModel(HybridPredictor):
         X, y, weights = check_rows(self, X, y, weights, reset)
         y = np.where(missing, np.nan, y)
         # Torch warns of columns of a data frame.
-        X = X if X.flags.writeable else X.copy()
-        groups = None if groups is None else labels(groups, len(X))
+        if not X.flags.writeable:
+            X = X.copy()
+        if groups is not None:
+            groups = labels(groups, len(X))
         return Rows(X, y, cast("NDArray | None", weights), groups)
 
     def _spec(self, rows: Rows) -> Spec:

@@ -114,7 +114,8 @@ def box_limited_step(
     Hiriart-Urruty, Strodiot & Nguyen, Appl. Math. Optim. 11 (1984); Qi & Sun, Math. Program. 58
     (1993), for semismooth Newton methods.
     """
-    mu = torch.zeros_like(problem.v) if mu is None else mu
+    if mu is None:
+        mu = torch.zeros_like(problem.v)
     best = mu.clone()
     live = problem
     rows = torch.arange(len(mu), device=mu.device)

@@ -219,7 +219,8 @@ def limited_step(
         J = J * unit
         lower = lower / unit
         upper = upper / unit
-        posture = None if posture is None else posture / unit
+        if posture is not None:
+            posture = posture / unit
     gram = quick_gram(J, trust is not None) if quick else row_gram(J)
     if trust is not None:
         damping_sq = trust * gram.sigma_max.square()

@@ -287,7 +287,8 @@ class InverseKinematics:
             rows_of(a, lead, trailing) for a, trailing in arguments
         )
         before = None if last is None else optional.pop()
-        before = before if settings.accelerates else None
+        if not settings.accelerates:
+            before = None
         feed_forward = None if dx is None else settings.dt * optional.pop()
         measured = optional.pop() if optional else None
         if core is not None and as_numpy and rows.dtype == torch.float64:

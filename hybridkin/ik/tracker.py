@@ -66,7 +66,8 @@ class Tracker(Portable):
     def __init__(
         self, settings: StepSettings, q0: Array, tol: Tolerance, memory: float | None
     ) -> None:
-        memory = None if memory is None else number(memory, "memory")
+        if memory is not None:
+            memory = number(memory, "memory")
         good = memory is None or 0.0 < memory < math.inf
         require(good, f"`memory` must be a positive time [s], got {memory!r}.")
         self._settings = settings
@@ -275,7 +276,8 @@ class Tracker(Portable):
             tip = None if plant is None else self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
             ahead_now = ahead[i : i + 1]
-            target = target if finite[i] else None
+            if not finite[i]:
+                target = None
             tick = self._robot.advance(periods[i], target, ahead_now, used)
             rows.append(
                 (tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped)

@@ -201,7 +201,8 @@ class ELMRegressorCV(FittedNetwork):
         first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
         X = X[first]
         y = y[first]
-        groups = None if groups is None else groups[first]
+        if groups is not None:
+            groups = groups[first]
         if len(y) < 2:
             raise ValueError(
                 f"`X` must have at least 2 different rows of positive weight, so that one can be "

@@ -171,7 +171,8 @@ class TrackAnimation(Display):
         ends = None if tips is None else shaped(tips, "tips", "T3", len(q))[rows]
         body = BackboneDisplay.from_estimator(model, q[rows], tips=ends, names=names)
         name = "tip (model)" if x is None else "tip (measured)"
-        x = tips if x is None else x
+        if x is None:
+            x = tips
         if x is None:
             finite = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
@@ -359,7 +360,8 @@ class TrackAnimation(Display):
 
 def _evenly(t: NDArray | None, n_rows: int, most: int) -> NDArray:
     """Return the rows nearest to even times, increasing."""
-    t = np.arange(n_rows) if t is None else t
+    if t is None:
+        t = np.arange(n_rows)
     wanted = np.linspace(t[0], t[-1], min(most, n_rows))
     return np.unique(np.rint(np.interp(wanted, t, np.arange(n_rows))).astype(int))
 

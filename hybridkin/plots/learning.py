@@ -66,7 +66,8 @@ class LearningCurveDisplay(Display):
         self.errors: dict[str, NDArray] = {}
         for name, values in named(errors, "errors").items():
             array = plain(values, "errors")
-            array = array[:, None] if array.ndim == 1 else array
+            if array.ndim == 1:
+                array = array[:, None]
             if array.ndim != 2 or len(array) != len(self.sizes):
                 raise ValueError(
                     f"`errors` must hold arrays of shape ({len(self.sizes)},) or "
@@ -132,7 +133,8 @@ class LearningCurveDisplay(Display):
         if not isinstance(models, Mapping):
             models = {type(models).__name__: models}
         rng = check_random_state(random_state)
-        groups = None if groups is None else np.asarray(groups)
+        if groups is not None:
+            groups = np.asarray(groups)
         splits = _splits(cv, q, groups, rng)
         splits = [
             (_ordered(np.asarray(train), groups, rng), test) for train, test in splits

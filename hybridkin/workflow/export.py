@@ -53,7 +53,8 @@ def export_model(
     report.record.update(n_actuators=loaded.n_actuators, dtype=dtype, dt=dt)
     report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
     if dt is not None:
-        limits = path_limits(loaded) if limits is None else limits
+        if limits is None:
+            limits = path_limits(loaded)
         settings: dict[str, Any] = {
             k: v for k, v in vars(limits).items() if k != "source"
         }

@@ -77,7 +77,8 @@ def next_rows(
     """
     check_out(out, "next", ["next.csv"], force=force)
     n = whole(n, "n")
-    limits = path_limits(loaded, within_fit=False) if limits is None else limits
+    if limits is None:
+        limits = path_limits(loaded, within_fit=False)
     domain = Domain(loaded, limits)
     log = loaded.log_format()
     candidates = domain.postures(_POOL)

@@ -54,7 +54,8 @@ def read_path(
         If the file has no times and `dt` is not given, or is not a table of numbers.
     """
     file = as_path(path)
-    dt = None if dt is None else number(dt, "dt")
+    if dt is not None:
+        dt = number(dt, "dt")
     if not file.is_file():
         raise FileNotFoundError(
             f"`path` must be a CSV file of points, there is none at {file}."
@@ -167,7 +168,8 @@ def shape_path(
     if normal is None:
         across = np.linalg.svd(tips - tips.mean(axis=0), full_matrices=False)[2][2]
         ahead = across if loaded.chain is None else as_array(loaded.chain.base)[:3, 2]
-        across = across if across @ ahead > 0.0 else -across
+        if not (across @ ahead > 0.0):
+            across = -across
     timing: Any = {"duration": duration, "dt": dt}
     half = 0.5 * np.array(extent)
     if shape == "figure-eight":

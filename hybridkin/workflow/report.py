@@ -242,7 +242,8 @@ class Report:
 
     def plain(self, table: Callable[..., str] | None = None) -> str:
         """Return the report as text; `table` makes text of header and rows, by default aligned."""
-        table = _aligned if table is None else table
+        if table is None:
+            table = _aligned
         texts = []
         for _, block in self._blocks:
             texts.append(block if isinstance(block, str) else table(*block))

@@ -99,7 +99,8 @@ def track_path(
     """
     check_out(out, "track", ["track.csv", "track.png", "commands.png"], force=force)
     log_format = loaded.log_format()
-    limits = path_limits(loaded) if limits is None else limits
+    if limits is None:
+        limits = path_limits(loaded)
     domain = Domain(loaded, limits)
     stands = _start(domain, start)
     check_reach(domain, path, tol, force, progress)
