@@ -18,7 +18,6 @@ from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
 from hybridkin.native.library import evaluate
 
-_MAX_ROUNDS = 12
 _MEDIAN = 2.3660  # of the squared length of a normal vector with three coordinates
 
 
@@ -42,6 +41,18 @@ def _huber(s: NDArray, far: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         far**-0.5,
         -0.5 * (s > 1) * far**-1.5,
     )
+
+
+class Accuracy(NamedTuple):
+    """When a fit ends: relative change of a step, and rounds of the noise level."""
+
+    tolerance: float
+    rounds: int
+
+
+EXACT = Accuracy(1e-12, 12)
+HELD_OUT = Accuracy(1e-6, 12)  # for errors of held-out rows
+ROUGH = Accuracy(1e-5, 2)  # to compare initial guesses
 
 
 class Rows(NamedTuple):
@@ -138,12 +149,13 @@ class Fit:
 
 
 def solve(
-    problem: Problem, rows: Rows, theta: NDArray, loss: str, *, roughly: bool = False
+    problem: Problem,
+    rows: Rows,
+    theta: NDArray,
+    loss: str,
+    accuracy: Accuracy = EXACT,
 ) -> Fit:
-    """Return a fit that alternates least squares and the noise level, the weight of the prior.
-
-    With `roughly` it stops early, with enough accuracy to compare initial guesses.
-    """
+    """Return a fit that alternates least squares and the noise level, the weight of the prior."""
     weight = rows.weights
     root = np.sqrt(weight)[:, None]
 
@@ -170,13 +182,14 @@ def solve(
     robust = loss != "linear"
     sigma = max(rows.noise(residual(theta), robust), floor)
     converged = False
-    tol = 1e-5 if roughly else 1e-12
-    options: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), tol)
+    options: dict[str, Any] = dict.fromkeys(
+        ("ftol", "xtol", "gtol"), accuracy.tolerance
+    )
     options |= {"jac": slope, "bounds": (problem.low, problem.high), "max_nfev": 100}
     options |= {
         "loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"
     }
-    for _ in range(2 if roughly else _MAX_ROUNDS):
+    for _ in range(accuracy.rounds):
         solution = least_squares(whitened, theta, args=(sigma,), **options)
         theta = solution.x
         converged = solution.status > 0

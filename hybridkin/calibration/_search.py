@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
-from hybridkin.calibration._least_squares import Fit, Rows, solve
+from hybridkin.calibration._least_squares import ROUGH, Fit, Rows, solve
 from hybridkin.calibration._parameters import Problem
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -49,7 +49,7 @@ def search(
     if len(guesses) == 1:
         return Start(problems[0], thetas[0])
     pairs = zip(problems, thetas, strict=True)
-    fits = [solve(problem, rows, theta, loss, roughly=True) for problem, theta in pairs]
+    fits = [solve(problem, rows, theta, loss, ROUGH) for problem, theta in pairs]
     best, message = _best(fits, guesses, bool({"angles", "turns"} & {*names}))
     return Start(best.problem, best.theta, message)
 

@@ -26,7 +26,7 @@ from hybridkin._core.arrays import (
 from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
-from hybridkin.calibration._least_squares import LOSSES, Fit, Rows, solve
+from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, solve
 from hybridkin.calibration._parameters import ALIASES, parameter_names
 from hybridkin.calibration._search import Start, search
 from hybridkin.calibration._unidentified import sentences
@@ -40,6 +40,7 @@ __all__ = ["CalibrationResult", "calibrate"]
 _IDENTIFIED = 0.1
 # fewest rows; ratio of residual to spread, a quarter of the variance
 _FEW = 10
+_ENOUGH = 500  # rows to calibrate on when rows are held out
 _LEFT = 0.5
 _MEASURED = ("radii", "lengths")  # sizes that can be measured with a ruler:
 _UNPHYSICAL = 1.75  # a change by this factor gives a warning
@@ -269,10 +270,17 @@ def fit_geometry(
 
 
 def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
-    """Return only the chain of a calibration to different rows from a start."""
+    """Return only the chain of a calibration to different rows from a start.
+
+    It is for errors of held-out rows: of many rows, which follow one another in a log, evenly
+    spaced ones determine the few parameters.
+    """
     like = start.problem.chain.geometry()["base"]
     rows = Rows(*(part.to(like) for part in (q, x, weights)))
-    return solve(start.problem, rows, start.theta, "linear").chain()
+    spaced = np.linspace(0, len(q) - 1, min(_ENOUGH, len(q))).astype(int)
+    return solve(
+        start.problem, rows.take(spaced), start.theta, "linear", HELD_OUT
+    ).chain()
 
 
 def _few(fit: Fit, rows: Rows) -> str | None:
@@ -390,7 +398,7 @@ def _result(
 def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     squares = 0.0
     for train, test in folds(groups, groups):
-        fit = solve(best.problem, rows.take(train), best.theta, loss)
+        fit = solve(best.problem, rows.take(train), best.theta, loss, HELD_OUT)
         held_out = rows.take(test)
         squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weights.sum())
     return float(np.sqrt(squares / float(rows.weights.sum())))

@@ -15,7 +15,7 @@ from torch import Tensor
 from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
 from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin._core.model import ForwardModel
-from hybridkin.calibration._least_squares import LOSSES, Rows, solve
+from hybridkin.calibration._least_squares import LOSSES, ROUGH, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration.calibrate import check_data
 from hybridkin.calibration.measured import folds, inner_and_outer
@@ -356,7 +356,7 @@ def _rings(rung: _Rung) -> set[str]:
 def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
     """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
     fits = [
-        solve(start.problem, rows, start.theta, loss, roughly=True) for start in starts
+        solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts
     ]
     best = min(range(len(fits)), key=lambda k: fits[k].rmse * (1.0 + (k > 0) * _ALIKE))
     return starts[best]._replace(theta=fits[best].theta)
@@ -385,7 +385,7 @@ def _errors(
         new = rows.take(test)
         if start is not None:
             chain = solve(
-                start.problem, training, start.theta, loss, roughly=True
+                start.problem, training, start.theta, loss, ROUGH
             ).chain()
         residual = new.residual(chain)
         weight = new.weights
