@@ -93,8 +93,10 @@ class Linearised:
         `less` is the Gram matrix of rows to subtract.
         """
         finite = torch.isfinite(penalty)
-        gram = self.gram if less is None else self.gram - less
-        system = gram[:, finite][..., finite].flatten(2).flatten(0, 1)
+        gram = self.gram.clone() if less is None else self.gram - less
+        if not finite.all():
+            gram = gram[:, finite][..., finite]
+        system = gram.flatten(2).flatten(0, 1)
         system.diagonal().add_(penalty[finite].repeat(len(self.gram)))
         return finite, torch.linalg.cholesky(system)
 
@@ -115,22 +117,25 @@ class Linearised:
         members : list of Tensor, optional
             Rows of every group, the same at every call. None: single rows.
         """
-        finite, L = self.factor(penalty)
-        residual = self.residual(solve_kept(self.moment, finite, L))
+        n_weights = len(self.gram) * int(torch.isfinite(penalty).sum())
         if members is None:
+            finite, L, residual = self._solved(penalty)
             leverage = (
                 self.J @ self._spread(finite, torch.cholesky_inverse(L)) @ self.J.mT
             )
             return torch.linalg.solve(
                 identity(leverage.shape[1], leverage) - leverage, residual
             )
-        result = torch.empty_like(residual)
-        few = len(L) if len(members) > _FOLDS else len(L) // 4
+        result = torch.empty_like(self.y)
+        few = n_weights if len(members) > _FOLDS else n_weights // 4
+        whole = None  # the solution for all rows
         for k, rows in enumerate(members):
             J = self.J[rows]
             phi = self.phi[rows]
             y = self.y[rows]
             if y.numel() <= few:
+                whole = whole or self._solved(penalty)
+                finite, L, residual = whole
                 A = design(J, phi[:, finite]).flatten(0, 1)
                 white = torch.linalg.solve_triangular(L, A.mT, upper=False)
                 leverage = identity(len(A), A) - white.mT @ white
@@ -142,8 +147,13 @@ class Linearised:
                 self._apart[k] = _gram(J, Products(phi))
             rest = self.factor(penalty, self._apart[k])
             readout = solve_kept(self.moment - moment(J, y, phi), *rest)
-            result[rows] = self.residual(readout)[rows]
+            result[rows] = y - (J @ (phi @ readout.mT)[..., None])[..., 0]
         return result
+
+    def _solved(self, penalty: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the factor, as `factor`, and the residual (N, m) of the fit to all rows."""
+        finite, L = self.factor(penalty)
+        return finite, L, self.residual(solve_kept(self.moment, finite, L))
 
     def _spread(self, kept: Tensor, inverse: Tensor) -> Tensor:
         """Return the covariance (N, C, C) of W phi, from that of W (D, D)."""
@@ -236,7 +246,7 @@ def choose(
     score : callable
         Score of a pair; a penalty may be infinite.
     start : tuple of two floats, optional
-        Start of the search, besides no correction. Default: a coarse grid.
+        Start of the search in single steps, besides no correction. Default: a coarse grid.
     """
     scores: dict[Pair, float] = {}  # by half decades
 
@@ -252,9 +262,11 @@ def choose(
 
     if start is None:
         at = best_of(product(_GRID, _GRID))
+        steps = (2.0, 1.0)
     else:
         at = best_of([(inf, inf), (_half_decades(start[0]), _half_decades(start[1]))])
-    for step in (2.0, 1.0):
+        steps = (1.0,)
+    for step in steps:
         previous = None
         while at != previous:
             previous = at

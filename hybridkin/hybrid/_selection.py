@@ -38,7 +38,7 @@ _FEW_MOTIONS, _FEW_ROWS = (
     40,
     100,
 )
-_ANEW = 5  # folds without which penalties are then chosen once more
+_ANEW = 3  # folds without which penalties are then chosen once more
 
 
 def select(
