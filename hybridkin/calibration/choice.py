@@ -355,9 +355,7 @@ def _rings(rung: _Rung) -> set[str]:
 
 def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
     """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
-    fits = [
-        solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts
-    ]
+    fits = [solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts]
     best = min(range(len(fits)), key=lambda k: fits[k].rmse * (1.0 + (k > 0) * _ALIKE))
     return starts[best]._replace(theta=fits[best].theta)
 
@@ -384,9 +382,7 @@ def _errors(
         training = rows.take(train)
         new = rows.take(test)
         if start is not None:
-            chain = solve(
-                start.problem, training, start.theta, loss, ROUGH
-            ).chain()
+            chain = solve(start.problem, training, start.theta, loss, ROUGH).chain()
         residual = new.residual(chain)
         weight = new.weights
         totals[kind] += weight @ np.linalg.norm(residual, axis=1), weight.sum()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache, lru_cache
 from itertools import product
 from math import inf
@@ -21,14 +22,13 @@ _FOLDS_OF_FEW = 10
 _FEW = 200
 _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 # Divided by the mean variance of the inputs.
-_GAMMAS = (
-    0.003,
-    0.01,
-    0.03,
-    0.1,
-    0.3,
-    1.0,
-)
+_GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+_WIDTHS = range(len(_GAMMAS))
+_PENALTIES = range(len(_ALPHAS))
+_ENOUGH = 600  # rows to search on
+_BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
+_AROUND = ((-1, -1), (-1, 1), (1, -1), (1, 1), *_BESIDE)
+Place = tuple[int, int]
 
 
 def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
@@ -41,7 +41,8 @@ def tuned_kernel(
 ) -> KernelRidge:
     """Return Gaussian kernel ridge with the width and the penalty of least held-out error.
 
-    The search starts on a coarse grid and moves to the best neighbour until none is better.
+    The search starts on a coarse grid and moves to the best neighbour until none is better. Of many
+    rows it takes evenly spaced ones first; then all rows move it to neighbours in one parameter.
     """
     if len(X) > _MOST:
         raise ValueError(
@@ -49,46 +50,69 @@ def tuned_kernel(
             f"grows with the square of their number, got {len(X)}; use fewer rows, or "
             "error_model=ELMRegressorCV()."
         )
-    splits = folds_of(X, groups)
     spread = X.var(axis=0).mean() or 1.0
-    with TURNS.filters:
-        squares = euclidean_distances(X.astype(np.float64), squared=True)
-    root = np.sqrt(weights).reshape(-1, *[1] * (error.ndim - 1))
-    targets = root * error
-
-    @lru_cache(1)
-    def kernel(width: int) -> NDArray:
-        return np.exp(-_GAMMAS[width] / spread * squares) * np.outer(root, root)
-
-    @cache
-    def held_out(at: tuple[int, int]) -> float:
-        """Return the sum of held-out distances."""
-        total = 0.0
-        K = kernel(at[0])
-        alpha = _ALPHAS[at[1]]
-        for train, test in splits:
-            system = K[np.ix_(train, train)]
-            system.flat[:: len(train) + 1] += alpha
-            try:
-                dual = cho_solve(
-                    cho_factor(system.T, True, True, False), targets[train]
-                )
-            except LinAlgError:
-                return inf
-            predicted = K[np.ix_(test, train)] @ dual / root[test]
-            total += float(weights[test] @ distance(predicted, error[test]))
-        return total
-
-    widths = range(len(_GAMMAS))
-    penalties = range(len(_ALPHAS))
-    best = min(product(widths[::2], penalties[1::2]), key=held_out)
-    previous = None
-    while best != previous:
-        width, penalty = best
-        near = product(range(width - 1, width + 2), range(penalty - 1, penalty + 2))
-        allowed = (at for at in near if at[0] in widths and at[1] in penalties)
-        previous = best
-        best = min(allowed, key=held_out)
+    spaced = np.linspace(0, len(X) - 1, min(_ENOUGH, len(X))).astype(int)
+    if groups is not None and len(np.unique(groups[spaced])) < len(np.unique(groups)):
+        spaced = np.arange(len(X))
+    some_groups = None if groups is None else groups[spaced]
+    held_out = _HeldOut(X[spaced], error[spaced], weights[spaced], some_groups, spread)
+    best = min(product(_WIDTHS[::2], _PENALTIES[1::2]), key=held_out.distance)
+    best = held_out.best_near(best, _AROUND)
+    if len(spaced) < len(X):
+        best = _HeldOut(X, error, weights, groups, spread).best_near(best, _BESIDE)
     width = _GAMMAS[best[0]] / spread
     alpha = _ALPHAS[best[1]]
     return KernelRidge(kernel="rbf", gamma=width).set_params(alpha=alpha)
+
+
+class _HeldOut:
+    """Held-out distances of kernels; a kernel is a place among the widths and the penalties."""
+
+    def __init__(
+        self,
+        X: NDArray,
+        error: NDArray,
+        weights: NDArray,
+        groups: NDArray | None,
+        spread: float,
+    ) -> None:
+        self._error = error
+        self._weights = weights
+        self._spread = spread
+        self._splits = folds_of(X, groups)
+        self._root = np.sqrt(weights).reshape(-1, *[1] * (error.ndim - 1))
+        with TURNS.filters:
+            self._squares = euclidean_distances(X.astype(np.float64), squared=True)
+        self._kernel = lru_cache(1)(self._weighted_kernel)
+        self.distance = cache(self._distance)
+
+    def best_near(self, at: Place, steps: Iterable[Place]) -> Place:
+        """Return the place from which none of the steps leads to a smaller distance."""
+        previous = None
+        while at != previous:
+            previous = at
+            near = [(at[0] + width, at[1] + penalty) for width, penalty in steps]
+            inside = [one for one in near if one[0] in _WIDTHS and one[1] in _PENALTIES]
+            at = min([at, *inside], key=self.distance)
+        return at
+
+    def _weighted_kernel(self, width: int) -> NDArray:
+        kernel = np.exp(-_GAMMAS[width] / self._spread * self._squares)
+        return kernel * np.outer(self._root, self._root)
+
+    def _distance(self, at: Place) -> float:
+        """Return the sum of held-out distances."""
+        total = 0.0
+        K = self._kernel(at[0])
+        targets = self._root * self._error
+        for train, test in self._splits:
+            system = K[np.ix_(train, train)]
+            system.flat[:: len(train) + 1] += _ALPHAS[at[1]]
+            try:
+                factor = cho_factor(system.T, True, True, False)
+            except LinAlgError:
+                return inf
+            predicted = K[np.ix_(test, train)] @ cho_solve(factor, targets[train])
+            far = distance(predicted / self._root[test], self._error[test])
+            total += float(self._weights[test] @ far)
+        return total
