@@ -28,7 +28,6 @@ from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
 
 # Times the largest eigenvalue of the features' Gram matrix.
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)
-_NEAR = 3  # of these on each side of the best one of the candidate before are tried
 # Factors on the best weight scale, tried with new input scales.
 _ZOOM = (
     0.5,
@@ -98,8 +97,7 @@ class ELMRegressorCV(FittedNetwork):
         a row was held out more than once; NaN if never, or if its weight is 0.
     cv_results_ : dict of ndarray
         One row per candidate: n_hidden, weight_scale, relevance (n_inputs,), alphas and
-        mean_squared_error (n_alphas,). With alphas="auto" only the first candidate tries all
-        penalties, the others those near the best; the error of the rest is infinite.
+        mean_squared_error (n_alphas,).
     module_ : ELM
         The fitted network as a torch module.
     n_features_in_ : int
@@ -225,7 +223,7 @@ class ELMRegressorCV(FittedNetwork):
         tried = []
         for size, scale in product(sizes, scales):
             params = {**shared, "n_hidden": int(size), "weight_scale": float(scale)}
-            tried.append(_candidate(params, untouched, task, *tried[-1:]))
+            tried.append(_candidate(params, untouched, task))
         best = min(tried, key=lambda candidate: candidate.score)
         for _ in range(self.relevance_rounds):
             relevance, bounds = _relevance(best, task)
@@ -237,7 +235,7 @@ class ELMRegressorCV(FittedNetwork):
                     "weight_scale": scale,
                     "input_scaling": bounds,
                 }
-                tried.append(_candidate(params, relevance, task, before))
+                tried.append(_candidate(params, relevance, task))
             best = min(
                 best, *tried[-len(_ZOOM) :], key=lambda candidate: candidate.score
             )
@@ -245,7 +243,7 @@ class ELMRegressorCV(FittedNetwork):
                 break
         while 2 * best.params["n_hidden"] <= self.max_hidden:
             params = {**best.params, "n_hidden": 2 * best.params["n_hidden"]}
-            tried.append(_candidate(params, best.relevance, task, best))
+            tried.append(_candidate(params, best.relevance, task))
             if not tried[-1].score < _WORTH_GROWING * best.score:
                 break
             best = tried[-1]
@@ -306,43 +304,25 @@ class _Candidate(NamedTuple):
 
 
 @np.errstate(all="ignore")  # errors that overflow are never the smallest
-def _candidate(params, relevance, task, before=None):
-    """Return a candidate; penalties are tried near the best one of the candidate `before` it."""
-    X = task.X
-    targets = task.targets
+def _candidate(params, relevance, task):
+    X, targets, sample_weight, weights, splits, alphas = task
     candidate = ELMRegressor(**params)
-    elm = draw_layer(candidate, X, task.sample_weight)
-    elm.to(device_named(candidate.device))
-    stats = gather(None, elm, X, targets, task.sample_weight, candidate.block_size)
-    left_out = LeftOut(elm, stats, X, targets, task.weights, candidate.fit_intercept)
-    automatic = isinstance(task.alphas, str)
-    if automatic:
-        alphas = _AUTO_ALPHAS * (left_out.eigenvalues[-1] or 1.0)
+    elm = draw_layer(candidate, X, sample_weight).to(device_named(candidate.device))
+    stats = gather(None, elm, X, targets, sample_weight, candidate.block_size)
+    left_out = LeftOut(elm, stats, X, targets, weights, candidate.fit_intercept)
+    largest = left_out.eigenvalues[-1] or 1.0
+    if isinstance(alphas, str):
+        alphas = _AUTO_ALPHAS * largest
     else:
-        alphas = _positive(task.alphas, "alphas")
-    if before is None or not automatic:
-        mse = _mean_squared_error(left_out, task, alphas)
-    else:
-        mse = np.full(len(alphas), np.inf)
-        place = None
-        best = before.mean_squared_error.argmin()
-        while place is None or abs(best - place) >= _NEAR:
-            place = best
-            near = slice(max(place - _NEAR, 0), place + _NEAR + 1)
-            mse[near] = _mean_squared_error(left_out, task, alphas[near])
-            best = mse.argmin()
+        alphas = _positive(alphas, "alphas")
+    total = np.zeros((len(alphas), targets.shape[1]))
+    weight = 0.0
+    for rows, errors in _errors(left_out, splits, alphas):
+        total += np.einsum("r, lrm -> lm", weights[rows], errors * errors)
+        weight += weights[rows].sum()
+    mse = np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
     params = {**params, "alpha": float(alphas[mse.argmin()])}
     return _Candidate(params, relevance, alphas, mse, float(mse.min()), left_out)
-
-
-def _mean_squared_error(left_out, task, alphas):
-    """Return the mean squared held-out error (n_alphas,) of each penalty."""
-    total = np.zeros((len(alphas), task.targets.shape[1]))
-    weight = 0.0
-    for rows, errors in _errors(left_out, task.splits, alphas):
-        total += np.einsum("r, lrm -> lm", task.weights[rows], errors * errors)
-        weight += task.weights[rows].sum()
-    return np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
 
 
 def _errors(left_out, splits, alphas):
