@@ -51,7 +51,7 @@ def select(
     Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
     but one, and to the inner rows, each time with the mechanical model calibrated on the same rows.
     The predictions for the held-out and the outer rows give the weights of the blend. It can be a
-    single candidate. With few motions its penalties are then chosen once more without each fold:
+    single candidate. With few motions its penalties are then chosen once more without three folds:
     penalties that suit the held-out rows would make the error to expect too small.
 
     Parameters
