@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel, RigidChain
+from hybridkin.calibration.calibrate import refitted
 from hybridkin.calibration.choice import choose_geometry
 
 NOISE = 5e-4
@@ -129,3 +130,17 @@ def test_rigid_robots_choose_their_base():
     q = np.random.default_rng(0).uniform(-1, 1, (60, 2))
     moved = arm.with_geometry(base=moved_base())
     assert choose_geometry(arm, q, measured(moved, q)).name == "base"
+
+
+def test_rows_held_out_of_a_long_log_are_predicted_from_evenly_spaced_others():
+    """Of many rows 500 calibrate: with exact tips they give the robot, with noise nearly."""
+    truth = bent(base=moved_base())
+    q = chambers(1500)
+    exact = truth(torch.from_numpy(q))
+    choice = choose_geometry(ConstantCurvatureChain([0.05]), q, exact, outside=False)
+    weights = torch.ones(len(q), dtype=torch.float64)
+    chain = refitted(choice.start, torch.from_numpy(q), exact, weights)
+    assert (chain(torch.from_numpy(q)) - exact).norm(dim=1).max() < 1e-7
+    noisy = torch.from_numpy(measured(truth, q))
+    chain = refitted(choice.start, torch.from_numpy(q), noisy, weights)
+    assert (chain(torch.from_numpy(q)) - exact).norm(dim=1).mean() < 0.3 * NOISE
