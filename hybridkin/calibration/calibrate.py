@@ -30,7 +30,12 @@ from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, so
 from hybridkin.calibration._parameters import ALIASES, parameter_names
 from hybridkin.calibration._search import Start, search
 from hybridkin.calibration._unidentified import sentences
-from hybridkin.calibration.measured import folds, points, with_missing_markers
+from hybridkin.calibration.measured import (
+    evenly_spaced,
+    folds,
+    points,
+    with_missing_markers,
+)
 from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
@@ -277,10 +282,8 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     """
     like = start.problem.chain.geometry()["base"]
     rows = Rows(*(part.to(like) for part in (q, x, weights)))
-    spaced = np.linspace(0, len(q) - 1, min(_ENOUGH, len(q))).astype(int)
-    return solve(
-        start.problem, rows.take(spaced), start.theta, "linear", HELD_OUT
-    ).chain()
+    some = rows.take(evenly_spaced(len(q), _ENOUGH))
+    return solve(start.problem, some, start.theta, "linear", HELD_OUT).chain()
 
 
 def _few(fit: Fit, rows: Rows) -> str | None:

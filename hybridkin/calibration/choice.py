@@ -18,7 +18,7 @@ from hybridkin._core.model import ForwardModel
 from hybridkin.calibration._least_squares import LOSSES, ROUGH, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration.calibrate import check_data
-from hybridkin.calibration.measured import folds, inner_and_outer
+from hybridkin.calibration.measured import evenly_spaced, folds, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -184,9 +184,7 @@ def choose_geometry(
         chosen_rows = np.arange(len(q))
     else:
         chosen_rows = np.argsort(groups, kind="stable")
-    chosen_rows = np.sort(
-        chosen_rows[np.linspace(0, len(q) - 1, min(_MOST, len(q))).astype(int)]
-    )
+    chosen_rows = np.sort(chosen_rows[evenly_spaced(len(q), _MOST)])
     if weights is None:
         counts = q.new_ones(len(q))
     else:

@@ -97,6 +97,11 @@ def folds(
         return [*splitter.split(X, groups=groups)]
 
 
+def evenly_spaced(n: int, most: int) -> NDArray[np.intp]:
+    """Return the places of at most `most` of n rows, evenly spaced."""
+    return np.linspace(0, n - 1, min(most, n)).astype(np.intp)
+
+
 def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:
     """Return the inner 40 % and the outer 35 % of rows by Mahalanobis distance from the mean.
 

@@ -14,7 +14,7 @@ from sklearn.kernel_ridge import KernelRidge
 from sklearn.metrics.pairwise import euclidean_distances
 
 from hybridkin._core.turns import TURNS
-from hybridkin.calibration.measured import distance, folds
+from hybridkin.calibration.measured import distance, evenly_spaced, folds
 
 _MOST = 10_000  # rows; the matrices then take 3 GB
 _FOLDS = 5
@@ -51,7 +51,8 @@ def tuned_kernel(
             "error_model=ELMRegressorCV()."
         )
     spread = X.var(axis=0).mean() or 1.0
-    spaced = np.linspace(0, len(X) - 1, min(_ENOUGH, len(X))).astype(int)
+    spaced = evenly_spaced(len(X), _ENOUGH)
+    # Without a whole motion the folds would not be those of the log.
     if groups is not None and len(np.unique(groups[spaced])) < len(np.unique(groups)):
         spaced = np.arange(len(X))
     some_groups = None if groups is None else groups[spaced]
@@ -92,8 +93,8 @@ class _HeldOut:
         while at != previous:
             previous = at
             near = [(at[0] + width, at[1] + penalty) for width, penalty in steps]
-            inside = [one for one in near if one[0] in _WIDTHS and one[1] in _PENALTIES]
-            at = min([at, *inside], key=self.distance)
+            inside = set(near) & set(product(_WIDTHS, _PENALTIES))
+            at = min([at, *sorted(inside)], key=self.distance)
         return at
 
     def _weighted_kernel(self, width: int) -> NDArray:

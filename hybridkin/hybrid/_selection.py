@@ -38,7 +38,7 @@ _FEW_MOTIONS, _FEW_ROWS = (
     40,
     100,
 )
-_ANEW = 3  # folds without which penalties are then chosen once more
+_ANEW = 3  # folds, without each of which penalties are then chosen once more
 
 
 def select(
@@ -51,8 +51,8 @@ def select(
     Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
     but one, and to the inner rows, each time with the mechanical model calibrated on the same rows.
     The predictions for the held-out and the outer rows give the weights of the blend. It can be a
-    single candidate. With few motions its penalties are then chosen once more without three folds:
-    penalties that suit the held-out rows would make the error to expect too small.
+    single candidate. With few motions its penalties are then chosen once more without each of three
+    folds: penalties that suit the held-out rows would make the error to expect too small.
 
     Parameters
     ----------

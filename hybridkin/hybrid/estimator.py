@@ -131,7 +131,7 @@ class HybridForwardModel(HybridPredictor):
         that was calibrated; ``mechanical_model``: the same two errors of every set, "cv" and "io",
         without backlash [m]. On each fold the blend has weights chosen without that fold.
         ``expected_distance``: the mean distance to expect on new motions like those of the log [m].
-        With few groups or rows, the penalties are for this chosen without three folds, too.
+        With few groups or rows, the penalties are for this chosen without each of three folds.
     candidates_ : dict of str to nn.Module, or None
         For error_model="auto": every candidate of ``cv_results_``, fitted to all rows; a module
         from q to x as ``module_``, with `play` from the motion of the actuators. `adapt` and

@@ -21,15 +21,16 @@ def held_out(X, y, weights, groups, gamma, alpha):
 
 @pytest.mark.parametrize("n_outputs", [None, 3])
 @pytest.mark.parametrize("grouped", [False, True])
-@pytest.mark.parametrize("n_rows", [60, 700])  # the search begins on at most 600
-def test_no_neighbour_of_the_tuned_kernel_is_better(n_rows, n_outputs, grouped):
+@pytest.mark.parametrize("enough", [600, 24])  # rows on which the search begins
+def test_no_neighbour_of_the_tuned_kernel_is_better(enough, n_outputs, grouped, monkeypatch):
+    monkeypatch.setattr(_kernel, "_ENOUGH", enough)
     rng = np.random.default_rng(3)
-    X = rng.uniform(-0.1, 0.1, (n_rows, 2))
+    X = rng.uniform(-0.1, 0.1, (60, 2))
     y = 0.01 * np.sin(20.0 * X @ rng.standard_normal((2, n_outputs or 1)))
     y += 1e-3 * rng.standard_normal(y.shape)
     y = y if n_outputs else y[:, 0]
-    weights = rng.integers(1, 4, n_rows).astype(float)
-    groups = np.arange(n_rows) // 6 if grouped else None
+    weights = rng.integers(1, 4, 60).astype(float)
+    groups = np.arange(60) // 6 if grouped else None
     found = tuned_kernel(X, y, weights, groups)
     spread = X.var(axis=0).mean()
     best = held_out(X, y, weights, groups, found.gamma, found.alpha)
