@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hybridkin.learning.elm import ELMRegressor
     from hybridkin.learning.elm_cv import ELMRegressorCV
     from hybridkin.saving.saved_model import load_model, save_model
+    from hybridkin.viewer import view
 
 __all__ = [
     "CalibrationResult",
@@ -57,6 +58,7 @@ __all__ = [
     "save_model",
     "tasks",
     "trajectories",
+    "view",
     "workflow",
 ]
 
@@ -76,6 +78,7 @@ _NAMES_OF = {
     "learning.elm": ("ELMRegressor",),
     "learning.elm_cv": ("ELMRegressorCV",),
     "saving.saved_model": ("load_model", "save_model"),
+    "viewer": ("view",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 _FOLDER_OF = {"robots": "chains.", "tasks": "ik.", "trajectories": "ik."}

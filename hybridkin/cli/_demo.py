@@ -71,6 +71,9 @@ def summary(out: Path, records: dict[str, dict[str, Any]]) -> Report:
         f"Track: by the model the tip reaches {track['reached']} of {track['n']} points. A robot "
         f"misses them by about the held-out error, {means[saved]:.1f} mm on average.",
         f"Look at {out}/track.gif, {out}/model/report.md and {out}/robot.toml.",
+        "Take the tip and pull, in the browser:\n"
+        f"$ hybridkin view {shlex.quote((out / 'model').as_posix())} "
+        f"{shlex.quote((out / 'log.csv').as_posix())}",
         "For your own robot, with a log of its actuators and its tip:\n"
         "$ hybridkin init robot.toml --log log.csv\n"
         "$ hybridkin fit log.csv --robot robot.toml --out model\n"

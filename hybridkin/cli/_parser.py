@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
     begin = (_demo, _init, _describe, _fit, _evaluate)
-    use = (_track, _verify, _animate)
+    use = (_view, _track, _verify, _animate)
     for add_options in (*begin, *use, _next, _export):
         text = _help(add_options)
         line = text["description"].partition("\n")[0].rstrip(".")
@@ -311,6 +311,38 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="exit with 1 if the mean error is larger",
     )
+    _add_log(command)
+
+
+def _view(command: argparse.ArgumentParser) -> None:
+    """Show the robot in the browser, to drag its tip and move its actuators.
+
+    Opens a page of this machine with the robot in 3D. Drag the target, and the tip follows; move a
+    slider, and an actuator moves. "Wiggle every actuator" shows whether a description bends the
+    right way. With a log its tips are coloured by the error of the model. Ctrl-C ends it.
+
+    Some examples:
+      hybridkin view model
+      hybridkin view robot.toml log.csv
+      hybridkin view model --q-min=-8 --q-max 8 --dq-max 20
+      hybridkin view model --no-browser --port 9000    # over ssh: forward this port
+
+    Limits are in the unit and sign of the robot's logs. Default: those of `track`; without any, the
+    range of the log. Only this machine can open the page, unless --host says otherwise; it has no
+    password.
+    """
+    add = command.add_argument
+    _add_model(command)
+    add("log", type=Path, nargs="?", metavar="LOG", help="measured rows to show")
+    add(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="listen here (this machine)",
+    )
+    add("--port", type=count, default=8080, help="port, or the next free one (8080)")
+    add("--no-browser", action="store_true", help="print the address, open nothing")
+    _add_limits(command)
     _add_log(command)
 
 

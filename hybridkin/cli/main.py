@@ -11,6 +11,7 @@ import sys
 import tempfile
 import threading
 import warnings
+import webbrowser
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -31,7 +32,7 @@ from hybridkin.cli._terminal import Stages, shown
 
 if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
-    from hybridkin.chains.robots import LogFormat
+    from hybridkin.chains.robots import Limits, LogFormat
     from hybridkin.datasets import LogReport
     from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits
 
@@ -236,6 +237,25 @@ def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     return _Outcome(report.record, shown(report), paths, code)
 
 
+def _view(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    log = None
+    if arguments.log is not None:
+        robot_format = None if loaded.description is None else loaded.description.log
+        log_format = _log_format(arguments, robot_format, arguments.model)
+        log = _read(arguments, log_format, None, True, stages)
+    limits = _scaled_limits(arguments, loaded)
+    place = {"host": arguments.host, "port": arguments.port}
+    with hybridkin.view(loaded, log, **vars(limits), **place) as shown_robot:
+        address = shown_robot.address
+        stages.note(f"{loaded.name} is at {address}. Ctrl-C ends it.", important=True)
+        if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:
+            webbrowser.open(address)
+        with contextlib.suppress(KeyboardInterrupt):
+            shown_robot.wait()
+    return _Outcome({"address": address}, "The view is closed.")
+
+
 def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
@@ -406,6 +426,7 @@ _COMMANDS = (
     _next,
     _fit,
     _evaluate,
+    _view,
     _track,
     _verify,
     _animate,
@@ -420,12 +441,17 @@ _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 def _limits(
     arguments: argparse.Namespace, loaded: LoadedModel, **options: bool
 ) -> PathLimits:
+    """Return the limits of a track with what the arguments say."""
+    scaled = _scaled_limits(arguments, loaded)
+    return hybridkin.workflow.path_limits(loaded, **vars(scaled), **options)
+
+
+def _scaled_limits(arguments: argparse.Namespace, loaded: LoadedModel) -> Limits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
     limits = {
         name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max", "ddq_max")
     }
-    scaled = hybridkin.robots.Limits(**limits).scaled(loaded.log_format().q_factor)
-    return hybridkin.workflow.path_limits(loaded, **vars(scaled), **options)
+    return hybridkin.robots.Limits(**limits).scaled(loaded.log_format().q_factor)
 
 
 def _note(found: LogReport, stages: Stages) -> None:

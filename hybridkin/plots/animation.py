@@ -25,9 +25,9 @@ from hybridkin.plots._canvas import (
     space_or_new,
     steps_of,
 )
-from hybridkin.plots._models import Model, predicted
 from hybridkin.plots._page import page
 from hybridkin.plots._scene import Line, Scene, Stage
+from hybridkin.plots.models import Model, predicted
 from hybridkin.plots.space import BackboneDisplay
 
 _FORMATS = (".mp4", ".gif", ".html")

@@ -23,7 +23,7 @@ from hybridkin.plots._canvas import (
     looks_of,
     scale_of,
 )
-from hybridkin.plots._models import Predictor, predicted
+from hybridkin.plots.models import Predictor, predicted
 
 _MOST_TICKS = 8
 

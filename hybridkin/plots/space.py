@@ -15,8 +15,8 @@ from typing_extensions import Self
 from hybridkin._core.arrays import whole
 from hybridkin.plots._arrays import distance, plain, shaped
 from hybridkin.plots._canvas import COLORS, Display, label_space, scale_of, space_or_new
-from hybridkin.plots._models import Model, body_of
 from hybridkin.plots._scene import Line
+from hybridkin.plots.models import Model, body_of
 
 _BODY = "#404040"
 # Of the actuators by segment; dark and light alternate, for prints without colour.

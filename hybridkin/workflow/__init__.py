@@ -1,7 +1,7 @@
 """From a log to a model, a report and a track: the functions behind the command line."""
 
 from hybridkin.workflow._describe import describe
-from hybridkin.workflow._domain import PathLimits, path_limits
+from hybridkin.workflow.domain import PathLimits, path_limits
 from hybridkin.workflow.evaluate import evaluate_log
 from hybridkin.workflow.export import export_model
 from hybridkin.workflow.fit import Comparison, FitSettings, compare_by_group, fit_log

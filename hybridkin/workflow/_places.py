@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.workflow._domain import Domain
+from hybridkin.workflow.domain import Domain
 from hybridkin.workflow.report import in_millimetres
 
 _POINTS = (

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.workflow._domain import Domain
 from hybridkin.workflow._places import solver, some_rows
+from hybridkin.workflow.domain import Domain
 from hybridkin.workflow.path import scaled_path
 from hybridkin.workflow.report import Progress, in_millimetres
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.native.export import export_c
-from hybridkin.workflow._domain import Domain, PathLimits, path_limits
+from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report
 

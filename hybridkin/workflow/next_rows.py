@@ -12,7 +12,7 @@ from hybridkin._core.units import METRES
 from hybridkin.calibration.measured import distance
 from hybridkin.hybrid.choose_rows import choose_rows
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.workflow._domain import Domain, PathLimits, path_limits
+from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, quiet

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from hybridkin._core.arrays import as_array, as_path, number, one_of, real_array
 from hybridkin.ik import trajectories
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.workflow._domain import Domain, PathLimits
 from hybridkin.workflow._places import placed
+from hybridkin.workflow.domain import Domain, PathLimits
 from hybridkin.workflow.model import LoadedModel
 
 _TOL = 1e-4  # of a point that lies in the domain [m]

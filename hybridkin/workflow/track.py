@@ -22,9 +22,9 @@ from hybridkin.ik.results import IKStatus, Track, score
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.plots import ActuatorDisplay, TrackAnimation, TrackingDisplay, new_figure
-from hybridkin.workflow._domain import Domain, PathLimits, path_limits
 from hybridkin.workflow._places import better_place
 from hybridkin.workflow._reach import check_reach
+from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, check_out, millimetres, quiet
 

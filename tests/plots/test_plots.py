@@ -22,7 +22,7 @@ from hybridkin import (
     robots,
     trajectories,
 )
-from hybridkin.plots._models import body_of
+from hybridkin.plots.models import body_of
 
 SPACE = {"projection": "3d"}
 SHIFT = np.array([0.0, 0.01, -0.02])

@@ -22,7 +22,7 @@ from hybridkin import (
 )
 from hybridkin.cli.main import main
 from hybridkin.hybrid.estimator import fit_quietly
-from hybridkin.workflow._domain import Domain
+from hybridkin.workflow.domain import Domain
 
 ROBOT = """
 calibrate = ["radii", "base"]

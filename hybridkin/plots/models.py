@@ -24,7 +24,9 @@ _REACHED = 1e-6  # largest distance of a drawn tip from its place [m]
 class Predictor(Protocol):
     """A fitted estimator."""
 
-    def predict(self, X: object, /) -> Any: ...
+    def predict(self, X: object, /) -> Any:
+        """Return tips (N, m) for actuator vectors (N, n)."""
+        ...
 
 
 Model: TypeAlias = Predictor | torch.nn.Module
