@@ -7,7 +7,7 @@ TESTS := -q -n auto --maxprocesses 4 --dist worksteal
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test quick bench examine coverage check docs clean dist oldest native
+.PHONY: paper test quick view-test bench examine coverage check docs clean dist oldest native
 
 paper: $(VENV)/.native
 	$(BIN)/python examples/paper --out $(OUT)
@@ -17,6 +17,10 @@ test: $(VENV)/.native
 
 quick: $(VENV)/.native
 	$(BIN)/python -m pytest tests $(TESTS) -m "not slow"
+
+# The live view in a real browser; needs Chromium of the system.
+view-test: $(VENV)/.browser $(VENV)/.native
+	$(BIN)/python -m pytest -q tests/viewer -m browser
 
 bench: $(VENV)/.bench $(VENV)/.native
 	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet
@@ -69,6 +73,10 @@ $(VENV)/.bench: $(VENV)/.installed
 
 $(VENV)/.examine: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --group examine
+	touch $@
+
+$(VENV)/.browser: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --group browser
 	touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

@@ -6,6 +6,7 @@ import csv
 import io
 import time
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -15,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.datasets import Log
@@ -133,7 +135,10 @@ class LiveView:
             ) from error
         self.robot = robot
         self.ticks_per_second = 0.0
-        self._server = viser.ViserServer(host, port, verbose=False, label="hybridkin")
+        with redirect_stdout(io.StringIO()):  # it prints, also if not verbose
+            self._server = viser.ViserServer(
+                host, port, verbose=False, label="hybridkin"
+            )
         self.address = f"http://{host}:{self._server.get_port()}"
         self._wake = Event()
         self._closed = False
@@ -183,7 +188,8 @@ class LiveView:
             self._closed = True
             self._wake.set()
             self._thread.join()
-            self._server.stop()
+            with redirect_stdout(io.StringIO()):
+                self._server.stop()
 
     def wait(self) -> None:
         """Wait until the view is closed, or Ctrl-C."""
@@ -406,6 +412,8 @@ class _Body:
         self._chain = robot.loaded.chain
         body = body_of(model, robot.q, _POINTS)
         self._thick = 0.015 * robot.size
+        if isinstance(self._chain, ArcChain):
+            self._thick = min(self._thick, 0.4 * float(self._chain.radii.min()))
         self._backbone = scene.add_spline_catmull_rom(
             "/robot/backbone",
             body["points"][0],

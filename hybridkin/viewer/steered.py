@@ -19,7 +19,7 @@ RATE = 50.0  # ticks per second
 _GAIN = 8.0  # [1/s]
 _TRAVEL = 1.0  # time for the whole range of an actuator without a limit of speed [s]
 _CLOSE = 1e-3  # distance to a target that is reached, relative to the size of the robot
-_STILL = 1e-4  # largest step of a robot at rest, relative to the range of an actuator
+_STILL = 1e-5  # largest step of a robot at rest, relative to the range of an actuator
 _REMEMBERED = 30_000  # commands kept: ten minutes
 
 

@@ -1,0 +1,139 @@
+"""The live view: what it draws and says, without a browser."""
+
+import builtins
+import socket
+import time
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+import hybridkin
+from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots
+from hybridkin.cli.main import main
+
+pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    data = datasets.load_trunk()
+    rows = datasets.paper_split(data, random_state=0)[0][:300]
+    chain = robots.bionic_handling_assistant()
+    model = HybridForwardModel(chain, "quadratic", calibrate="default", random_state=0)
+    log = datasets.Log(data.q[rows], data.x[rows])
+    return model.fit(log.q, log.x), log
+
+
+@pytest.fixture
+def shown(fitted):
+    with hybridkin.view(*fitted, port=9300) as view:
+        yield view
+
+
+def until(condition, seconds=10.0):
+    """Wait until a condition holds; fail after some seconds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_the_tip_follows_the_target_and_the_page_says_so(shown):
+    target = shown.robot.x + np.array([0.1, 0.05, -0.02])
+    shown.follow(target)
+    until(lambda: np.linalg.norm(shown.robot.x - target) < 1e-3)
+    until(lambda: "On target" in shown._words.content)
+    time.sleep(0.3)
+    assert np.linalg.norm(shown.robot.x - target) < 1e-3
+    assert shown._aim.position == pytest.approx(target)
+    sliders = np.array([slider.value for slider in shown._sliders])
+    assert sliders == pytest.approx(shown.robot.q, abs=5e-4)
+    assert shown._body._backbone.points[-1] == pytest.approx(shown.robot.x, abs=0.01)
+
+
+def test_out_of_reach_is_red(shown):
+    shown.follow([2.0, 0.0, 0.0])
+    until(lambda: "Out of reach" in shown._words.content)
+    assert tuple(shown._ball.color) == (210, 50, 50)
+
+
+def test_a_robot_at_rest_costs_nothing(shown):
+    until(lambda: not shown.robot.tick())
+    time.sleep(0.2)
+    start = time.process_time()
+    time.sleep(1.0)
+    assert time.process_time() - start < 0.05
+
+
+def test_every_actuator_wiggles_and_the_robot_returns(shown):
+    seen = []
+    move = shown.robot.go_to
+    shown.robot.go_to = lambda q: (seen.append(q), move(q))
+    buttons = {h.label: h for h in shown._server.gui._gui_input_handle_from_uuid.values()}
+    (start,) = buttons["Wiggle every actuator"]._impl.update_cb
+    start(None)
+    until(lambda: len(seen) == 19 and shown._motion is None, 60.0)
+    away = np.array(seen[1::2]) - seen[0]
+    assert (np.count_nonzero(away, axis=1) == 1).all()
+    assert sorted(np.argmax(abs(away), axis=1)) == [*range(9)]
+    assert shown.robot.q == pytest.approx(seen[0])
+
+
+def test_a_closed_view_frees_its_port_and_a_taken_port_is_passed_over(fitted):
+    with hybridkin.view(*fitted, port=9310) as first, hybridkin.view(*fitted, port=9310) as second:
+        assert first.address != second.address
+        ports = [int(view.address.rpartition(":")[2]) for view in (first, second)]
+    for port in ports:
+        with socket.socket() as probe:
+            assert probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def test_rubbish_from_a_client_does_not_stop_the_view(shown):
+    import viser
+    from websockets.exceptions import WebSocketException
+    from websockets.sync.client import connect
+
+    address = shown.address.replace("http", "ws")
+    protocol = f"viser-v{viser.__version__}"
+    for rubbish in (b"\xff" * 1000, "not a message", b""):
+        with suppress(WebSocketException, TimeoutError, OSError):
+            with connect(address, subprotocols=[protocol], open_timeout=2) as client:
+                client.send(rubbish)
+                client.recv(timeout=0.2)
+    shown.follow(shown.robot.x + np.array([0.02, 0.0, 0.0]))
+    until(lambda: shown.robot.situation.reached)
+
+
+def test_messages_of_what_cannot_be_shown(fitted, monkeypatch):
+    data_only = ELMRegressor(20).fit(fitted[1].q, fitted[1].x)
+    with pytest.raises(TypeError, match="mechanical part"):
+        hybridkin.view(data_only)
+    with pytest.raises(ValueError, match="q_min"):
+        hybridkin.view(robots.bionic_handling_assistant())
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name == "viser":
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"hybridkin\[view\]"):
+        hybridkin.view(fitted[0])
+
+
+def test_the_command_ends_at_ctrl_c(fitted, tmp_path, capsys, monkeypatch):
+    hybridkin.save_model(fitted[0], tmp_path / "model.safetensors")
+    opened = []
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr(
+        hybridkin.viewer.LiveView, "wait", lambda view: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
+    assert main(["view", str(tmp_path / "model.safetensors"), "--port", "9320"]) == 0
+    out, err = capsys.readouterr()
+    assert "closed" in out
+    assert opened
+    assert opened[0] in err
+    assert opened[0].startswith("http://127.0.0.1:93")
