@@ -28,6 +28,8 @@ ELSEWHERE = {
         "extra_repr",
     ),
     "with_geometry",
+    # threads and rubbish: tests/viewer
+    *("view", "follow", "go_to", "close", "wait"),
     # files: hostile ones are an examination of their own
     *("from_urdf", "from_mjcf", "to_urdf", "load_armlab", "load_asl_trunk", "load_ftdcr"),
     # arguments go to matplotlib, or are dictionaries and sentences
