@@ -8,9 +8,9 @@ import torch
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, IKStatus, workflow
 from hybridkin.ik import trajectories
-from hybridkin.workflow.domain import Domain
 from hybridkin.workflow._places import better_place, placed, solver
 from hybridkin.workflow._promise import Promise
+from hybridkin.workflow.domain import Domain
 
 rng = np.random.default_rng(0)
 
