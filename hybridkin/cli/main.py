@@ -397,7 +397,12 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         code = 0 if read.report.ok else 1
     log_name, robot_name = (shlex.quote(str(path)) for path in (log or "log.csv", out))
     fit = f"hybridkin fit {log_name} --robot {robot_name} --out model"
-    report.text(f"Read through {out}, then fit a model:\n$ {fit}")
+    look = shlex.join(["hybridkin", "view", str(out), *map(str, filter(None, [log]))])
+    report.text(
+        f"Read through {out}, and look whether every actuator bends the robot the "
+        f"right way:\n$ {look}",
+        f"Then fit a model:\n$ {fit}",
+    )
     write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
     return _Outcome(report.record, shown(report), [out], code)
 
