@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -142,7 +142,7 @@ class LiveView:
         self.address = f"http://{host}:{self._server.get_port()}"
         self._wake = Event()
         self._closed = False
-        self._motion: Callable[[], bool] | None = None  # of a path, a wiggle or a log
+        self._motion: _Motion | None = None
         self._said = 0.0
         scene = self._server.scene
         loaded = robot.loaded
@@ -297,9 +297,7 @@ class LiveView:
             button = gui.add_button("Download the commands")
             button.on_click(self._download)
 
-    def _button(
-        self, name: str, motion: Callable[[], Callable[[], bool] | None]
-    ) -> None:
+    def _button(self, name: str, motion: Callable[[], _Motion | None]) -> None:
         def start(_: object) -> None:
             self._motion = motion()
             self._wake.set()
@@ -398,10 +396,26 @@ class LiveView:
             lines.append(f"error {1e3 * situation.error:.2f} mm")
         lines.append("at limits: " + (", ".join(held) or "none"))
         lines.append(f"{self.ticks_per_second:.0f} ticks/s")
+        if (motion := self._motion) is not None:
+            lines.append(f"moving: {motion.label}")
         self._words.content = "<br>".join(lines)
         for slider, value in zip(self._sliders, robot.q / self._factor, strict=True):
             if abs(slider.value - value) > 0.5 * slider.step:
                 slider.value = float(np.clip(value, slider.min, slider.max))
+
+
+class _Motion(Protocol):
+    """A motion: called before every tick, until it returns False.
+
+    Attributes
+    ----------
+    label : str
+        What moves at present, for the page.
+    """
+
+    label: str
+
+    def __call__(self) -> bool: ...
 
 
 class _Body:
@@ -427,6 +441,15 @@ class _Body:
             )
             for k, path in enumerate(body.get("actuators", []))
         ]
+        self._markers = None
+        if self._chain is not None and self._chain.n_outputs > 3:
+            self._markers = scene.add_point_cloud(
+                "/robot/markers",
+                self._marked(robot),
+                _BLUE,
+                point_size=2.0 * self._thick,
+                point_shape="circle",
+            )
         self._disks = None
         if "disks" in body:
             self._disks = scene.add_line_segments(
@@ -442,6 +465,8 @@ class _Body:
         self._tip.position = robot.x
         if self._disks is not None:
             self._disks.points = _rims(body)
+        if self._markers is not None:
+            self._markers.points = self._marked(robot)
         colors, slack = self._tensions(robot)
         for k, handle in enumerate(self._actuators):
             handle.points = body["actuators"][k][0]
@@ -451,6 +476,10 @@ class _Body:
                 handle.color = color
             if handle.thickness != thickness:
                 handle.thickness = thickness
+
+    def _marked(self, robot: SteeredRobot) -> NDArray:
+        """Return the markers (K, 3) as the model predicts them."""
+        return robot.loaded.predict(robot.q[None]).reshape(-1, 3)
 
     def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
         """Return colours (n, 3) of the actuators, and which are slack (n,)."""
@@ -495,6 +524,7 @@ class _Wiggle:
         low, high = robot.limits.q_min, robot.limits.q_max
         home = np.clip(robot.domain.preferred, low, high)
         self._robot = robot
+        self._names = robot.loaded.log_format().q
         self._steps = [home]
         for j in range(len(home)):
             there = home.copy()
@@ -502,6 +532,7 @@ class _Wiggle:
             there[j] += (_SWING if up else -_SWING) * robot.span[j]
             self._steps += [there, home]
         self._at = -1
+        self.label = ""
 
     def __call__(self) -> bool:
         if self._at < 0 or np.array_equal(self._robot.q, self._steps[self._at]):
@@ -509,6 +540,7 @@ class _Wiggle:
             if self._at == len(self._steps):
                 return False
             self._robot.go_to(self._steps[self._at])
+            self.label = self._names[max(self._at - 1, 0) // 2]
         return True
 
 
@@ -520,6 +552,7 @@ class _Path:
         self._center = shown.robot.x
         self._kind = kind
         self._tick = 0
+        self.label = "the target"
 
     def __call__(self) -> bool:
         phase = 2.0 * np.pi * self._tick / (RATE * _TURN)
@@ -543,6 +576,8 @@ class _Replay:
         )
         self._rows = iter(zip(effective[fine], log.x[fine, -3:], strict=True))
         self._goal: NDArray | None = None
+        self._count = 0
+        self.label = ""
 
     def __call__(self) -> bool:
         limits = self._robot.limits
@@ -553,6 +588,8 @@ class _Replay:
                 return False
             goal = self._goal = np.clip(row, limits.q_min, limits.q_max)
             self._mark.position = tip
+            self._count += 1
+            self.label = f"row {self._count} of the log"
             self._robot.go_to(goal)
         return True
 

@@ -73,6 +73,7 @@ def test_every_actuator_wiggles_and_the_robot_returns(shown):
     buttons = {h.label: h for h in shown._server.gui._gui_input_handle_from_uuid.values()}
     (start,) = buttons["Wiggle every actuator"]._impl.update_cb
     start(None)
+    until(lambda: "moving: q5" in shown._words.content, 30.0)
     until(lambda: len(seen) == 19 and shown._motion is None, 60.0)
     away = np.array(seen[1::2]) - seen[0]
     assert (np.count_nonzero(away, axis=1) == 1).all()
@@ -137,3 +138,15 @@ def test_the_command_ends_at_ctrl_c(fitted, tmp_path, capsys, monkeypatch):
     assert opened
     assert opened[0] in err
     assert opened[0].startswith("http://127.0.0.1:93")
+
+
+def test_markers_are_drawn_where_the_model_predicts_them():
+    base = robots.bionic_handling_assistant()
+    chain = base.with_markers([(0, 1.0), (1, 1.0), (2, 1.0)])
+    with hybridkin.view(chain, q_min=0.1, q_max=0.4, port=9330) as shown:
+        shown.go_to(np.linspace(0.2, 0.3, 9))
+        until(lambda: shown.robot._resting)
+        time.sleep(0.2)
+        expected = shown.robot.loaded.predict(shown.robot.q[None]).reshape(3, 3)
+        assert shown._body._markers.points == pytest.approx(expected, abs=1e-3)
+        assert expected[-1] == pytest.approx(shown.robot.x)
