@@ -9,33 +9,34 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.plots.models import body_of
+from hybridkin.viewer.drawing import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    RED,
+    YELLOW,
+    Body,
+    Ghost,
+    between,
+)
+from hybridkin.viewer.motions import Loop, Motion, Replay, Wiggle
 from hybridkin.viewer.steered import RATE, SteeredRobot
 from hybridkin.workflow.domain import path_limits
 from hybridkin.workflow.model import LoadedModel
 
 __all__ = ["LiveView", "view"]
 
-_GREEN, _ORANGE, _RED = (40, 160, 80), (235, 150, 30), (210, 50, 50)
-_BLUE, _GREY, _YELLOW = (40, 90, 200), (150, 150, 150), (250, 215, 70)
-_GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
-_POINTS = 10  # drawn along a segment
 _MOST_ROWS = 2000  # of a log, drawn as a cloud
-_SWING = 0.3  # of a wiggle, relative to the range of the actuator
 _CAMERA = np.array([0.9, -1.1, 0.4])  # from the middle, relative to the robot's size
-_TURN = 8.0  # time of one turn on a path [s]
 _SAID = 0.1  # between two updates of the words [s]
 
 
@@ -121,7 +122,7 @@ class LiveView:
     address : str
         Address of the page.
     ticks_per_second : float
-        Rate of the last second in which the robot moved.
+        Rate while the robot moved, averaged over some ticks.
     """
 
     def __init__(
@@ -142,7 +143,7 @@ class LiveView:
         self.address = f"http://{host}:{self._server.get_port()}"
         self._wake = Event()
         self._closed = False
-        self._motion: _Motion | None = None
+        self._motion: Motion | None = None
         self._said = 0.0
         scene = self._server.scene
         loaded = robot.loaded
@@ -154,13 +155,13 @@ class LiveView:
         scene.add_frame(
             "/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size
         )
-        self._body = _Body(scene, loaded.model, robot)
+        self._body = Body(scene, loaded.model, robot)
         self._ghosts = {
-            name: _Ghost(scene, name, chain, robot)
+            name: Ghost(scene, name, chain, robot)
             for name, chain in _other_models(loaded).items()
         }
         self._radius = scene.add_icosphere(
-            "/radius", 1.0, color=_ORANGE, opacity=0.2, visible=False
+            "/radius", 1.0, color=ORANGE, opacity=0.2, visible=False
         )
         self._aim = scene.add_transform_controls(
             "/target",
@@ -169,7 +170,7 @@ class LiveView:
             position=robot.target,
         )
         self._aim.on_update(self._dragged)
-        self._ball = scene.add_icosphere("/target/ball", 0.02 * robot.size, _GREEN)
+        self._ball = scene.add_icosphere("/target/ball", 0.02 * robot.size, GREEN)
         self._add_clouds(log)
         self._add_panel(log)
         self._show()
@@ -217,7 +218,7 @@ class LiveView:
                 scene.add_point_cloud(
                     "/reachable",
                     reach,
-                    _BLUE,
+                    BLUE,
                     point_size=size,
                     point_shape="circle",
                     visible=False,
@@ -235,7 +236,7 @@ class LiveView:
         rows, error = rows[drawn], error[drawn]
         largest = float(np.percentile(error, 95)) if len(error) else 1.0
         name = f"log, red: error of {1e3 * largest:.3g} mm or more"
-        colors = _between(_YELLOW, _RED, error / max(largest, 1e-12))
+        colors = between(YELLOW, RED, error / max(largest, 1e-12))
         self._clouds[name] = [
             scene.add_point_cloud(
                 "/log", tips[rows], colors, point_size=size, point_shape="circle"
@@ -255,7 +256,7 @@ class LiveView:
             scene.add_line_segments(
                 "/learned",
                 np.stack([from_, to], 1),
-                _ORANGE,
+                ORANGE,
                 thickness=0.3 * size,
                 visible=False,
             )
@@ -288,16 +289,18 @@ class LiveView:
             if self._expected() > 0.0:
                 self._switch("expected error", [self._radius])
         with gui.add_folder("Motion"):
-            self._button("Wiggle every actuator", lambda: _Wiggle(self))
-            self._button("Circle", lambda: _Path(self, np.array([1.0, 0.0])))
-            self._button("Figure eight", lambda: _Path(self, np.array([0.0, 1.0])))
+            self._button("Wiggle every actuator", lambda: Wiggle(self.robot))
+            self._button("Circle", lambda: Loop(self.robot, np.array([1.0, 0.0])))
+            self._button("Figure eight", lambda: Loop(self.robot, np.array([0.0, 1.0])))
             if log is not None:
-                self._button("Play the log", lambda: _Replay(self, log))
+                self._button(
+                    "Play the log", lambda: Replay(self.robot, log, self._measured)
+                )
             self._button("Stop", lambda: None)
             button = gui.add_button("Download the commands")
             button.on_click(self._download)
 
-    def _button(self, name: str, motion: Callable[[], _Motion | None]) -> None:
+    def _button(self, name: str, motion: Callable[[], Motion | None]) -> None:
         def start(_: object) -> None:
             self._motion = motion()
             self._wake.set()
@@ -384,9 +387,9 @@ class LiveView:
         robot = self.robot
         situation = robot.situation
         if not situation.reached:
-            color = _RED if situation.words.startswith("Out") else _ORANGE
+            color = RED if situation.words.startswith("Out") else ORANGE
         else:
-            color = _GREEN if situation.in_domain else _ORANGE
+            color = GREEN if situation.in_domain else ORANGE
         if tuple(self._ball.color) != color:
             self._ball.color = color
         names = robot.loaded.log_format().q
@@ -404,196 +407,6 @@ class LiveView:
                 slider.value = float(np.clip(value, slider.min, slider.max))
 
 
-class _Motion(Protocol):
-    """A motion: called before every tick, until it returns False.
-
-    Attributes
-    ----------
-    label : str
-        What moves at present, for the page.
-    """
-
-    label: str
-
-    def __call__(self) -> bool: ...
-
-
-class _Body:
-    """The robot: backbone, actuators and disks."""
-
-    def __init__(self, scene: Any, model: Any, robot: SteeredRobot) -> None:
-        self._model = model
-        self._chain = robot.loaded.chain
-        body = body_of(model, robot.q, _POINTS)
-        self._thick = 0.015 * robot.size
-        if isinstance(self._chain, ArcChain):
-            self._thick = min(self._thick, 0.4 * float(self._chain.radii.min()))
-        self._backbone = scene.add_spline_catmull_rom(
-            "/robot/backbone",
-            body["points"][0],
-            thickness=self._thick,
-            color=(60, 60, 60),
-        )
-        self._tip = scene.add_icosphere("/robot/tip", 0.012 * robot.size, (20, 20, 20))
-        self._actuators = [
-            scene.add_spline_catmull_rom(
-                f"/robot/actuator {k + 1}", path[0], thickness=0.4 * self._thick
-            )
-            for k, path in enumerate(body.get("actuators", []))
-        ]
-        self._markers = None
-        if self._chain is not None and self._chain.n_outputs > 3:
-            self._markers = scene.add_point_cloud(
-                "/robot/markers",
-                self._marked(robot),
-                _BLUE,
-                point_size=2.0 * self._thick,
-                point_shape="circle",
-            )
-        self._disks = None
-        if "disks" in body:
-            self._disks = scene.add_line_segments(
-                "/robot/disks", _rims(body), _GREY, thickness=0.3 * self._thick
-            )
-
-    def move(self, robot: SteeredRobot) -> None:
-        """Draw the robot where it is."""
-        body = body_of(self._model, robot.q, _POINTS)
-        if not np.isfinite(body["points"]).all():
-            return
-        self._backbone.points = body["points"][0]
-        self._tip.position = robot.x
-        if self._disks is not None:
-            self._disks.points = _rims(body)
-        if self._markers is not None:
-            self._markers.points = self._marked(robot)
-        colors, slack = self._tensions(robot)
-        for k, handle in enumerate(self._actuators):
-            handle.points = body["actuators"][k][0]
-            color = tuple(int(c) for c in colors[k])
-            thickness = (0.12 if slack[k] else 0.4) * self._thick
-            if tuple(handle.color) != color:
-                handle.color = color
-            if handle.thickness != thickness:
-                handle.thickness = thickness
-
-    def _marked(self, robot: SteeredRobot) -> NDArray:
-        """Return the markers (K, 3) as the model predicts them."""
-        return robot.loaded.predict(robot.q[None]).reshape(-1, 3)
-
-    def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
-        """Return colours (n, 3) of the actuators, and which are slack (n,)."""
-        chain = self._chain
-        if isinstance(chain, ElasticTendonChain):
-            with torch.no_grad():
-                tension = chain.tensions(torch.from_numpy(robot.q)).numpy()
-            share = tension / max(float(tension.max()), 1e-300)
-            return _between(_BLUE, _RED, share), tension <= 0.0
-        share = (robot.q - robot.limits.q_min) / robot.span
-        return _between(_RED, _BLUE, share), np.zeros(len(share), dtype=bool)
-
-
-class _Ghost:
-    """The backbone of another model at the same command."""
-
-    def __init__(
-        self, scene: Any, name: str, chain: Chain, robot: SteeredRobot
-    ) -> None:
-        self._chain = chain
-        self.line = scene.add_spline_catmull_rom(
-            f"/{name}",
-            body_of(chain, robot.q, _POINTS)["points"][0],
-            thickness=0.008 * robot.size,
-            color=_GHOSTS[name],
-            visible=False,
-        )
-
-    def move(self, robot: SteeredRobot) -> None:
-        """Draw it, if it is shown."""
-        if self.line.visible:
-            points = body_of(self._chain, robot.q, _POINTS)["points"][0]
-            if np.isfinite(points).all():
-                self.line.points = points
-
-
-class _Wiggle:
-    """Every actuator moves out and back, one after another."""
-
-    def __init__(self, shown: LiveView) -> None:
-        robot = shown.robot
-        low, high = robot.limits.q_min, robot.limits.q_max
-        home = np.clip(robot.domain.preferred, low, high)
-        self._robot = robot
-        self._names = robot.loaded.log_format().q
-        self._steps = [home]
-        for j in range(len(home)):
-            there = home.copy()
-            up = high[j] - home[j] > home[j] - low[j]
-            there[j] += (_SWING if up else -_SWING) * robot.span[j]
-            self._steps += [there, home]
-        self._at = -1
-        self.label = ""
-
-    def __call__(self) -> bool:
-        if self._at < 0 or np.array_equal(self._robot.q, self._steps[self._at]):
-            self._at += 1
-            if self._at == len(self._steps):
-                return False
-            self._robot.go_to(self._steps[self._at])
-            self.label = self._names[max(self._at - 1, 0) // 2]
-        return True
-
-
-class _Path:
-    """A circle, a figure eight or a sum of both around the present tip, in turns."""
-
-    def __init__(self, shown: LiveView, kind: NDArray) -> None:
-        self._robot = shown.robot
-        self._center = shown.robot.x
-        self._kind = kind
-        self._tick = 0
-        self.label = "the target"
-
-    def __call__(self) -> bool:
-        phase = 2.0 * np.pi * self._tick / (RATE * _TURN)
-        circle = np.array([np.cos(phase) - 1.0, np.sin(phase), 0.0])
-        eight = np.array([np.sin(phase), np.sin(2.0 * phase), 0.0])
-        shape = self._kind @ np.stack([circle, eight])
-        self._robot.follow(self._center + 0.12 * self._robot.size * shape)
-        self._tick += 1
-        return True
-
-
-class _Replay:
-    """The rows of a log in their order, with the measured tip beside the model's."""
-
-    def __init__(self, shown: LiveView, log: Log) -> None:
-        self._robot = shown.robot
-        self._mark = shown._measured
-        effective = shown.robot.loaded.effective(log.q, log.groups)
-        fine = np.isfinite(effective).all(axis=1) & np.isfinite(log.x[:, -3:]).all(
-            axis=1
-        )
-        self._rows = iter(zip(effective[fine], log.x[fine, -3:], strict=True))
-        self._goal: NDArray | None = None
-        self._count = 0
-        self.label = ""
-
-    def __call__(self) -> bool:
-        limits = self._robot.limits
-        if self._goal is None or np.array_equal(self._robot.q, self._goal):
-            row, tip = next(self._rows, (None, None))
-            self._mark.visible = row is not None
-            if row is None or tip is None:
-                return False
-            goal = self._goal = np.clip(row, limits.q_min, limits.q_max)
-            self._mark.position = tip
-            self._count += 1
-            self.label = f"row {self._count} of the log"
-            self._robot.go_to(goal)
-        return True
-
-
 def _other_models(loaded: LoadedModel) -> dict[str, Chain]:
     """Return the mechanical models behind a model, by name."""
     models = {}
@@ -602,15 +415,3 @@ def _other_models(loaded: LoadedModel) -> dict[str, Chain]:
     if loaded.hybrid is not None and loaded.chain is not None:
         models["calibrated model"] = loaded.chain
     return {name: m for name, m in models.items() if m is not loaded.model}
-
-
-def _rims(body: dict[str, Any]) -> NDArray:
-    """Return the rims of the disks as segments (L, 2, 3)."""
-    rims = body["disks"][0]
-    return np.stack([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2, 3)
-
-
-def _between(low: tuple, high: tuple, share: NDArray) -> NDArray:
-    """Return colours (N, 3) from low to high for shares (N,) from 0 to 1."""
-    part = np.clip(share, 0.0, 1.0)[:, None]
-    return ((1.0 - part) * np.array(low) + part * np.array(high)).astype(np.uint8)

@@ -1,0 +1,130 @@
+"""What is drawn of a robot: its body, and the backbone of another model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.plots.models import body_of
+from hybridkin.viewer.steered import SteeredRobot
+
+GREEN, ORANGE, RED = (40, 160, 80), (235, 150, 30), (210, 50, 50)
+BLUE, GREY, YELLOW = (40, 90, 200), (150, 150, 150), (250, 215, 70)
+GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
+_POINTS = 10  # drawn along a segment
+
+
+class Body:
+    """The robot: backbone, actuators and disks."""
+
+    def __init__(self, scene: Any, model: Any, robot: SteeredRobot) -> None:
+        self._model = model
+        self._chain = robot.loaded.chain
+        body = body_of(model, robot.q, _POINTS)
+        self._thick = 0.015 * robot.size
+        if isinstance(self._chain, ArcChain):
+            self._thick = min(self._thick, 0.4 * float(self._chain.radii.min()))
+        self._backbone = scene.add_spline_catmull_rom(
+            "/robot/backbone",
+            body["points"][0],
+            thickness=self._thick,
+            color=(60, 60, 60),
+        )
+        self._tip = scene.add_icosphere("/robot/tip", 0.012 * robot.size, (20, 20, 20))
+        self._actuators = [
+            scene.add_spline_catmull_rom(
+                f"/robot/actuator {k + 1}", path[0], thickness=0.4 * self._thick
+            )
+            for k, path in enumerate(body.get("actuators", []))
+        ]
+        self._markers = None
+        if self._chain is not None and self._chain.n_outputs > 3:
+            self._markers = scene.add_point_cloud(
+                "/robot/markers",
+                self._marked(robot),
+                BLUE,
+                point_size=2.0 * self._thick,
+                point_shape="circle",
+            )
+        self._disks = None
+        if "disks" in body:
+            self._disks = scene.add_line_segments(
+                "/robot/disks", _rims(body), GREY, thickness=0.3 * self._thick
+            )
+
+    def move(self, robot: SteeredRobot) -> None:
+        """Draw the robot where it is."""
+        body = body_of(self._model, robot.q, _POINTS)
+        if not np.isfinite(body["points"]).all():
+            return
+        self._backbone.points = body["points"][0]
+        self._tip.position = robot.x
+        if self._disks is not None:
+            self._disks.points = _rims(body)
+        if self._markers is not None:
+            self._markers.points = self._marked(robot)
+        colors, slack = self._tensions(robot)
+        for k, handle in enumerate(self._actuators):
+            handle.points = body["actuators"][k][0]
+            color = tuple(int(c) for c in colors[k])
+            thickness = (0.12 if slack[k] else 0.4) * self._thick
+            if tuple(handle.color) != color:
+                handle.color = color
+            if handle.thickness != thickness:
+                handle.thickness = thickness
+
+    def _marked(self, robot: SteeredRobot) -> NDArray:
+        """Return the markers (K, 3) as the model predicts them."""
+        return robot.loaded.predict(robot.q[None]).reshape(-1, 3)
+
+    def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
+        """Return colours (n, 3) of the actuators, and which are slack (n,)."""
+        chain = self._chain
+        if isinstance(chain, ElasticTendonChain):
+            with torch.no_grad():
+                tension = chain.tensions(torch.from_numpy(robot.q)).numpy()
+            share = tension / max(float(tension.max()), 1e-300)
+            return between(BLUE, RED, share), tension <= 0.0
+        share = (robot.q - robot.limits.q_min) / robot.span
+        return between(RED, BLUE, share), np.zeros(len(share), dtype=bool)
+
+
+class Ghost:
+    """The backbone of another model at the same command."""
+
+    def __init__(
+        self, scene: Any, name: str, chain: Chain, robot: SteeredRobot
+    ) -> None:
+        self._chain = chain
+        self.line = scene.add_spline_catmull_rom(
+            f"/{name}",
+            body_of(chain, robot.q, _POINTS)["points"][0],
+            thickness=0.008 * robot.size,
+            color=GHOSTS[name],
+            visible=False,
+        )
+
+    def move(self, robot: SteeredRobot) -> None:
+        """Draw it, if it is shown."""
+        if self.line.visible:
+            points = body_of(self._chain, robot.q, _POINTS)["points"][0]
+            if np.isfinite(points).all():
+                self.line.points = points
+
+
+def _rims(body: dict[str, Any]) -> NDArray:
+    """Return the rims of the disks as segments (L, 2, 3)."""
+    rims = body["disks"][0]
+    return np.stack([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2, 3)
+
+
+def between(low: tuple, high: tuple, share: NDArray) -> NDArray:
+    """Return colours (N, 3) from low to high for shares (N,) from 0 to 1."""
+    part = np.clip(share, 0.0, 1.0)[:, None]
+    return ((1.0 - part) * np.array(low) + part * np.array(high)).astype(np.uint8)
