@@ -99,16 +99,16 @@ def test_versions_agree():
 
 def test_extras():
     extras = PROJECT["optional-dependencies"]
-    assert {"sim", "dask", "interactive", "parquet", "docs", "dev", "bench"} <= {*extras}
+    assert {"sim", "dask", "parquet", "view", "docs", "dev", "bench"} <= {*extras}
     (whole,) = (name for name in extras["dev"] if name.startswith("hybridkin["))
-    assert {"sim", "dask", "interactive", "parquet", "view"} <= {*re.findall(r"\w+", whole)[1:]}
+    assert {"sim", "dask", "parquet", "view"} <= {*re.findall(r"\w+", whole)[1:]}
 
 
 @pytest.mark.slow
 def test_what_is_imported_is_declared():
     needed = modules_of(PROJECT["dependencies"])
     extras = PROJECT["optional-dependencies"]
-    used = ("sim", "dask", "interactive", "parquet", "view")
+    used = ("sim", "dask", "parquet", "view")
     optional = needed.union(*(modules_of(extras[extra]) for extra in used))
     for path in (ROOT / "hybridkin").rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))

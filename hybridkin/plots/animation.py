@@ -229,8 +229,8 @@ class TrackAnimation(Display):
         ----------
         path : path-like
             Its ending is the format: ".mp4" needs ffmpeg; ".gif" is larger and needs nothing else;
-            ".html" is one page of about 5 MB that needs no network, to turn the robot, play, and
-            scrub the time. To write it needs plotly, ``pip install "hybridkin[interactive]"``.
+            ".html" is one page of about 1.5 MB that needs no network, to turn the robot, play, and
+            scrub the time. To write it needs viser, ``pip install "hybridkin[view]"``.
         unit : {"m", "cm", "mm"}, default="cm"
             Of the axes and of the error.
         speed : float, default=1.0
@@ -250,7 +250,7 @@ class TrackAnimation(Display):
         Raises
         ------
         ImportError
-            For a page without plotly.
+            For a page without viser.
         RuntimeError
             For mp4 without ffmpeg.
         ValueError

@@ -618,7 +618,7 @@ def test_track_without_known_limits_asks_for_them(fitted, tmp_path, capsys):
 @pytest.mark.parametrize("kind", ["gif", "html"])
 def test_animate_a_track(fitted, tmp_path, capsys, kind):
     if kind == "html":
-        pytest.importorskip("plotly")
+        pytest.importorskip("viser")
     shape = ["--shape", "spiral", "--size", "2,8", "--duration", "1", "--dt", "0.1"]
     run(capsys, "track", fitted / "model", *shape, "--out", tmp_path / "track")
     out = tmp_path / f"film.{kind}"

@@ -85,7 +85,7 @@ def table(out):
 )
 def test_every_writer_names_the_file_that_does_not_fit(tmp_path, write, name, failing):
     if name.endswith("html"):
-        pytest.importorskip("plotly")
+        pytest.importorskip("viser")
     with small_files(), pytest.raises(OSError, match="too large") as caught:
         write(tmp_path / name)
     assert caught.value.filename.startswith(str(tmp_path / failing))

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.image import imread
 
 import hybridkin
-from hybridkin import robots
+from hybridkin import plots, robots
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 sync_api = pytest.importorskip("playwright.sync_api", reason="`make view-test` installs it")
@@ -126,3 +126,21 @@ def test_two_clients_see_the_same_robot_and_a_reload_comes_back(browser, page, s
     assert len(shown._server.get_clients()) == 2
     second.close()
     until(lambda: len(shown._server.get_clients()) == 1)
+
+
+def test_the_page_of_a_track_plays_without_a_server(browser, tmp_path):
+    chain = robots.bionic_handling_assistant()
+    q = np.linspace(np.full(9, 0.2), [0.3, 0.2, 0.2] * 3, 40)
+    film = plots.TrackAnimation.from_estimator(chain, q, t=np.linspace(0.0, 4.0, 40))
+    page = browser.new_page(viewport={"width": 1100, "height": 720})
+    requests = []
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto(film.save(tmp_path / "track.html").as_uri())
+    page.wait_for_selector("canvas")
+    page.wait_for_timeout(2500)
+    before = picture(page)
+    assert (before.std(axis=(0, 1)) > 0.02).any()
+    page.wait_for_timeout(1500)
+    assert (np.abs(picture(page) - before).max(axis=-1) > 0.2).sum() > 50
+    assert not [url for url in requests if url.startswith("http")]
+    page.close()
