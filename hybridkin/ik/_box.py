@@ -1,4 +1,4 @@
-"""Exact least-squares steps within a box of limits, and points within half-spaces."""
+"""Exact least-squares steps within a box of limits."""
 
 from __future__ import annotations
 
@@ -41,45 +41,6 @@ class BoxProblem(NamedTuple):
         """Return y = z + J^T mu, and dq, which is y clipped to the box."""
         y = self.z + apply_columns(self.J, mu)
         return y, torch.clamp(y, self.lower, self.upper)
-
-
-class HalfSpaces(NamedTuple):
-    """Half-spaces in which the tip must stay: normals x <= offsets, unit normals (k, m)."""
-
-    normals: Tensor
-    offsets: Tensor
-
-    def __repr__(self) -> str:
-        """Return the number of half-spaces, for printing."""
-        return f"{len(self.offsets)} half-spaces"
-
-    def margin(self, x: Tensor) -> Tensor:
-        """Return the distances (N, k) of points (N, m) to the planes, negative outside."""
-        return self.offsets.to(x) - self.along(x)
-
-    def along(self, way: Tensor) -> Tensor:
-        """Return the components (N, k) of displacements (N, m) along the normals."""
-        return way @ self.normals.to(way).T
-
-    def way_in(self, margin: Tensor) -> Tensor:
-        """Return the shortest displacements (N, m) with along(way) <= margin.
-
-        They are -normals^T nu, where nu >= 0 minimises |normals^T nu|^2 / 2 + nu . margin. A change
-        of nu is a box-limited step; proximal rounds remove the effect of its damping.
-        """
-        J = self.normals.to(margin).T.expand(len(margin), -1, -1)
-        way = margin.new_zeros(len(margin), J.shape[1])
-        nu = torch.zeros_like(margin)
-        small = margin.new_full(
-            (len(margin),), max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps))
-        )
-        for _ in range(1 + IK_PROXIMAL):
-            z = (self.along(way) - margin) / small[:, None]
-            problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
-            change = box_limited_step(problem, small)[0]
-            nu = nu + change
-            way = way - apply_rows(J, change)
-        return way
 
 
 def box_limited_step(

@@ -1,11 +1,10 @@
-"""The checked settings of inverse kinematics, and the conversion of the caller's arrays."""
+"""The checked settings of inverse kinematics, and what they say about configurations."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from inspect import Signature
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -21,7 +20,6 @@ from hybridkin._core.arrays import (
     check_shape,
     countable,
     real_array,
-    whole,
 )
 from hybridkin._core.kernel_numbers import (
     IK_ACCELERATES,
@@ -34,31 +32,43 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin._core.model import Portable
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Stored
-from hybridkin.ik._box import HalfSpaces
+from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik.tasks import PoseTask, PositionTask, Task, Tolerance
 
 Array: TypeAlias = Numbers | Transform  # what a caller may pass
 Posture: TypeAlias = Callable[[Tensor], Tensor]
+
+# Largest plausible speed: this many times the largest plausible q per second.
+_FAST = 5.0
+_TURN = 2.0 * math.pi
+_FULL = 0.999  # a range of this fraction of a turn counts as a whole turn
+PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
+
+
+def require(good: bool | Tensor, message: str) -> None:
+    """Raise a ValueError with this message if an argument is not good."""
+    if not good:
+        raise ValueError(message)
 
 
 def bound(
     value: Array, name: str, *, finite: bool = False, positive: bool = False
 ) -> Tensor:
     """Return a limit, a posture or weights as a float64 tensor of shape () or (n,)."""
-    a = as_tensor(value, name).cpu().double().clone()
-    good = a.ndim < 2 and a.numel() > 0 and not torch.isnan(a).any()
+    numbers = as_tensor(value, name).cpu().double().clone()
+    good = ~numbers.isnan()
+    need = "must be a number or of shape (n,), not NaN"
+    if finite:
+        good &= numbers.isfinite()
+        need += ", finite"
+    if positive:
+        good &= numbers > 0.0
+        need += ", positive (to lock an actuator, give it equal limits)"
     require(
-        good,
-        f"`{name}` must be a number or of shape (n,), without NaN, got {a.tolist()}.",
+        numbers.ndim < 2 and numbers.numel() > 0 and good.all(),
+        f"`{name}` {need}, got {numbers.tolist()!r:.200}.",
     )
-    good = torch.isfinite(a).all() or not finite
-    require(good, f"`{name}` must be finite, got {a.tolist()}.")
-    lock = "to lock an actuator, give it equal limits"
-    require(
-        (a > 0.0).all() or not positive,
-        f"`{name}` must be positive, got {a.tolist()}; {lock}.",
-    )
-    return a
+    return numbers
 
 
 def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
@@ -69,51 +79,31 @@ def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
     }
 
 
-def half_spaces(given: Sequence[Array], task: Task) -> HalfSpaces:
-    """Return tip limits, a pair (A, b) with A x <= b, as half-spaces with unit normals."""
-    need = "`tip_limits` must be a pair (A, b)"
-    m = task.shape[0]
-    got = type(task).__name__
-    require(
-        isinstance(task, PositionTask),
-        f"`tip_limits` needs a PositionTask, got a {got}.",
-    )
-    require(
-        isinstance(given, Sequence) and len(given) == 2, f"{need}, got {given!r:.200}."
-    )
-    A, b = (as_tensor(a, "tip_limits").cpu().double() for a in given)
-    size = A.norm(dim=-1)
-    good = A.shape == (b.numel(), m) and b.ndim == 1 and bool(torch.isfinite(b).all())
-    good = good and bool((size > 0.0).all() and torch.isfinite(size).all())
-    shapes = f"of shapes (k, {m}) and (k,), finite, with a direction in every row of A"
-    require(good, f"{need} {shapes}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
-    spaces = HalfSpaces(A / size[:, None], b / size)
-    inside = spaces.margin(spaces.way_in(spaces.offsets[None])) >= -1e-9
-    require(
-        inside.all(),
-        "`tip_limits` must have a common point; these half-spaces have none.",
-    )
-    return spaces
-
-
-def require(good: bool | Tensor, message: str) -> None:
-    """Raise a ValueError with this message if an argument is not good."""
-    if not good:
-        raise ValueError(message)
-
-
 def stopping(way: Tensor, change: Tensor) -> Tensor:
     """Return the largest first step for which steps that shrink by `change` stop within `way`."""
     stops = way / (0.5 + 0.5 * (1.0 + 2.0 * (way.clamp_min(0.0) / change)).sqrt())
     return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
 
 
-_FAST = (
-    5.0  # largest plausible speed: this many times the largest plausible q per second
-)
-_TURN = 2.0 * math.pi
-_FULL = 0.999  # a range of this share of a turn counts as a whole turn
-PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
+def _in_one_period(name: str, rate: float, seconds: float) -> float:
+    """Return a rate [1/s] times the period, at most 1."""
+    need = f"`{name}` times the period must be at most 1"
+    way = f"use a {name} up to {1.0 / seconds:.4g} 1/s or a shorter period"
+    fraction = rate * seconds
+    require(
+        fraction <= 1.0 + 1e-9,
+        f"{need}, got {rate:.6g} 1/s x {seconds:.6g} s; {way}.",
+    )
+    return min(fraction, 1.0)
+
+
+def _in_words(limits: Tensor) -> str:
+    """Return a number, or the smallest and the largest one; None if all are infinite."""
+    if torch.isinf(limits).all():
+        return "None"
+    smallest = f"{float(limits.min()):.4g}"
+    largest = f"{float(limits.max()):.4g}"
+    return smallest if smallest == largest else f"{smallest} to {largest}"
 
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
@@ -157,7 +147,8 @@ class StepSettings(Portable):
     Limits, weights and a fixed posture are float64 tensors of shape () or (n,). `posture` is
     `q_pref`, or by default the middle of the limits. `of_model` names the limits taken from the
     model. `periods`, shape () or (n,), are the periods of q: a turn for an angle with a range of a
-    whole turn, else inf. `pulls` is that of the robot, see `ForwardModel`.
+    whole turn, else inf. `pulls` is that of the robot, see `ForwardModel`. `n_actuators` is None if
+    neither settings nor model define it.
     """
 
     layout: ClassVar[Layout] = Layout("inverse_kinematics", {}, write_plan=_write_plan)
@@ -179,47 +170,58 @@ class StepSettings(Portable):
     posture: Tensor | Posture | None = field(init=False)
     periods: Tensor = field(init=False)
     pulls: Tensor = field(init=False)
+    n_actuators: int | None = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check the settings; without `q_pref` the posture is the middle of the limits."""
-        sizes = self._sizes()
-        need = "give scalars or one value per actuator"
-        good = len(set(sizes.values())) < 2
-        names = ", ".join(f"`{name}`" for name in sizes)
+        """Check the settings against each other and the model, and derive the others."""
+        model = self.task.models[0]
+        vectors = {
+            name: len(value)
+            for name, value in vars(self).items()
+            if isinstance(value, Tensor) and value.ndim == 1
+        }
+        sizes = {*vectors.values(), self.task.n_actuators} - {None}
         require(
-            good,
-            f"{names} must have the same number of actuators, got {sizes}; {need}.",
+            len(sizes) < 2,
+            f"limits, `q_pref` and `weights` must be scalars or have one value per actuator, got "
+            f"the lengths {vectors} for {self.task.n_actuators or 'n'} actuators of the model.",
         )
-        low = self.q_min.tolist()
-        high = self.q_max.tolist()
-        good = (self.q_min <= self.q_max).all()
         require(
-            good, f"`q_min` must not exceed `q_max`, got {low} and {high}; swap them."
+            (self.q_min <= self.q_max).all(),
+            f"`q_min` must not exceed `q_max`, got {self.q_min.tolist()} and "
+            f"{self.q_max.tolist()}; swap them.",
+        )
+        require(
+            0.0 < self.dt < LARGEST,
+            f"`dt` must be a positive period [s], got {self.dt!r}.",
+        )
+        require(
+            self.gain is None or self.gain > 0.0,
+            f"`gain` must be positive [1/s], got {self.gain!r}.",
+        )
+        require(
+            self.beta is None or self.beta >= 0.0,
+            f"`beta` must not be negative [1/s], got {self.beta!r}.",
+        )
+        self.rates()
+        require(
+            self.damping == "adaptive"
+            or (not isinstance(self.damping, str) and 0.0 <= self.damping < math.inf),
+            f'`damping` must be "adaptive" or lambda / sigma_max >= 0, got {self.damping!r}.',
         )
         posture = self.middle if self.q_pref is None else self.q_pref
         if isinstance(posture, Tensor):
             posture = self.on_plane(posture)
-        object.__setattr__(self, "posture", posture)
-        good = 0.0 < self.dt < LARGEST
-        require(good, f"`dt` must be a positive period [s], got {self.dt!r}.")
-        self.rates()
-        least = 0.0 if self.damping == "adaptive" else self.damping
-        good = not isinstance(least, str) and 0.0 <= least < math.inf
-        text = '"adaptive" or'
-        require(
-            good,
-            f"`damping` must be {text} lambda / sigma_max >= 0, got {self.damping!r}.",
+        # An angle that can turn once round is periodic.
+        turns = torch.as_tensor(model.turns, device="cpu") & (self.limits != "off")
+        full = self.q_max - self.q_min >= _FULL * _TURN
+        periods = torch.where(turns & full, self.q_max.new_tensor(_TURN), math.inf)
+        vars(self).update(
+            posture=posture,
+            periods=periods,
+            pulls=bound(model.robot.pulls, "pulls"),
+            n_actuators=next(iter(sizes), None),
         )
-        models = self.task.models
-        turns = torch.stack(
-            [torch.as_tensor(model.turns, device="cpu") for model in models]
-        )
-        full = (self.q_max - self.q_min >= _FULL * _TURN) & (self.limits != "off")
-        periods = torch.where(
-            turns.all(0) & full, self.q_max.new_tensor(_TURN), math.inf
-        )
-        object.__setattr__(self, "periods", periods)
-        object.__setattr__(self, "pulls", bound(models[0].robot.pulls, "pulls"))
 
     def present(self) -> StepSettings:
         """Return the settings for the model that the estimator of the task has now."""
@@ -228,45 +230,39 @@ class StepSettings(Portable):
             return self
         n = task.n_actuators
         before = self.task.n_actuators
-        way = "make a new InverseKinematics"
         require(
             n == before,
-            f"`model` must keep its {before} actuators, but now has {n}; {way}.",
+            f"`model` must keep its {before} actuators, but now has {n}; make a new "
+            "InverseKinematics.",
         )
         return replace(self, task=task, **limits_of(task, self.of_model))
 
-    def shown(self, arguments: Signature, defaults: bool = False) -> dict[str, str]:
-        """Return the settings that differ from their defaults, or all of them, in words."""
-        shown = {}
-        for name, default in arguments.parameters.items():
-            value = vars(self).get(name)
-            if isinstance(value, Tensor):
-                ends = dict.fromkeys(
-                    f"{float(end):.4g}" for end in (value.min(), value.max())
-                )
-                whose = " of the model" if name in self.of_model else ""
-                if torch.isfinite(value).any():
-                    shown[name] = f"{' to '.join(ends)}{whose}"
-            elif value not in (None, default.default):
-                shown[name] = repr(value)
-            if defaults and name != "model":
-                shown.setdefault(name, repr(default.default))
-        return shown
+    def in_words(self) -> dict[str, str]:
+        """Return the arguments of `InverseKinematics`, except the model, as short texts."""
+        words = {}
+        for argument in fields(self):
+            name = argument.name
+            value = getattr(self, name)
+            if name in ("task", "of_model") or not argument.init:
+                continue
+            words[name] = _in_words(value) if isinstance(value, Tensor) else repr(value)
+            if name in self.of_model and words[name] != "None":
+                words[name] += " of the model"
+        return words
 
     def unit_messages(self) -> list[str]:
         """Return warnings if limits or a posture seem to have another unit than the model."""
         messages = []
-        n = self.n_actuators
         for name in ("q_min", "q_max", "dq_max", "q_pref"):
-            value = vars(self)[name]
-            if (
-                isinstance(value, Tensor)
-                and n is not None
-                and name not in self.of_model
-            ):
-                q = torch.where(torch.isfinite(value), value, 0.0).expand(1, n)
+            value = getattr(self, name)
+            if not isinstance(value, Tensor) or name in self.of_model:
+                continue
+            if self.n_actuators is not None:
+                q = torch.where(torch.isfinite(value), value, 0.0)
+                rows = q.expand(1, self.n_actuators)
                 factor = _FAST if name == "dq_max" else 1.0
-                messages += self.task.models[0].robot.unit_messages(q, name, factor)
+                robot = self.task.models[0].robot
+                messages += robot.unit_messages(rows, name, factor)
         return messages
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
@@ -285,20 +281,6 @@ class StepSettings(Portable):
 
     def _positions(self, x: Tensor) -> Tensor:
         return x[..., :3, 3] if self.task.shape == (4, 4) else x
-
-    def _sizes(self) -> dict[str, int]:
-        """Return the numbers of actuators given by the settings and the model, by name."""
-        vectors = {
-            k: a for k, a in vars(self).items() if isinstance(a, Tensor) and a.ndim == 1
-        }
-        sizes = {name: len(a) for name, a in vectors.items()}
-        n = self.task.n_actuators
-        return sizes if n is None else {**sizes, "model": n}
-
-    @property
-    def n_actuators(self) -> int | None:
-        """Length of q, or None if neither settings nor model define it."""
-        return next(iter(self._sizes().values()), None)
 
     @property
     def middle(self) -> Tensor | None:
@@ -319,14 +301,13 @@ class StepSettings(Portable):
     def whole_turns(self, dq: Tensor) -> Tensor:
         """Return the whole turns nearest to dq (..., n)."""
         periods = self.periods.to(dq)
-        return torch.where(
-            torch.isfinite(periods), periods * (dq / periods).round(), 0.0
-        )
+        turns = periods * (dq / periods).round()
+        return torch.where(torch.isfinite(periods), turns, 0.0)
 
     @property
     def has_posture(self) -> bool:
         """Whether there is a preferred configuration."""
-        return self.posture is not None and (self.beta is None or self.beta > 0.0)
+        return self.posture is not None and self.beta != 0.0
 
     def stored(self) -> Stored:
         """Return the description of the settings, with the model as their part.
@@ -379,9 +360,11 @@ class StepSettings(Portable):
             self.layout.kind, arrays, {"model": model.stored()}, **settings
         )
 
+    # The plane of q to keep to, where the log lies in one.
+
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
-        """The plane of q to keep to, if any, see `ForwardModel`."""
+        """A point and orthonormal normals of the plane, if any, see `ForwardModel`."""
         return self.task.models[0].plane
 
     def in_plane(self, motion: Tensor) -> Tensor:
@@ -400,12 +383,11 @@ class StepSettings(Portable):
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (N, ...) and J (N, m, n) of motions in the plane, at q of shape (N, n)."""
-        if len(q) > 0:
-            x, J = self.task.evaluate(q)
-            return x, self.in_plane(J)
-        return q.new_zeros(0, *self.task.shape), q.new_zeros(
-            0, sum(self.task.parts), q.shape[1]
-        )
+        if len(q) == 0:
+            x = q.new_zeros(0, *self.task.shape)
+            return x, q.new_zeros(0, sum(self.task.parts), q.shape[1])
+        x, J = self.task.evaluate(q)
+        return x, self.in_plane(J)
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
@@ -420,14 +402,11 @@ class StepSettings(Portable):
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); if it is a function, evaluate it mid-range."""
         start = self.posture if isinstance(self.posture, Tensor) else self.middle
-        need = "give `q0` or `q_pref` of shape (n,)"
-        if start is None:
+        if start is None or self.n_actuators is None:
             raise ValueError(
-                f"a start is needed: {need}, or finite `q_min` and `q_max`."
-            )
-        if self.n_actuators is None:
-            raise ValueError(
-                f"the number of actuators is not known from this model; {need}."
+                "a start is needed: give `q0` or `q_pref` of shape (n,), or finite `q_min` and "
+                "`q_max`, one value per actuator where the number of actuators is not known from "
+                "the model."
             )
         start = start.to(like).expand(self.n_actuators)
         return self.preferred(start) if callable(self.q_pref) else start
@@ -435,22 +414,19 @@ class StepSettings(Portable):
     def rates(self, period: float | None = None) -> tuple[float, float, float]:
         """Return gain dt and beta dt, both at most 1, and dt, for a period [s], default `dt`."""
         dt = self.dt if period is None else period
-        gain = 1.0 if self.gain is None else self.gain * dt
-        beta = min(dt, 1.0) if self.beta is None else self.beta * dt
-        for name, share, good in (
-            ("gain", gain, gain > 0.0),
-            ("beta", beta, beta >= 0.0),
-        ):
-            need = "must lie in [0, 1], and a gain above 0"
-            got = f"got {share / dt:.6g} 1/s x {dt:.6g} s = {share:.4g}"
-            way = f"use a {name} up to {1.0 / dt:.4g} 1/s or a shorter period"
-            good = good and share <= 1.0 + 1e-9
-            require(good, f"`{name}` times the period {need}, {got}; {way}.")
-        return min(gain, 1.0), min(beta, 1.0), dt
+        gain = 1.0
+        beta = min(dt, 1.0)
+        if self.gain is not None:
+            gain = _in_one_period("gain", self.gain, dt)
+        if self.beta is not None:
+            beta = _in_one_period("beta", self.beta, dt)
+        return gain, beta, dt
 
     def unit(self, q: Tensor) -> Tensor:
         """Return the units of q, shape () or (n,), in which all weights are 1."""
         return q.new_ones(()) if self.weights is None else self.weights.to(q).rsqrt()
+
+    # Limits of q and of its steps.
 
     def box(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the limits of q."""
@@ -466,8 +442,9 @@ class StepSettings(Portable):
 
     def start_at(self, q: Tensor) -> Tensor:
         """Return q moved onto the plane and into the limits."""
-        for _ in range(0 if self.plane is None else PLANE_ROUNDS):
-            q = self.inside(self.on_plane(q))
+        if self.plane is not None:
+            for _ in range(PLANE_ROUNDS):
+                q = self.inside(self.on_plane(q))
         return self.inside(q)
 
     def allowed(self, x: Tensor) -> Tensor:
@@ -486,8 +463,7 @@ class StepSettings(Portable):
 
         They are intersected and never empty. `last` is the previous step, scaled to this period.
         Outside the limits both bounds are the step back to them, limited by the largest step. If
-        the speed cannot be stopped in time, both bounds are the hardest braking. The nextafter
-        ensures q + upper <= q_max after rounding, and so q + dq <= q_max for every dq.
+        the speed cannot be stopped in time, both bounds are the hardest braking.
 
         With speed u = dq / period and acceleration a, the distance to a stop is at most
         u period + u^2 / (2 a), whatever the following periods are. The robot can stop within d if
@@ -496,14 +472,15 @@ class StepSettings(Portable):
         q_min, q_max = self.box(q)
         lower = q_min - q
         upper = q_max - q
-        up = torch.full_like(q, math.inf)
-        down = torch.full_like(q, -math.inf)
-        upper = torch.where(q + upper > q_max, torch.nextafter(upper, down), upper)
-        lower = torch.where(q + lower < q_min, torch.nextafter(lower, up), lower)
+        # q + upper <= q_max also after rounding, and so q + dq <= q_max for every dq.
+        one_less = torch.nextafter(upper, torch.full_like(q, -math.inf))
+        one_more = torch.nextafter(lower, torch.full_like(q, math.inf))
+        upper = torch.where(q + upper > q_max, one_less, upper)
+        lower = torch.where(q + lower < q_min, one_more, lower)
         if self.limits == "off" or period is None:
             return lower, upper
-        most = self.dq_max.to(q) * period
-        ends = -most, most
+        fastest = self.dq_max.to(q) * period
+        ends = [-fastest, fastest]
         if self.accelerates:
             change = self.change(q, period)
             lower = -stopping(-lower, change)
@@ -522,8 +499,8 @@ class StepSettings(Portable):
     ) -> Tensor:
         """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
         q = as_tensor(value, name, self.task.device if like is None else like.device)
-        n = self.n_actuators
-        check_shape(q, name, ("...", n or "n"), "one value per actuator")
+        n = self.n_actuators or "n"
+        check_shape(q, name, ("...", n), "one value per actuator")
         if like is None:
             return q
         return q.to(like.device, torch.promote_types(q.dtype, like.dtype))
@@ -542,10 +519,9 @@ class StepSettings(Portable):
         `lead` gives the leading axes: "..." any, "T" one, "" none.
         """
         x = as_tensor(value, name, self.task.device)
-        point_shape = shape or self.task.shape
-        check_shape(
-            x, name, [*filter(None, [lead]), *point_shape], "one point [m] per row"
-        )
+        point = shape or self.task.shape
+        need = [lead, *point] if lead else point
+        check_shape(x, name, need, "one point [m] per row")
         if shape is None:
             self.task.check(x, name)
         return x if like is None else x.to(like)
@@ -553,50 +529,26 @@ class StepSettings(Portable):
     def times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
         """Return the times of a path's points, and the period after each point."""
         n = len(target)
-        dt = self.dt
         if t is None:
-            return dt * torch.arange(n, dtype=target.dtype, device=target.device), [
-                dt
-            ] * n
+            steps = torch.arange(n, dtype=target.dtype, device=target.device)
+            return self.dt * steps, [self.dt] * n
         times = as_tensor(t, "t", target.device)
         check_shape(times, "t", [n], "one time per point of `path`")
         periods = times.diff().tolist()
-        increasing = bool(countable(times).all()) and min(periods, default=dt) > 0.0
         require(
-            increasing,
+            countable(times).all() and min(periods, default=self.dt) > 0.0,
             "`t` must be finite and increasing [s]; sort it, drop repeated times.",
         )
-        self.rates(max(periods, default=dt))
-        return times, [*periods, dt]
-
-    def places(self, n_solutions: int | None, differentiable: bool) -> int:
-        """Return the number of configurations per target."""
-        if n_solutions is None:
-            return 1
-        require(
-            not differentiable, "`n_solutions` must be None for differentiable=True."
-        )
-        n_solutions = whole(n_solutions, "n_solutions", 1, 10_000)
-        good = torch.isfinite(self.spans).all()
-        way = "give finite `q_min` and `q_max`"
-        require(
-            good,
-            f"`n_solutions` needs finite ranges of q to compare configurations; {way}.",
-        )
-        return n_solutions
+        self.rates(max(periods, default=self.dt))
+        return times, [*periods, self.dt]
 
     def tolerance(self, tol: float | Sequence[float]) -> Tolerance:
         """Return one tolerance [m], or one for every part of the task."""
-        tolerances = np.atleast_1d(real_array(tol, "tol").astype(float))
-        require(
-            bool((tolerances > 0.0).all()), f"`tol` must be positive [m], got {tol!r}."
-        )
-        if np.ndim(tol) == 0:
-            return float(tolerances[0])
+        tolerances = real_array(tol, "tol").astype(float)
         n = len(self.task.parts)
-        parts = "one for every part of the task"
         require(
-            tolerances.shape == (n,),
-            f"`tol` must be one number [m] or {n}, {parts}, got {tol!r}.",
+            tolerances.shape in ((), (n,)) and bool((tolerances > 0.0).all()),
+            f"`tol` must be positive: one number [m], or {n}, one for every part of the task; got "
+            f"{tol!r:.200}.",
         )
-        return tuple(tolerances.tolist())
+        return tolerances.item() if np.ndim(tol) == 0 else tuple(tolerances.tolist())

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import (
-    as_array,
     give_back,
     is_numpy,
     leading,
@@ -24,6 +23,7 @@ from hybridkin._core.html import html_table
 from hybridkin._core.stored import Stored
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._gram import row_gram
+from hybridkin.ik._half_spaces import half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
 from hybridkin.ik._settings import (
@@ -31,18 +31,18 @@ from hybridkin.ik._settings import (
     Posture,
     StepSettings,
     bound,
-    half_spaces,
     limits_of,
     require,
 )
 from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import control_step
+from hybridkin.ik._tracks import Loop, Path, followed
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, score, statuses
-from hybridkin.ik.tasks import Tolerance, as_task
+from hybridkin.ik.tasks import as_task
 from hybridkin.ik.tracker import Plant, Tracker
 from hybridkin.ik.trajectories import Trajectory
 
-# of points of a path, by the model and measured [m]
+# Default tolerances of points of a path, by the model and measured [m].
 _TOL = 1e-4
 _MEASURED = 1e-3
 _GUESSES = 16  # configurations from which the first point of a path is solved
@@ -158,35 +158,39 @@ class InverseKinematics:
     ) -> None:
         self.model = model
         task = as_task(model)
-        good = 0 not in np.shape(task.models[0].robot.limits["q_min"])
-        require(good, "`model` must have an actuator, but all its joints are fixed.")
+        require(
+            0 not in np.shape(task.models[0].robot.limits["q_min"]),
+            "`model` must have an actuator, but all its joints are fixed.",
+        )
         box = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
         of_model = tuple(name for name, value in box.items() if value is None)
         bounds = limits_of(task, of_model)
         for name, value in box.items():
             if value is not None:
                 bounds[name] = bound(value, name, positive=name == "dq_max")
+        if ddq_max is None:
+            ddq_max = np.inf
+        if q_pref is not None and not callable(q_pref):
+            q_pref = bound(q_pref, "q_pref", finite=True)
+        if weights is not None:
+            weights = bound(weights, "weights", finite=True, positive=True)
+        one_of(limits, "limits", ("saturate", "off"))
+        half = None
+        if tip_limits is not None and limits != "off":
+            half = half_spaces(tip_limits, task)
         self._settings = StepSettings(
             task,
-            bounds["q_min"],
-            bounds["q_max"],
-            bounds["dq_max"],
-            bound(np.inf if ddq_max is None else ddq_max, "ddq_max", positive=True),
-            q_pref
-            if q_pref is None or callable(q_pref)
-            else bound(q_pref, "q_pref", finite=True),
-            None if beta is None else number(beta, "beta"),
-            None if gain is None else number(gain, "gain"),
-            damping if isinstance(damping, str) else number(damping, "damping"),
-            one_of(limits, "limits", ("saturate", "off")),
-            number(dt, "dt"),
-            None
-            if weights is None
-            else bound(weights, "weights", finite=True, positive=True),
-            of_model,
-            None
-            if tip_limits is None or limits == "off"
-            else half_spaces(tip_limits, task),
+            **bounds,
+            ddq_max=bound(ddq_max, "ddq_max", positive=True),
+            q_pref=q_pref,
+            beta=None if beta is None else number(beta, "beta"),
+            gain=None if gain is None else number(gain, "gain"),
+            damping=damping if isinstance(damping, str) else number(damping, "damping"),
+            limits=limits,
+            dt=number(dt, "dt"),
+            weights=weights,
+            of_model=of_model,
+            tip_limits=half,
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
@@ -199,18 +203,19 @@ class InverseKinematics:
 
     def __repr__(self) -> str:
         """Return the model's name, the limits, and the settings that differ from their defaults."""
-        settings = self.settings.shown(signature(type(self)))
-        shown = (f"{name}={text}" for name, text in settings.items())
-        return f"InverseKinematics({', '.join([type(self.model).__name__, *shown])})"
+        arguments = signature(type(self)).parameters
+        words = [type(self.model).__name__]
+        for name, text in self.settings.in_words().items():
+            if text != repr(arguments[name].default):
+                words.append(f"{name}={text}")
+        return f"InverseKinematics({', '.join(words)})"
 
     def _repr_html_(self) -> str:
-        models = {
-            f"model: {type(m).__name__}": m.html_rows()
-            for m in self.settings.task.models
-        }
-        settings = self.settings.shown(signature(type(self)), defaults=True)
-        task = {"task": type(self.settings.task).__name__}
-        return html_table(type(self).__name__, {**task, **settings, **models})
+        settings = self.settings
+        rows = {"task": type(settings.task).__name__, **settings.in_words()}
+        for model in settings.task.models:
+            rows[f"model: {type(model).__name__}"] = model.html_rows()
+        return html_table(type(self).__name__, rows)
 
     def stored(self) -> Stored:
         """Return the description of the solver, with its model as a part, for kernels.
@@ -253,54 +258,61 @@ class InverseKinematics:
             `ddq_max` it brakes first); outside the limits its known actuators return to them.
         """
         core = core_of(self.settings)
-        if core is None or dq is not None:
-            result = None
-        else:
+        if core is not None and dq is None:
             result = core.step(q, x_target, dx, x_measured)
-        if result is None:
-            return self._steps(core, q, x_target, dx, x_measured, dq)
-        step = object.__new__(Step)  # its constructor takes longer than the step
-        vars(step)["_row"] = result
-        return step
+            if result is not None:
+                step = object.__new__(
+                    Step
+                )  # its constructor takes longer than the step
+                vars(step)["_row"] = result
+                return step
+        return self._steps(core, q, x_target, dx, x_measured, dq)
 
     @torch.no_grad()
     def _steps(
-        self, core: Core | None, q: Array, x_target: Array, *more: Array | None
+        self,
+        core: Core | None,
+        q: Array,
+        x_target: Array,
+        dx: Array | None,
+        x_measured: Array | None,
+        dq: Array | None,
     ) -> Step:
+        """Return a batch of steps, with full checks of the arguments."""
         settings = self.settings
-        task = self.settings.task
-        dx, tip, last = more
-        as_numpy = is_numpy(q)
+        task = settings.task
         axes = len(task.shape)
-        rows = settings.configurations(q, "q")
-        arguments = [(rows, 1), (settings.points(x_target, "x_target", rows), axes)]
-        if tip is not None:
-            arguments.append((settings.points(tip, "x_measured", rows), axes))
+        q_given = settings.configurations(q, "q")
+        arguments = [(q_given, 1)]
+        arguments.append((settings.points(x_target, "x_target", q_given), axes))
         if dx is not None:
-            arguments.append(
-                (settings.points(dx, "dx", rows, shape=(sum(task.parts),)), 1)
-            )
-        if last is not None:
-            arguments.append((settings.configurations(last, "dq").to(rows), 1))
+            m = sum(task.parts)
+            arguments.append((settings.points(dx, "dx", q_given, shape=(m,)), 1))
+        if x_measured is not None:
+            tip = settings.points(x_measured, "x_measured", q_given)
+            arguments.append((tip, axes))
+        if dq is not None:
+            last_step = settings.configurations(dq, "dq").to(q_given)
+            arguments.append((last_step, 1))
+        # All of them with the same rows.
         lead = leading(arguments)
-        rows, target, *optional = (
-            rows_of(a, lead, trailing) for a, trailing in arguments
-        )
-        before = None if last is None else optional.pop()
+        in_rows = (rows_of(a, lead, trailing) for a, trailing in arguments)
+        rows = next(in_rows)
+        target = next(in_rows)
+        feed_forward = None if dx is None else settings.dt * next(in_rows)
+        measured = None if x_measured is None else next(in_rows)
+        last = None if dq is None else next(in_rows)
         if not settings.accelerates:
-            before = None
-        feed_forward = None if dx is None else settings.dt * optional.pop()
-        measured = optional.pop() if optional else None
+            last = None
+        as_numpy = is_numpy(q)
         if core is not None and as_numpy and rows.dtype == torch.float64:
-            parts = core.steps(rows, target, feed_forward, measured, before)
+            parts = core.steps(rows, target, feed_forward, measured, last)
             return Step(*give_back(parts, lead, as_numpy))
         x, J = settings.evaluate(rows)
-        known_tip = x if measured is None else measured
-        e = task.difference(known_tip, target)
-        step = control_step(
-            settings, rows, J, e, feed_forward, last=before, tip=known_tip
-        )
-        parts = (
+        tip = x if measured is None else measured
+        e = task.difference(tip, target)
+        step = control_step(settings, rows, J, e, feed_forward, last=last, tip=tip)
+        results = (
             step.dq,
             x,
             e.norm(dim=-1),
@@ -308,7 +320,7 @@ class InverseKinematics:
             step.damping,
             step.saturated,
         )
-        return Step(*give_back(parts, lead, as_numpy))
+        return Step(*give_back(results, lead, as_numpy))
 
     @torch.no_grad()
     def solve(
@@ -367,69 +379,67 @@ class InverseKinematics:
         must be twice differentiable by torch.
         """
         settings = self.settings
-        task = self.settings.task
+        task = settings.task
+        axes = len(task.shape)
         tolerance = settings.tolerance(tol)
         max_iter = whole(max_iter, "max_iter", 1, 1_000_000)
         restarts = whole(restarts, "restarts", 0, 1_000_000)
         as_numpy = is_numpy(x_target)
-        axes = len(task.shape)
-        places = settings.places(n_solutions, differentiable)
-        good = isinstance(x_target, Tensor) or not differentiable
-        require(good, "`x_target` must be a torch tensor for differentiable=True.")
+        places = self._places(n_solutions, differentiable)
+        require(
+            isinstance(x_target, Tensor) or not differentiable,
+            "`x_target` must be a torch tensor for differentiable=True.",
+        )
         target = settings.points(x_target, "x_target")
         for message in settings.far_messages(target, "x_target"):
             warnings.warn(message, stacklevel=3)
         if q0 is None:
-            q = settings.start(target)
+            start = settings.start(target)
         else:
-            q = settings.configurations(q0, "q0", target)
-        target = target.to(q.dtype)
-        lead = leading([(q, 1), (target, axes)])
-        q = rows_of(q, lead)
+            start = settings.configurations(q0, "q0", target)
+        target = target.to(start.dtype)
+        lead = leading([(start, 1), (target, axes)])
         target = rows_of(target, lead, axes)
+        start = rows_of(start, lead)
         # Limits must not make it finite.
-        q = torch.where(torch.isfinite(q), q, torch.nan)
-        if as_numpy and q.dtype == torch.float64:
-            core = core_of(settings, search=True)
-        else:
-            core = None
+        start = torch.where(torch.isfinite(start), start, torch.nan)
         search = Search(settings, tolerance, max_iter)
-        if core is not None:
-            search = core.search(tolerance, max_iter)
-            settings = core.settings
-            task = settings.task
-        solution = search.solve(q, target, q0 is None, restarts)
+        if as_numpy and start.dtype == torch.float64:
+            core = core_of(settings, search=True)
+            if core is not None:
+                search = core.search(tolerance, max_iter)
+                settings = core.settings
+                task = settings.task
+        solution = search.solve(start, target, q0 is None, restarts)
         if n_solutions is not None:
-            solution = search.several(solution, q, restarts, places)
+            solution = search.several(solution, start, restarts, places)
             lead = (*lead, places)
             target = target.repeat_interleave(places, 0)
-        # by tip limits
-        q = solution.q
+        # Tip limits have moved these targets.
         moved = (solution.target != target).flatten(1).any(-1)
+        q = solution.q
         if differentiable:
             with torch.enable_grad():
-                goal = rows_of(
-                    torch.as_tensor(x_target, device=q.device).to(q), lead, axes
-                )
-                q = with_derivatives(
-                    settings, q, goal, solution.reached & ~moved, tolerance
-                )
+                goal = torch.as_tensor(x_target, device=q.device).to(q)
+                goal = rows_of(goal, lead, axes)
+                solved = solution.reached & ~moved
+                q = with_derivatives(settings, q, goal, solved, tolerance)
         # Error and status refer to the returned q.
-        x, J = settings.evaluate(q.detach())
+        q_plain = q.detach()
+        x, J = settings.evaluate(q_plain)
         e = task.difference(x, target)
         error = e.norm(dim=-1)
         gram = row_gram(J)
         reached = task.reached(e, tolerance)
         status = statuses(
-            task, q.detach(), error, reached, solution.held, gram.is_singular
+            task, q_plain, error, reached, solution.held, gram.is_singular
         )
         missed = ~reached & torch.isfinite(error)
         status[missed & solution.stationary] = IKStatus.MAX_ITER
         beyond = moved | (settings.misses(target) > np.max(tolerance))
         status[missed & beyond] = IKStatus.UNREACHABLE
-        further = torch.arange(len(q), device=q.device) % places > 0
-        status[further & q.isnan().all(-1)] = IKStatus.NO_FURTHER
-        margin = settings.margin(q.detach())
+        place = torch.arange(len(q), device=q.device) % places
+        status[(place > 0) & q.isnan().all(-1)] = IKStatus.NO_FURTHER
         results = (
             q,
             x,
@@ -438,10 +448,24 @@ class InverseKinematics:
             solution.n_iter,
             solution.n_starts,
             gram.sigma_min,
-            margin,
+            settings.margin(q_plain),
         )
         with torch.set_grad_enabled(differentiable):
             return IKSolution(*give_back(results, lead, as_numpy))
+
+    def _places(self, n_solutions: int | None, differentiable: bool) -> int:
+        """Return the number of configurations per target."""
+        if n_solutions is None:
+            return 1
+        require(
+            not differentiable, "`n_solutions` must be None for differentiable=True."
+        )
+        require(
+            torch.isfinite(self.settings.spans).all(),
+            "`n_solutions` needs finite ranges of q to compare configurations; give finite `q_min` "
+            "and `q_max`.",
+        )
+        return whole(n_solutions, "n_solutions", 1, 10_000)
 
     @torch.no_grad()
     def track(
@@ -496,119 +520,72 @@ class InverseKinematics:
             warning is given, and the motion continues with feed-forward only.
         """
         settings = self.settings
-        good = feedback in ("model", "measured", None)
+        one_of(feedback or "model", "feedback", ("model", "measured"), " or None")
         require(
-            good, f'`feedback` must be "model", "measured" or None, got {feedback!r}.'
+            feedback != "measured" or plant is not None,
+            '`feedback="measured"` needs `plant`, a callable q -> measured tip.',
         )
-        good = feedback != "measured" or plant is not None
         require(
-            good, '`feedback="measured"` needs `plant`, a callable q -> measured tip.'
+            memory is None or feedback == "measured",
+            '`memory` requires feedback="measured"; set it, or remove `memory`.',
         )
-        good = memory is None or feedback == "measured"
-        require(
-            good, '`memory` requires feedback="measured"; set it, or remove `memory`.'
-        )
-        points = path.x if isinstance(path, Trajectory) else path
-        if isinstance(path, Trajectory) and t is None:
-            t = path.t
         if tol is None:
             tol = _MEASURED if feedback == "measured" else _TOL
-        as_numpy = is_numpy(points)
-        tolerance = settings.tolerance(tol)
+        points = path
+        if isinstance(path, Trajectory):
+            points = path.x
+            t = path.t if t is None else t
         target = settings.points(points, "path", lead="T")
-        require(
-            len(target) > 0,
-            f"`path` must hold at least one point, got {tuple(target.shape)}.",
-        )
-        starts = None if q0 is None else settings.configurations(q0, "q0", target)
-        if starts is not None:
-            good = starts.ndim < 3 and starts.numel() > 0
+        require(len(target) > 0, "`path` must hold at least one point, got none.")
+        starts = None
+        if q0 is not None:
+            starts = settings.configurations(q0, "q0", target)
             require(
-                good, f"`q0` must have shape (n,) or (K, n), got {tuple(starts.shape)}."
+                starts.ndim < 3 and starts.numel() > 0,
+                f"`q0` must have shape (n,) or (K, n), got {tuple(starts.shape)}.",
             )
-        t, periods = settings.times(t, target)
-        way = (target, t, periods, tolerance)
-        loop = (plant, feedback, memory)
+        times, periods = settings.times(t, target)
+        tolerance = settings.tolerance(tol)
+        timed = Path(target, times, periods, tolerance, is_numpy(points))
+        loop = Loop(plant, feedback, memory, progress)
         if starts is not None and starts.ndim == 1:
             for message in settings.far_messages(target, "path"):
                 warnings.warn(message, stacklevel=3)
-            return self._followed(starts, *way, *loop, as_numpy, progress)
+            return followed(settings, starts, timed, loop)
+        # The start is chosen on the model alone: the robot moves once.
+        alone = plant is None and feedback == "model"
+        on_model = Loop(progress=progress if alone else None)
         tracks: list[Track] = []
-        dry = plant is not None or feedback != "model"  # the robot moves once
-        shown = None if dry else progress
         for start in self._starts(target[:1], starts):
-            tracks.append(
-                self._followed(start, *way, None, "model", None, as_numpy, shown)
-            )
+            tracks.append(followed(settings, start, timed, on_model))
             if score(tracks[-1]) == (len(target), len(target)):
                 break
         best = max(tracks, key=score)  # of equal tracks the first
-        if dry:
-            return self._followed(best.q[0], *way, *loop, as_numpy, progress)
-        return best
+        if alone:
+            return best
+        return followed(settings, torch.as_tensor(best.q[0]), timed, loop)
 
     def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
         settings = self.settings
-        has_start = q0 is not None
-        if q0 is None:
-            start = settings.start(target)[None]
-            q0 = nearest_starts(settings, start, start[:, 0], target, _GUESSES)[0]
+        guesses = q0
+        if guesses is None:
             yield self.solve(target[0]).q
-        away = settings.task.distances(settings.evaluate(q0)[0][None], target)[0]
-        away[0] = -1.0  # stays the first
-        q0 = q0[away.argsort()[: _GUESSES + 1]]
-        solution = self.solve(target[0], q0, max_iter=200)
-        if has_start:
+            start = settings.start(target)[None]
+            guesses = nearest_starts(settings, start, start[:, 0], target, _GUESSES)[0]
+        # The nearest ones, and always the first.
+        x, _ = settings.evaluate(guesses)
+        distances = settings.task.distances(x[None], target)[0]
+        distances[0] = -1.0
+        guesses = guesses[distances.argsort()[: _GUESSES + 1]]
+        solution = self.solve(target[0], guesses, max_iter=200)
+        if q0 is not None:
             yield solution.q[0]
         for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN):
             regular = torch.where(solution.status == wanted, solution.sigma_min, -1.0)
             if regular.max() >= 0.0:
                 yield solution.q[regular.argmax()]
                 return
-
-    def _followed(
-        self,
-        q0: Array,
-        target: Tensor,
-        t: Tensor,
-        periods: list[float],
-        tol: Tolerance,
-        plant: Plant | None,
-        feedback: str | None,
-        memory: float | None,
-        as_numpy: bool,
-        progress: Callable[[int, int], None] | None,
-    ) -> Track:
-        """Return the track from one start (n,)."""
-        settings = self.settings
-        task = self.settings.task
-        q = settings.configurations(q0, "q0", target)
-        target = target.to(q.dtype)
-        tracker = Tracker(settings, as_array(q) if as_numpy else q, tol, memory)
-        parts = tracker.follow(target, periods, plant, feedback, progress)
-        q, x, measured, sigma_min, held, damped = parts
-        e_model, e = (task.difference(a, target) for a in (x, measured))
-        judged = e if feedback == "measured" else e_model
-        error = e.norm(dim=-1)
-        reached = task.reached(judged, tol)
-        status = statuses(task, q, judged.norm(dim=-1), reached, held, damped)
-        status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
-        results = (
-            t,
-            q,
-            x,
-            measured,
-            target,
-            error,
-            status,
-            sigma_min,
-            settings.margin(q),
-        )
-        results = give_back(results, (len(target),), as_numpy)
-        if plant is None:
-            results[3] = None
-        return Track(*results)
 
     def tracker(
         self,

@@ -1,0 +1,81 @@
+"""Limits of the tip: half-spaces, and the shortest way into them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.arrays import Numbers, Transform, as_tensor
+from hybridkin._core.kernel_numbers import IK_PROXIMAL
+from hybridkin.ik._box import BoxProblem, box_limited_step
+from hybridkin.ik._gram import apply_rows
+from hybridkin.ik.tasks import PositionTask, Task
+
+
+class HalfSpaces(NamedTuple):
+    """Half-spaces in which the tip must stay: normals x <= offsets, unit normals (k, m)."""
+
+    normals: Tensor
+    offsets: Tensor
+
+    def __repr__(self) -> str:
+        """Return the number of half-spaces, for printing."""
+        return f"{len(self.offsets)} half-spaces"
+
+    def margin(self, x: Tensor) -> Tensor:
+        """Return the distances (N, k) of points (N, m) to the planes, negative outside."""
+        return self.offsets.to(x) - self.along(x)
+
+    def along(self, way: Tensor) -> Tensor:
+        """Return the components (N, k) of displacements (N, m) along the normals."""
+        return way @ self.normals.to(way).T
+
+    def way_in(self, margin: Tensor) -> Tensor:
+        """Return the shortest displacements (N, m) with along(way) <= margin.
+
+        They are -normals^T nu, where nu >= 0 minimises |normals^T nu|^2 / 2 + nu . margin. A change
+        of nu is a box-limited step; proximal rounds remove the effect of its damping.
+        """
+        n_rows = len(margin)
+        J = self.normals.to(margin).T.expand(n_rows, -1, -1)
+        way = margin.new_zeros(n_rows, J.shape[1])
+        nu = torch.zeros_like(margin)
+        damping = max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps))
+        damping_sq = margin.new_full((n_rows,), damping)
+        for _ in range(1 + IK_PROXIMAL):
+            z = (self.along(way) - margin) / damping
+            problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
+            change, _ = box_limited_step(problem, damping_sq)
+            nu = nu + change
+            way = way - apply_rows(J, change)
+        return way
+
+
+def half_spaces(pair: Sequence[Numbers | Transform], task: Task) -> HalfSpaces:
+    """Return tip limits, a pair (A, b) with A x <= b, as half-spaces with unit normals."""
+    if not isinstance(task, PositionTask):
+        got = type(task).__name__
+        raise ValueError(f"`tip_limits` needs a PositionTask, got a {got}.")
+    m = task.shape[0]
+    need = (
+        f"`tip_limits` must be a pair (A, b) of shapes (k, {m}) and (k,), finite, with a direction "
+        "in every row of A"
+    )
+    if not isinstance(pair, Sequence) or len(pair) != 2:
+        raise ValueError(f"{need}, got {pair!r:.200}.")
+    A, b = (as_tensor(part, "tip_limits").cpu().double() for part in pair)
+    size = A.norm(dim=-1)
+    good = b.ndim == 1 and A.shape == (len(b), m)
+    if not good or not torch.isfinite(b + size).all() or not (size > 0.0).all():
+        raise ValueError(f"{need}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
+    spaces = HalfSpaces(A / size[:, None], b / size)
+    margin = spaces.margin(spaces.way_in(spaces.offsets[None]))
+    if not (margin >= -1e-9).all():
+        raise ValueError(
+            "`tip_limits` must have a common point; these half-spaces have none."
+        )
+    return spaces

@@ -1,0 +1,66 @@
+"""A path followed from one start, by the model or on a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.arrays import as_array, give_back
+from hybridkin.ik._settings import StepSettings
+from hybridkin.ik.results import IKStatus, Track, statuses
+from hybridkin.ik.tasks import Tolerance
+from hybridkin.ik.tracker import Plant, Tracker
+
+
+@dataclass(frozen=True)
+class Path:
+    """Points to follow (T, ...), their times (T,), and the period after each."""
+
+    points: Tensor
+    t: Tensor
+    periods: list[float]
+    tol: Tolerance  # of a reached point
+    as_numpy: bool  # type of the results
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What closes the loop, see `InverseKinematics.track`."""
+
+    plant: Plant | None = None
+    feedback: str | None = "model"
+    memory: float | None = None
+    progress: Callable[[int, int], None] | None = None
+
+
+def followed(settings: StepSettings, q0: Tensor, path: Path, loop: Loop) -> Track:
+    """Return the track from one start (n,)."""
+    task = settings.task
+    start = settings.configurations(q0, "q0", path.points)
+    target = path.points.to(start.dtype)
+    tracker = Tracker(
+        settings,
+        as_array(start) if path.as_numpy else start,
+        path.tol,
+        loop.memory,
+    )
+    q, x, measured, sigma_min, held, damped = tracker.follow(
+        target, path.periods, loop.plant, loop.feedback, loop.progress
+    )
+    e = task.difference(measured, target)
+    error = e.norm(dim=-1)
+    judged = e
+    if loop.feedback != "measured":
+        judged = task.difference(x, target)
+    reached = task.reached(judged, path.tol)
+    status = statuses(task, q, judged.norm(dim=-1), reached, held, damped)
+    status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
+    margin = settings.margin(q)
+    rows = (path.t, q, x, measured, target, error, status, sigma_min, margin)
+    results = give_back(rows, (len(target),), path.as_numpy)
+    if loop.plant is None:
+        results[3] = None
+    return Track(*results)
