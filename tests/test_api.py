@@ -23,7 +23,7 @@ FLOORS = [
     {"_core", "datasets", "plots"},
 ]
 BESIDE = {
-    "datasets": {"_core"},
+    "datasets": {"_core", "chains"},
     "plots": {"_core", "chains"},
     "_core": set(),
 }

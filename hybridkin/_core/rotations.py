@@ -46,6 +46,25 @@ def nearest_rotation(moments: Tensor) -> tuple[Tensor, Tensor]:
     return (left * sign[..., None, :]) @ right, (stretch * sign).sum(-1)
 
 
+def rigid_motion(
+    points: Tensor, targets: Tensor, weights: Tensor | None = None
+) -> Tensor:
+    """Return the motion (4, 4) that brings points (N, 3) nearest to their targets (N, 3).
+
+    `weights` (N,) are those of the squared distances, by default equal.
+    """
+    if weights is None:
+        weights = points.new_ones(len(points))
+    weights = (weights / weights.sum())[:, None]
+    center = (weights * points).sum(0)
+    target_center = (weights * targets).sum(0)
+    moments = (weights * (targets - target_center)).mT @ (points - center)
+    motion = identity(4, points)
+    motion[:3, :3] = nearest_rotation(moments)[0]
+    motion[:3, 3] = target_center - motion[:3, :3] @ center
+    return motion
+
+
 def rotation_vector(R: Tensor) -> Tensor:
     """Return the logarithm (..., 3) of rotations (..., 3, 3) [rad], valid up to half turns.
 

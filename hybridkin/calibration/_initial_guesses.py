@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.rotations import nearest_rotation
+from hybridkin._core.rotations import rigid_motion
 from hybridkin.calibration._least_squares import Rows
 from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
@@ -64,14 +64,8 @@ def aligned(chain: _Chain, rows: Rows) -> _Chain:
     """Return the chain at the base pose that aligns predicted and measured tips."""
     x = torch.from_numpy(points(rows.x.numpy())[rows.seen])
     tips = x + torch.from_numpy(rows.residual(chain)).to(x)
-    weight = torch.from_numpy(rows.weights).to(x)[:, None] / rows.weights.sum()
-    here = (weight * tips).sum(0)
-    there = (weight * x).sum(0)
-    rotation, _ = nearest_rotation((weight * (x - there)).mT @ (tips - here))
-    move = torch.eye(4, dtype=here.dtype, device=here.device)
-    move[:3, :3] = rotation
-    move[:3, 3] = there - rotation @ here
-    return chain.with_geometry(base=move @ chain.geometry()["base"])
+    motion = rigid_motion(tips, x, torch.from_numpy(rows.weights).to(x))
+    return chain.with_geometry(base=motion @ chain.geometry()["base"])
 
 
 def _searched(

@@ -1,111 +1,98 @@
-"""Search for the order and signs of the actuator columns that explain the tips best."""
+"""Search for the order and signs of the actuator columns that explain the tips best.
+
+A way to read the columns is a matrix (n, n) of ints with one 1 or -1 in each row and column:
+``q @ way`` has the columns in their true order and with their true signs.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.rotations import nearest_rotation
+from hybridkin._core.rotations import nearest_rotation, rigid_motion
+
+if TYPE_CHECKING:
+    from hybridkin.chains.arc_chain import ArcChain
 
 _ROWS = 60  # rows of the search; enough to distinguish two orders
 _MANY = 5  # for more actuators in a segment, or more segments, only pairs of columns are swapped
 _ROUNDS = 12  # successive changes
-_KEPT = 10  # orders from which each round starts
+_CANDIDATES = 10  # ways from which each round starts
 _GAIN = 0.97  # largest ratio of errors after and before a further change
-_SIMPLE = 1.1  # an earlier change in the list is chosen if it is nearly as good
+SIMPLE = 1.1  # an earlier change in the list is chosen if it is nearly as good
 
 
-class Way(NamedTuple):
-    """A way of reading the columns: ``sign * q[:, order]``."""
-
-    order: tuple[int, ...]
-    sign: tuple[int, ...]
-
-    def then(self, other: Way) -> Way:
-        """Return this way followed by another one."""
-        order = np.array(self.order)[[*other.order]]
-        sign = np.array(self.sign)[[*other.order]] * other.sign
-        return Way(tuple(order.tolist()), tuple(sign.tolist()))
-
-    def of(self, q: NDArray) -> NDArray:
-        """Return the columns of q (N, n), read this way."""
-        return np.array(self.sign) * q[:, list(self.order)]
-
-
-def as_declared(n: int) -> Way:
-    """Return the way that does not change n columns."""
-    return Way(tuple(range(n)), (1,) * n)
-
-
-def changes(counts: list[int], signed: bool) -> Iterator[Way]:
+def changes(counts: Sequence[int], signed: bool) -> Iterator[NDArray]:
     """Yield the single changes that are tried, common mistakes first.
 
     They are: reversed numbering of all segments; all signs, or one; two columns swapped; another
     order of the columns of one segment; another order of the segments.
     """
     n = sum(counts)
-    declared = as_declared(n)
-    clockwise = _clockwise(counts)
-    yield clockwise
+    declared = np.eye(n, dtype=int)
+    numbering = declared[:, other_direction(counts)]
+    yield numbering
     if signed:
-        yield Way(declared.order, (-1,) * n)
-        yield Way(clockwise.order, (-1,) * n)
+        yield -declared
+        yield -numbering
         for i in range(n):
-            sign = [1] * n
-            sign[i] = -1
-            yield Way(declared.order, tuple(sign))
+            one_sign = declared.copy()
+            one_sign[i, i] = -1
+            yield one_sign
     for i, j in itertools.combinations(range(n), 2):
-        yield _reordered(n, (i, j), (j, i))
-    segments = _segments(counts)
+        yield _reordered(declared, [i, j], [j, i])
+    segments = segment_columns(counts)
     for segment in segments:
         if len(segment) <= _MANY:
             for order in [*itertools.permutations(segment)][1:]:
-                yield _reordered(n, segment, order)
+                yield _reordered(declared, segment, order)
     if len(segments) <= _MANY:
         for listed in itertools.permutations(range(len(segments))):
-            yield _segments_listed(counts, listed)
+            yield declared[:, _segments_listed(counts, listed)]
 
 
-def _segments(counts: Sequence[int]) -> list[list[int]]:
+def segment_columns(counts: Sequence[int]) -> list[list[int]]:
     """Return the columns of every segment."""
-    return [
-        part.tolist()
-        for part in np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-    ]
+    ends = np.cumsum(counts)
+    segments = []
+    for count, end in zip(counts, ends.tolist(), strict=True):
+        segments.append([*range(end - count, end)])
+    return segments
 
 
-def _clockwise(counts: list[int]) -> Way:
-    """Return the way with the actuators of every segment numbered in the other direction."""
+def other_direction(counts: Sequence[int]) -> list[int]:
+    """Return the columns with the actuators of every segment numbered in the other direction."""
     order = []
-    for first, *others in _segments(counts):
-        order += [first, *others[::-1]]
-    return as_declared(len(order))._replace(order=tuple(order))
+    for first, *following in segment_columns(counts):
+        order += [first, *reversed(following)]
+    return order
 
 
-def _reordered(n: int, columns: Sequence[int], order: Sequence[int]) -> Way:
-    """Return the way with some of n columns in another order."""
-    way = [*range(n)]
-    for column, other in zip(columns, order, strict=True):
-        way[column] = other
-    return as_declared(n)._replace(order=tuple(way))
+def _reordered(
+    declared: NDArray, columns: Sequence[int], order: Sequence[int]
+) -> NDArray:
+    """Return the way with some columns in another order."""
+    way = declared.copy()
+    way[:, columns] = declared[:, order]
+    return way
 
 
-def _segments_listed(counts: list[int], listed: Sequence[int]) -> Way:
-    """Return the way for columns that list the segments in another order."""
-    columns = _segments([counts[k] for k in listed])
+def _segments_listed(counts: Sequence[int], listed: Sequence[int]) -> list[int]:
+    """Return the columns in their true order if they list the segments in another order."""
+    listed_columns = segment_columns([counts[k] for k in listed])
     order = []
     for k in range(len(counts)):
-        order += columns[listed.index(k)]
-    return as_declared(len(order))._replace(order=tuple(order))
+        order += listed_columns[listed.index(k)]
+    return order
 
 
-def misses(chain: object, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
+def misses(chain: ArcChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
     """Return for each q (N, n) of qs (K, N, n) the relative error of the chain's tips.
 
     This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for
@@ -120,18 +107,17 @@ def misses(chain: object, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArra
     return (squares / measured.square().sum(-1).mean()).sqrt().numpy()
 
 
-def base_turn(chain: Any, q: NDArray, x: NDArray) -> tuple[float, float]:
+def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     tips, measured = _centred(chain, q[None], x)
-    turn, _ = nearest_rotation(measured.mT @ tips[0])
     base = chain.base[:3, :3].double()
-    turn = (base.mT @ turn @ base).numpy()
+    turn = (base.mT @ rigid_motion(tips[0], measured)[:3, :3] @ base).numpy()
     twist = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
     tilt = np.arccos(np.clip(turn[2, 2], -1.0, 1.0))
     return float(np.degrees(twist)), float(np.degrees(tilt))
 
 
-def _centred(chain: Any, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
+def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
@@ -141,8 +127,8 @@ def _centred(chain: Any, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
 
 
 def better_way(
-    chain: Any, q: NDArray, x: NDArray, base_is_free: bool
-) -> tuple[Way, float]:
+    chain: ArcChain, q: NDArray, x: NDArray, base_is_free: bool
+) -> tuple[NDArray, float]:
     """Return the best found way to read the columns, and its relative error (see `misses`).
 
     Each round tries all changes on the best ways of the previous round.
@@ -151,18 +137,21 @@ def better_way(
     q = q[rows]
     x = x[rows]
     tried = [*changes(chain.actuators_per_segment, not any(chain.extensible))]
-    best = as_declared(q.shape[1])
+    best = np.eye(q.shape[1], dtype=int)
     least = float(misses(chain, q[None], x, base_is_free)[0])
-    candidates = [best]
+    candidates = np.array([best])
     for _ in range(_ROUNDS):
-        ways = [
-            *dict.fromkeys(way.then(change) for way in candidates for change in tried)
-        ]
-        missed = misses(chain, np.stack([way.of(q) for way in ways]), x, base_is_free)
-        candidates = [ways[i] for i in np.argsort(missed)[:_KEPT]]
+        different = {}
+        for candidate in candidates:
+            for change in tried:
+                way = candidate @ change
+                different.setdefault(way.tobytes(), way)
+        ways = np.array([*different.values()])
+        missed = misses(chain, q @ ways, x, base_is_free)
         if missed.min() > _GAIN * least:
             break
-        first = int(np.flatnonzero(missed <= _SIMPLE * missed.min())[0])
+        candidates = ways[np.argsort(missed)[:_CANDIDATES]]
+        first = np.argmax(missed <= SIMPLE * missed.min())
         best = ways[first]
         least = float(missed[first])
     return best, least

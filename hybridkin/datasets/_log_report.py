@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,8 @@ SEVERITIES = ("error", "warning", "note")
 MISREAD = ("units", "order", "sign", "numbering", "axes", "size")
 _WIDTH = 96
 _ARROW = " " * 11 + "-> "
+_MOST_RANGES = 4  # of rows that are named in a message
+_SHOWN_IN = {"m": (1e3, " mm"), "rad": (180.0 / np.pi, " deg")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,72 +99,82 @@ class LogReport:
 
     def accepting(self, kind: str) -> LogReport:
         """Return the report with findings of a kind as notes, because their rows are left out."""
-        findings = [f for f in self.findings if f.kind != kind]
-        for f in self.findings:
-            if f.kind == kind:
-                message = f"{f.message} They were left out."
-                findings.append(
-                    LogFinding(kind, "note", message, "find out why.", f.rows)
-                )
-        return replace(self, findings=tuple(findings))
+        findings = []
+        accepted = []
+        for finding in self.findings:
+            if finding.kind == kind:
+                message = f"{finding.message} They were left out."
+                note = LogFinding(kind, "note", message, "find out why.", finding.rows)
+                accepted.append(note)
+            else:
+                findings.append(finding)
+        return replace(self, findings=(*findings, *accepted))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the report as numbers, text and lists, for JSON."""
-        record = {**vars(self), "ok": self.ok, "duration_s": self.duration}
-        del record["duration"]
-        for name in ("q_range", "x_range"):
-            record[name] = record[name].tolist()
-        record["findings"] = [
-            {**vars(f), "rows": f.rows.tolist(), "n_rows": len(f.rows)}
-            for f in self.findings
-        ]
+        record = asdict(self)
+        for finding in record["findings"]:
+            finding["n_rows"] = len(finding["rows"])
+            finding["rows"] = finding["rows"].tolist()
+        record["q_range"] = self.q_range.tolist()
+        record["x_range"] = self.x_range.tolist()
+        record["duration_s"] = record.pop("duration")
+        record["ok"] = self.ok
         return record
 
     def summary(self) -> str:
         """Return the numbers of errors and warnings as text."""
-        counts = {"error": len(self.errors), "warning": len(self.warnings)}
-        counted = [
-            f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n
-        ]
-        return " and ".join(counted) or "no errors and no warnings"
+        counts = []
+        for n, word in ((len(self.errors), "error"), (len(self.warnings), "warning")):
+            if n:
+                counts.append(f"{n} {word}{'s' if n > 1 else ''}")
+        return " and ".join(counts) or "no errors and no warnings"
 
     def __str__(self) -> str:
         """Return the report as text, one paragraph for each finding."""
-        if self.n_motions is None:
-            motions = "motions not named"
-        else:
+        motions = "motions not named"
+        if self.n_motions is not None:
             motions = f"{self.n_motions} motions"
-        spans = 1e3 * np.ptp(self.x_range, axis=1)
-        scale, unit = {"m": (1e3, " mm"), "rad": (180.0 / np.pi, " deg")}.get(
-            self.q_unit, (1, "")
-        )
-        lines = [
-            f"Log {self.source}: {self.n_rows} rows, {motions}, {self.n_actuators} actuators"
-            + ("" if self.duration is None else f", {self.duration:.4g} s"),
-            f"  q from {scale * self.q_range[:, 0].min():.4g} to "
-            f"{scale * self.q_range[:, 1].max():.4g}{unit}, "
-            f"tip within {spans[0]:.4g} x {spans[1]:.4g} x {spans[2]:.4g} mm",
-        ]
+        head = f"Log {self.source}: {self.n_rows} rows, {motions}, {self.n_actuators} actuators"
+        if self.duration is not None:
+            head += f", {self.duration:.4g} s"
+        scale, unit = _SHOWN_IN.get(self.q_unit, (1.0, ""))
+        low = scale * self.q_range.min()
+        high = scale * self.q_range.max()
+        x, y, z = 1e3 * np.ptp(self.x_range, axis=1)
+        tips = f"tip within {x:.4g} x {y:.4g} x {z:.4g} mm"
+        lines = [head, f"  q from {low:.4g} to {high:.4g}{unit}, {tips}"]
         for finding in self.findings:
-            head = f"  {finding.severity.upper():8s} {finding.kind}: "
-            lines += [_filled(head, finding.message), _filled(_ARROW, finding.advice)]
+            title = f"  {finding.severity.upper():8s} {finding.kind}: "
+            lines.append(_filled(title, finding.message))
+            lines.append(_filled(_ARROW, finding.advice))
         lines.append(f"  {self.summary()}")
         return "\n".join(lines)
 
 
 def _filled(head: str, text: str) -> str:
-    lines = textwrap.TextWrapper(_WIDTH, head, " " * 14, break_on_hyphens=False)
-    lines.break_long_words = False
-    return lines.fill(text)
+    return textwrap.fill(
+        text,
+        _WIDTH,
+        initial_indent=head,
+        subsequent_indent=" " * 14,
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
 
 
 def named_rows(places: NDArray, kind: str) -> str:
     """Return places as text, neighbours as ranges: "lines 3, 8-12 and 40 more"."""
     ordered = np.sort(places)
-    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
-    words = [
-        f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:4]
-    ]
-    left = sum(map(len, runs[4:]))
-    rest = f" and {left} more" if left else ""
-    return f"{kind}{'s' if len(ordered) > 1 else ''} {', '.join(words)}{rest}"
+    ranges = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
+    words = []
+    n_named = 0
+    for neighbours in ranges[:_MOST_RANGES]:
+        first = neighbours[0]
+        last = neighbours[-1]
+        words.append(f"{first}" if first == last else f"{first}-{last}")
+        n_named += len(neighbours)
+    text = f"{kind}{'s' if len(ordered) > 1 else ''} {', '.join(words)}"
+    if n_named < len(ordered):
+        text += f" and {len(ordered) - n_named} more"
+    return text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from hybridkin.datasets._log_report import LogFinding
 from hybridkin.datasets._logs import Log
 
+if TYPE_CHECKING:
+    from hybridkin.chains.arc_chain import ArcChain
+
 _LAGS = 10  # largest lag of the tip in rows, in both directions
 # Limits of the rms residual of a model with a drift, and with a lag, relative to that without. For
 # simulated logs and recordings of real robots without drift or lag it was above 0.89.
@@ -19,7 +22,9 @@ _DRIFT = 0.8
 _LAG = 0.6
 
 
-def residual_findings(log: Log, chain: object, same: NDArray) -> Iterator[LogFinding]:
+def residual_findings(
+    log: Log, chain: ArcChain | None, same: NDArray
+) -> Iterator[LogFinding]:
     """Yield findings on a drift of the tip and on lags.
 
     Parameters
@@ -67,7 +72,7 @@ def residual_findings(log: Log, chain: object, same: NDArray) -> Iterator[LogFin
         yield LogFinding("lag", "warning", message, advice)
 
 
-def _features(q: NDArray, chain: Any) -> NDArray:
+def _features(q: NDArray, chain: ArcChain | None) -> NDArray:
     """Return the features of a rough linear model of the tip: q, squares and the chain's tips."""
     spans = np.ptp(q, axis=0)
     z = (q - q.mean(axis=0)) / np.where(spans > 0, spans, 1.0)

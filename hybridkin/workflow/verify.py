@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from hybridkin._core.arrays import as_array
-from hybridkin._core.rotations import nearest_rotation
+from hybridkin._core.rotations import rigid_motion
 from hybridkin.chains.play import PlayOperator
 from hybridkin.datasets import Log
 from hybridkin.native.library import evaluate
@@ -226,10 +226,8 @@ def _without_backlash(
 
 def _moved(tips: NDArray, x: NDArray) -> NDArray:
     """Return tips (N, 3) after the rigid motion that brings them nearest to x."""
-    middle = x.mean(axis=0)
-    centred = tips - tips.mean(axis=0)
-    turn, _ = nearest_rotation(torch.from_numpy((x - middle).T @ centred))
-    return middle + centred @ turn.numpy().T
+    motion = rigid_motion(torch.from_numpy(tips), torch.from_numpy(x)).numpy()
+    return tips @ motion[:3, :3].T + motion[:3, 3]
 
 
 def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
