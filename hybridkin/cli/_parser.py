@@ -319,10 +319,12 @@ def _view(command: argparse.ArgumentParser) -> None:
 
     Opens a page of this machine with the robot in 3D. Drag the target, and the tip follows; move a
     slider, and an actuator moves. "Wiggle every actuator" shows whether a description bends the
-    right way. With a log its tips are coloured by the error of the model. Ctrl-C ends it.
+    right way. With a log its tips are coloured by the error of the model, and a click on one moves
+    the robot there. Ctrl-C ends it.
 
     Some examples:
       hybridkin view model
+      hybridkin view model --path path.csv --unit mm   # a button follows it, in a loop
       hybridkin view robot.toml log.csv
       hybridkin view model --q-min=-8 --q-max 8 --dq-max 20
       hybridkin view model --no-browser --port 9000    # over ssh: forward this port
@@ -334,6 +336,9 @@ def _view(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     _add_model(command)
     add("log", type=Path, nargs="?", metavar="LOG", help="measured rows to show")
+    add("--path", type=Path, metavar="CSV", help="path of the tip to follow in a loop")
+    add("--dt", type=positive, metavar="S", help="time between points of the path [s]")
+    add("--unit", choices=METRES, help="unit of the path (that of x in the log)")
     add(
         "--host",
         default="127.0.0.1",

@@ -244,9 +244,13 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         robot_format = None if loaded.description is None else loaded.description.log
         log_format = _log_format(arguments, robot_format, arguments.model)
         log = _read(arguments, log_format, None, True, stages)
+    path = None
+    if arguments.path is not None:
+        unit = arguments.unit or loaded.log_format().x_unit
+        path = hybridkin.workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
     limits = _scaled_limits(arguments, loaded)
     place = {"host": arguments.host, "port": arguments.port}
-    with hybridkin.view(loaded, log, **vars(limits), **place) as shown_robot:
+    with hybridkin.view(loaded, log, path=path, **vars(limits), **place) as shown_robot:
         address = shown_robot.address
         stages.note(f"{loaded.name} is at {address}. Ctrl-C ends it.", important=True)
         if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.model import ForwardModel
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.datasets import Log
 from hybridkin.plots.models import body_of
 from hybridkin.viewer.steered import SteeredRobot
 
-GREEN, ORANGE, RED = (40, 160, 80), (235, 150, 30), (210, 50, 50)
-BLUE, GREY, YELLOW = (40, 90, 200), (150, 150, 150), (250, 215, 70)
+Color: TypeAlias = tuple[int, int, int]
+
+GREEN = (40, 160, 80)
+ORANGE = (235, 150, 30)
+RED = (210, 50, 50)
+BLUE = (40, 90, 200)
+GREY = (150, 150, 150)
+YELLOW = (250, 215, 70)
 GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
 _POINTS = 10  # drawn along a segment
+_MOST_ROWS = 2000  # of a log, drawn as a cloud
+_CLICK = 2.0  # distance of a click from a row, relative to the size of its dot
 
 
 class Body:
@@ -89,10 +99,10 @@ class Body:
         if isinstance(chain, ElasticTendonChain):
             with torch.no_grad():
                 tension = chain.tensions(torch.from_numpy(robot.q)).numpy()
-            share = tension / max(float(tension.max()), 1e-300)
-            return between(BLUE, RED, share), tension <= 0.0
-        share = (robot.q - robot.limits.q_min) / robot.span
-        return between(RED, BLUE, share), np.zeros(len(share), dtype=bool)
+            fraction = tension / max(float(tension.max()), 1e-300)
+            return between(BLUE, RED, fraction), tension <= 0.0
+        fraction = (robot.q - robot.limits.q_min) / robot.span
+        return between(RED, BLUE, fraction), np.zeros(len(fraction), dtype=bool)
 
 
 class Ghost:
@@ -118,13 +128,65 @@ class Ghost:
                 self.line.points = points
 
 
+class LogCloud:
+    """Rows of a log: measured tips coloured by the error of the model, which can be clicked."""
+
+    def __init__(self, scene: Any, robot: SteeredRobot, log: Log) -> None:
+        loaded = robot.loaded
+        (commands, tips) = robot.measured_rows(log)
+        every = 1 + len(tips) // _MOST_ROWS
+        self._commands = commands[::every]
+        self._tips = tips[::every]
+        error = np.linalg.norm(loaded.tips(self._commands) - self._tips, axis=1)
+        self._size = 0.007 * robot.size
+        largest = float(np.percentile(error, 95)) if len(error) else 1.0
+        self.name = f"log, red: error of {1e3 * largest:.3g} mm or more"
+        self.dots = scene.add_point_cloud(
+            "/log",
+            self._tips,
+            between(YELLOW, RED, error / max(largest, 1e-12)),
+            point_size=self._size,
+            point_shape="circle",
+        )
+        self.learned = None
+        if loaded.hybrid is not None and loaded.chain is not None:
+            mechanical = tips_of(loaded.chain, self._commands)
+            hybrid = tips_of(loaded.hybrid.module_, self._commands)
+            self.learned = scene.add_line_segments(
+                "/learned",
+                np.stack([mechanical, hybrid], axis=1),
+                ORANGE,
+                thickness=0.3 * self._size,
+                visible=False,
+            )
+
+    def row_at(
+        self, origin: NDArray, direction: NDArray
+    ) -> tuple[NDArray, NDArray] | None:
+        """Return the command (n,) and the tip (3,) of the first row that a ray meets, or None."""
+        ways = self._tips - origin
+        along = ways @ direction
+        distance = np.linalg.norm(ways - along[:, None] * direction, axis=1)
+        hit = np.flatnonzero((distance < _CLICK * self._size) & (along > 0.0))
+        if not len(hit):
+            return None
+        first = hit[np.argmin(along[hit])]
+        return self._commands[first], self._tips[first]
+
+
+def tips_of(model: ForwardModel, q: NDArray) -> NDArray:
+    """Return the tips (N, 3) of a model for rows of q (N, n)."""
+    with torch.no_grad():
+        return model.tip_model(torch.from_numpy(q)).numpy()
+
+
 def _rims(body: dict[str, Any]) -> NDArray:
     """Return the rims of the disks as segments (L, 2, 3)."""
     rims = body["disks"][0]
     return np.stack([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
-def between(low: tuple, high: tuple, share: NDArray) -> NDArray:
-    """Return colours (N, 3) from low to high for shares (N,) from 0 to 1."""
-    part = np.clip(share, 0.0, 1.0)[:, None]
+def between(low: Color, high: Color, fraction: NDArray) -> NDArray:
+    """Return colours (N, 3) from low to high for fractions (N,) from 0 to 1."""
+    part = np.clip(fraction, 0.0, 1.0)[:, None]
     return ((1.0 - part) * np.array(low) + part * np.array(high)).astype(np.uint8)

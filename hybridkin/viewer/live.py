@@ -12,42 +12,41 @@ from threading import Event, Thread
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.viewer.drawing import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    RED,
-    YELLOW,
-    Body,
-    Ghost,
-    between,
+from hybridkin.ik.trajectories import Trajectory
+from hybridkin.viewer.drawing import BLUE, GREEN, ORANGE, RED, Body, Ghost, LogCloud
+from hybridkin.viewer.motions import (
+    Loop,
+    Motion,
+    Replay,
+    Wiggle,
+    circle,
+    figure_eight,
 )
-from hybridkin.viewer.motions import Loop, Motion, Replay, Wiggle
 from hybridkin.viewer.steered import RATE, SteeredRobot
 from hybridkin.workflow.domain import path_limits
 from hybridkin.workflow.model import LoadedModel
 
 __all__ = ["LiveView", "view"]
 
-_MOST_ROWS = 2000  # of a log, drawn as a cloud
 _CAMERA = np.array([0.9, -1.1, 0.4])  # from the middle, relative to the robot's size
-_SAID = 0.1  # between two updates of the words [s]
+_PAUSE = 0.1  # between two updates of the words [s]
 
 
 def view(
     model: LoadedModel | HybridForwardModel | Chain,
     log: Log | None = None,
     *,
-    q_min: Any = None,
-    q_max: Any = None,
-    dq_max: Any = None,
-    ddq_max: Any = None,
+    path: Trajectory | None = None,
+    q_min: ArrayLike | None = None,
+    q_max: ArrayLike | None = None,
+    dq_max: ArrayLike | None = None,
+    ddq_max: ArrayLike | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> LiveView:
@@ -58,7 +57,10 @@ def view(
     model : LoadedModel, HybridForwardModel or Chain
         A model with a mechanical part that can be drawn; from a file by `workflow.open_model`.
     log : Log, optional
-        Measured rows to show, from `datasets.load_log` or `workflow.read_log`.
+        Measured rows to show, from `datasets.load_log` or `workflow.read_log`. A click on a row
+        moves the robot there.
+    path : Trajectory, optional
+        A path that a button starts, in a loop; from `workflow.read_path` or `trajectories`.
     q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
         Limits of position, speed and acceleration [unit of q, s]. Default: those of the model and
         its description; else the range of the log, and one second for the whole range.
@@ -96,12 +98,13 @@ def view(
             "`model` must be a chain, or a hybrid fitted on one, so that its body can be drawn; "
             f"got a model without a mechanical part, {model.name}."
         )
-    bounds = {"q_min": q_min, "q_max": q_max}
     if log is not None and not _has_range(model):
-        ends = {"q_min": np.nanmin(log.q, axis=0), "q_max": np.nanmax(log.q, axis=0)}
-        bounds = {k: ends[k] if v is None else v for k, v in bounds.items()}
-    limits = path_limits(model, **bounds, dq_max=dq_max, ddq_max=ddq_max)
-    return LiveView(SteeredRobot(model, limits), log, host, port)
+        q_min = np.nanmin(log.q, axis=0) if q_min is None else q_min
+        q_max = np.nanmax(log.q, axis=0) if q_max is None else q_max
+    limits = path_limits(
+        model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max
+    )
+    return LiveView(SteeredRobot(model, limits), log, path, host, port)
 
 
 def _has_range(model: LoadedModel) -> bool:
@@ -126,7 +129,12 @@ class LiveView:
     """
 
     def __init__(
-        self, robot: SteeredRobot, log: Log | None, host: str, port: int
+        self,
+        robot: SteeredRobot,
+        log: Log | None,
+        path: Trajectory | None,
+        host: str,
+        port: int,
     ) -> None:
         try:
             import viser
@@ -143,26 +151,29 @@ class LiveView:
         self.address = f"http://{host}:{self._server.get_port()}"
         self._wake = Event()
         self._closed = False
+        self._failure: Exception | None = None
         self._motion: Motion | None = None
-        self._said = 0.0
+        self._last_words = 0.0
+        self._draw_scene(log)
+        self._add_panel(log, path)
+        self._show()
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _draw_scene(self, log: Log | None) -> None:
+        """Draw the robot, its target, and what can be shown beside it."""
+        robot = self.robot
         scene = self._server.scene
-        loaded = robot.loaded
         scene.set_up_direction("+z")
-        ends = np.vstack([robot.domain.sample[1], np.zeros(3)])
-        middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
+        reachable = robot.domain.sample[1]
+        corners = np.vstack([reachable, np.zeros(3)])
+        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         self._server.initial_camera.look_at = middle
         self._server.initial_camera.position = middle + robot.size * _CAMERA
         scene.add_frame(
             "/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size
         )
-        self._body = Body(scene, loaded.model, robot)
-        self._ghosts = {
-            name: Ghost(scene, name, chain, robot)
-            for name, chain in _other_models(loaded).items()
-        }
-        self._radius = scene.add_icosphere(
-            "/radius", 1.0, color=ORANGE, opacity=0.2, visible=False
-        )
+        self._body = Body(scene, robot.loaded.model, robot)
         self._aim = scene.add_transform_controls(
             "/target",
             scale=0.15 * robot.size,
@@ -171,11 +182,35 @@ class LiveView:
         )
         self._aim.on_update(self._dragged)
         self._ball = scene.add_icosphere("/target/ball", 0.02 * robot.size, GREEN)
-        self._add_clouds(log)
-        self._add_panel(log)
-        self._show()
-        self._thread = Thread(target=self._run, daemon=True)
-        self._thread.start()
+        self._measured = scene.add_icosphere(
+            "/measured", 0.015 * robot.size, (0, 0, 0), visible=False
+        )
+        self._radius = scene.add_icosphere(
+            "/radius", 1.0, color=ORANGE, opacity=0.2, visible=False
+        )
+        self._switched: dict[str, Any] = {}
+        self._switched["reachable"] = scene.add_point_cloud(
+            "/reachable",
+            reachable,
+            BLUE,
+            point_size=0.007 * robot.size,
+            point_shape="circle",
+            visible=False,
+        )
+        if log is not None:
+            self._rows = LogCloud(scene, robot, log)
+            self._switched[self._rows.name] = self._rows.dots
+            if self._rows.learned is not None:
+                name = "learned error: mechanical to hybrid tip"
+                self._switched[name] = self._rows.learned
+            scene.on_click()(self._clicked)
+        self._ghosts = []
+        for name, chain in _other_models(robot.loaded).items():
+            ghost = Ghost(scene, name, chain, robot)
+            self._ghosts.append(ghost)
+            self._switched[name] = ghost.line
+        if self._expected() > 0.0:
+            self._switched["expected error"] = self._radius
 
     def __enter__(self) -> Self:
         return self
@@ -193,8 +228,10 @@ class LiveView:
                 self._server.stop()
 
     def wait(self) -> None:
-        """Wait until the view is closed, or Ctrl-C."""
+        """Wait until the view is closed, or Ctrl-C; an error of the drawing is raised here."""
         self._thread.join()
+        if self._failure is not None:
+            raise self._failure
 
     def follow(self, target: NDArray) -> None:
         """Follow a target (3,) [m], as if it was dragged there."""
@@ -208,97 +245,43 @@ class LiveView:
         self.robot.go_to(q)
         self._wake.set()
 
-    def _add_clouds(self, log: Log | None) -> None:
-        """Add what the log holds and what the robot can reach."""
-        scene, robot = self._server.scene, self.robot
-        size = 0.007 * robot.size
-        reach = robot.domain.sample[1]
-        self._clouds: dict[str, list[Any]] = {
-            "reachable": [
-                scene.add_point_cloud(
-                    "/reachable",
-                    reach,
-                    BLUE,
-                    point_size=size,
-                    point_shape="circle",
-                    visible=False,
-                )
-            ]
-        }
-        self._log = log
-        if log is None:
-            return
-        rows = np.arange(0, len(log.q), 1 + len(log.q) // _MOST_ROWS)
-        tips = np.asarray(log.x)[:, -3:]
-        predicted = robot.loaded.predict(log.q, log.groups)[:, -3:]
-        error = np.linalg.norm(predicted - tips, axis=1)[rows]
-        drawn = np.isfinite(error)
-        rows, error = rows[drawn], error[drawn]
-        largest = float(np.percentile(error, 95)) if len(error) else 1.0
-        name = f"log, red: error of {1e3 * largest:.3g} mm or more"
-        colors = between(YELLOW, RED, error / max(largest, 1e-12))
-        self._clouds[name] = [
-            scene.add_point_cloud(
-                "/log", tips[rows], colors, point_size=size, point_shape="circle"
-            )
-        ]
-        self._measured = scene.add_icosphere(
-            "/measured", 0.015 * robot.size, (0, 0, 0), visible=False
-        )
-        if robot.loaded.hybrid is None or robot.loaded.chain is None:
-            return
-        effective = robot.loaded.effective(log.q, log.groups)
-        from_, to = (
-            LoadedModel(m.__class__.__name__, Path(), m).tips(effective[rows])
-            for m in (robot.loaded.chain, robot.loaded.hybrid)
-        )
-        self._clouds["learned error: mechanical to hybrid tip"] = [
-            scene.add_line_segments(
-                "/learned",
-                np.stack([from_, to], 1),
-                ORANGE,
-                thickness=0.3 * size,
-                visible=False,
-            )
-        ]
-
-    def _add_panel(self, log: Log | None) -> None:
+    def _add_panel(self, log: Log | None, path: Trajectory | None) -> None:
         """Add words, sliders and buttons."""
-        gui, robot = self._server.gui, self.robot
-        log_format = robot.loaded.log_format()
+        gui = self._server.gui
+        robot = self.robot
         self._words = gui.add_markdown("")
-        self._factor = np.broadcast_to(log_format.q_factor, robot.q.shape)
-        ends = [robot.limits.q_min / self._factor, robot.limits.q_max / self._factor]
-        self._sliders = []
-        with gui.add_folder(f"Actuators [{log_format.q_unit}]"):
-            for name, low, high, at in zip(
-                log_format.q,
-                *np.sort(ends, axis=0),
-                robot.q / self._factor,
-                strict=True,
-            ):
-                step = max((high - low) / 1000.0, 1e-12)
-                slider = gui.add_slider(name, low, max(high, low + step), step, at)
-                slider.on_update(self._slid)
-                self._sliders.append(slider)
-        with gui.add_folder("Show", expand_by_default=len(self._clouds) > 1):
-            for name, handles in self._clouds.items():
-                self._switch(name, handles)
-            for name, ghost in self._ghosts.items():
-                self._switch(name, [ghost.line])
-            if self._expected() > 0.0:
-                self._switch("expected error", [self._radius])
+        self._add_sliders()
+        with gui.add_folder("Show", expand_by_default=len(self._switched) > 1):
+            for name, handle in self._switched.items():
+                self._switch(name, handle)
         with gui.add_folder("Motion"):
-            self._button("Wiggle every actuator", lambda: Wiggle(self.robot))
-            self._button("Circle", lambda: Loop(self.robot, np.array([1.0, 0.0])))
-            self._button("Figure eight", lambda: Loop(self.robot, np.array([0.0, 1.0])))
+            self._button("Wiggle every actuator", lambda: Wiggle(robot))
+            self._button("Circle", lambda: Loop(robot, circle(robot)))
+            self._button("Figure eight", lambda: Loop(robot, figure_eight(robot)))
+            if path is not None:
+                self._button("Follow the path", lambda: Loop(robot, path))
             if log is not None:
-                self._button(
-                    "Play the log", lambda: Replay(self.robot, log, self._measured)
-                )
+                self._button("Play the log", lambda: Replay(robot, log, self._measured))
             self._button("Stop", lambda: None)
             button = gui.add_button("Download the commands")
             button.on_click(self._download)
+
+    def _add_sliders(self) -> None:
+        """Add a slider for every actuator, in the names and the unit of the log."""
+        robot = self.robot
+        log_format = robot.loaded.log_format()
+        self._factor = np.broadcast_to(log_format.q_factor, robot.q.shape)
+        ends = [robot.limits.q_min / self._factor, robot.limits.q_max / self._factor]
+        (low, high) = np.sort(ends, axis=0)
+        start = robot.q / self._factor
+        self._sliders = []
+        with self._server.gui.add_folder(f"Actuators [{log_format.q_unit}]"):
+            for k, name in enumerate(log_format.q):
+                step = max((high[k] - low[k]) / 1000.0, 1e-12)
+                end = max(high[k], low[k] + step)
+                slider = self._server.gui.add_slider(name, low[k], end, step, start[k])
+                slider.on_update(self._slid)
+                self._sliders.append(slider)
 
     def _button(self, name: str, motion: Callable[[], Motion | None]) -> None:
         def start(_: object) -> None:
@@ -307,15 +290,23 @@ class LiveView:
 
         self._server.gui.add_button(name).on_click(start)
 
-    def _switch(self, name: str, handles: list[Any]) -> None:
-        box = self._server.gui.add_checkbox(name, handles[0].visible)
+    def _switch(self, name: str, handle: Any) -> None:
+        box = self._server.gui.add_checkbox(name, handle.visible)
 
         def switch(_: object) -> None:
-            for handle in handles:
-                handle.visible = box.value
+            handle.visible = box.value
             self._show()
 
         box.on_update(switch)
+
+    def _clicked(self, event: Any) -> None:
+        """Go to the row of the log that was clicked."""
+        origin = np.array(event.ray_origin)
+        row = self._rows.row_at(origin, np.array(event.ray_direction))
+        if row is not None and self._rows.dots.visible:
+            (q, self._measured.position) = row
+            self._measured.visible = True
+            self.go_to(q)
 
     def _dragged(self, event: Any) -> None:
         if event.client is not None:  # not one of our own
@@ -340,6 +331,13 @@ class LiveView:
         return float(expected[0][0]) if expected else 0.0
 
     def _run(self) -> None:
+        try:
+            self._tick_until_closed()
+        except Exception as error:
+            self._failure = error
+            self._words.content = f"**The view has stopped: {error}**"
+
+    def _tick_until_closed(self) -> None:
         """Tick while something moves, else wait."""
         due = time.perf_counter()
         while not self._closed:
@@ -371,35 +369,36 @@ class LiveView:
         robot = self.robot
         with self._server.atomic():
             self._body.move(robot)
-            for ghost in self._ghosts.values():
+            for ghost in self._ghosts:
                 ghost.move(robot)
             if self._radius.visible:
                 self._radius.position = robot.x
                 self._radius.scale = self._expected()
             if not np.array_equal(self._aim.position, robot.target):
                 self._aim.position = robot.target
-        if time.perf_counter() - self._said > _SAID:
+        if time.perf_counter() - self._last_words > _PAUSE:
             self._say()
 
     def _say(self) -> None:
         """Write words and sliders, a few times a second."""
-        self._said = time.perf_counter()
+        self._last_words = time.perf_counter()
         robot = self.robot
         situation = robot.situation
-        if not situation.reached:
-            color = RED if situation.words.startswith("Out") else ORANGE
-        else:
-            color = GREEN if situation.in_domain else ORANGE
+        color = ORANGE
+        if situation.out_of_reach:
+            color = RED
+        elif situation.reached and situation.in_domain:
+            color = GREEN
         if tuple(self._ball.color) != color:
             self._ball.color = color
-        names = robot.loaded.log_format().q
-        held = [name for name, at in zip(names, robot.held, strict=True) if at]
+        at_limits = np.array(robot.loaded.log_format().q)[robot.held]
         lines = [f"**{situation.words}**"]
         if np.isfinite(situation.error):
             lines.append(f"error {1e3 * situation.error:.2f} mm")
-        lines.append("at limits: " + (", ".join(held) or "none"))
+        lines.append("at limits: " + (", ".join(at_limits) or "none"))
         lines.append(f"{self.ticks_per_second:.0f} ticks/s")
-        if (motion := self._motion) is not None:
+        motion = self._motion
+        if motion is not None:
             lines.append(f"moving: {motion.label}")
         self._words.content = "<br>".join(lines)
         for slider, value in zip(self._sliders, robot.q / self._factor, strict=True):
@@ -414,4 +413,4 @@ def _other_models(loaded: LoadedModel) -> dict[str, Chain]:
         models["nominal model"] = loaded.description.chain
     if loaded.hybrid is not None and loaded.chain is not None:
         models["calibrated model"] = loaded.chain
-    return {name: m for name, m in models.items() if m is not loaded.model}
+    return {name: chain for name, chain in models.items() if chain is not loaded.model}

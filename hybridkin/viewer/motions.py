@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin.datasets import Log
+from hybridkin.ik import trajectories
+from hybridkin.ik.trajectories import Trajectory
 from hybridkin.viewer.steered import RATE, SteeredRobot
 
 _SWING = 0.3  # of a wiggle, relative to the range of the actuator
-_TURN = 8.0  # time of one turn on a path [s]
+_LAP = 8.0  # time of one lap on a path [s]
+_WIDTH = 0.12  # half the width of a path, relative to the size of the robot
 
 
 class Motion(Protocol):
@@ -34,15 +38,16 @@ class Wiggle:
     """Every actuator moves out and back, one after another."""
 
     def __init__(self, robot: SteeredRobot) -> None:
-        low, high = robot.limits.q_min, robot.limits.q_max
+        low = robot.limits.q_min
+        high = robot.limits.q_max
         home = np.clip(robot.domain.preferred, low, high)
         self._robot = robot
         self._names = robot.loaded.log_format().q
         self._steps = [home]
         for j in range(len(home)):
             there = home.copy()
-            up = high[j] - home[j] > home[j] - low[j]
-            there[j] += (_SWING if up else -_SWING) * robot.span[j]
+            has_more_room_above = high[j] - home[j] > home[j] - low[j]
+            there[j] += (_SWING if has_more_room_above else -_SWING) * robot.span[j]
             self._steps += [there, home]
         self._at = -1
         self.label = ""
@@ -59,24 +64,37 @@ class Wiggle:
 
 
 class Loop:
-    """A circle (1, 0), a figure eight (0, 1) or their sum from the present tip, in turns."""
+    """A path of the target, again and again."""
 
-    def __init__(self, robot: SteeredRobot, kind: NDArray) -> None:
+    def __init__(self, robot: SteeredRobot, path: Trajectory) -> None:
         self._robot = robot
-        self._center = robot.x
-        self._kind = kind
-        self._tick = 0
+        n_ticks = max(2, round(RATE * path.duration))
+        times = np.linspace(path.t[0], path.t[-1], n_ticks)
+        places = [np.interp(times, path.t, column) for column in path.x.T]
+        self._targets = itertools.cycle(np.stack(places, axis=1))
         self.label = "the target"
 
     def __call__(self) -> bool:
         """Move the target on; it never ends."""
-        phase = 2.0 * np.pi * self._tick / (RATE * _TURN)
-        circle = np.array([np.cos(phase) - 1.0, np.sin(phase), 0.0])
-        eight = np.array([np.sin(phase), np.sin(2.0 * phase), 0.0])
-        shape = self._kind @ np.stack([circle, eight])
-        self._robot.follow(self._center + 0.12 * self._robot.size * shape)
-        self._tick += 1
+        self._robot.follow(next(self._targets))
         return True
+
+
+def circle(robot: SteeredRobot) -> Trajectory:
+    """Return a horizontal circle through the present tip."""
+    radius = _WIDTH * robot.size
+    center = robot.x - [radius, 0.0, 0.0]
+    return trajectories.spiral(
+        center, radius, turns=1.0, duration=_LAP, dt=1.0 / RATE, timing="uniform"
+    )
+
+
+def figure_eight(robot: SteeredRobot) -> Trajectory:
+    """Return a horizontal figure eight about the present tip."""
+    width = 2.0 * _WIDTH * robot.size
+    return trajectories.figure_eight(
+        robot.x, (width, 0.5 * width), duration=_LAP, dt=1.0 / RATE, timing="uniform"
+    )
 
 
 class Replay:
@@ -85,11 +103,7 @@ class Replay:
     def __init__(self, robot: SteeredRobot, log: Log, mark: Any) -> None:
         self._robot = robot
         self._mark = mark
-        effective = robot.loaded.effective(log.q, log.groups)
-        fine = np.isfinite(effective).all(axis=1) & np.isfinite(log.x[:, -3:]).all(
-            axis=1
-        )
-        self._rows = iter(zip(effective[fine], log.x[fine, -3:], strict=True))
+        self._rows = iter(zip(*robot.measured_rows(log), strict=True))
         self._goal: NDArray | None = None
         self._count = 0
         self.label = ""
@@ -98,12 +112,13 @@ class Replay:
         """Go to the next row where the last one is reached."""
         limits = self._robot.limits
         if self._goal is None or np.array_equal(self._robot.q, self._goal):
-            row, tip = next(self._rows, (None, None))
-            self._mark.visible = row is not None
-            if row is None or tip is None:
+            following = next(self._rows, None)
+            self._mark.visible = following is not None
+            if following is None:
                 return False
-            goal = self._goal = np.clip(row, limits.q_min, limits.q_max)
-            self._mark.position = tip
+            (row, self._mark.position) = following
+            goal = np.clip(row, limits.q_min, limits.q_max)
+            self._goal = goal
             self._count += 1
             self.label = f"row {self._count} of the log"
             self._robot.go_to(goal)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin.datasets import Log
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.solver import InverseKinematics
 from hybridkin.workflow.domain import Domain, PathLimits
@@ -30,14 +31,16 @@ class Situation(NamedTuple):
     ----------
     words : str
         One sentence.
-    reached, in_domain : bool
-        Whether the tip is at the target, and the model knows this configuration.
+    reached, out_of_reach, in_domain : bool
+        Whether the tip is at the target, or has stopped away from it, and whether the model knows
+        this configuration.
     error : float
         Distance from the tip to the target [m]; NaN without a target.
     """
 
     words: str
     reached: bool
+    out_of_reach: bool
     in_domain: bool
     error: float
 
@@ -71,7 +74,8 @@ class SteeredRobot:
         self.span = np.maximum(limits.q_max - limits.q_min, np.finfo(float).tiny)
         speed = self.span / _TRAVEL if limits.dq_max is None else limits.dq_max
         self.q = self.domain.preferred
-        self.x = self.target = loaded.tips(self.q[None])[0]
+        self.x = loaded.tips(self.q[None])[0]
+        self.target = self.x
         tips = self.domain.sample[1]
         self.size = float(np.ptp(np.vstack([tips, np.zeros(3)]), axis=0).max())
         self._close = _CLOSE * self.size
@@ -136,19 +140,20 @@ class SteeredRobot:
         """What there is to say about robot and target."""
         with self._lock:
             inside = bool(self.loaded.domain_distance(self.q[None])[0] <= 1.0)
-            known = "" if inside else ", outside the domain of the model"
+            domain = "" if inside else ", outside the domain of the model"
             if self._goal is not None:
-                return Situation(
-                    f"Actuators set by hand{known}.", True, inside, math.nan
-                )
+                words = f"Actuators set by hand{domain}."
+                return Situation(words, True, False, inside, math.nan)
             error = float(np.linalg.norm(self.target - self.x))
             if error <= self._close:
-                return Situation(f"On target{known}.", True, inside, error)
+                return Situation(f"On target{domain}.", True, False, inside, error)
             if not self._resting:
-                return Situation(f"Moving{known}.", False, inside, error)
-            held = self._tracker.status == IKStatus.AT_LIMITS
-            why = ": actuators are at their limits" if held else ""
-            return Situation(f"Out of reach{why}{known}.", False, inside, error)
+                return Situation(f"Moving{domain}.", False, False, inside, error)
+            at_limits = self._tracker.status == IKStatus.AT_LIMITS
+            cause = ": actuators are at their limits" if at_limits else ""
+            return Situation(
+                f"Out of reach{cause}{domain}.", False, True, inside, error
+            )
 
     @property
     def held(self) -> NDArray[np.bool_]:
@@ -156,6 +161,13 @@ class SteeredRobot:
         close = 1e-6 * self.span
         low = self.q <= self.limits.q_min + close
         return low | (self.q >= self.limits.q_max - close)
+
+    def measured_rows(self, log: Log) -> tuple[NDArray, NDArray]:
+        """Return motions of the actuators (N, n) and tips (N, 3) of the known rows of a log."""
+        tips = log.x[:, -3:]
+        measured = np.isfinite(log.q).all(axis=1) & np.isfinite(tips).all(axis=1)
+        groups = None if log.groups is None else np.asarray(log.groups)[measured]
+        return self.loaded.effective(log.q[measured], groups), tips[measured]
 
     def commands(self) -> NDArray:
         """Return the commands (T, n) since the start, at most ten minutes, in the log's unit.

@@ -4,13 +4,15 @@ import builtins
 import socket
 import time
 from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hybridkin
-from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots
+from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots, trajectories
 from hybridkin.cli.main import main
+from hybridkin.viewer.motions import Loop
 
 pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
 
@@ -79,6 +81,53 @@ def test_every_actuator_wiggles_and_the_robot_returns(shown):
     assert (np.count_nonzero(away, axis=1) == 1).all()
     assert sorted(np.argmax(abs(away), axis=1)) == [*range(9)]
     assert shown.robot.q == pytest.approx(seen[0])
+
+
+def test_a_click_on_a_row_of_the_log_moves_the_robot_there(shown, fitted):
+    log = fitted[1]
+    eye = log.x[7] + [0.0, -2.0, 0.3]
+    ray = (log.x[7] - eye) / np.linalg.norm(log.x[7] - eye)
+    (q, tip) = shown._rows.row_at(eye, ray)
+    assert (log.q == q).all(axis=1).any()
+    assert np.linalg.norm(np.cross(tip - eye, ray)) < 0.02 * shown.robot.size
+    assert shown._rows.row_at(eye, -ray) is None
+    shown._clicked(SimpleNamespace(ray_origin=tuple(eye), ray_direction=tuple(ray)))
+    until(lambda: shown.robot.q == pytest.approx(q))
+    assert shown._measured.position == pytest.approx(tip)
+
+
+def test_a_path_is_followed_in_a_loop(fitted):
+    path = trajectories.line([0.0, 0.0, 0.7], [0.05, 0.0, 0.7], duration=0.4, dt=0.02)
+    with hybridkin.view(*fitted, path=path, port=9340) as shown:
+        shown._motion = Loop(shown.robot, path)
+        targets = []
+        follow = shown.robot.follow
+        shown.robot.follow = lambda target: (targets.append(target), follow(target))
+        shown._wake.set()
+        until(lambda: len(targets) > 41)
+    np.testing.assert_allclose(targets[19], path.x[-1])
+    np.testing.assert_allclose(targets[:20], targets[20:40])
+
+
+def test_rows_with_unknown_numbers_are_left_out(fitted):
+    log = fitted[1]
+    q = log.q.copy()
+    q[3, 2] = np.nan
+    x = log.x.copy()
+    x[5] = np.nan
+    with hybridkin.view(fitted[0], datasets.Log(q, x), port=9350) as shown:
+        assert len(shown._rows.dots.points) == len(q) - 2
+
+
+def test_an_error_of_the_drawing_is_raised_where_one_waits(shown):
+    def fail(robot):
+        raise RuntimeError("no picture")
+
+    shown._body.move = fail
+    shown.follow(shown.robot.x + np.array([0.02, 0.0, 0.0]))
+    with pytest.raises(RuntimeError, match="no picture"):
+        shown.wait()
+    assert "no picture" in shown._words.content
 
 
 def test_a_closed_view_frees_its_port_and_a_taken_port_is_passed_over(fitted):
